@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Array types and the letters used for shapes in docstrings.
+
+Shape letters: ``N`` observations, ``C`` cameras or images, ``P`` points, ``L`` lines, ``K`` planes, ``M`` residual
+rows, ``...`` any leading batch axes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.integer]
+BoolArray = npt.NDArray[np.bool_]
+__all__ = ["BoolArray", "FloatArray", "IntArray"]

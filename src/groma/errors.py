@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The errors of groma.
+
+::
+
+    GromaError
+    ├── InputError (ValueError)      what the caller passed cannot be used
+    │   ├── ShapeError               an array has the wrong shape
+    │   ├── FileFormatError          a file is not what it claims to be: truncated, mutated, hostile
+    │   └── ProblemError             variables and factors do not fit together
+    └── OutputError (OSError)        a result could not be written
+
+Every message has three parts: what was expected, what came, what to do next. Failing to converge is an outcome, not
+an error: see :class:`groma.solver.termination.Termination`.
+"""
+
+
+class GromaError(Exception):
+    """Root of all errors that groma raises on purpose."""
+
+
+class InputError(GromaError, ValueError):
+    """Something passed in cannot be used."""
+
+
+class ShapeError(InputError):
+    """An array has the wrong shape."""
+
+
+class FileFormatError(InputError):
+    """A file does not hold what its format promises."""
+
+
+class ProblemError(InputError):
+    """Variables and factors of a problem do not fit together."""
+
+
+class OutputError(GromaError, OSError):
+    """A result could not be written."""
+
+
+__all__ = ["FileFormatError", "GromaError", "InputError", "OutputError", "ProblemError", "ShapeError"]
