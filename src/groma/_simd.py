@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Small dense block products as explicit vector instructions.
+
+Bundle adjustment spends its time in products of tiny blocks (3x9, 9x9). LLVM does not vectorise Numba's loops over
+them, because a store might alias a load. Here the blocks are loaded into vector registers by hand.
+
+Block sizes must be known when a loop is compiled. They are passed as *widths*: a tuple of zeros whose length is the
+size, ``width(9) == (0,) * 9``. The size is then part of the argument's type, so one loop at module level is compiled
+once for each size and cached on disk as such.
+
+With ``NUMBA_DISABLE_JIT=1`` the same names are plain NumPy.
+"""
+
+from __future__ import annotations
+
+import numba
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+_I32, _I64 = ir.IntType(32), ir.IntType(64)
+_DOUBLE = ir.DoubleType()
+
+
+def width(size: int) -> tuple[int, ...]:
+    """Return the tuple whose type tells a compiled loop the block size."""
+    return (0,) * size
+
+
+class _Vectors:
+    """LLVM vectors of ``lanes`` doubles at unaligned addresses."""
+
+    def __init__(self, builder: ir.IRBuilder, lanes: int) -> None:
+        self.builder = builder
+        self.type = ir.VectorType(_DOUBLE, lanes)
+        self.lanes = lanes
+        module = builder.module
+        self._fma = cgutils.get_or_insert_function(
+            module, ir.FunctionType(self.type, [self.type] * 3), f"llvm.fma.v{lanes}f64"
+        )
+        self._sum = cgutils.get_or_insert_function(
+            module, ir.FunctionType(_DOUBLE, [_DOUBLE, self.type]), f"llvm.vector.reduce.fadd.v{lanes}f64"
+        )
+
+    def load(self, pointer):
+        value = self.builder.load(self.builder.bitcast(pointer, self.type.as_pointer()))
+        value.align = 8
+        return value
+
+    def store(self, value, pointer) -> None:
+        self.builder.store(value, self.builder.bitcast(pointer, self.type.as_pointer())).align = 8
+
+    def splat(self, scalar):
+        undefined = ir.Constant(self.type, ir.Undefined)
+        first = self.builder.insert_element(undefined, scalar, ir.Constant(_I32, 0))
+        return self.builder.shuffle_vector(
+            first, undefined, ir.Constant(ir.VectorType(_I32, self.lanes), [0] * self.lanes)
+        )
+
+    def fma(self, a, b, c):
+        return self.builder.call(self._fma, [a, b, c])
+
+    def sum(self, value):
+        total = self.builder.call(self._sum, [ir.Constant(_DOUBLE, 0.0), value])
+        total.fastmath.add("reassoc")
+        return total
+
+
+def _pointer(context, builder, array_type, array, offset):
+    return builder.gep(context.make_array(array_type)(context, builder, array).data, [offset])
+
+
+def _product_codegen(context, builder, signature, args, accumulate: bool):
+    depth, rows, lanes = (signature.args[i].count for i in (8, 9, 10))
+    vectors = _Vectors(builder, lanes)
+    C = _pointer(context, builder, signature.args[0], args[0], args[1])
+    A = _pointer(context, builder, signature.args[2], args[2], args[3])
+    B = _pointer(context, builder, signature.args[5], args[5], args[6])
+    A_rows, B_rows = [A], [B]
+    for _ in range(1, depth):
+        A_rows.append(builder.gep(A_rows[-1], [args[4]]))
+        B_rows.append(builder.gep(B_rows[-1], [args[7]]))
+    b = [vectors.load(row) for row in B_rows]
+    a = [[builder.load(builder.gep(row, [ir.Constant(_I64, i)])) for row in A_rows] for i in range(rows)]
+    for i in range(rows):
+        target = builder.gep(C, [ir.Constant(_I64, i * lanes)])
+        total = vectors.load(target) if accumulate else None
+        for k in range(depth):
+            factor = vectors.splat(a[i][k])
+            total = builder.fmul(factor, b[k]) if total is None else vectors.fma(factor, b[k], total)
+        vectors.store(total, target)
+    return context.get_dummy_value()
+
+
+def _product_signature(args):
+    return types.void(*args)
+
+
+@intrinsic
+def _add_product(typing, C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes):
+    def codegen(context, builder, signature, args):
+        return _product_codegen(context, builder, signature, args, accumulate=True)
+
+    return _product_signature((C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)), codegen
+
+
+@intrinsic
+def _set_product(typing, C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes):
+    def codegen(context, builder, signature, args):
+        return _product_codegen(context, builder, signature, args, accumulate=False)
+
+    return _product_signature((C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)), codegen
+
+
+@intrinsic
+def _add_matvec(typing, y, y0, A, a0, x, x0, rows, lanes):
+    signature = types.void(y, y0, A, a0, x, x0, rows, lanes)
+
+    def codegen(context, builder, signature, args):
+        num_rows, num_lanes = signature.args[6].count, signature.args[7].count
+        vectors = _Vectors(builder, num_lanes)
+        y_pointer = _pointer(context, builder, signature.args[0], args[0], args[1])
+        A_pointer = _pointer(context, builder, signature.args[2], args[2], args[3])
+        x_value = vectors.load(_pointer(context, builder, signature.args[4], args[4], args[5]))
+        sums = []
+        for i in range(num_rows):
+            row = vectors.load(builder.gep(A_pointer, [ir.Constant(_I64, i * num_lanes)]))
+            sums.append(vectors.sum(builder.fmul(row, x_value)))
+        for i, value in enumerate(sums):
+            target = builder.gep(y_pointer, [ir.Constant(_I64, i)])
+            builder.store(builder.fadd(builder.load(target), value), target)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _blocks(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes):
+    m, p, q = len(depth), len(rows), len(lanes)
+    first = [A[a0 + k * a_stride : a0 + k * a_stride + p] for k in range(m)]
+    second = [B[b0 + k * b_stride : b0 + k * b_stride + q] for k in range(m)]
+    product = sum(x[:, None] * y[None, :] for x, y in zip(first, second, strict=True))
+    return C[c0 : c0 + p * q], product.reshape(-1)
+
+
+def _add_product_plain(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes):
+    target, product = _blocks(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)
+    target += product
+
+
+def _set_product_plain(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes):
+    target, product = _blocks(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)
+    target[:] = product
+
+
+def _add_matvec_plain(y, y0, A, a0, x, x0, rows, lanes):
+    p, q = len(rows), len(lanes)
+    y[y0 : y0 + p] += A[a0 : a0 + p * q].reshape(p, q) @ x[x0 : x0 + q]
+
+
+if numba.config.DISABLE_JIT:
+    add_product, set_product, add_matvec = _add_product_plain, _set_product_plain, _add_matvec_plain
+else:
+    #: ``add_product(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)``: C += A^T B for flat float64 arrays
+    #: at element offsets. A is depth x rows and B depth x lanes, with the given distances between their rows; C is
+    #: rows x lanes without gaps. The last three arguments are widths.
+    add_product = _add_product
+    #: As :data:`add_product`, but C = A^T B.
+    set_product = _set_product
+    #: ``add_matvec(y, y0, A, a0, x, x0, rows, lanes)``: y += A x for the rows x lanes block A, without gaps.
+    add_matvec = _add_matvec

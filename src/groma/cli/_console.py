@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a command says: text, warnings, one progress line on a terminal."""
+
+import os
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class Console:
+    """Speaks on standard output, or on standard error when the report goes to standard output."""
+
+    def __init__(self, quiet: bool, verbose: bool, json_target: str | None, threads: int | None = None) -> None:
+        self.quiet = quiet
+        self.verbose = verbose and not quiet
+        self._stream = sys.stderr if json_target == "-" else sys.stdout
+        if threads is not None:
+            # Read by the numerical libraries when they are loaded, which has not happened yet.
+            for variable in _THREAD_VARIABLES:
+                os.environ[variable] = str(threads)
+
+    def say(self, text: str = "") -> None:
+        """Print a line unless --quiet."""
+        if not self.quiet:
+            print(text, file=self._stream, flush=True)
+
+    def detail(self, text: str) -> None:
+        """Print a line with --verbose."""
+        if self.verbose:
+            print(text, file=self._stream, flush=True)
+
+    def warn(self, text: str) -> None:
+        """Print a warning on standard error unless --quiet."""
+        if not self.quiet:
+            print(f"warning: {text}", file=sys.stderr, flush=True)
+
+    def announce_compilation(self) -> None:
+        """Say so when kernels are about to be compiled for the first time, because it takes a while."""
+        if not _cache_is_filled():
+            self.say("First run: compiling for this machine. Later runs start at once.")
+
+    def progress(self) -> "Progress":
+        """Return a progress line; silent when not on a terminal."""
+        return Progress(enabled=not self.quiet and sys.stderr.isatty())
+
+
+class Progress:
+    """One line that rewrites itself; call it with the progress events of a pipeline."""
+
+    def __init__(self, enabled: bool) -> None:
+        self._enabled = enabled
+
+    def __call__(self, event: Any) -> None:
+        """Show one event: iteration, limit and cost."""
+        if self._enabled:
+            sys.stderr.write(f"\r\x1b[K  step {event.iteration}/{event.max_iterations}   cost {event.cost:.6g}")
+            sys.stderr.flush()
+
+    def __enter__(self) -> "Progress":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._enabled:
+            sys.stderr.write("\r\x1b[K")
+            sys.stderr.flush()
+
+
+def _cache_is_filled() -> bool:
+    """Whether compiled kernels of this package lie in the cache, wherever Numba keeps it."""
+    package = Path(__file__).resolve().parents[1]
+    folders = [package]
+    if "NUMBA_CACHE_DIR" in os.environ:
+        folders = [Path(os.environ["NUMBA_CACHE_DIR"])]
+    elif not os.access(package, os.W_OK):
+        return True  # a per-user folder that only Numba knows; better silent than wrong
+    return any(next(folder.rglob("*.nbc"), None) is not None for folder in folders if folder.is_dir())

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Turn what a command raises into an exit code and one line; a traceback is only for errors of groma itself."""
+
+import functools
+import sys
+from collections.abc import Callable
+from typing import ParamSpec
+
+import typer
+
+from groma.cli.main import INTERRUPTED
+from groma.errors import GromaError
+
+P = ParamSpec("P")
+
+
+def guard(command: Callable[P, None]) -> Callable[P, None]:
+    """Wrap a command: known errors end in exit code 1 and one line, Ctrl-C in 130."""
+
+    @functools.wraps(command)
+    def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            command(*args, **kwargs)
+            sys.stdout.flush()
+        except KeyboardInterrupt:
+            _fail("interrupted; nothing was written.", INTERRUPTED)
+        except BrokenPipeError:
+            # The reader of a pipe has gone (``groma ... | head``). Nothing more can be said to it.
+            sys.stdout = None  # type: ignore[assignment]
+            raise typer.Exit(1) from None
+        except GromaError as error:
+            _fail(str(error), 1)
+        except OSError as error:
+            place = f"{error.filename}: " if error.filename else ""
+            _fail(f"{place}{error.strerror or error}", 1)
+        except MemoryError:
+            _fail("the memory of this machine is not enough for this input.", 1)
+
+    return guarded
+
+
+def _fail(message: str, code: int) -> None:
+    line = " ".join(message.split())
+    print(f"groma: {line}", file=sys.stderr, flush=True)
+    raise typer.Exit(code) from None

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Options that every command shares."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Json = Annotated[
+    str | None,
+    typer.Option("--json", metavar="FILE", help="Write a machine-readable report to FILE; '-' is standard output."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")]
+Threads = Annotated[int | None, typer.Option("--threads", min=1, metavar="N", help="Use at most N threads.")]
+Seed = Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the random numbers.")]
+Force = Annotated[bool, typer.Option("--force", "-f", help="Replace what is there.")]
+Input = Annotated[
+    Path,
+    typer.Argument(metavar="INPUT", help="COLMAP model folder, BAL file (.txt, .bz2, .gz) or groma archive (.npz)."),
+]

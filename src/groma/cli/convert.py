@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma convert``: from one file format to another."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from groma.cli import _options
+
+
+def convert(
+    source: _options.Input,
+    target: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUTPUT",
+            help="Its name says the format: a folder for a COLMAP model, .npz for a groma archive, .txt, .bz2 or .gz "
+            "for BAL, .ply or .obj for geometry only.",
+        ),
+    ],
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Read a scene and write it in another format."""
+    from groma.cli import _output
+    from groma.cli._console import Console
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_output(target, force)
+    _output.check_json(json_target)
+
+    from groma.cli._counts import counts_of, sentence_of
+    from groma.io import read_scene, write_scene
+
+    scene = read_scene(source)
+    with _output.atomic_output(target, force) as draft:
+        write_scene(scene, draft)
+    console.say(f"Wrote {target}: {sentence_of(scene)}")
+    _output.write_json(json_target, {"input": str(source), "output": str(target), **counts_of(scene)})

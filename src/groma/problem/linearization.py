@@ -1,0 +1,451 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""From states to normal equations.
+
+For every chunk of the layout the factors write their records ``[J_1 | J_2 | ... | r]`` into a scratch that stays in
+cache. The records are whitened, weighted by the robust loss, chained with the charts, and summed into
+
+.. math:: V = \sum J_l^\top J_l, \quad W = \sum J_l^\top J_c, \quad H = \sum J_c^\top J_c, \quad g = \sum J^\top r .
+
+V, W and the landmarks' gradient belong to a chunk alone; H and the cameras' gradient are summed per thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from groma._numba import loop
+from groma._simd import add_product, set_product, width
+from groma._typing import FloatArray
+from groma.factors.losses import loss_derivatives, loss_value
+from groma.problem._parallel import Workers
+from groma.problem.layout import Chunk, FactorLayout, Layout
+
+States = Mapping[str, FloatArray]
+
+# ---------------------------------------------------------------------------------------------------------- Kernels
+
+
+@loop
+def _whiten(record, begin, information):
+    """Multiply each record from the left by its square root information matrix."""
+    n, m, columns = record.shape
+    old = np.empty(m)
+    for i in range(n):
+        for c in range(columns):
+            for a in range(m):
+                old[a] = record[i, a, c]
+            for a in range(m):
+                total = 0.0
+                for b in range(m):
+                    total += information[begin + i, a, b] * old[b]
+                record[i, a, c] = total
+
+
+@loop
+def _weigh(record, begin, scale, step, code, first, second, norms):
+    """Scale each record by 1/sigma and by the root of the loss' weight; return sum of rho, write the squared norms."""
+    n, m, columns = record.shape
+    cost = 0.0
+    for i in range(n):
+        s = scale[(begin + i) * step]
+        norm = 0.0
+        for a in range(m):
+            norm += record[i, a, columns - 1] * record[i, a, columns - 1]
+        norm *= s * s
+        norms[i] = norm
+        if code == 0:
+            cost += norm
+        else:
+            rho, weight, _ = loss_derivatives(code, first, second, norm)
+            cost += rho
+            s *= np.sqrt(weight)
+        if s != 1.0:
+            for a in range(m):
+                for c in range(columns):
+                    record[i, a, c] *= s
+    return cost
+
+
+@loop
+def _cost_scaled(residual, begin, scale, step, code, first, second, rho):
+    n, m = residual.shape
+    cost = 0.0
+    for i in range(n):
+        s = scale[(begin + i) * step]
+        norm = 0.0
+        for a in range(m):
+            norm += residual[i, a] * residual[i, a]
+        value = loss_value(code, first, second, norm * s * s)
+        rho[i] = value
+        cost += value
+    return cost
+
+
+@loop
+def _cost_whitened(residual, begin, information, code, first, second, rho):
+    n, m = residual.shape
+    cost = 0.0
+    for i in range(n):
+        norm = 0.0
+        for a in range(m):
+            total = 0.0
+            for b in range(m):
+                total += information[begin + i, a, b] * residual[i, b]
+            norm += total * total
+        value = loss_value(code, first, second, norm)
+        rho[i] = value
+        cost += value
+    return cost
+
+
+@loop
+def _chain(record, begin, raw, column, index, basis, raw_width, dof_width, one):
+    """Columns of the chart = columns in factor coordinates times the basis of the chart."""
+    n, m, columns = record.shape
+    flat, bases = record.reshape(record.size), basis.reshape(basis.size)
+    size, dof = len(raw_width), len(dof_width)
+    for i in range(n):
+        b = np.int64(index[begin + i]) * (size * dof)
+        for a in range(m):
+            row = (i * m + a) * columns
+            set_product(flat, row + column, flat, row + raw, 1, bases, b, dof, raw_width, one, dof_width)
+
+
+@loop
+def _mask(record, begin, column, index, free):
+    """Zero the columns of coordinates that are held constant."""
+    n, m, _ = record.shape
+    for i in range(n):
+        k = index[begin + i]
+        for c in range(free.shape[1]):
+            if not free[k, c]:
+                for a in range(m):
+                    record[i, a, column + c] = 0.0
+
+
+@loop
+def _add_primary(
+    record, begin, landmark, l_column, incidence, block, c_column, V, g_l, W, H, g_c, rows, l_width, c_width, one
+):
+    """Sum the landmark, its incidence and its kept block, for factors with a landmark and a first kept block."""
+    n, m, columns = record.shape
+    flat = record.reshape(record.size)
+    dl, dc = len(l_width), len(c_width)
+    for i in range(n):
+        base = i * m * columns
+        at_l, at_c, at_r = base + l_column, base + c_column, base + columns - 1
+        p, q, c = np.int64(landmark[begin + i]), incidence[begin + i], np.int64(block[begin + i])
+        add_product(V, p * (dl * dl), flat, at_l, columns, flat, at_l, columns, rows, l_width, l_width)
+        add_product(g_l, p * dl, flat, at_r, columns, flat, at_l, columns, rows, one, l_width)
+        add_product(W, q * (dl * dc), flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
+        add_product(H, c * (dc * dc), flat, at_c, columns, flat, at_c, columns, rows, c_width, c_width)
+        add_product(g_c, c * dc, flat, at_r, columns, flat, at_c, columns, rows, one, c_width)
+
+
+@loop
+def _add_incidence(record, begin, l_column, incidence, c_column, W, rows, l_width, c_width):
+    n, m, columns = record.shape
+    flat = record.reshape(record.size)
+    size = len(l_width) * len(c_width)
+    for i in range(n):
+        base = i * m * columns
+        at_l, at_c = base + l_column, base + c_column
+        add_product(W, incidence[begin + i] * size, flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
+
+
+@loop
+def _add_block(record, begin, block, column, H, g, rows, block_width, one):
+    """Sum the square and the gradient of one block; serves landmarks alone and kept blocks alone."""
+    n, m, columns = record.shape
+    flat = record.reshape(record.size)
+    size = len(block_width)
+    for i in range(n):
+        base = i * m * columns
+        at_c, at_r = base + column, base + columns - 1
+        c = np.int64(block[begin + i])
+        add_product(H, c * (size * size), flat, at_c, columns, flat, at_c, columns, rows, block_width, block_width)
+        add_product(g, c * size, flat, at_r, columns, flat, at_c, columns, rows, one, block_width)
+
+
+@loop
+def _add_cross(record, begin, block_a, column_a, block_b, column_b, slot, same_class, H, rows, a_width, b_width):
+    """Sum the product of two kept blocks; within one class the smaller block is the row."""
+    n, m, columns = record.shape
+    flat = record.reshape(record.size)
+    size = len(a_width) * len(b_width)
+    for i in range(n):
+        base = i * m * columns
+        at_a, at_b = base + column_a, base + column_b
+        target = np.int64(slot[begin + i]) * size
+        a, b = block_a[begin + i], block_b[begin + i]
+        if not same_class or a <= b:
+            add_product(H, target, flat, at_a, columns, flat, at_b, columns, rows, a_width, b_width)
+        if same_class and a >= b:
+            add_product(H, target, flat, at_b, columns, flat, at_a, columns, rows, b_width, a_width)
+
+
+# ----------------------------------------------------------------------------------------------------------- Public
+
+_ONE = width(1)
+
+
+class Noise:
+    """The noise and the loss of a factor group in the form the loops take."""
+
+    def __init__(self, layout: FactorLayout) -> None:
+        factor = layout.factor
+        information = np.asarray(factor.sqrt_information, dtype=np.float64)
+        self.matrices: FloatArray | None = None
+        self.scale = np.ones(1)
+        self.step = 0
+        if information.ndim == 3:
+            self.matrices = np.ascontiguousarray(information)
+        elif information.ndim == 1:
+            self.scale, self.step = np.ascontiguousarray(information), 1
+        else:
+            self.scale = information.reshape(1)
+        self.code = factor.loss.code
+        self.first, self.second = (float(p) for p in factor.loss.parameters)
+
+
+class NormalEquations:
+    """The sums V, W, H and g of a layout, and the scratch to form them."""
+
+    def __init__(self, layout: Layout, workers: Workers) -> None:
+        self.layout = layout
+        self.workers = workers
+        self._noise = [Noise(factor) for factor in layout.factors]
+        self._sizes = [0] * len(layout.factors)
+        for chunk in layout.chunks:
+            for f, begin, end in chunk.factors:
+                self._sizes[f] = max(self._sizes[f], end - begin)
+        self.shares = _shares(layout.chunks, workers.count)
+        self._scratch: list[dict[int, FloatArray]] = [{} for _ in self.shares]
+        self._free = {}
+        for name, group in layout.problem.variables.items():
+            free = group.free_coordinates()
+            if free is not None:
+                order = next((e.order for e in layout.eliminated if e.group == name), None)
+                self._free[name] = np.ascontiguousarray(free if order is None else free[order])
+        self.V = [np.zeros(e.count * e.dof * e.dof) for e in layout.eliminated]
+        self.g_landmarks = [np.zeros(e.count * e.dof) for e in layout.eliminated]
+        self.W = [
+            {c: np.zeros(len(i.block) * e.dof * layout.kept[c].width) for c, i in e.incidences.items()}
+            for e in layout.eliminated
+        ]
+        self._H = [
+            {p: np.zeros(n * layout.kept[p[0]].width * layout.kept[p[1]].width) for p, n in layout.num_direct.items()}
+            for _ in self.shares
+        ]
+        self._g = [[np.zeros(c.count * c.width) for c in layout.kept] for _ in self.shares]
+        self.num_degenerate = [0] * len(layout.factors)
+        self.costs = [0.0] * len(layout.factors)
+
+    # ------------------------------------------------------------------------------------------------ evaluation
+
+    def prepare(self, states: States) -> list[tuple]:
+        """Evaluate what each factor group reads of the states."""
+        ambients = {name: self.layout.problem.variables[name].manifold.ambient(state) for name, state in states.items()}
+        return [
+            layout.factor.prepare(tuple(ambients[ref.group] for _, ref in layout.factor.references()))
+            for layout in self.layout.factors
+        ]
+
+    def cost(self, inputs: list[tuple], landmark_costs: list[FloatArray] | None = None) -> float:
+        """Return the total cost; also store the cost of each factor group in ``costs``.
+
+        With ``landmark_costs`` (one array of zeros per eliminated group) the cost of each landmark is added there.
+        """
+
+        def work(share: int) -> list[float]:
+            sums = [0.0] * len(self.layout.factors)
+            for chunk in self.shares[share]:
+                for f, begin, end in chunk.factors:
+                    if begin == end:
+                        continue
+                    value, rho = self._chunk_cost(share, f, inputs[f], begin, end)
+                    sums[f] += value
+                    if landmark_costs is not None and chunk.eliminated is not None:
+                        landmark = self.layout.factors[f].landmark[begin:end] - chunk.begin
+                        landmark_costs[chunk.eliminated][chunk.begin : chunk.end] += 0.5 * np.bincount(
+                            landmark, weights=rho, minlength=chunk.end - chunk.begin
+                        )
+            return sums
+
+        parts = self.workers.map(work, len(self.shares))
+        self.costs = [0.5 * sum(part[f] for part in parts) for f in range(len(self.layout.factors))]
+        return float(sum(self.costs))
+
+    def _chunk_cost(self, share: int, f: int, inputs: tuple, begin: int, end: int) -> tuple[float, FloatArray]:
+        layout, noise = self.layout.factors[f], self._noise[f]
+        n, m = end - begin, layout.factor.residual_size
+        flat = self._record(share, f)
+        out = flat[: n * m].reshape(n, m)
+        rho = flat[n * m : n * m + n]
+        layout.factor.residuals(inputs, begin, end, out)
+        if noise.matrices is not None:
+            value = _cost_whitened(out, begin, noise.matrices, noise.code, noise.first, noise.second, rho)
+        else:
+            value = _cost_scaled(
+                out, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, rho
+            )
+        return value, rho
+
+    def _record(self, share: int, f: int) -> FloatArray:
+        scratch = self._scratch[share]
+        if f not in scratch:
+            layout = self.layout.factors[f]
+            size = self._sizes[f] * (layout.factor.residual_size * layout.width + 1)
+            scratch[f] = np.zeros(size)
+        return scratch[f]
+
+    def linearize(self, states: States, inputs: list[tuple], after_chunk=None) -> float:
+        """Form all sums at the given states and return the cost.
+
+        ``after_chunk(share, chunk)`` is called as soon as the sums of a chunk's landmarks are complete, while they
+        are still in cache.
+        """
+        bases = {}
+        for layout in self.layout.factors:
+            for chain in layout.chains:
+                name = layout.factor.references()[chain.reference][1].group
+                if name not in bases:
+                    bases[name] = self.layout.problem.variables[name].manifold.basis(states[name])
+
+        def work(share: int) -> tuple[list[float], list[int]]:
+            costs, degenerate = [0.0] * len(self.layout.factors), [0] * len(self.layout.factors)
+            for H in self._H[share].values():
+                H[:] = 0.0
+            for g in self._g[share]:
+                g[:] = 0.0
+            for chunk in self.shares[share]:
+                self._clear(chunk)
+                for f, begin, end in chunk.factors:
+                    if begin < end:
+                        cost, count = self._linearize_chunk(share, f, inputs[f], bases, begin, end)
+                        costs[f] += cost
+                        degenerate[f] += count
+                if after_chunk is not None and chunk.eliminated is not None:
+                    after_chunk(share, chunk)
+            return costs, degenerate
+
+        parts = self.workers.map(work, len(self.shares))
+        self.costs = [0.5 * sum(part[0][f] for part in parts) for f in range(len(self.layout.factors))]
+        self.num_degenerate = [sum(part[1][f] for part in parts) for f in range(len(self.layout.factors))]
+        self.H = {pair: sum_of([H[pair] for H in self._H]) for pair in self.layout.num_direct}
+        self.g_kept = [sum_of([g[c] for g in self._g]) for c in range(len(self.layout.kept))]
+        return float(sum(self.costs))
+
+    def _clear(self, chunk: Chunk) -> None:
+        if chunk.eliminated is None:
+            return
+        e = self.layout.eliminated[chunk.eliminated]
+        self.V[chunk.eliminated][chunk.begin * e.dof**2 : chunk.end * e.dof**2] = 0.0
+        self.g_landmarks[chunk.eliminated][chunk.begin * e.dof : chunk.end * e.dof] = 0.0
+        for c, incidences in e.incidences.items():
+            size = e.dof * self.layout.kept[c].width
+            first, last = incidences.pointer[chunk.begin], incidences.pointer[chunk.end]
+            self.W[chunk.eliminated][c][first * size : last * size] = 0.0
+
+    def _linearize_chunk(
+        self, share: int, f: int, inputs: tuple, bases: dict, begin: int, end: int
+    ) -> tuple[float, int]:
+        """Write, weigh, chain and sum the records of one factor group in one chunk."""
+        layout, noise = self.layout.factors[f], self._noise[f]
+        n, m = end - begin, layout.factor.residual_size
+        flat = self._record(share, f)
+        record = flat[: n * m * layout.width].reshape(n, m, layout.width)
+        norms = flat[len(flat) - n :]
+        if layout.has_gaps:
+            record[:] = 0.0
+        degenerate = layout.factor.linearize(inputs, begin, end, layout.columns, record)
+        if noise.matrices is not None:
+            _whiten(record, begin, noise.matrices)
+        cost = _weigh(record, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, norms)
+        references = layout.factor.references()
+        for chain in layout.chains:
+            ref = references[chain.reference][1]
+            _chain(
+                record, begin, chain.raw_column, chain.column, ref.index, bases[ref.group],
+                width(chain.raw_size), width(chain.dof), _ONE,
+            )  # fmt: skip
+        for reference, column, _ in layout.masked:
+            ref = references[reference][1]
+            _mask(record, begin, column, ref.index, self._free[ref.group])
+        self._sum(share, layout, record, begin)
+        return cost, degenerate
+
+    def _sum(self, share: int, layout: FactorLayout, record: FloatArray, begin: int) -> None:
+        rows = width(layout.factor.residual_size)
+        H, g = self._H[share], self._g[share]
+        rest = layout.kept
+        if layout.eliminated is not None:
+            e = layout.eliminated
+            l_width = width(self.layout.eliminated[e].dof)
+            if not layout.kept:
+                _add_block(
+                    record, begin, layout.landmark, layout.landmark_column, self.V[e], self.g_landmarks[e],
+                    rows, l_width, _ONE,
+                )  # fmt: skip
+                return
+            first, rest = layout.kept[0], layout.kept[1:]
+            c = first.kept_class
+            _add_primary(
+                record, begin, layout.landmark, layout.landmark_column, first.incidence, first.block, first.column,
+                self.V[e], self.g_landmarks[e], self.W[e][c], H[c, c], g[c],
+                rows, l_width, width(self.layout.kept[c].width), _ONE,
+            )  # fmt: skip
+            for entry in rest:
+                c = entry.kept_class
+                _add_incidence(
+                    record, begin, layout.landmark_column, entry.incidence, entry.column, self.W[e][c],
+                    rows, l_width, width(self.layout.kept[c].width),
+                )  # fmt: skip
+        for entry in rest:
+            c = entry.kept_class
+            _add_block(
+                record, begin, entry.block, entry.column, H[c, c], g[c], rows, width(self.layout.kept[c].width), _ONE
+            )
+        for i, j, slot in layout.crosses:
+            a, b = layout.kept[i], layout.kept[j]
+            pair = (a.kept_class, b.kept_class)
+            _add_cross(
+                record, begin, a.block, a.column, b.block, b.column, slot, pair[0] == pair[1], H[pair],
+                rows, width(self.layout.kept[pair[0]].width), width(self.layout.kept[pair[1]].width),
+            )  # fmt: skip
+
+
+def _shares(chunks: tuple[Chunk, ...], count: int) -> list[list[Chunk]]:
+    """Divide consecutive chunks among ``count`` threads, about equal in the number of factors."""
+    if count == 1 or len(chunks) < 2 * count:
+        return [list(chunks)]
+    done = np.concatenate([[0], np.cumsum([max(chunk.size, 1) for chunk in chunks])])
+    cuts = np.searchsorted(done, done[-1] * np.arange(count + 1) / count)
+    cuts[0], cuts[-1] = 0, len(chunks)
+    return [list(chunks[cuts[i] : cuts[i + 1]]) for i in range(count)]
+
+
+def sum_of(parts: list[FloatArray]) -> FloatArray:
+    """Sum of equal arrays; a single one is passed on as it is."""
+    return parts[0] if len(parts) == 1 else np.sum(parts, axis=0)
+
+
+def to_original_order(layout: Layout, states: States) -> dict[str, FloatArray]:
+    """Undo the sorting of landmarks."""
+    result = dict(states)
+    for e in layout.eliminated:
+        original = np.empty_like(states[e.group])
+        original[e.order] = states[e.group]
+        result[e.group] = original
+    return result
+
+
+def to_solver_order(layout: Layout) -> dict[str, FloatArray]:
+    """States of the problem's variables, landmarks in the order of the layout."""
+    states = {name: group.state for name, group in layout.problem.variables.items()}
+    for e in layout.eliminated:
+        states[e.group] = np.ascontiguousarray(states[e.group][e.order])
+    return states
+

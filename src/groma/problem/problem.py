@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A least-squares problem: groups of variables and groups of factors.
+
+The cost is :math:`\\tfrac12 \\sum_i \\rho_i(\\lVert \\Sigma_i^{-1/2} r_i \\rVert^2)` over all factors.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.errors import ProblemError
+from groma.factors._factor import Factor
+from groma.problem.variables import Variables
+
+
+@dataclass(frozen=True, init=False)
+class Problem:
+    """Variables by group name, and the factors between them."""
+
+    variables: Mapping[str, Variables]
+    factors: tuple[Factor, ...]
+
+    def __init__(self, variables: Mapping[str, Variables], factors: Iterable[Factor]) -> None:
+        object.__setattr__(self, "variables", dict(variables))
+        object.__setattr__(self, "factors", tuple(factors))
+        for factor in self.factors:
+            self._check(factor)
+
+    def _check(self, factor: Factor) -> None:
+        """Check that every reference of a factor meets an existing variable of the right kind."""
+        name = factor.type_name or type(factor).__name__
+        for slot, ref in factor.references():
+            if ref.group not in self.variables:
+                raise ProblemError(
+                    f"Factor {name!r} refers to the group {ref.group!r} in its slot {slot.name!r}; "
+                    f"the problem has the groups {sorted(self.variables)}."
+                )
+            variables = self.variables[ref.group]
+            if slot.kind not in (variables.manifold.kind, "vector"):
+                raise ProblemError(
+                    f"Slot {slot.name!r} of factor {name!r} takes variables of kind {slot.kind!r}; "
+                    f"group {ref.group!r} holds {variables.manifold.kind!r}."
+                )
+            if len(ref.index) != len(factor):
+                raise ProblemError(
+                    f"Slot {slot.name!r} of factor {name!r} has {len(ref.index)} indices for {len(factor)} factors."
+                )
+            if len(ref.index) and (ref.index.min() < 0 or ref.index.max() >= len(variables)):
+                bad = int(np.flatnonzero((ref.index < 0) | (ref.index >= len(variables)))[0])
+                raise ProblemError(
+                    f"Factor {bad} of {name!r} refers to variable {int(ref.index[bad])} of group {ref.group!r}, "
+                    f"which has {len(variables)} (0 to {len(variables) - 1}). Drop it or add the variable."
+                )
+
+    def with_states(self, states: Mapping[str, FloatArray]) -> Problem:
+        """Return the same problem at other states; groups that are not named keep theirs."""
+        variables = {
+            name: group.with_state(states[name]) if name in states else group for name, group in self.variables.items()
+        }
+        return dataclasses.replace(self, variables=variables, factors=self.factors)
+
+    @property
+    def num_residuals(self) -> int:
+        """Total number of residual rows."""
+        return sum(len(factor) * factor.residual_size for factor in self.factors)

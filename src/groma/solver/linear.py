@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Three ways to solve the reduced system S x = b.
+
+``dense``
+    Cholesky (LAPACK). Best below about 1 500 unknowns, or when S is nearly full.
+``sparse``
+    Direct factorisation with a fill-reducing symmetric ordering (SuperLU). Best when cameras see few others.
+``pcg``
+    Conjugate gradients, preconditioned with the inverses of the diagonal blocks, stopped early: a Newton step needs few
+    digits. Best for thousands of cameras.
+
+Each solver is made once per layout and called once per step. It returns None when S is not positive definite; the
+caller then raises the damping.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+
+from groma._numba import loop
+from groma._simd import add_matvec, add_product, width
+from groma._typing import FloatArray
+from groma.problem.layout import Layout
+
+Blocks = dict[tuple[int, int], FloatArray]
+
+#: Up to this many unknowns a dense factorisation is taken without looking at the structure.
+DENSE_UNKNOWNS = 1500
+#: A denser reduced system than this share of blocks is factorised densely up to ``DENSE_LIMIT`` unknowns.
+DENSE_SHARE = 0.3
+DENSE_LIMIT = 12000
+
+# ---------------------------------------------------------------------------------------------------------- Kernels
+
+
+@loop
+def _scatter(blocks, rows, columns, row_start, column_start, M):
+    """Write the blocks into the upper triangle of M."""
+    n, a, b = blocks.shape
+    for i in range(n):
+        r, c = row_start + np.int64(rows[i]) * a, column_start + np.int64(columns[i]) * b
+        for k in range(a):
+            for m in range(b):
+                M[r + k, c + m] = blocks[i, k, m]
+
+
+@loop
+def _multiply(blocks, rows, columns, same_class, x_row, x_column, y_row, y_column, a_width, b_width, one):
+    """Add S x to y for the blocks of one class pair, and their mirror images below the diagonal."""
+    a, b = len(a_width), len(b_width)
+    flat = blocks.reshape(blocks.size)
+    for i in range(rows.shape[0]):
+        r, c = np.int64(rows[i]), np.int64(columns[i])
+        add_matvec(y_row, r * a, flat, i * a * b, x_column, c * b, a_width, b_width)
+        if not same_class or r != c:
+            add_product(y_column, c * b, x_row, r * a, 1, flat, i * a * b, b, a_width, one, b_width)
+
+
+# ----------------------------------------------------------------------------------------------------------- Public
+
+
+class LinearSolver(Protocol):
+    """Solves S x = b for the blocks of one layout."""
+
+    name: str
+
+    def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:
+        """Return x by class, flat, or None when S is not positive definite."""
+        ...
+
+
+def choose(layout: Layout, name: str) -> LinearSolver:
+    """Return the solver called ``name``; ``auto`` looks at size and structure."""
+    if name == "auto":
+        unknowns = layout.num_kept_unknowns
+        filled = 0.0
+        for (a, b), (rows, _) in layout.blocks.items():
+            size = layout.kept[a].width * layout.kept[b].width * len(rows)
+            filled += size if a == b else 2 * size
+        share = 2 * filled / max(unknowns, 1) ** 2
+        if unknowns <= DENSE_UNKNOWNS or (share > DENSE_SHARE and unknowns <= DENSE_LIMIT):
+            name = "dense"
+        else:
+            name = "pcg"
+    return {"dense": Dense, "sparse": Sparse, "pcg": ConjugateGradients}[name](layout)
+
+
+def _split(layout: Layout, x: FloatArray) -> list[FloatArray]:
+    return [np.ascontiguousarray(x[c.start : c.start + c.count * c.width]) for c in layout.kept]
+
+
+class Dense:
+    """Cholesky factorisation of the full matrix."""
+
+    name = "dense"
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        n = layout.num_kept_unknowns
+        self._M = np.zeros((n, n))
+        self.factor: FloatArray | None = None
+
+    def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
+        layout = self._layout
+        self._M[:] = 0.0
+        for (a, b), S in blocks.items():
+            rows, columns = layout.blocks[a, b]
+            _scatter(S, rows, columns, layout.kept[a].start, layout.kept[b].start, self._M)
+        # the upper triangle in C order is the lower triangle of the transpose, which LAPACK takes without a copy
+        self.factor, info = scipy.linalg.lapack.dpotrf(self._M.T, lower=1, overwrite_a=1, clean=0)
+        if info != 0:
+            return None
+        x, info = scipy.linalg.lapack.dpotrs(self.factor, np.concatenate(rhs), lower=1)
+        return _split(layout, x) if np.isfinite(x).all() else None
+
+
+class Sparse:
+    """Factorisation of the scalar sparse matrix."""
+
+    name = "sparse"
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        n = layout.num_kept_unknowns
+        rows_of, columns_of, source = [], [], []
+        position = 0
+        self._order = list(layout.blocks)
+        for a, b in self._order:
+            rows, columns = layout.blocks[a, b]
+            wa, wb = layout.kept[a].width, layout.kept[b].width
+            r = layout.kept[a].start + rows[:, None, None] * wa + np.arange(wa)[None, :, None]
+            c = layout.kept[b].start + columns[:, None, None] * wb + np.arange(wb)[None, None, :]
+            r, c = (np.broadcast_to(x, (len(rows), wa, wb)).reshape(-1) for x in (r, c))
+            s = position + np.arange(len(r))
+            position += len(r)
+            upper = r <= c
+            r, c, s = r[upper], c[upper], s[upper]
+            off = r != c
+            rows_of += [r, c[off]]
+            columns_of += [c, r[off]]
+            source += [s, s[off]]
+        r, c, s = np.concatenate(rows_of), np.concatenate(columns_of), np.concatenate(source)
+        matrix = scipy.sparse.csc_matrix((s + 1.0, (r, c)), shape=(n, n))
+        matrix.sort_indices()
+        self._source = (matrix.data - 1).astype(np.int64)
+        self._matrix = matrix
+        self.factor: scipy.sparse.linalg.SuperLU | None = None
+
+    def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
+        values = np.concatenate([blocks[pair].reshape(-1) for pair in self._order])
+        self._matrix.data = values[self._source]
+        try:
+            self.factor = scipy.sparse.linalg.splu(
+                self._matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
+        except RuntimeError:  # exactly singular
+            return None
+        x = self.factor.solve(np.concatenate(rhs))
+        return _split(self._layout, x) if np.isfinite(x).all() else None
+
+
+class ConjugateGradients:
+    """Preconditioned conjugate gradients on the blocks."""
+
+    name = "pcg"
+    #: Stop when one more iteration improves the quadratic model by less than this share of its mean improvement.
+    model_tolerance = 0.05
+    max_iterations = 500
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self.num_iterations = 0
+        #: b - S x of the last solve, by class.
+        self.residual: list[FloatArray] = []
+
+    def multiply(self, blocks: Blocks, x: list[FloatArray]) -> list[FloatArray]:
+        """Return S x."""
+        layout = self._layout
+        y = [np.zeros_like(part) for part in x]
+        for (a, b), S in blocks.items():
+            rows, columns = layout.blocks[a, b]
+            _multiply(
+                S, rows, columns, a == b, x[a], x[b], y[a], y[b],
+                width(layout.kept[a].width), width(layout.kept[b].width), width(1),
+            )  # fmt: skip
+        return y
+
+    def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
+        inverses = []
+        for c, kept in enumerate(self._layout.kept):
+            try:
+                inverses.append(np.linalg.inv(blocks[c, c][: kept.count]))
+            except np.linalg.LinAlgError:
+                return None
+
+        def precondition(r: list[FloatArray]) -> list[FloatArray]:
+            parts = zip(r, inverses, self._layout.kept, strict=True)
+            return [np.einsum("nij,nj->ni", inv, v.reshape(-1, kept.width)).reshape(-1) for v, inv, kept in parts]
+
+        x = [np.zeros_like(b) for b in rhs]
+        r = [b.copy() for b in rhs]
+        z = precondition(r)
+        p = [v.copy() for v in z]
+        rz = _dot(r, z)
+        model = 0.0
+        for k in range(1, self.max_iterations + 1):
+            if rz <= 0.0:
+                break
+            Sp = self.multiply(blocks, p)
+            curvature = _dot(p, Sp)
+            if not curvature > 0.0:
+                if k == 1:
+                    return None
+                break
+            alpha = rz / curvature
+            for i in range(len(x)):
+                x[i] += alpha * p[i]
+                r[i] -= alpha * Sp[i]
+            # value of the quadratic model, as in Nash and Sofer, "Assessing a search direction within a
+            # truncated-Newton method", 1990
+            value = -0.5 * (_dot(x, rhs) + _dot(x, r))
+            self.num_iterations = k
+            if k * (value - model) / value < self.model_tolerance:
+                break
+            model = value
+            z = precondition(r)
+            rz_next = _dot(r, z)
+            p = [a + (rz_next / rz) * b for a, b in zip(z, p, strict=True)]
+            rz = rz_next
+        self.residual = r
+        return x if all(np.isfinite(part).all() for part in x) else None
+
+
+def _dot(x: list[FloatArray], y: list[FloatArray]) -> float:
+    return float(sum(a @ b for a, b in zip(x, y, strict=True)))
+
+

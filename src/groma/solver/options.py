@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Options of a solve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from groma.errors import InputError
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """How a problem is solved. The defaults suit bundle adjustment."""
+
+    #: Most steps tried, accepted or not.
+    max_iterations: int = 50
+    #: Stop when the cost falls by less than this fraction in an accepted step.
+    function_tolerance: float = 1e-6
+    #: Stop when no component of the gradient exceeds this.
+    gradient_tolerance: float = 1e-10
+    #: Stop when a step is shorter than this fraction of the state.
+    step_tolerance: float = 1e-10
+    #: ``levenberg_marquardt`` or ``dogleg``.
+    strategy: str = "levenberg_marquardt"
+    #: First damping, relative to the diagonal of the normal equations.
+    initial_damping: float = 1e-4
+    #: ``auto``, ``dense``, ``sparse`` or ``pcg``: how the reduced system is solved.
+    linear_solver: str = "auto"
+    #: Steps of every landmark on its own after each accepted joint step; a step that does not help is undone.
+    landmark_steps: int = 0
+    #: Groups of variables that are eliminated, or ``auto``.
+    eliminate: str | tuple[str, ...] = "auto"
+    #: Threads; None takes one for small problems and all cores for large ones.
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        choices = {
+            "strategy": ("levenberg_marquardt", "dogleg"),
+            "linear_solver": ("auto", "dense", "sparse", "pcg"),
+        }
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise InputError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
+        for name in ("max_iterations", "landmark_steps"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name} must not be negative; got {getattr(self, name)}.")
+        for name in ("function_tolerance", "gradient_tolerance", "step_tolerance", "initial_damping"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name} must be a number that is not negative; got {getattr(self, name)}.")
+        if self.threads is not None and self.threads < 1:
+            raise InputError(f"threads must be at least 1, or None; got {self.threads}.")

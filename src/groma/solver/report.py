@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a solve returns besides the states: why it stopped, what it cost, how long it took, what was odd."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from groma.solver.termination import Termination
+
+STAGES = ("setup", "linearize", "schur", "solve", "backsubstitute", "cost")
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One step that was tried."""
+
+    iteration: int
+    #: Cost after the step if it was accepted, else the cost that was refused.
+    cost: float
+    accepted: bool
+    damping: float
+    #: Actual over predicted decrease of the cost.
+    gain_ratio: float
+    #: Euclidean length of the step in increments.
+    step_norm: float
+    #: Largest component of the gradient at the start of the step.
+    gradient_max: float
+    #: Iterations of the linear solver; 0 for direct solvers.
+    linear_iterations: int
+    #: Since the start of the solve.
+    seconds: float
+
+
+@dataclass
+class SolveReport:
+    """Outcome of a solve. Not converging is an outcome, not an error: see ``termination``."""
+
+    termination: Termination = Termination.NOTHING_TO_DO
+    #: Half the sum of the robustified squared residuals.
+    initial_cost: float = 0.0
+    final_cost: float = 0.0
+    #: Steps tried, accepted or not.
+    iterations: int = 0
+    history: list[Iteration] = field(default_factory=list)
+    #: Cost by factor type at the start and at the end.
+    initial_costs: dict[str, float] = field(default_factory=dict)
+    final_costs: dict[str, float] = field(default_factory=dict)
+    #: Number of factors and of residual rows.
+    num_factors: int = 0
+    num_residuals: int = 0
+    #: Unknowns that could move.
+    num_unknowns: int = 0
+    #: Factors by type that could not be evaluated (a line through the camera centre, say) and were left out.
+    num_degenerate: dict[str, int] = field(default_factory=dict)
+    #: Landmarks with a direction that the data did not determine at the last linearisation.
+    num_underdetermined_landmarks: int = 0
+    #: ``dense``, ``sparse``, ``pcg``, or ``blocks`` when every variable is a problem of its own.
+    linear_solver: str = ""
+    threads: int = 1
+    #: Wall time by stage, and ``total``.
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+    #: Sentences for the user.
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def converged(self) -> bool:
+        """Whether a stop criterion was met."""
+        return self.termination.converged
+
+    @property
+    def reduced_chi_square(self) -> float:
+        """Twice the final cost over the redundancy; about 1 when the noise is as stated and no loss bends it."""
+        redundancy = self.num_residuals - self.num_unknowns
+        return 2 * self.final_cost / redundancy if redundancy > 0 else float("nan")
+
+    def __str__(self) -> str:
+        rows = [
+            f"{self.termination.sentence}",
+            f"cost {self.initial_cost:.6e} -> {self.final_cost:.6e} in {self.iterations} steps, "
+            f"{self.seconds.get('total', 0.0):.3f} s ({self.linear_solver}, {self.threads} thread(s))",
+            f"{self.num_factors} factors, {self.num_residuals} residuals, {self.num_unknowns} unknowns",
+        ]
+        return "\n".join(rows + [f"note: {warning}" for warning in self.warnings])
+
+
+class Stopwatch:
+    """Adds the time of named stages to a report."""
+
+    def __init__(self, report: SolveReport) -> None:
+        self._report = report
+        self._start = time.perf_counter()
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time one stage."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._report.seconds[stage] += time.perf_counter() - begin
+
+    def move(self, source: str, target: str, seconds: float) -> None:
+        """Book time under another stage, for stages that run inside one another."""
+        self._report.seconds[source] -= seconds
+        self._report.seconds[target] += seconds
+
+    def elapsed(self) -> float:
+        """Seconds since the stopwatch was made."""
+        return time.perf_counter() - self._start

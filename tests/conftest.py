@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Settings that hold for every test: the kernel cache, hypothesis, the data beside the checkout.
+
+Numba's disk cache does not notice that a kernel in *another* file has changed, and then returns old numbers. The
+cache folder is therefore named after a hash of all files that hold kernels. This runs before Numba is imported.
+"""
+
+import hashlib
+import os
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED_DATA = ROOT.parent / "shared" / "data"
+SHARED_GOLDEN = ROOT.parent / "shared" / "math" / "golden"
+
+
+def _hash_of_kernels() -> str:
+    digest = hashlib.sha256()
+    for path in sorted((ROOT / "src" / "groma").rglob("*.py")):
+        content = path.read_bytes()
+        if b"_numba" in content:
+            digest.update(path.name.encode() + b"\0" + content)
+    return digest.hexdigest()[:16]
+
+
+os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".cache" / f"numba-{_hash_of_kernels()}"))
+
+hypothesis.settings.register_profile(
+    "groma",
+    deadline=None,
+    derandomize=True,
+    print_blob=False,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+    database=None,
+)
+hypothesis.settings.load_profile("groma")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what needs the data beside the checkout where there is none."""
+    if SHARED_DATA.is_dir():
+        return
+    skip = pytest.mark.skip(reason="needs the data beside the checkout (../shared/data)")
+    for item in items:
+        if "shared" in item.keywords:
+            item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the data beside the checkout."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip("needs the data beside the checkout (../shared/data)")
+    return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def shared_golden() -> Path:
+    """Folder of reference values beside the checkout."""
+    if not SHARED_GOLDEN.is_dir():
+        pytest.skip("needs the reference values beside the checkout")
+    return SHARED_GOLDEN
