@@ -2,11 +2,20 @@
 """From ray to pixel and back, each with its derivative: one file per family of camera models."""
 
 from groma.cameras._camera import CameraModel, model, models, register_camera
+from groma.cameras.fisheye import OPENCV_FISHEYE
+from groma.cameras.opencv import FULL_OPENCV, OPENCV
 from groma.cameras.pinhole import PINHOLE, SIMPLE_PINHOLE
+from groma.cameras.radial import BAL, RADIAL, SIMPLE_RADIAL
 
 __all__ = [
+    "BAL",
+    "FULL_OPENCV",
+    "OPENCV",
+    "OPENCV_FISHEYE",
     "PINHOLE",
+    "RADIAL",
     "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
     "CameraModel",
     "model",
     "models",

@@ -1,20 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""What a camera model is, and how compiled code calls the right one.
+r"""What a camera model is, and the registry of models.
 
 A camera model maps a point in the camera frame (x right, y down, z forward) to a pixel, in COLMAP's pixel convention
 (the centre of the first pixel is (0.5, 0.5)), and a pixel back to a unit bearing. It depends on ``k`` parameters.
 
-**Dispatch.** Loops that project points (the factors) do not know the model. They take :attr:`CameraModel.tag` as an
-argument, a tuple of zeros whose length is one more than the number of the model. Numba compiles a loop per argument
-type, and the length is part of the type, so the loop calls the model's kernel directly: no branch, no function
-pointer, and Numba's disk cache works. Without the compiler the same names are plain Python functions::
-
-    @loop
-    def project_all(model_tag, params, points, pixels):
-        for i in range(points.shape[0]):
-            project(model_tag, params[i], points[i], pixels[i])
-
-The kernels return False, and write zeros, where the model has no value.
+Compiled loops call the kernels through :mod:`groma.cameras._dispatch`, whose names are repeated here.
 
 **Cheirality.** Perspective models evaluate their formula as written for z < 0 too and refuse only
 :math:`|z| \le 10^{-12} (|x| + |y| + |z|)`. Whether a point behind the camera may take part is the caller's decision.
@@ -26,75 +16,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba.extending import overload
 
 from groma._numba import loop
 from groma._typing import FloatArray
+from groma.cameras._dispatch import (
+    has_pinhole_kernels,
+    pinhole_parameters,
+    pinhole_parameters_jacobian,
+    project,
+    project_jacobian,
+    set_kernels,
+    unproject,
+)
 from groma.errors import InputError, ShapeError
 
 # --------------------------------------------------------------------------------------------------------- Kernels
-# Kernels by length of the tag. Filled by register_camera.
-
-_PROJECT: dict[int, Callable[..., bool]] = {}
-_PROJECT_JACOBIAN: dict[int, Callable[..., bool]] = {}
-_UNPROJECT: dict[int, Callable[..., bool]] = {}
-_PINHOLE: dict[int, Callable[..., None]] = {}
-_PINHOLE_JACOBIAN: dict[int, Callable[..., None]] = {}
-
-
-def project(model_tag, params, X, uv):
-    """Write the pixel ``uv`` (2,) of the point ``X`` (3,) in the camera frame; False and zeros if it has none."""
-    return _PROJECT[len(model_tag)](params, X, uv)
-
-
-def project_jacobian(model_tag, params, X, uv, J_point, J_params):
-    """Write pixel ``uv`` (2,), its derivatives ``J_point`` (2, 3) and ``J_params`` (2, k); False and zeros if none."""
-    return _PROJECT_JACOBIAN[len(model_tag)](params, X, uv, J_point, J_params)
-
-
-def unproject(model_tag, params, uv, bearing):
-    """Write the unit ``bearing`` (3,) of the pixel ``uv`` (2,); False and zeros if the model does not reach it."""
-    return _UNPROJECT[len(model_tag)](params, uv, bearing)
-
-
-def pinhole_parameters(model_tag, params, K):
-    """Write ``K`` (4,) = fx, fy, cx, cy of a model without distortion."""
-    _PINHOLE[len(model_tag)](params, K)
-
-
-def pinhole_parameters_jacobian(model_tag, params, J):
-    """Write ``J`` (4, k), the derivative of fx, fy, cx, cy by the parameters of a model without distortion."""
-    _PINHOLE_JACOBIAN[len(model_tag)](params, J)
-
-
-@overload(project)
-def _project(model_tag, params, X, uv):
-    kernel = _PROJECT[model_tag.count]
-    return lambda model_tag, params, X, uv: kernel(params, X, uv)
-
-
-@overload(project_jacobian)
-def _project_jacobian(model_tag, params, X, uv, J_point, J_params):
-    kernel = _PROJECT_JACOBIAN[model_tag.count]
-    return lambda model_tag, params, X, uv, J_point, J_params: kernel(params, X, uv, J_point, J_params)
-
-
-@overload(unproject)
-def _unproject(model_tag, params, uv, bearing):
-    kernel = _UNPROJECT[model_tag.count]
-    return lambda model_tag, params, uv, bearing: kernel(params, uv, bearing)
-
-
-@overload(pinhole_parameters)
-def _pinhole_parameters(model_tag, params, K):
-    kernel = _PINHOLE[model_tag.count]
-    return lambda model_tag, params, K: kernel(params, K)
-
-
-@overload(pinhole_parameters_jacobian)
-def _pinhole_parameters_jacobian(model_tag, params, J):
-    kernel = _PINHOLE_JACOBIAN[model_tag.count]
-    return lambda model_tag, params, J: kernel(params, J)
 
 
 @loop
@@ -153,6 +89,8 @@ class CameraModel:
     extra_indices: tuple[int, ...]
     #: COLMAP's name of the same model, or None.
     colmap_name: str | None = None
+    #: Whether points at and behind the image plane have an image of their own (fisheye), so that z > 0 is no test.
+    sees_behind: bool = False
 
     @property
     def num_parameters(self) -> int:
@@ -161,13 +99,13 @@ class CameraModel:
 
     @property
     def tag(self) -> tuple[int, ...]:
-        """What compiled loops take to select this model, see :mod:`groma.cameras._camera`."""
+        """What compiled loops take to select this model, see :mod:`groma.cameras._dispatch`."""
         return (0,) * (self.number + 1)
 
     @property
     def has_pinhole_parameters(self) -> bool:
         """Whether the model is free of distortion by its form, so that straight lines have straight images."""
-        return self.number + 1 in _PINHOLE
+        return has_pinhole_kernels(self.number + 1)
 
     def project(self, params: FloatArray, points_in_cam: FloatArray) -> FloatArray:
         """Project points to pixels.
@@ -260,7 +198,7 @@ class CameraModel:
     def require_pinhole(self) -> None:
         """Raise :class:`~groma.errors.InputError` unless the model is free of distortion by its form."""
         if not self.has_pinhole_parameters:
-            free = ", ".join(name for name, other in _MODELS.items() if other.has_pinhole_parameters)
+            free = ", ".join(other.name for other in models() if other.has_pinhole_parameters)
             raise InputError(
                 f"Straight image lines need a camera model without distortion ({free}); got {self.name}. "
                 f"Use the bearing factor for lines under distortion, or undistort the segments first."
@@ -305,7 +243,9 @@ class CameraModel:
     def bearing_jacobian(self, params: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         r"""Bearings and their derivative by the pixel.
 
-        .. math:: \frac{\partial f}{\partial u} = J^+ = J^\top (J J^\top)^{-1}, \qquad J = \partial\,\mathrm{project}/\partial X |_{X=f}
+        .. math::
+            \frac{\partial f}{\partial u} = J^+ = J^\top (J J^\top)^{-1}, \qquad
+            J = \frac{\partial\,\mathrm{project}}{\partial X}\Big|_{X=f}
 
         Projection does not depend on the length of its argument, so :math:`J f = 0` and the columns of the
         derivative lie in the tangent plane of the bearing: :math:`f^\top \partial f/\partial u = 0`.
@@ -400,7 +340,8 @@ def register_camera(
         The model. Its number must be free; groma uses 0 to 15. Keep it the same from run to run: compiled loops are
         cached on disk by this number.
     project, project_jacobian, unproject : callable
-        Kernels (decorated with ``groma._numba.kernel``) as described in this module, without the tag.
+        Kernels (decorated with ``groma._numba.kernel``) as described in :mod:`groma.cameras._dispatch`, without the
+        tag.
     pinhole_parameters, pinhole_parameters_jacobian : callable, optional
         For models without distortion only.
 
@@ -420,11 +361,15 @@ def register_camera(
                 f"A camera model needs a name and a number of its own; got {camera.name!r} and {camera.number}, "
                 f"but {other.name!r} has number {other.number}. Choose a free number from 16 upwards."
             )
-    length = camera.number + 1
     _MODELS[camera.name] = camera
-    _PROJECT[length], _PROJECT_JACOBIAN[length], _UNPROJECT[length] = project, project_jacobian, unproject
-    if pinhole_parameters is not None and pinhole_parameters_jacobian is not None:
-        _PINHOLE[length], _PINHOLE_JACOBIAN[length] = pinhole_parameters, pinhole_parameters_jacobian
+    set_kernels(
+        camera.number + 1,
+        project,
+        project_jacobian,
+        unproject,
+        pinhole_parameters,
+        pinhole_parameters_jacobian,
+    )
     return camera
 
 
@@ -432,15 +377,15 @@ def model(name: str) -> CameraModel:
     """Return the camera model of the given name, for example ``"PINHOLE"``; InputError lists the names if unknown."""
     if name not in _MODELS:
         raise InputError(
-            f"Camera model must be one of {', '.join(_MODELS)}; got {name!r}. "
+            f"Camera model must be one of {', '.join(other.name for other in models())}; got {name!r}. "
             f"Convert the images to one of these models first, or register it with groma.cameras.register_camera."
         )
     return _MODELS[name]
 
 
 def models() -> tuple[CameraModel, ...]:
-    """All registered camera models."""
-    return tuple(_MODELS.values())
+    """All registered camera models, by number."""
+    return tuple(sorted(_MODELS.values(), key=lambda camera: camera.number))
 
 
 def _rows(array: FloatArray, columns: int, name: str) -> FloatArray:

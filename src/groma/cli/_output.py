@@ -71,19 +71,19 @@ def atomic_output(path: Path, force: bool) -> Iterator[Path]:
         shutil.rmtree(workshop, ignore_errors=True)
 
 
-def check_json(target: str | None) -> None:
+def check_json(target: str | None, force: bool) -> None:
     """Refuse a report that could not be written, before any work is done."""
     if target not in (None, "-"):
         path = Path(target)
         if path.is_dir():
             raise OutputError(f"--json {target} is a folder. Give a file name, or '-' for standard output.")
-        check_output(path, force=True)
+        check_output(path, force)
 
 
-def write_json(target: str | None, content: dict[str, object]) -> None:
+def write_json(target: str | None, content: dict[str, object], force: bool = False) -> None:
     """Write ``content`` to the file ``target``, to standard output when it is '-', nowhere when it is None.
 
-    Numbers that are not finite become null, which every JSON reader accepts. A report is replaced without asking.
+    Numbers that are not finite become null, which every JSON reader accepts.
     """
     if target is None:
         return
@@ -91,7 +91,7 @@ def write_json(target: str | None, content: dict[str, object]) -> None:
     if target == "-":
         print(text, end="", flush=True)
         return
-    with atomic_output(Path(target), force=True) as draft:
+    with atomic_output(Path(target), force) as draft:
         draft.write_text(text, encoding="utf-8")
 
 

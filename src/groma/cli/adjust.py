@@ -74,7 +74,7 @@ def adjust(
     for path in (output, page):
         if path is not None:
             _output.check_output(path, force)
-    _output.check_json(json_target)
+    _output.check_json(json_target, force)
 
     from groma.cli._numbers import describe
     from groma.io import read_scene, write_scene
@@ -120,4 +120,4 @@ def adjust(
             console.say(f"Wrote {path}")
     if output is None and page is None and json_target is None:
         console.say("No -o given: the adjusted scene was not written.")
-    _output.write_json(json_target, {**numbers, "warnings": list(result.report.warnings)})
+    _output.write_json(json_target, {**numbers, "warnings": list(result.report.warnings)}, force)

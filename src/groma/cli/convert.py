@@ -31,7 +31,7 @@ def convert(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_output(target, force)
-    _output.check_json(json_target)
+    _output.check_json(json_target, force)
 
     from groma.cli._counts import counts_of, sentence_of
     from groma.io import read_scene, write_scene
@@ -40,4 +40,4 @@ def convert(
     with _output.atomic_output(target, force) as draft:
         write_scene(scene, draft)
     console.say(f"Wrote {target}: {sentence_of(scene)}")
-    _output.write_json(json_target, {"input": str(source), "output": str(target), **counts_of(scene)})
+    _output.write_json(json_target, {"input": str(source), "output": str(target), **counts_of(scene)}, force)

@@ -29,7 +29,7 @@ def demo(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_output(output, force)
-    _output.check_json(json_target)
+    _output.check_json(json_target, force)
 
     from importlib.resources import as_file, files
 
@@ -56,4 +56,4 @@ def demo(
     for sentence in result.report.warnings:
         console.warn(sentence)
     console.say(f"Open {(output / 'report.html').absolute()} in a browser to look at the scene before and after.")
-    _output.write_json(json_target, numbers)
+    _output.write_json(json_target, numbers, force)

@@ -12,6 +12,7 @@ from groma.cli import _options
 def poses(
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to judge.")],
     reference: Annotated[Path, typer.Argument(metavar="REF", help="Scene taken for true.")],
+    force: _options.Force = False,
     threads: _options.Threads = None,
     json_target: _options.Json = None,
     quiet: _options.Quiet = False,
@@ -22,7 +23,7 @@ def poses(
     from groma.cli._console import Console
 
     console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target)
+    _output.check_json(json_target, force)
 
     from groma.evaluation.poses import evaluate_poses
     from groma.io import read_scene
@@ -33,4 +34,4 @@ def poses(
     console.say(f"  rotations        {scores['rotation_deg_mean']:.4g} deg mean, {scores['rotation_deg_max']:.4g} max")
     areas = ", ".join(f"{value:.3f} at {degrees} deg" for degrees, value in scores["auc"].items())
     console.say(f"  pose error AUC   {areas}")
-    _output.write_json(json_target, scores)
+    _output.write_json(json_target, scores, force)

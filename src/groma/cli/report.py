@@ -29,7 +29,7 @@ def report(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_output(output, force)
-    _output.check_json(json_target)
+    _output.check_json(json_target, force)
 
     from groma.cli._counts import counts_of
     from groma.io import read_scene
@@ -40,4 +40,4 @@ def report(
     with _output.atomic_output(output, force) as draft:
         write_report(draft, earlier, scene, title=source.name)
     console.say(f"Wrote {output}")
-    _output.write_json(json_target, {"output": str(output), **counts_of(scene)})
+    _output.write_json(json_target, {"output": str(output), **counts_of(scene)}, force)

@@ -38,7 +38,7 @@ def synth(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_output(output, force)
-    _output.check_json(json_target)
+    _output.check_json(json_target, force)
 
     from groma.cli._counts import counts_of, sentence_of
     from groma.io import write_scene
@@ -51,4 +51,4 @@ def synth(
         write_scene(made.truth, draft / "truth.npz")
         write_scene(made.start, draft / "start.npz")
     console.say(f"Wrote {output}/truth.npz and start.npz: {sentence_of(made.truth)}")
-    _output.write_json(json_target, {"kind": kind, "seed": seed, "noise_px": noise, **counts_of(made.truth)})
+    _output.write_json(json_target, {"kind": kind, "seed": seed, "noise_px": noise, **counts_of(made.truth)}, force)

@@ -1,1 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
+"""Factors: one residual per file, each with its formula, its kernels, its class and its registration."""

@@ -1,1 +1,27 @@
 # SPDX-License-Identifier: BSD-3-Clause
+"""What is known about the world: arrays and identifiers, no algorithms."""
+
+from groma.scene.camera import Cameras, Rigs, Sensors
+from groma.scene.image import Frames, Images
+from groma.scene.landmarks import Directions, Lines, Planes, Points
+from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
+from groma.scene.scene import Scene
+from groma.scene.similarity import Similarity
+
+__all__ = [
+    "Cameras",
+    "Directions",
+    "Frames",
+    "Images",
+    "Keypoints",
+    "LineObservations",
+    "Lines",
+    "Planes",
+    "PointObservations",
+    "Points",
+    "Relations",
+    "Rigs",
+    "Scene",
+    "Sensors",
+    "Similarity",
+]

@@ -1,14 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Levenberg-Marquardt with elimination of landmarks.
-
-::
-
-    linearise and eliminate
-    repeat
-        solve the reduced system, back-substitute        -> step
-        move the states, evaluate the cost               -> gain ratio
-        if the cost fell:  keep the states, lower the damping, test for convergence, linearise and eliminate
-        else:              raise the damping, eliminate again at the same linearisation
+r"""Levenberg-Marquardt: the step is damped, :math:`(J^\top J + \lambda D)\,\delta = -g` with :math:`D` the diagonal.
 
 The damping follows Nielsen: with the gain ratio :math:`\varrho` = actual / predicted decrease,
 :math:`\lambda \leftarrow \lambda \max(1/3, 1 - (2\varrho - 1)^3)` after an accepted step; after a refused one
@@ -19,177 +10,69 @@ H. B. Nielsen, *Damping parameter in Marquardt's method*, IMM-REP-1999-05, 1999.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from groma.problem.linearization import NormalEquations
+from groma.solver.linear import ConjugateGradients, LinearSolver
+from groma.solver.report import Stopwatch
+from groma.solver.schur import ReducedSystem
+from groma.solver.steps import States, Step, diagonal, gradient
 
-import numpy as np
-
-from groma._typing import FloatArray
-from groma.problem._parallel import Workers, available_cores
-from groma.problem.layout import Layout, lay_out
-from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
-from groma.problem.problem import Problem
-from groma.solver.independent import IndependentBlocks
-from groma.solver.linear import ConjugateGradients, LinearSolver, choose
-from groma.solver.options import SolverOptions
-from groma.solver.report import Iteration, SolveReport, Stopwatch
-from groma.solver.schur import MIN_DIAGONAL, ReducedSystem
-from groma.solver.termination import Termination
-
-#: From this many factors on, all cores are used unless the caller says otherwise.
-FACTORS_FOR_THREADS = 50_000
 MAX_DAMPING = 1e16
 
-#: Called after every step tried; returning False stops the solve.
-Progress = Callable[[Iteration], bool | None]
+
+class LevenbergMarquardt:
+    """Proposes damped steps and adapts the damping."""
+
+    def __init__(
+        self, equations: NormalEquations, system: ReducedSystem, linear: LinearSolver, watch: Stopwatch, damping: float
+    ) -> None:
+        self._equations, self._system, self._linear, self._watch = equations, system, linear, watch
+        self.damping = damping
+        self._growth = 2.0
+
+    def linearize(self, states: States, inputs: list[tuple]) -> None:
+        """Form the normal equations and eliminate each chunk's landmarks while they are in cache."""
+        linearize_and_eliminate(self._equations, self._system, states, inputs, self.damping, self._watch)
+
+    def propose(self) -> tuple[Step, float] | None:
+        r"""Return a step and the decrease of the quadratic model, :math:`-g^\top\delta - \tfrac12\delta^\top J^\top J\delta`.
+
+        From :math:`(J^\top J + \lambda D)\,\delta = -g - e`, with e the residual that an iterative solver leaves, the
+        decrease is :math:`\tfrac12(-g^\top\delta + \lambda\,\delta^\top D\,\delta + e^\top\delta)`.
+        """
+        with self._watch("schur"):
+            self._system.assemble(self.damping)
+        with self._watch("solve"):
+            kept = self._linear.solve(self._system.S, self._system.rhs)
+        if kept is None:
+            return None
+        with self._watch("backsubstitute"):
+            step = Step(kept, self._system.landmark_steps(kept))
+            scaled = [d * delta for d, delta in zip(diagonal(self._equations, self._system).parts(), step.parts(), strict=True)]
+            total = self.damping * sum(float(a @ b) for a, b in zip(scaled, step.parts(), strict=True))
+            total -= gradient(self._equations).dot(step)
+            if isinstance(self._linear, ConjugateGradients):
+                total += sum(float(r @ d) for r, d in zip(self._linear.residual, kept, strict=True))
+        return step, 0.5 * total
+
+    def accept(self, gain_ratio: float) -> None:
+        """Lower the damping after an accepted step."""
+        self.damping = max(self.damping * max(1.0 / 3.0, 1.0 - (2.0 * gain_ratio - 1.0) ** 3), 1e-16)
+        self._growth = 2.0
+
+    def refuse(self) -> bool:
+        """Raise the damping after a refused step; return False when there is no use in trying on."""
+        self.damping, self._growth = self.damping * self._growth, self._growth * 2.0
+        if self.damping > MAX_DAMPING:
+            return False
+        with self._watch("schur"):
+            self._system.eliminate(self.damping)
+        return True
 
 
-@dataclass(frozen=True)
-class Solution:
-    """The problem at its new states, and how it got there."""
-
-    problem: Problem
-    report: SolveReport
-
-    def __getitem__(self, group: str) -> FloatArray:
-        """Return the states of a group of variables."""
-        return self.problem.variables[group].state
-
-
-def solve(problem: Problem, options: SolverOptions | None = None, progress: Progress | None = None) -> Solution:
-    r"""Minimise :math:`\tfrac12 \sum \rho(\lVert r \rVert^2)` over the free variables of a problem.
-
-    Parameters
-    ----------
-    problem
-        Variables and factors; not changed.
-    options
-        How to solve; the defaults suit bundle adjustment.
-    progress
-        Called with an :class:`Iteration` after every step tried; return False to stop.
-
-    Returns
-    -------
-    Solution
-        A new problem at the states found, and the report. Not converging is reported, not raised.
-
-    Raises
-    ------
-    ProblemError
-        If a factor couples two landmarks that were both to be eliminated.
-    """
-    options = options or SolverOptions()
-    report = SolveReport(num_factors=sum(map(len, problem.factors)), num_residuals=problem.num_residuals)
-    watch = Stopwatch(report)
-    with watch("setup"):
-        layout = lay_out(problem, options.eliminate)
-    report.warnings += layout.warnings
-    report.num_unknowns = _count_unknowns(problem)
-    if not layout.factors:
-        report.seconds["total"] = watch.elapsed()
-        return Solution(problem, report)
-    report.threads = options.threads or (available_cores() if report.num_factors >= FACTORS_FOR_THREADS else 1)
-    workers = Workers(report.threads)
-    try:
-        run = _solve_jointly if layout.kept else _solve_independently
-        states = run(layout, workers, options, report, watch, progress)
-    finally:
-        workers.close()
-    _note_oddities(report)
-    report.seconds["total"] = watch.elapsed()
-    return Solution(problem.with_states(to_original_order(layout, states)), report)
-
-
-def _solve_jointly(
-    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
-) -> dict[str, FloatArray]:
-    with watch("setup"):
-        equations = NormalEquations(layout, workers)
-        system = ReducedSystem(equations)
-        linear = choose(layout, options.linear_solver)
-        refiner = _landmark_refiner(layout, workers, options)
-        states = to_solver_order(layout)
-    report.linear_solver = linear.name
-    damping, growth = options.initial_damping, 2.0
-    with watch("cost"):
-        inputs = equations.prepare(states)
-        cost = equations.cost(inputs)
-    _start(report, layout, equations, cost)
-    if not np.isfinite(cost):
-        report.termination = Termination.NOT_FINITE
-        return states
-    _linearize(equations, system, states, inputs, damping, watch)
-    report.termination = Termination.MAX_ITERATIONS
-    while report.iterations < options.max_iterations:
-        gradient = _largest(equations)
-        if gradient <= options.gradient_tolerance:
-            report.termination = Termination.GRADIENT_CONVERGED
-            break
-        report.iterations += 1
-        step = _step(system, linear, damping, watch)
-        new_cost, ratio, length = np.inf, 0.0, 0.0
-        candidate = states
-        if step is not None:
-            with watch("backsubstitute"):
-                candidate = _retract(layout, states, step)
-            with watch("cost"):
-                new_inputs = equations.prepare(candidate)
-                new_cost = equations.cost(new_inputs)
-            length = np.sqrt(sum(float(d @ d) for d in step.deltas()))
-            predicted = _predicted_decrease(equations, system, linear, step, damping)
-            ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
-        accepted = bool(new_cost < cost)
-        record = Iteration(
-            report.iterations, float(new_cost), accepted, damping, float(ratio), float(length), gradient,
-            linear.num_iterations if isinstance(linear, ConjugateGradients) else 0, watch.elapsed(),
-        )  # fmt: skip
-        report.history.append(record)
-        if accepted:
-            if refiner is not None:
-                with watch("backsubstitute"):
-                    candidate, new_cost = refiner.refine(equations, candidate, new_cost)
-                    new_inputs = equations.prepare(candidate)
-            decrease, old_cost = cost - new_cost, cost
-            states, cost, inputs = candidate, new_cost, new_inputs
-            damping *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
-            damping, growth = max(damping, 1e-16), 2.0
-            if decrease <= options.function_tolerance * old_cost:
-                report.termination = Termination.COST_CONVERGED
-            elif length <= options.step_tolerance * _size(states):
-                report.termination = Termination.STEP_CONVERGED
-        else:
-            damping, growth = damping * growth, growth * 2.0
-            if damping > MAX_DAMPING or (step is not None and length <= 1e-14 * _size(states)):
-                report.termination = Termination.DAMPING_EXHAUSTED
-        if progress is not None and progress(record) is False:
-            report.termination = Termination.STOPPED_BY_CALLER
-        if report.termination is not Termination.MAX_ITERATIONS or report.iterations >= options.max_iterations:
-            break
-        if accepted:
-            _linearize(equations, system, states, inputs, damping, watch)
-        else:
-            with watch("schur"):
-                system.eliminate(damping)
-    report.final_cost = cost
-    with watch("cost"):
-        equations.cost(inputs)
-    _finish(report, layout, equations, system.num_singular_landmarks)
-    return states
-
-
-@dataclass
-class _Step:
-    """Increments of the kept blocks by class and of the landmarks by group, flat."""
-
-    kept: list[FloatArray]
-    landmarks: list[FloatArray]
-
-    def deltas(self) -> list[FloatArray]:
-        return self.kept + self.landmarks
-
-
-def _linearize(equations: NormalEquations, system: ReducedSystem, states, inputs, damping: float, watch) -> None:
-    """Form the normal equations and eliminate each chunk's landmarks while they are in cache."""
+def linearize_and_eliminate(
+    equations: NormalEquations, system: ReducedSystem, states: States, inputs: list[tuple], damping: float, watch: Stopwatch
+) -> None:
+    """Form the normal equations; eliminate each chunk's landmarks right after, while they are in cache."""
     spent = [0.0]
 
     def eliminate(share: int, chunk) -> None:
@@ -202,189 +85,3 @@ def _linearize(equations: NormalEquations, system: ReducedSystem, states, inputs
         system.clear()
         equations.linearize(states, inputs, eliminate)
     watch.move("linearize", "schur", spent[0])
-
-
-def _step(system: ReducedSystem, linear: LinearSolver, damping: float, watch: Stopwatch) -> _Step | None:
-    with watch("schur"):
-        system.assemble(damping)
-    with watch("solve"):
-        kept = linear.solve(system.S, system.rhs)
-    if kept is None:
-        return None
-    with watch("backsubstitute"):
-        return _Step(kept, system.landmark_steps(kept))
-
-
-def _retract(layout: Layout, states: dict[str, FloatArray], step: _Step) -> dict[str, FloatArray]:
-    new = dict(states)
-    for kept, delta in zip(layout.kept, step.kept, strict=True):
-        blocks = delta.reshape(kept.count, kept.width)
-        for member in kept.members:
-            part = blocks[:, member.offset : member.offset + member.dof]
-            if member.block_of is not None:
-                part = part[member.block_of]
-            manifold = layout.problem.variables[member.group].manifold
-            new[member.group] = manifold.retract(states[member.group], np.ascontiguousarray(part))
-    for group, delta in zip(layout.eliminated, step.landmarks, strict=True):
-        manifold = layout.problem.variables[group.group].manifold
-        new[group.group] = manifold.retract(states[group.group], delta.reshape(group.count, group.dof))
-    return new
-
-
-def _predicted_decrease(
-    equations: NormalEquations, system: ReducedSystem, linear: LinearSolver, step: _Step, damping: float
-) -> float:
-    r"""Decrease of the quadratic model, :math:`-g^\top\delta - \tfrac12 \delta^\top J^\top J \delta`.
-
-    From :math:`(J^\top J + \lambda D)\,\delta = -g - e`, with e the residual an iterative solver leaves,
-    it is :math:`\tfrac12(-g^\top\delta + \lambda\,\delta^\top D\,\delta + e^\top\delta)`.
-    """
-    total = 0.0
-    for c, (delta, g) in enumerate(zip(step.kept, equations.g_kept, strict=True)):
-        diagonal = np.maximum(system.diagonal(c).reshape(-1), MIN_DIAGONAL)
-        total += float(-g @ delta + damping * (delta * delta) @ diagonal)
-    for e, (delta, g) in enumerate(zip(step.landmarks, equations.g_landmarks, strict=True)):
-        dof = equations.layout.eliminated[e].dof
-        diagonal = np.maximum(equations.V[e].reshape(-1, dof * dof)[:, :: dof + 1].reshape(-1), MIN_DIAGONAL)
-        total += float(-g @ delta + damping * (delta * delta) @ diagonal)
-    if isinstance(linear, ConjugateGradients):
-        total += sum(float(r @ d) for r, d in zip(linear.residual, step.kept, strict=True))
-    return 0.5 * total
-
-
-def _largest(equations: NormalEquations) -> float:
-    return max((float(np.abs(g).max()) for g in equations.g_kept + equations.g_landmarks if g.size), default=0.0)
-
-
-def _size(states: dict[str, FloatArray]) -> float:
-    return float(np.sqrt(sum(float(np.vdot(state, state)) for state in states.values()))) + 1e-12
-
-
-# ------------------------------------------------------------------------------------------- landmarks on their own
-
-
-class _LandmarkRefiner:
-    """A few steps of each landmark on its own, cameras held; a step that does not lower its cost is undone."""
-
-    def __init__(self, layout: Layout, workers: Workers, groups: list[str], steps: int) -> None:
-        held = {
-            name: group if name in groups else _hold(group) for name, group in layout.problem.variables.items()
-        }
-        factors = [f for f in layout.problem.factors if any(ref.group in groups for _, ref in f.references())]
-        self._outer, self._steps = layout, steps
-        self._blocks = IndependentBlocks(lay_out(Problem(held, factors), tuple(groups)), workers, 1e-6)
-
-    def refine(self, equations: NormalEquations, states, cost: float):
-        """Return better states and their cost."""
-        inner = to_original_order(self._outer, states)
-        self._blocks.reset()
-        costs = self._blocks.costs(inner)
-        for _ in range(self._steps):
-            inner, costs, _, _ = self._blocks.step(inner, costs)
-        refined = dict(states)
-        for group in self._outer.eliminated:
-            refined[group.group] = np.ascontiguousarray(inner[group.group][group.order])
-        new_cost = equations.cost(equations.prepare(refined))
-        return (refined, new_cost) if new_cost < cost else (states, cost)
-
-
-def _hold(group):
-    return replace(group, constant=True)
-
-
-def _landmark_refiner(layout: Layout, workers: Workers, options: SolverOptions) -> _LandmarkRefiner | None:
-    groups = [e.group for e in layout.eliminated]
-    if options.landmark_steps == 0 or not groups:
-        return None
-    return _LandmarkRefiner(layout, workers, groups, options.landmark_steps)
-
-
-def _solve_independently(
-    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
-) -> dict[str, FloatArray]:
-    with watch("setup"):
-        blocks = IndependentBlocks(layout, workers, options.initial_damping)
-        states = to_solver_order(layout)
-    report.linear_solver = "blocks"
-    with watch("cost"):
-        costs = blocks.costs(states)
-    cost = float(sum(blocks.equations.costs))
-    _start(report, layout, blocks.equations, cost)
-    if not np.isfinite(cost):
-        report.termination = Termination.NOT_FINITE
-        return states
-    report.termination = Termination.MAX_ITERATIONS
-    while report.iterations < options.max_iterations:
-        report.iterations += 1
-        with watch("linearize"):
-            states, new_costs, lengths, gradient = blocks.step(states, costs)
-        unfinished = blocks.unfinished(costs, new_costs, options.function_tolerance)
-        new_cost = cost + float(sum((a - b).sum() for a, b in zip(new_costs, costs, strict=True)))
-        length = float(np.sqrt(sum(float(x @ x) for x in lengths)))
-        damping = max((float(d.max()) for d in blocks.damping if d.size), default=0.0)
-        record = Iteration(
-            report.iterations, new_cost, new_cost < cost, damping, 0.0, length, gradient, 0, watch.elapsed()
-        )
-        report.history.append(record)
-        costs, cost = new_costs, new_cost
-        if gradient <= options.gradient_tolerance:
-            report.termination = Termination.GRADIENT_CONVERGED
-        elif unfinished == 0:
-            report.termination = Termination.COST_CONVERGED
-        if progress is not None and progress(record) is False:
-            report.termination = Termination.STOPPED_BY_CALLER
-        if report.termination is not Termination.MAX_ITERATIONS:
-            break
-    with watch("cost"):
-        report.final_cost = blocks.equations.cost(blocks.equations.prepare(states))
-    _finish(report, layout, blocks.equations, getattr(blocks, "num_singular", 0))
-    return states
-
-
-# ------------------------------------------------------------------------------------------------------- reporting
-
-
-def _count_unknowns(problem: Problem) -> int:
-    total = 0
-    used = {ref.group for factor in problem.factors if len(factor) for _, ref in factor.references()}
-    for name in used:
-        group = problem.variables[name]
-        free = group.free_coordinates()
-        total += len(group) * group.manifold.dof if free is None else int(free.sum())
-    return total
-
-
-def _by_type(layout: Layout, values: list) -> dict:
-    totals: dict = {}
-    for factor, value in zip(layout.factors, values, strict=True):
-        totals[factor.factor.type_name] = totals.get(factor.factor.type_name, 0) + value
-    return totals
-
-
-def _start(report: SolveReport, layout: Layout, equations: NormalEquations, cost: float) -> None:
-    report.initial_cost = report.final_cost = cost
-    report.initial_costs = report.final_costs = _by_type(layout, equations.costs)
-
-
-def _finish(report: SolveReport, layout: Layout, equations: NormalEquations, singular: int) -> None:
-    report.final_costs = _by_type(layout, equations.costs)
-    report.num_degenerate = {name: n for name, n in _by_type(layout, equations.num_degenerate).items() if n}
-    report.num_underdetermined_landmarks = singular
-
-
-def _note_oddities(report: SolveReport) -> None:
-    for name, count in report.num_degenerate.items():
-        report.warnings.append(
-            f"{count} factor(s) of type {name!r} could not be evaluated (degenerate geometry) and were left out."
-        )
-    if report.num_underdetermined_landmarks:
-        report.warnings.append(
-            f"{report.num_underdetermined_landmarks} landmark(s) have a direction that the observations do not "
-            "determine; it was left where it was."
-        )
-    if report.num_residuals < report.num_unknowns:
-        report.warnings.append(
-            f"There are fewer residuals ({report.num_residuals}) than unknowns ({report.num_unknowns}): the result is "
-            "one of many. Hold variables constant, add priors or add observations."
-        )
-

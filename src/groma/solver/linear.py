@@ -90,6 +90,21 @@ def choose(layout: Layout, name: str) -> LinearSolver:
     return {"dense": Dense, "sparse": Sparse, "pcg": ConjugateGradients}[name](layout)
 
 
+def multiply(layout: Layout, blocks: Blocks, x: list[FloatArray]) -> list[FloatArray]:
+    """Return the product of a symmetric block matrix, given by its upper blocks, with x; both by class and flat.
+
+    A class pair may hold fewer blocks than the layout lists; they are then the first ones.
+    """
+    y = [np.zeros_like(part) for part in x]
+    for (a, b), S in blocks.items():
+        rows, columns = (index[: len(S)] for index in layout.blocks[a, b])
+        _multiply(
+            S, rows, columns, a == b, x[a], x[b], y[a], y[b],
+            width(layout.kept[a].width), width(layout.kept[b].width), width(1),
+        )  # fmt: skip
+    return y
+
+
 def _split(layout: Layout, x: FloatArray) -> list[FloatArray]:
     return [np.ascontiguousarray(x[c.start : c.start + c.count * c.width]) for c in layout.kept]
 
@@ -106,17 +121,21 @@ class Dense:
         self.factor: FloatArray | None = None
 
     def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
-        layout = self._layout
         self._M[:] = 0.0
-        for (a, b), S in blocks.items():
-            rows, columns = layout.blocks[a, b]
-            _scatter(S, rows, columns, layout.kept[a].start, layout.kept[b].start, self._M)
+        self.fill(blocks, self._M)
         # the upper triangle in C order is the lower triangle of the transpose, which LAPACK takes without a copy
         self.factor, info = scipy.linalg.lapack.dpotrf(self._M.T, lower=1, overwrite_a=1, clean=0)
         if info != 0:
             return None
         x, info = scipy.linalg.lapack.dpotrs(self.factor, np.concatenate(rhs), lower=1)
-        return _split(layout, x) if np.isfinite(x).all() else None
+        return _split(self._layout, x) if np.isfinite(x).all() else None
+
+    def fill(self, blocks: Blocks, M: FloatArray) -> None:
+        """Write the blocks into the upper triangle of M (unknowns, unknowns)."""
+        layout = self._layout
+        for (a, b), S in blocks.items():
+            rows, columns = layout.blocks[a, b]
+            _scatter(S, rows, columns, layout.kept[a].start, layout.kept[b].start, M)
 
 
 class Sparse:
@@ -178,18 +197,6 @@ class ConjugateGradients:
         #: b - S x of the last solve, by class.
         self.residual: list[FloatArray] = []
 
-    def multiply(self, blocks: Blocks, x: list[FloatArray]) -> list[FloatArray]:
-        """Return S x."""
-        layout = self._layout
-        y = [np.zeros_like(part) for part in x]
-        for (a, b), S in blocks.items():
-            rows, columns = layout.blocks[a, b]
-            _multiply(
-                S, rows, columns, a == b, x[a], x[b], y[a], y[b],
-                width(layout.kept[a].width), width(layout.kept[b].width), width(1),
-            )  # fmt: skip
-        return y
-
     def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
         inverses = []
         for c, kept in enumerate(self._layout.kept):
@@ -211,7 +218,7 @@ class ConjugateGradients:
         for k in range(1, self.max_iterations + 1):
             if rz <= 0.0:
                 break
-            Sp = self.multiply(blocks, p)
+            Sp = multiply(self._layout, blocks, p)
             curvature = _dot(p, Sp)
             if not curvature > 0.0:
                 if k == 1:

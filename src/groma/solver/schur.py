@@ -250,6 +250,17 @@ class ReducedSystem:
         H = self.equations.H[c, c][: kept.count * kept.width**2].reshape(kept.count, kept.width, kept.width)
         return np.einsum("nii->ni", H)
 
+    def incident_products(self, delta_kept: list[FloatArray]) -> list[FloatArray]:
+        """Return W delta_c for the landmarks of each eliminated group, (count * dof,)."""
+        products = [np.zeros_like(g) for g in self.equations.g_landmarks]
+        for e, eliminated in enumerate(self.layout.eliminated):
+            for c, incidences in eliminated.incidences.items():
+                _add_incident_steps(
+                    incidences.pointer, incidences.block, self.equations.W[e][c], delta_kept[c], 0, eliminated.count,
+                    products[e], width(eliminated.dof), width(self.layout.kept[c].width),
+                )  # fmt: skip
+        return products
+
     def landmark_steps(self, delta_kept: list[FloatArray]) -> list[FloatArray]:
         """Back-substitute: steps of the landmarks of each eliminated group, (count * dof,)."""
         deltas = [np.empty_like(g) for g in self.equations.g_landmarks]

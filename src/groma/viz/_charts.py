@@ -5,14 +5,17 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from groma._typing import FloatArray
 
 WIDTH, HEIGHT = 560, 250
-_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 12, 10, 34
+#: Images shown in the bar chart.
+MAX_BARS = 24
+_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 12, 10, 40
 
 
 def _svg(body: list[str], height: int = HEIGHT) -> str:
@@ -31,7 +34,7 @@ def _number(value: float) -> str:
     if value == 0:
         return "0"
     if 1e-3 <= abs(value) < 1e5:
-        return f"{value:,.4g}"
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     mantissa, exponent = f"{value:.0e}".split("e")
     return f"{mantissa}e{int(exponent)}"
 
@@ -65,7 +68,7 @@ def histogram(before: FloatArray | None, after: FloatArray) -> str:
         ]
         body.append(f'<g class="{name}" opacity="0.62">{"".join(bars)}</g>')
     body.append(_line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
-    body.append(_text((_LEFT + WIDTH) / 2, HEIGHT - 2, "length of a residual, pixels"))
+    body.append(_text((_LEFT + WIDTH) / 2, HEIGHT - 5, "length of a residual, pixels"))
     body.append(_text(_LEFT - 8, _TOP + 10, f"{100 * top:.2g} %", "end") + _text(_LEFT - 8, bottom, "0", "end"))
     return _svg(body)
 
@@ -75,18 +78,19 @@ def _shares(values: FloatArray, edges: FloatArray) -> FloatArray:
     return counts / max(len(values), 1)
 
 
-def convergence(history: Sequence[dict[str, object]]) -> str:
+def convergence(history: Sequence[Any]) -> str:
     """Return the cost after each accepted step, on a logarithmic axis; rejected steps are hollow.
 
     Parameters
     ----------
-    history : sequence of dict
-        ``iteration``, ``cost``, ``accepted`` of each step.
+    history : sequence
+        Mappings or objects with ``iteration``, ``cost``, ``accepted``.
     """
+    rows = [row if isinstance(row, Mapping) else vars(row) for row in history]
     steps = [
-        (int(row["iteration"]), float(row["cost"]), bool(row.get("accepted", True)))  # type: ignore[call-overload, arg-type]
-        for row in history
-        if math.isfinite(float(row["cost"])) and float(row["cost"]) > 0  # type: ignore[arg-type]
+        (int(row["iteration"]), float(row["cost"]), bool(row["accepted"]))
+        for row in rows
+        if math.isfinite(row["cost"]) and row["cost"] > 0
     ]
     if not steps:
         return _svg([_text(WIDTH / 2, HEIGHT / 2, "no steps were taken")])
@@ -119,7 +123,7 @@ def convergence(history: Sequence[dict[str, object]]) -> str:
             f"{'' if accepted else ', rejected'}</title></circle>"
         )
     body.append(_line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
-    body.append(_text((_LEFT + WIDTH) / 2, HEIGHT - 2, "step"))
+    body.append(_text((_LEFT + WIDTH) / 2, HEIGHT - 5, "step"))
     return _svg(body)
 
 
@@ -135,10 +139,11 @@ def _log_ticks(low: float, high: float) -> list[float]:
 
 def bars(names: Sequence[str], before: FloatArray | None, after: FloatArray) -> str:
     """Return one pair of bars per image: root mean square residual in pixels, the worst after adjustment first."""
-    order = np.argsort(-after, kind="stable")[:24]
+    order = np.argsort(-after, kind="stable")[:MAX_BARS]
     row = 22
     height = row * len(order) + 8
-    left, right = 190, 64
+    labels = [name if len(name) <= 26 else "…" + name[-25:] for name in names]
+    left, right = 14 + 7 * max((len(labels[index]) for index in order), default=0), 104
     values = after if before is None else np.concatenate([before, after])
     finite = values[np.isfinite(values)]
     # One image that is far off at the start must not flatten all the others.
@@ -147,14 +152,15 @@ def bars(names: Sequence[str], before: FloatArray | None, after: FloatArray) -> 
     body = []
     for position, index in enumerate(order):
         y = row * position + 4
-        name = names[index] if len(names[index]) <= 26 else "…" + names[index][-25:]
         words = f"{after[index]:.3g}" if before is None else f"{before[index]:.3g} → {after[index]:.3g}"
-        body.append(_text(left - 8, y + 13, name, "end"))
+        body.append(_text(left - 8, y + 13, labels[index], "end"))
         longest = 0.0
         for kind, series, offset in (("before", before, 0), ("after", after, 9 if before is not None else 4)):
             if series is not None:
                 length = min(series[index] * scale, WIDTH - left - right)
                 longest = max(longest, length)
-                body.append(f'<rect class="{kind}" x="{left}" y="{y + offset}" width="{length:.1f}" height="8" rx="2"/>')
+                body.append(
+                    f'<rect class="{kind}" x="{left}" y="{y + offset}" width="{length:.1f}" height="8" rx="2"/>'
+                )
         body.append(_text(min(left + longest + 6, WIDTH - right + 2), y + 12, words, "start"))
     return _svg(body, height)

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The directive ``package-reference``: one section per public module of a package, found by looking."""
+
+import importlib
+import pkgutil
+
+from docutils import nodes
+from docutils.statemachine import StringList
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+
+class PackageReference(SphinxDirective):
+    """Document the package, then each module in it; modules with a leading underscore only when named."""
+
+    required_arguments = 1
+    optional_arguments = 20
+
+    def run(self) -> list[nodes.Node]:
+        """Build the sections."""
+        package = importlib.import_module(self.arguments[0])
+        names = [package.__name__]
+        found = {module.name for module in pkgutil.iter_modules(getattr(package, "__path__", []))}
+        public = {name for name in found if not name.startswith("_")}
+        names += [f"{package.__name__}.{name}" for name in self.arguments[1:]]
+        names += [f"{package.__name__}.{name}" for name in sorted(public)]
+        return [self._section(name, first=position == 0) for position, name in enumerate(dict.fromkeys(names))]
+
+    def _section(self, name: str, first: bool) -> nodes.Node:
+        section = nodes.section(ids=[f"module-{name.replace('.', '-')}-section"])
+        section += nodes.title(text=name)
+        lines = [f".. automodule:: {name}", "   :no-members:" if first else "   :members:", ""]
+        self.state.nested_parse(StringList(lines, source=f"<{name}>"), self.content_offset, section)
+        return section
+
+
+def setup(app: Sphinx) -> dict[str, object]:
+    """Register the directive."""
+    app.add_directive("package-reference", PackageReference)
+    return {"parallel_read_safe": True}

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""How compiled code calls the kernels of the right camera model.
+
+Loops that project points (the factors) do not know the model. They take :attr:`groma.cameras.CameraModel.tag` as an
+argument, a tuple of zeros whose length is one more than the number of the model. Numba compiles a loop per argument
+type, and the length is part of the type, so the loop calls the model's kernel directly: no branch, no function
+pointer, and Numba's disk cache works. Without the compiler the same names are plain Python functions::
+
+    from groma._numba import loop
+
+    @loop
+    def project_all(model_tag, params, points, pixels):
+        for i in range(points.shape[0]):
+            project(model_tag, params[i], points[i], pixels[i])
+
+The kernels return False, and write zeros, where the model has no value.
+
+**Cheirality.** Perspective models evaluate their formula as written for z < 0 too and refuse only
+:math:`|z| \le 10^{-12} (|x| + |y| + |z|)`. Whether a point behind the camera may take part is the caller's decision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from numba.extending import overload
+
+# --------------------------------------------------------------------------------------------------------- Kernels
+# Kernels by length of the tag. Filled by set_kernels.
+
+_PROJECT: dict[int, Callable[..., bool]] = {}
+_PROJECT_JACOBIAN: dict[int, Callable[..., bool]] = {}
+_UNPROJECT: dict[int, Callable[..., bool]] = {}
+_PINHOLE: dict[int, Callable[..., None]] = {}
+_PINHOLE_JACOBIAN: dict[int, Callable[..., None]] = {}
+
+
+def project(model_tag, params, X, uv):
+    """Write the pixel ``uv`` (2,) of the point ``X`` (3,) in the camera frame; False and zeros if it has none."""
+    return _PROJECT[len(model_tag)](params, X, uv)
+
+
+def project_jacobian(model_tag, params, X, uv, J_point, J_params):
+    """Write pixel ``uv`` (2,), its derivatives ``J_point`` (2, 3) and ``J_params`` (2, k); False and zeros if none."""
+    return _PROJECT_JACOBIAN[len(model_tag)](params, X, uv, J_point, J_params)
+
+
+def unproject(model_tag, params, uv, bearing):
+    """Write the unit ``bearing`` (3,) of the pixel ``uv`` (2,); False and zeros if the model does not reach it."""
+    return _UNPROJECT[len(model_tag)](params, uv, bearing)
+
+
+def pinhole_parameters(model_tag, params, K):
+    """Write ``K`` (4,) = fx, fy, cx, cy of a model without distortion."""
+    _PINHOLE[len(model_tag)](params, K)
+
+
+def pinhole_parameters_jacobian(model_tag, params, J):
+    """Write ``J`` (4, k), the derivative of fx, fy, cx, cy by the parameters of a model without distortion."""
+    _PINHOLE_JACOBIAN[len(model_tag)](params, J)
+
+
+@overload(project)
+def _project(model_tag, params, X, uv):
+    kernel = _PROJECT[model_tag.count]
+    return lambda model_tag, params, X, uv: kernel(params, X, uv)
+
+
+@overload(project_jacobian)
+def _project_jacobian(model_tag, params, X, uv, J_point, J_params):
+    kernel = _PROJECT_JACOBIAN[model_tag.count]
+    return lambda model_tag, params, X, uv, J_point, J_params: kernel(params, X, uv, J_point, J_params)
+
+
+@overload(unproject)
+def _unproject(model_tag, params, uv, bearing):
+    kernel = _UNPROJECT[model_tag.count]
+    return lambda model_tag, params, uv, bearing: kernel(params, uv, bearing)
+
+
+@overload(pinhole_parameters)
+def _pinhole_parameters(model_tag, params, K):
+    kernel = _PINHOLE[model_tag.count]
+    return lambda model_tag, params, K: kernel(params, K)
+
+
+@overload(pinhole_parameters_jacobian)
+def _pinhole_parameters_jacobian(model_tag, params, J):
+    kernel = _PINHOLE_JACOBIAN[model_tag.count]
+    return lambda model_tag, params, J: kernel(params, J)
+
+
+# ---------------------------------------------------------------------------------------------------------- Public
+
+
+def set_kernels(
+    length: int,
+    project: Callable[..., bool],
+    project_jacobian: Callable[..., bool],
+    unproject: Callable[..., bool],
+    pinhole_parameters: Callable[..., None] | None = None,
+    pinhole_parameters_jacobian: Callable[..., None] | None = None,
+) -> None:
+    """Say which kernels a tag of ``length`` selects."""
+    _PROJECT[length], _PROJECT_JACOBIAN[length], _UNPROJECT[length] = project, project_jacobian, unproject
+    if pinhole_parameters is not None and pinhole_parameters_jacobian is not None:
+        _PINHOLE[length], _PINHOLE_JACOBIAN[length] = pinhole_parameters, pinhole_parameters_jacobian
+
+
+def has_pinhole_kernels(length: int) -> bool:
+    """Whether a tag of ``length`` selects a model without distortion."""
+    return length in _PINHOLE
+
+
+__all__ = [
+    "has_pinhole_kernels",
+    "pinhole_parameters",
+    "pinhole_parameters_jacobian",
+    "project",
+    "project_jacobian",
+    "set_kernels",
+    "unproject",
+]

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Small random instances of factors, and the charts that exist for each kind of variable."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.errors import ProblemError
+from groma.factors._factor import Example, Factor
+from groma.geometry import se3
+from groma.geometry._manifold import Euclidean, Manifold
+from groma.geometry.line_charts import LINE_CHARTS
+from groma.geometry.plane_charts import PLANE_CHARTS
+from groma.geometry.pose_charts import POSE_CHARTS
+from groma.geometry.unit3 import Unit3
+
+#: Factors in one example.
+COUNT = 6
+
+
+def charts(kind: str) -> tuple[Manifold, ...]:
+    """Return every chart known for ``kind``, the default first; none for kinds of any size."""
+    if kind == "point":
+        return (Euclidean(3, "point"),)
+    if kind == "direction":
+        return (Unit3(),)
+    tables = {"pose": POSE_CHARTS, "line": LINE_CHARTS, "plane": PLANE_CHARTS}
+    return tuple(chart() for chart in tables[kind].values()) if kind in tables else ()
+
+
+def indices(rng: np.random.Generator, count: int) -> IntArray:
+    """Return an index below ``count`` for each factor of an example."""
+    return rng.integers(0, count, COUNT)
+
+
+def random_poses(rng: np.random.Generator, count: int, rotation: float) -> FloatArray:
+    """Return poses (count, 7) whose rotation angles are below ``rotation`` (radians)."""
+    omega = rng.normal(size=(count, 3))
+    omega *= rotation * rng.uniform(0.1, 1.0, (count, 1)) / np.linalg.norm(omega, axis=1, keepdims=True)
+    return se3.exp(np.hstack([rng.normal(size=(count, 3)), omega]))
+
+
+def make_example(
+    factor: Factor,
+    rng: np.random.Generator,
+    *,
+    manifolds: Mapping[str, Manifold] | None = None,
+    states: Mapping[str, FloatArray] | None = None,
+) -> Example:
+    """Fill the groups that ``factor`` refers to with random variables.
+
+    Parameters
+    ----------
+    factor : Factor
+        The factors.
+    rng : numpy.random.Generator
+        Source of chance.
+    manifolds : mapping, optional
+        Charts by group; the default chart of the kind otherwise.
+    states : mapping, optional
+        States by group, in that chart; random ones otherwise.
+
+    Raises
+    ------
+    ProblemError
+        If a group is of a kind without a default chart (intrinsics, vectors) and none is given.
+    """
+    manifolds, states = dict(manifolds or {}), dict(states or {})
+    counts: dict[str, int] = {}
+    for slot, ref in factor.references():
+        counts[ref.group] = max(counts.get(ref.group, 1), int(ref.index.max(initial=-1)) + 1)
+        if ref.group not in manifolds:
+            known = charts(slot.kind)
+            if not known:
+                raise ProblemError(
+                    f"The example of {type(factor).__name__} needs a chart for its group {ref.group!r}: variables of "
+                    f"kind {slot.kind!r} may have any size. Pass manifolds={{{ref.group!r}: Euclidean(size)}}."
+                )
+            manifolds[ref.group] = known[0]
+    variables = {
+        group: (manifolds[group], states[group] if group in states else manifolds[group].random(rng, count))
+        for group, count in counts.items()
+    }
+    return Example(factor, variables)

@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""What all factors seen by a camera share: the pose of the camera, alone or in a rig.
+
+Such a factor has a slot ``pose``. Alone it is ``cam_from_world``, :math:`T_{cw}`. With the optional slot
+``extrinsics``, which holds ``cam_from_body``, :math:`T_{cb}`, the slot ``pose`` is ``body_from_world``, and
+
+.. math:: T_{cw} = T_{cb}\, T_{bw}, \qquad
+          J_{cb} = J_{cw}, \qquad J_{bw} = J_{cw}\, \mathrm{Ad}(T_{cb}), \qquad
+          \mathrm{Ad}(T) = \begin{bmatrix} R & [t]_\times R \\ 0 & R \end{bmatrix}
+
+for left increments in the order :math:`(\rho, \omega)`. So the concrete factors know :math:`T_{cw}` only:
+:meth:`CameraFactor.prepare` composes it once per pair of body and sensor that occurs, and
+:meth:`CameraFactor.linearize` applies the chain rule to the finished records.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from groma._numba import kernel, loop
+from groma._typing import FloatArray, IntArray
+from groma.cameras import CameraModel, model
+from groma.errors import InputError, ShapeError
+from groma.factors._examples import charts, random_poses
+from groma.factors._factor import Factor, Ref, Slot
+from groma.factors._record import set_rows
+
+POSE = Slot("pose", "pose")
+EXTRINSICS = Slot("extrinsics", "pose", optional=True)
+
+
+# ------------------------------------------------------------------------------------------------------------ Kernels
+@kernel
+def transform_point(poses, c, points, p, P):
+    """Write P = R X + t (3,) for row ``c`` of ``poses`` (M, 12) and row ``p`` of ``points`` (P, 3)."""
+    x, y, z = points[p, 0], points[p, 1], points[p, 2]
+    P[0] = poses[c, 0] * x + poses[c, 1] * y + poses[c, 2] * z + poses[c, 3]
+    P[1] = poses[c, 4] * x + poses[c, 5] * y + poses[c, 6] * z + poses[c, 7]
+    P[2] = poses[c, 8] * x + poses[c, 9] * y + poses[c, 10] * z + poses[c, 11]
+
+
+@kernel
+def put_point_row(a0, a1, a2, poses, c, P, record, i, row, pose_column, point_column):
+    """Write the blocks of one residual row with derivative ``a`` by the point in the camera: pose [a, P x a], a R."""
+    if pose_column >= 0:
+        record[i, row, pose_column] = a0
+        record[i, row, pose_column + 1] = a1
+        record[i, row, pose_column + 2] = a2
+        record[i, row, pose_column + 3] = P[1] * a2 - P[2] * a1
+        record[i, row, pose_column + 4] = P[2] * a0 - P[0] * a2
+        record[i, row, pose_column + 5] = P[0] * a1 - P[1] * a0
+    if point_column >= 0:
+        record[i, row, point_column] = a0 * poses[c, 0] + a1 * poses[c, 4] + a2 * poses[c, 8]
+        record[i, row, point_column + 1] = a0 * poses[c, 1] + a1 * poses[c, 5] + a2 * poses[c, 9]
+        record[i, row, point_column + 2] = a0 * poses[c, 2] + a1 * poses[c, 6] + a2 * poses[c, 10]
+
+
+@kernel
+def transform_line(poses, c, lines, j, L):
+    """Write L = (m, d) (6,) in the camera frame; False if the line passes through the camera centre, to rounding.
+
+    m_c = R m + t x R d, d_c = R d. The limit is 1e-9 of the two terms of m_c.
+    """
+    m0, m1, m2, d0, d1, d2 = lines[j, 0], lines[j, 1], lines[j, 2], lines[j, 3], lines[j, 4], lines[j, 5]
+    t0, t1, t2 = poses[c, 3], poses[c, 7], poses[c, 11]
+    L[3] = poses[c, 0] * d0 + poses[c, 1] * d1 + poses[c, 2] * d2
+    L[4] = poses[c, 4] * d0 + poses[c, 5] * d1 + poses[c, 6] * d2
+    L[5] = poses[c, 8] * d0 + poses[c, 9] * d1 + poses[c, 10] * d2
+    L[0] = poses[c, 0] * m0 + poses[c, 1] * m1 + poses[c, 2] * m2 + (t1 * L[5] - t2 * L[4])
+    L[1] = poses[c, 4] * m0 + poses[c, 5] * m1 + poses[c, 6] * m2 + (t2 * L[3] - t0 * L[5])
+    L[2] = poses[c, 8] * m0 + poses[c, 9] * m1 + poses[c, 10] * m2 + (t0 * L[4] - t1 * L[3])
+    terms = m0 * m0 + m1 * m1 + m2 * m2 + (t0 * t0 + t1 * t1 + t2 * t2) * (d0 * d0 + d1 * d1 + d2 * d2)
+    return L[0] * L[0] + L[1] * L[1] + L[2] * L[2] > 1e-18 * terms
+
+
+@kernel
+def put_line_row(g0, g1, g2, h0, h1, h2, poses, c, L, record, i, row, pose_column, line_column):
+    """Write the blocks of one residual row with derivatives g, h by m, d of the line ``L`` in the camera.
+
+    Pose [d x g, m x g + d x h]; line [gᵀ R, (g x t + h)ᵀ R].
+    """
+    if pose_column >= 0:
+        record[i, row, pose_column] = L[4] * g2 - L[5] * g1
+        record[i, row, pose_column + 1] = L[5] * g0 - L[3] * g2
+        record[i, row, pose_column + 2] = L[3] * g1 - L[4] * g0
+        record[i, row, pose_column + 3] = L[1] * g2 - L[2] * g1 + L[4] * h2 - L[5] * h1
+        record[i, row, pose_column + 4] = L[2] * g0 - L[0] * g2 + L[5] * h0 - L[3] * h2
+        record[i, row, pose_column + 5] = L[0] * g1 - L[1] * g0 + L[3] * h1 - L[4] * h0
+    if line_column >= 0:
+        t0, t1, t2 = poses[c, 3], poses[c, 7], poses[c, 11]
+        k0, k1, k2 = g1 * t2 - g2 * t1 + h0, g2 * t0 - g0 * t2 + h1, g0 * t1 - g1 * t0 + h2
+        for j in range(3):
+            record[i, row, line_column + j] = g0 * poses[c, j] + g1 * poses[c, 4 + j] + g2 * poses[c, 8 + j]
+            record[i, row, line_column + 3 + j] = k0 * poses[c, j] + k1 * poses[c, 4 + j] + k2 * poses[c, 8 + j]
+
+
+@kernel
+def put_parameters_row(J_params, record, i, row, column):
+    """Copy row ``row`` of ``J_params`` (m, k) into the record at ``column``; -1 means it is not wanted."""
+    if column >= 0:
+        for j in range(J_params.shape[1]):
+            record[i, row, column + j] = J_params[row, j]
+
+
+@kernel
+def clear_block(record, i, column, width):
+    """Write zeros to a block of all rows of record ``i``; -1 means it is not wanted."""
+    if column >= 0:
+        for row in range(record.shape[1]):
+            for j in range(width):
+                record[i, row, column + j] = 0.0
+
+
+@kernel
+def clear_residual(record, i):
+    """Write zeros to the residual of record ``i``."""
+    for row in range(record.shape[1]):
+        record[i, row, record.shape[2] - 1] = 0.0
+
+
+@kernel
+def load_row(rows, k, previous, out):
+    """Copy row ``k`` of ``rows`` to ``out`` unless it is there already; return k."""
+    if k != previous:
+        for j in range(out.shape[0]):
+            out[j] = rows[k, j]
+    return k
+
+
+@loop
+def _compose_all(extrinsics, bodies, extrinsics_index, body_index, out):
+    for i in range(out.shape[0]):
+        A, B, C = extrinsics[extrinsics_index[i]], bodies[body_index[i]], out[i]
+        for row in range(0, 12, 4):
+            a0, a1, a2 = A[row], A[row + 1], A[row + 2]
+            for j in range(4):
+                C[row + j] = a0 * B[j] + a1 * B[4 + j] + a2 * B[8 + j]
+            C[row + 3] += A[row + 3]
+
+
+@loop
+def _split_all(record, begin, extrinsics, extrinsics_index, source, pose_column, extrinsics_column):
+    """Turn the block J_cw, found at ``source``, into J_cb = J_cw and J_bw = J_cw Ad(T_cb)."""
+    for i in range(record.shape[0]):
+        T = extrinsics[extrinsics_index[begin + i]]
+        for row in range(record.shape[1]):
+            line = record[i, row]
+            if extrinsics_column >= 0 and extrinsics_column != source:
+                for j in range(6):
+                    line[extrinsics_column + j] = line[source + j]
+            if pose_column >= 0:
+                a0, a1, a2 = line[source], line[source + 1], line[source + 2]
+                # the lever arm: aᵀ [t]x = (a x t)ᵀ
+                b0 = line[source + 3] + a1 * T[11] - a2 * T[7]
+                b1 = line[source + 4] + a2 * T[3] - a0 * T[11]
+                b2 = line[source + 5] + a0 * T[7] - a1 * T[3]
+                for j in range(3):
+                    line[pose_column + j] = a0 * T[j] + a1 * T[4 + j] + a2 * T[8 + j]
+                    line[pose_column + 3 + j] = b0 * T[j] + b1 * T[4 + j] + b2 * T[8 + j]
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
+@dataclass(frozen=True, kw_only=True)
+class CameraFactor(Factor):
+    """A factor that reads the pose of a camera first; subclasses list :data:`POSE` first, :data:`EXTRINSICS` last."""
+
+    #: Poses cam_from_world; body_from_world where ``extrinsics`` are given.
+    pose: Ref
+    #: Poses cam_from_body of the cameras in their rig, or None.
+    extrinsics: Ref | None = None
+
+    #: Measured arrays: name of the field and length of a row, 0 for plain numbers. They are checked on construction.
+    measured: ClassVar[tuple[tuple[str, int], ...]] = ()
+
+    def __post_init__(self) -> None:
+        """Check that all references and measurements have N rows, and that measurements are finite."""
+        for slot, ref in self.references():
+            if len(ref.index) != len(self):
+                raise ShapeError(
+                    f"{type(self).__name__}.{slot.name} must have one index per factor, {len(self)} like its "
+                    f"{self.slots[0].name}; got {len(ref.index)}."
+                )
+        for field, size in self.measured:
+            set_rows(self, field, *([size] if size else []))
+            finite = np.isfinite(getattr(self, field)).reshape(len(self), max(size, 1)).all(axis=1)
+            if not finite.all():
+                row = int(np.argmin(finite))
+                raise InputError(
+                    f"{type(self).__name__}.{field} must be finite; row {row} is {getattr(self, field)[row]} "
+                    f"({np.count_nonzero(~finite)} such rows). Leave these observations out."
+                )
+
+    @cached_property
+    def _pairs(self) -> tuple[IntArray, IntArray, IntArray]:
+        """The pairs (extrinsics, pose) that occur, and for each factor its pair."""
+        assert self.extrinsics is not None
+        bodies = self.pose.index.astype(np.int64)
+        key = self.extrinsics.index.astype(np.int64) * (bodies.max(initial=0) + 1) + bodies
+        _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+        return self.extrinsics.index[first], self.pose.index[first], inverse.astype(np.int32)
+
+    def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:
+        """Return (extrinsics or None, cam_from_world (M, 12), its index (N,), the other ambient arrays...)."""
+        ambients = tuple(np.ascontiguousarray(ambient, dtype=np.float64) for ambient in ambients)
+        if self.extrinsics is None:
+            return None, ambients[0], self.pose.index, *ambients[1:]
+        extrinsics_index, pose_index, index = self._pairs
+        cam_from_world = np.empty((len(pose_index), 12))
+        _compose_all(ambients[-1], ambients[0], extrinsics_index, pose_index, cam_from_world)
+        return ambients[-1], cam_from_world, index, *ambients[1:-1]
+
+    def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:
+        """See :meth:`Factor.residuals`."""
+        return self.evaluate(inputs[1:], begin, end, self._nothing_wanted, out[:, :, None])
+
+    def linearize(
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        """See :meth:`Factor.linearize`."""
+        if self.extrinsics is None:
+            return self.evaluate(inputs[1:], begin, end, columns, record)
+        pose_column, extrinsics_column = columns[0], columns[-1]
+        source = pose_column if pose_column >= 0 else extrinsics_column
+        degenerate = self.evaluate(inputs[1:], begin, end, (source, *columns[1:-1]), record)
+        if source >= 0:
+            _split_all(record, begin, inputs[0], self.extrinsics.index, source, pose_column, extrinsics_column)
+        return degenerate
+
+    @property
+    def _nothing_wanted(self) -> tuple[int, ...]:
+        return (-1,) * sum(slot is not EXTRINSICS for slot in self.slots)
+
+    @abstractmethod
+    def evaluate(
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        """Write the records as :meth:`Factor.linearize` does, for poses of single cameras.
+
+        ``inputs`` are cam_from_world (M, 12), its index (N,), and the other ambient arrays; ``columns`` belong to all
+        slots but the extrinsics. With a record of width one only the residual is written.
+        """
+
+
+def as_camera_model(camera: CameraModel | str) -> CameraModel:
+    """Return the model itself, or the one of this name."""
+    return model(camera) if isinstance(camera, str) else camera
+
+
+def check_intrinsics(camera: CameraModel, intrinsics: FloatArray) -> FloatArray:
+    """Return ``intrinsics`` (C, k) if its width fits the model; raise ShapeError otherwise."""
+    if intrinsics.shape[1] != camera.num_parameters:
+        raise ShapeError(
+            f"{camera.name} has {camera.num_parameters} parameters; the group of intrinsics has "
+            f"{intrinsics.shape[1]}. Make one group of factors for each camera model."
+        )
+    return intrinsics
+
+
+def check_baseline(factor: Any) -> None:
+    """Make field ``baseline`` of a stereo factor a float or (N,); raise unless all are finite and positive."""
+    baseline = np.ascontiguousarray(factor.baseline, dtype=np.float64)
+    if np.ndim(factor.baseline) and baseline.shape != (len(factor),):
+        raise ShapeError(
+            f"{type(factor).__name__}.baseline must be a number or ({len(factor)},); got {baseline.shape}."
+        )
+    if not (np.isfinite(baseline) & (baseline > 0.0)).all():
+        raise InputError(
+            f"{type(factor).__name__}.baseline must be positive (the right camera's distance along x); got "
+            f"{baseline.min()}. Swap left and right if it is negative."
+        )
+    object.__setattr__(factor, "baseline", baseline if np.ndim(factor.baseline) else float(baseline[0]))
+
+
+def normalize_rows(factor: Any, field: str, size: int) -> None:
+    """Scale the rows of field ``field`` so that their first ``size`` numbers have norm one.
+
+    Rows that have it already, to rounding, keep their bits. Raises InputError for rows of zeros.
+    """
+    rows = getattr(factor, field)
+    norm = np.linalg.norm(rows[:, :size], axis=1)
+    if not (norm > 0.0).all():
+        raise InputError(
+            f"{type(factor).__name__}.{field} must not be zero; row {int(np.argmin(norm))} is. "
+            "Leave these observations out."
+        )
+    norm[np.abs(norm - 1.0) < 1e-15] = 1.0
+    object.__setattr__(factor, field, rows / norm[:, None])
+
+
+def visible_scene(rng: np.random.Generator) -> dict[str, FloatArray]:
+    """Return states of 3 poses, and of 4 points and 4 lines in front of them, for examples (default charts)."""
+    poses = random_poses(rng, 3, rotation=0.4)
+    poses[:, 6] += 8.0
+    first, second = rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
+    lines = charts("line")[0].from_ambient(np.hstack([np.cross(first, second), second - first]))
+    return {"poses": poses, "points": first, "lines": lines}
+
+
+__all__ = [
+    "EXTRINSICS",
+    "POSE",
+    "CameraFactor",
+    "as_camera_model",
+    "check_baseline",
+    "check_intrinsics",
+    "clear_block",
+    "clear_residual",
+    "load_row",
+    "normalize_rows",
+    "put_line_row",
+    "put_parameters_row",
+    "put_point_row",
+    "transform_line",
+    "transform_point",
+    "visible_scene",
+]

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""A line seen as an image segment: signed distances, in pixels, of the two end points from the projected line.
+
+With the line :math:`m_c = R m + t \times R d, \; d_c = R d` in the camera and a pinhole camera
+:math:`(f_x, f_y, c_x, c_y)`, the image line is :math:`l = \mathcal K m_c`; divided by :math:`f_x f_y` and written about
+the principal point it is :math:`(a, b, m_z)` with :math:`a = m_x/f_x,\; b = m_y/f_y`. For the end point (u, v)
+
+.. math:: r = \frac{a\,(u - c_x) + b\,(v - c_y) + m_z}{h}, \qquad h = \sqrt{a^2 + b^2} .
+
+.. math:: g = \frac{\partial r}{\partial m_c} = \frac1h \Big[ \frac{u - c_x - r a/h}{f_x},\;
+              \frac{v - c_y - r b/h}{f_y},\; 1 \Big]
+
+.. math:: \frac{\partial r}{\partial \xi} = [\,(d_c \times g)^\top,\; (m_c \times g)^\top\,], \qquad
+          \frac{\partial r}{\partial (m, d)} = [\,g^\top R,\; (g \times t)^\top R\,], \qquad
+          \frac{\partial r}{\partial (f_x, f_y, c_x, c_y)} =
+              \Big[ -g_x a,\; -g_y b,\; -\frac ah,\; -\frac bh \Big]
+
+for the left twist :math:`(\rho, \omega)`. The residual does not depend on the scale of (m, d), and changes its sign
+with that of (m, d).
+
+Source: Plücker notes, eqs. (65) to (68), (75), (76), with (66) in the layout of (82), and the denominators of (81) squared
+as in Point-line-plane notes, eqs. (6) to (12). Written about the principal point there is less cancellation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from groma._numba import kernel, loop
+from groma._typing import FloatArray
+from groma.cameras import CameraModel
+from groma.cameras._dispatch import pinhole_parameters, pinhole_parameters_jacobian
+from groma.factors._examples import indices, make_example
+from groma.factors._factor import Example, Ref, Slot, register
+from groma.factors._rig import (
+    EXTRINSICS,
+    POSE,
+    CameraFactor,
+    as_camera_model,
+    check_intrinsics,
+    clear_block,
+    clear_residual,
+    load_row,
+    put_line_row,
+    transform_line,
+    visible_scene,
+)
+from groma.geometry._manifold import Euclidean
+
+
+# ------------------------------------------------------------------------------------------------------------ Kernels
+@kernel
+def image_line_norm(m0, m1, m2, K):
+    """Return h of the image line of the moment m in the camera; 0 where there is none (m along the optical axis).
+
+    The limit is an image line 1e9 focal lengths away from the principal point.
+    """
+    if K[0] == 0.0 or K[1] == 0.0:
+        return 0.0
+    a, b = m0 / K[0], m1 / K[1]
+    h = math.sqrt(a * a + b * b)
+    return h if h * abs(K[0]) + h * abs(K[1]) > 1e-9 * abs(m2) else 0.0
+
+
+@kernel
+def endpoint_distance(m0, m1, m2, K, h, u, v, out):
+    """Write to ``out`` (8,): r, the three numbers of g = dr/dm, and dr/d(fx, fy, cx, cy)."""
+    a, b, k = m0 / K[0], m1 / K[1], 1.0 / h
+    x, y = u - K[2], v - K[3]
+    r = (a * x + b * y + m2) * k
+    out[0] = r
+    out[1] = (x - r * a * k) * k / K[0]
+    out[2] = (y - r * b * k) * k / K[1]
+    out[3] = k
+    out[4] = -out[1] * a
+    out[5] = -out[2] * b
+    out[6] = -a * k
+    out[7] = -b * k
+    return abs(r) < math.inf
+
+
+@kernel
+def put_pinhole_row(row_wrt_K, J_K, record, i, row, column):
+    """Write the derivative by the parameters of the camera, from out[4:8] of :func:`endpoint_distance`."""
+    if column >= 0:
+        for j in range(J_K.shape[1]):
+            total = 0.0
+            for k in range(4):
+                total += row_wrt_K[4 + k] * J_K[k, j]
+            record[i, row, column + j] = total
+
+
+@kernel
+def _linearize(m0, m1, m2, K, segments, i, first, second):
+    """Write residual and derivatives of both end points; False where the line has no image."""
+    h = image_line_norm(m0, m1, m2, K)
+    if not h > 0.0:
+        return False
+    return endpoint_distance(m0, m1, m2, K, h, segments[i, 0], segments[i, 1], first) and endpoint_distance(
+        m0, m1, m2, K, h, segments[i, 2], segments[i, 3], second
+    )
+
+
+@loop
+def _linearize_all(
+    model_tag, poses, pose_index, lines, intrinsics, line_index, intrinsics_index, segments,
+    begin, end, pose_column, line_column, intrinsics_column, record,
+):  # fmt: skip
+    size = intrinsics.shape[1]
+    L, K, J_K, params, out = np.empty(6), np.empty(4), np.empty((4, size)), np.empty(size), np.empty((2, 8))
+    camera, degenerate, last = -1, 0, record.shape[2] - 1
+    first, second = out[0], out[1]
+    for i in range(begin, end):
+        k, c = i - begin, pose_index[i]
+        if intrinsics_index[i] != camera:
+            camera = load_row(intrinsics, intrinsics_index[i], camera, params)
+            pinhole_parameters(model_tag, params, K)
+            pinhole_parameters_jacobian(model_tag, params, J_K)
+        if transform_line(poses, c, lines, line_index[i], L) and _linearize(
+            L[0], L[1], L[2], K, segments, i, first, second
+        ):
+            for row in range(2):
+                record[k, row, last] = out[row, 0]
+                put_line_row(
+                    out[row, 1], out[row, 2], out[row, 3], 0.0, 0.0, 0.0, poses, c, L,
+                    record, k, row, pose_column, line_column,
+                )  # fmt: skip
+            put_pinhole_row(first, J_K, record, k, 0, intrinsics_column)
+            put_pinhole_row(second, J_K, record, k, 1, intrinsics_column)
+        else:
+            clear_block(record, k, pose_column, 6)
+            clear_block(record, k, line_column, 6)
+            clear_block(record, k, intrinsics_column, size)
+            clear_residual(record, k)
+            degenerate += 1
+    return degenerate
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
+@register("line_reprojection")
+@dataclass(frozen=True, kw_only=True)
+class LineReprojection(CameraFactor):
+    """Lines seen as image segments, cameras without distortion; residual: two distances in pixels.
+
+    Under distortion use :class:`~groma.factors.line_bearing.LineBearing`. Degenerate: lines through the camera centre
+    (to 1e-9 of the lengths involved), and lines in the plane z = 0 of the camera, which have no image.
+    """
+
+    #: Lines in the world, any scale of (m, d).
+    line: Ref
+    #: Parameters of the cameras, all of one model.
+    intrinsics: Ref
+    #: SIMPLE_PINHOLE or PINHOLE (or another model without distortion).
+    camera_model: CameraModel | str
+    #: (N, 4) measured end points u1, v1, u2, v2 in pixels; their order does not matter.
+    segments: FloatArray
+
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
+    measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 4),)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "camera_model", as_camera_model(self.camera_model))
+        as_camera_model(self.camera_model).require_pinhole()
+
+    @property
+    def residual_size(self) -> int:  # noqa: D102
+        return 2
+
+    def evaluate(  # noqa: D102
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        camera = as_camera_model(self.camera_model)
+        check_intrinsics(camera, inputs[3])
+        indices = (self.line.index, self.intrinsics.index)
+        return _linearize_all(camera.tag, *inputs, *indices, self.segments, begin, end, *columns, record)
+
+    @classmethod
+    def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
+        factor = cls(
+            pose=Ref("poses", indices(rng, 3)),
+            line=Ref("lines", indices(rng, 4)),
+            intrinsics=Ref("intrinsics", indices(rng, 2)),
+            camera_model="PINHOLE",
+            segments=rng.uniform(100.0, 500.0, (6, 4)),
+        )
+        pinhole = np.array([[500.0, 520.0, 320.0, 240.0], [400.0, 380.0, 300.0, 200.0]])
+        manifolds = {"intrinsics": Euclidean(4, "intrinsics")}
+        return make_example(factor, rng, manifolds=manifolds, states={**visible_scene(rng), "intrinsics": pinhole})

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""A point seen at a pixel, under any camera model.
+
+With :math:`P = R_{cw} X_w + t_{cw}` and the projection :math:`\pi` of the camera model with parameters k,
+
+.. math:: r = \pi(P, k) - u \qquad \text{(pixels)}
+
+.. math:: A = \frac{\partial \pi}{\partial P}, \qquad
+          \frac{\partial r}{\partial \xi} = A\,[\, I \mid -[P]_\times \,], \qquad
+          \frac{\partial r}{\partial X_w} = A\, R_{cw}, \qquad
+          \frac{\partial r}{\partial k} = \frac{\partial \pi}{\partial k}
+
+for the left twist :math:`\xi = (\rho, \omega)`; each row a of A gives the pose row :math:`[a^\top, (P \times a)^\top]`.
+
+Source: Point-line-plane notes, eqs. (2) to (5). Here the residual has the opposite sign (predicted minus measured), and
+the twist has the translation first, which is the order in which the block :math:`[I, -[P]_\times]` printed there holds.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from groma._numba import kernel, loop
+from groma._typing import FloatArray
+from groma.cameras import CameraModel
+from groma.cameras._dispatch import project, project_jacobian
+from groma.factors._examples import indices, make_example
+from groma.factors._factor import Example, Ref, Slot, register
+from groma.factors._rig import (
+    EXTRINSICS,
+    POSE,
+    CameraFactor,
+    as_camera_model,
+    check_intrinsics,
+    clear_block,
+    clear_residual,
+    load_row,
+    put_parameters_row,
+    put_point_row,
+    transform_point,
+    visible_scene,
+)
+from groma.geometry._manifold import Euclidean
+
+
+# ------------------------------------------------------------------------------------------------------------ Kernels
+@kernel
+def _residual(model_tag, poses, c, points, p, params, pixels, i, smallest_depth, P, uv):
+    """Write uv = projection - pixel; False where the point has none, or is not in front of the camera."""
+    transform_point(poses, c, points, p, P)
+    if not (P[2] > smallest_depth and project(model_tag, params, P, uv)):
+        return False
+    uv[0] -= pixels[i, 0]
+    uv[1] -= pixels[i, 1]
+    return abs(uv[0]) + abs(uv[1]) < math.inf
+
+
+@kernel
+def _linearize(model_tag, poses, c, points, p, params, pixels, i, smallest_depth, P, uv, A, J_params):
+    """As :func:`_residual`; also write A = d uv/d P (2, 3) and ``J_params`` (2, k)."""
+    transform_point(poses, c, points, p, P)
+    if not (P[2] > smallest_depth and project_jacobian(model_tag, params, P, uv, A, J_params)):
+        return False
+    uv[0] -= pixels[i, 0]
+    uv[1] -= pixels[i, 1]
+    return abs(uv[0]) + abs(uv[1]) < math.inf
+
+
+@loop
+def _residual_all(
+    model_tag, smallest_depth, poses, pose_index, points, intrinsics, point_index, intrinsics_index, pixels,
+    begin, end, out,
+):  # fmt: skip
+    P, uv, params = np.empty(3), np.empty(2), np.empty(intrinsics.shape[1])
+    camera, degenerate = -1, 0
+    for i in range(begin, end):
+        camera = load_row(intrinsics, intrinsics_index[i], camera, params)
+        if not _residual(
+            model_tag, poses, pose_index[i], points, point_index[i], params, pixels, i, smallest_depth, P, uv
+        ):
+            uv[0] = uv[1] = 0.0
+            degenerate += 1
+        out[i - begin, 0], out[i - begin, 1] = uv[0], uv[1]
+    return degenerate
+
+
+@loop
+def _linearize_all(
+    model_tag, smallest_depth, poses, pose_index, points, intrinsics, point_index, intrinsics_index, pixels,
+    begin, end, pose_column, point_column, intrinsics_column, record,
+):  # fmt: skip
+    P, uv, params = np.empty(3), np.empty(2), np.empty(intrinsics.shape[1])
+    A, J_params = np.empty((2, 3)), np.empty((2, intrinsics.shape[1]))
+    camera, degenerate, last = -1, 0, record.shape[2] - 1
+    for i in range(begin, end):
+        k, c = i - begin, pose_index[i]
+        camera = load_row(intrinsics, intrinsics_index[i], camera, params)
+        if _linearize(
+            model_tag, poses, c, points, point_index[i], params, pixels, i, smallest_depth, P, uv, A, J_params
+        ):
+            for row in range(2):
+                record[k, row, last] = uv[row]
+                put_point_row(A[row, 0], A[row, 1], A[row, 2], poses, c, P, record, k, row, pose_column, point_column)
+                put_parameters_row(J_params, record, k, row, intrinsics_column)
+        else:
+            clear_block(record, k, pose_column, 6)
+            clear_block(record, k, point_column, 3)
+            clear_block(record, k, intrinsics_column, params.shape[0])
+            clear_residual(record, k)
+            degenerate += 1
+    return degenerate
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
+@register("point_reprojection")
+@dataclass(frozen=True, kw_only=True)
+class PointReprojection(CameraFactor):
+    """Points seen at pixels; residual in pixels.
+
+    Degenerate, thus left out of the sum: points that the model cannot project, and points not in front of a perspective
+    camera (see :attr:`require_in_front`).
+    """
+
+    #: Points in the world (with the slots of :class:`~groma.factors._rig.CameraFactor`).
+    point: Ref
+    #: Parameters of the cameras, all of one model.
+    intrinsics: Ref
+    #: The camera model, or its name.
+    camera_model: CameraModel | str
+    #: (N, 2) measured pixels.
+    pixels: FloatArray
+    #: Leave out points with z <= 0 in a perspective camera. False evaluates the formula there as it is written, which
+    #: is the habit of most bundle adjusters. Fisheye models see behind themselves and are not concerned.
+    require_in_front: bool = True
+
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
+    measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 2),)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "camera_model", as_camera_model(self.camera_model))
+
+    @property
+    def residual_size(self) -> int:  # noqa: D102
+        return 2
+
+    def _arguments(self, inputs: tuple[Any, ...]) -> tuple[Any, ...]:
+        camera = as_camera_model(self.camera_model)
+        smallest_depth = 0.0 if self.require_in_front and not camera.sees_behind else -np.inf
+        check_intrinsics(camera, inputs[3])
+        return camera.tag, smallest_depth, *inputs, self.point.index, self.intrinsics.index, self.pixels
+
+    def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
+        return _residual_all(*self._arguments(inputs[1:]), begin, end, out)
+
+    def evaluate(  # noqa: D102
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        return _linearize_all(*self._arguments(inputs), begin, end, *columns, record)
+
+    @classmethod
+    def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
+        scene = visible_scene(rng)
+        factor = cls(
+            pose=Ref("poses", indices(rng, 3)),
+            point=Ref("points", indices(rng, 4)),
+            intrinsics=Ref("intrinsics", indices(rng, 2)),
+            camera_model="RADIAL",
+            pixels=rng.uniform(100.0, 500.0, (6, 2)),
+        )
+        radial = np.array([[500.0, 320.0, 240.0, -0.1, 0.02], [400.0, 300.0, 200.0, 0.05, -0.01]])
+        manifolds = {"intrinsics": Euclidean(5, "intrinsics")}
+        return make_example(factor, rng, manifolds=manifolds, states={**scene, "intrinsics": radial})

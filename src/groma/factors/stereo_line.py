@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""A line seen as two segments by a rectified stereo pair: four signed distances in pixels.
+
+The first two rows are those of :mod:`groma.factors.line_reprojection` in the left camera, with the line
+:math:`(m_c, d_c)`; the last two are the same in the right camera, where the moment is
+
+.. math:: m_r = m_c + \tau \times d_c, \qquad \tau = (-b, 0, 0)
+
+for the baseline b. With :math:`g = \partial r_i/\partial m_r` and :math:`h = \partial r_i/\partial d_c = g \times \tau`
+(h = 0 in the left camera)
+
+.. math:: \frac{\partial r_i}{\partial \xi} = [\,(d_c \times g)^\top,\; (m_c \times g + d_c \times h)^\top\,], \qquad
+          \frac{\partial r_i}{\partial (m, d)} = [\,g^\top R,\; (g \times t + h)^\top R\,] .
+
+The two segments need not show the same part of the line. A line parallel to the baseline has one image row only: the pair
+then says nothing about its distance, and another view must.
+
+Source: Plücker notes, eqs. (65) to (76), with the corrections listed in :mod:`groma.factors.line_reprojection`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from groma._numba import kernel, loop
+from groma._typing import FloatArray
+from groma.cameras import CameraModel
+from groma.cameras._dispatch import pinhole_parameters, pinhole_parameters_jacobian
+from groma.factors._examples import indices, make_example
+from groma.factors._factor import Example, Ref, Slot, register
+from groma.factors._rig import (
+    EXTRINSICS,
+    POSE,
+    CameraFactor,
+    as_camera_model,
+    check_baseline,
+    check_intrinsics,
+    clear_block,
+    clear_residual,
+    load_row,
+    put_line_row,
+    transform_line,
+    visible_scene,
+)
+from groma.factors.line_reprojection import endpoint_distance, image_line_norm, put_pinhole_row
+from groma.geometry._manifold import Euclidean
+
+
+# ------------------------------------------------------------------------------------------------------------ Kernels
+@kernel
+def _linearize(L, baseline, K, segments, i, out):
+    """Write residuals and derivatives of the four end points to ``out`` (4, 8); False if one camera sees no line."""
+    # τ x d = (0, b d_z, -b d_y)
+    m1, m2 = L[1] + baseline * L[5], L[2] - baseline * L[4]
+    left, right = image_line_norm(L[0], L[1], L[2], K), image_line_norm(L[0], m1, m2, K)
+    if not (left > 0.0 and right > 0.0):
+        return False
+    valid = True
+    for row in range(2):
+        u, v = segments[i, 2 * row], segments[i, 2 * row + 1]
+        valid &= endpoint_distance(L[0], L[1], L[2], K, left, u, v, out[row])
+        u, v = segments[i, 4 + 2 * row], segments[i, 5 + 2 * row]
+        valid &= endpoint_distance(L[0], m1, m2, K, right, u, v, out[2 + row])
+    return valid
+
+
+@kernel
+def _passes_right_camera(L, baseline):
+    """Whether the line passes through the centre of the right camera, to 1e-9 of the terms of its moment there."""
+    m1, m2 = L[1] + baseline * L[5], L[2] - baseline * L[4]
+    terms = L[0] * L[0] + L[1] * L[1] + L[2] * L[2] + baseline * baseline * (L[4] * L[4] + L[5] * L[5])
+    return not L[0] * L[0] + m1 * m1 + m2 * m2 > 1e-18 * terms
+
+
+@loop
+def _linearize_all(
+    model_tag, poses, pose_index, lines, intrinsics, line_index, intrinsics_index, segments, baselines,
+    begin, end, pose_column, line_column, intrinsics_column, record,
+):  # fmt: skip
+    size = intrinsics.shape[1]
+    L, K, J_K, params, out = np.empty(6), np.empty(4), np.empty((4, size)), np.empty(size), np.empty((4, 8))
+    camera, degenerate, last = -1, 0, record.shape[2] - 1
+    step = 1 if baselines.shape[0] > 1 else 0
+    for i in range(begin, end):
+        k, c, baseline = i - begin, pose_index[i], baselines[i * step]
+        if intrinsics_index[i] != camera:
+            camera = load_row(intrinsics, intrinsics_index[i], camera, params)
+            pinhole_parameters(model_tag, params, K)
+            pinhole_parameters_jacobian(model_tag, params, J_K)
+        valid = transform_line(poses, c, lines, line_index[i], L) and not _passes_right_camera(L, baseline)
+        if valid and _linearize(L, baseline, K, segments, i, out):
+            for row in range(4):
+                record[k, row, last] = out[row, 0]
+                g0, g1, g2 = out[row, 1], out[row, 2], out[row, 3]
+                b = baseline if row >= 2 else 0.0
+                # g x τ = (0, -b g_z, b g_y)
+                put_line_row(g0, g1, g2, 0.0, -b * g2, b * g1, poses, c, L, record, k, row, pose_column, line_column)
+                put_pinhole_row(out[row], J_K, record, k, row, intrinsics_column)
+        else:
+            clear_block(record, k, pose_column, 6)
+            clear_block(record, k, line_column, 6)
+            clear_block(record, k, intrinsics_column, size)
+            clear_residual(record, k)
+            degenerate += 1
+    return degenerate
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
+@register("stereo_line")
+@dataclass(frozen=True, kw_only=True)
+class StereoLine(CameraFactor):
+    """Lines seen by rectified stereo pairs; residual: end point distances, left then right, in pixels.
+
+    Degenerate, both segments together: where one of the two cameras has no image of the line (see
+    :class:`~groma.factors.line_reprojection.LineReprojection`).
+    """
+
+    #: Lines in the world, any scale of (m, d).
+    line: Ref
+    #: Parameters common to both cameras of a pair.
+    intrinsics: Ref
+    #: SIMPLE_PINHOLE or PINHOLE (or another model without distortion).
+    camera_model: CameraModel | str
+    #: (N, 8) measured end points u1, v1, u2, v2 on the left, then on the right, in pixels.
+    segments: FloatArray
+    #: Distance of the right camera from the left one along x, scene units: a number, or (N,).
+    baseline: float | FloatArray
+
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
+    measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 8),)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "camera_model", as_camera_model(self.camera_model))
+        as_camera_model(self.camera_model).require_pinhole()
+        check_baseline(self)
+
+    @property
+    def residual_size(self) -> int:  # noqa: D102
+        return 4
+
+    def evaluate(  # noqa: D102
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        camera = as_camera_model(self.camera_model)
+        check_intrinsics(camera, inputs[3])
+        arrays = (self.line.index, self.intrinsics.index, self.segments, np.atleast_1d(self.baseline))
+        return _linearize_all(camera.tag, *inputs, *arrays, begin, end, *columns, record)
+
+    @classmethod
+    def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
+        factor = cls(
+            pose=Ref("poses", indices(rng, 3)),
+            line=Ref("lines", indices(rng, 4)),
+            intrinsics=Ref("intrinsics", indices(rng, 2)),
+            camera_model="PINHOLE",
+            segments=rng.uniform(100.0, 500.0, (6, 8)),
+            baseline=0.5,
+        )
+        pinhole = np.array([[500.0, 520.0, 320.0, 240.0], [400.0, 380.0, 300.0, 200.0]])
+        manifolds = {"intrinsics": Euclidean(4, "intrinsics")}
+        return make_example(factor, rng, manifolds=manifolds, states={**visible_scene(rng), "intrinsics": pinhole})

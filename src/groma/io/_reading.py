@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One place where everything that can go wrong while reading a file becomes an error of groma."""
+
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from groma.errors import FileFormatError, GromaError, InputError
+
+
+@contextmanager
+def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
+    """Turn whatever a parser raises on a damaged file into :class:`~groma.errors.FileFormatError`.
+
+    Parsers meet hostile bytes with many kinds of exceptions (of zipfile, bz2, zlib, NumPy, struct, pycolmap); a
+    caller cares only that the file is not what it claims to be. Missing files and missing permissions are told apart.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            yield
+    except FileFormatError:
+        raise
+    except GromaError as error:
+        raise FileFormatError(f"{path} is not a usable {kind}: {error}") from error
+    except (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError) as error:
+        raise InputError(f"Cannot read {path}: {error.strerror or error}. Check the path.") from error
+    except MemoryError as error:
+        raise FileFormatError(f"{path} is too large for the memory of this machine, or damaged.") from error
+    except Exception as error:
+        reason = str(error).strip() or type(error).__name__
+        raise FileFormatError(f"{path} is not a usable {kind}; it may be damaged or incomplete: {reason}") from error
+
+
+def existing(path: str | os.PathLike[str]) -> Path:
+    """Return ``path`` as a Path, or raise when there is nothing."""
+    place = Path(path)
+    try:
+        place.stat()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"Cannot read {place}: {reason}. Check the path.") from error
+    return place

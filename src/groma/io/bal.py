@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Files of *Bundle Adjustment in the Large* (BAL), plain or compressed with bzip2 or gzip.
+
+The text holds ``cameras points observations``, one line ``camera point u v`` per observation, nine numbers per camera
+(angle-axis rotation, translation, f, k1, k2) and three per point. BAL cameras look along their negative z axis with
+y up; scenes here look along positive z with y down. With :math:`D = \mathrm{diag}(1, -1, -1)`
+
+.. math:: R = D R_{BAL}, \qquad t = D t_{BAL}, \qquad (u, v) = (u_{BAL}, -v_{BAL}),
+
+and the world stays as it is. Pixels count from the image centre; the image size is not known.
+
+Reference: S. Agarwal, N. Snavely, S. Seitz, R. Szeliski, *Bundle Adjustment in the Large*, 2010.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.errors import FileFormatError, InputError
+from groma.geometry import quaternion
+from groma.io._atomic import atomic_output
+from groma.io._reading import existing, reading
+from groma.scene import Cameras, PointObservations, Points, Scene
+
+_FLIP = np.array([1.0, -1.0, -1.0])
+#: The rotation by pi about x, which is ``diag(1, -1, -1)``.
+_FLIP_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
+#: Numeric text shrinks by a factor of three to six; more than this is no text of numbers but a bomb.
+_MAX_RATIO = 200
+_KIND = "BAL file"
+
+
+def read_bal(path: str | os.PathLike[str]) -> Scene:
+    """Read a BAL file; each camera becomes an image with a calibration of model ``BAL`` of its own.
+
+    Parameters
+    ----------
+    path : path
+        Plain text, .bz2 or .gz (told by content, not by name).
+
+    Raises
+    ------
+    FileFormatError
+        If counts, indices or numbers are not those of a BAL file.
+    """
+    place = existing(path)
+    with reading(place, _KIND):
+        (num_cameras, num_points, num_observations), body = _split(_load(place), place)
+        wanted = 4 * num_observations + 9 * num_cameras + 3 * num_points
+        # Every number takes a character and a separator: refuse impossible counts before memory is taken for them.
+        if 2 * wanted - 1 > len(body):
+            raise FileFormatError(
+                f"{place} promises {num_cameras} cameras, {num_points} points and {num_observations} observations, "
+                f"which is {wanted} numbers, but holds only {len(body)} more characters. Fetch it again."
+            )
+        numbers = np.fromstring(body, sep=" ") if body.strip() else np.zeros(0)
+        if len(numbers) != wanted:
+            raise FileFormatError(f"{place} should hold {wanted} numbers after its first line; got {len(numbers)}.")
+        if not np.isfinite(numbers).all():
+            first = int(np.flatnonzero(~np.isfinite(numbers))[0])
+            raise FileFormatError(f"{place}: number {first + 1} after the first line is {numbers[first]}, not finite.")
+        observations, rest = np.split(numbers, [4 * num_observations])
+        observations = observations.reshape(-1, 4)
+        camera_params, xyz = np.split(rest, [9 * num_cameras])
+        index = [
+            _index(observations[:, 0], num_cameras, "camera", place),
+            _index(observations[:, 1], num_points, "point", place),
+        ]
+        return _scene(index[0], index[1], observations[:, 2:], camera_params.reshape(-1, 9), xyz.reshape(-1, 3))
+
+
+def write_bal(scene: Scene, path: str | os.PathLike[str], force: bool = False) -> None:
+    """Write the points of a scene as a BAL file, compressed as the name says (.bz2, .gz).
+
+    Raises
+    ------
+    InputError
+        If the scene holds lines or planes, or cameras that the BAL model cannot express (see :func:`bal_params`).
+    """
+    if scene.num_lines or scene.num_planes or scene.num_directions:
+        raise InputError(
+            f"A BAL file holds points only; the scene has {scene.num_lines} lines, {scene.num_planes} planes and "
+            f"{scene.num_directions} directions. Write a groma archive (.npz), or scene.points_only()."
+        )
+    params, principal_point = bal_params(scene)
+    seen = scene.point_observations
+    pixel = (seen.pixel - principal_point[seen.image_idx]) * [1, -1]
+    poses = scene.cam_from_world
+    rotation = quaternion.log(quaternion.multiply(_FLIP_QUATERNION, poses[:, :4]))
+    numbers = np.hstack([rotation, poses[:, 4:] * _FLIP, params]).ravel().tolist() + scene.points.xyz.ravel().tolist()
+    text = io.StringIO()
+    text.write(f"{scene.num_images} {scene.num_points} {len(seen)}\n")
+    rows = zip(seen.image_idx.tolist(), seen.point_idx.tolist(), *pixel.T.tolist(), strict=True)
+    text.writelines(f"{camera} {point} {u!r} {v!r}\n" for camera, point, u, v in rows)
+    text.writelines(f"{number!r}\n" for number in numbers)
+    content = text.getvalue().encode()
+    suffix = Path(path).suffix.lower()
+    if suffix == ".bz2":
+        content = bz2.compress(content)
+    elif suffix == ".gz":
+        content = gzip.compress(content, mtime=0)
+    with atomic_output(path, force) as draft:
+        draft.write_bytes(content)
+
+
+def bal_params(scene: Scene) -> tuple[FloatArray, FloatArray]:
+    """Return (f, k1, k2) and the principal point of every image, (N, 3) and (N, 2), where the BAL model can hold them.
+
+    Raises
+    ------
+    InputError
+        If a camera has two focal lengths that differ, or other distortion than k1 and k2.
+    """
+    # Where f, cx, cy, k1 and k2 stand among the parameters; -1: not there.
+    places = {
+        "BAL": (0, -1, -1, 1, 2),
+        "SIMPLE_PINHOLE": (0, 1, 2, -1, -1),
+        "PINHOLE": (0, 2, 3, -1, -1),
+        "SIMPLE_RADIAL": (0, 1, 2, 3, -1),
+        "RADIAL": (0, 1, 2, 3, 4),
+    }
+    values = np.zeros((scene.num_cameras, 5))
+    for row, name in enumerate(scene.cameras.models):
+        params = np.append(scene.cameras.params_of(row), 0.0)
+        if name not in places or (name == "PINHOLE" and params[0] != params[1]):
+            raise InputError(
+                f"A BAL file holds one focal length, k1 and k2 per camera; camera {scene.cameras.ids[row]} has model "
+                f"{name} {params[:-1].tolist()}. Write a COLMAP model or a groma archive instead."
+            )
+        values[row] = params[list(places[name])]
+    values = values[scene.images.camera_idx]
+    return values[:, [0, 3, 4]], values[:, 1:3]
+
+
+def looks_like_bal(head: bytes) -> bool:
+    """Tell from the first bytes of a file, decompressed where needed, whether three counts stand there."""
+    words = head.split(None, 3)[:3]
+    return len(words) == 3 and all(word.isdigit() for word in words)
+
+
+def _load(path: Path) -> bytes:
+    raw = path.read_bytes()
+    limit = _MAX_RATIO * len(raw) + 4096
+    if raw[:3] == b"BZh":
+        with bz2.open(io.BytesIO(raw)) as stream:
+            text = stream.read(limit + 1)
+    elif raw[:2] == b"\x1f\x8b":
+        with gzip.open(io.BytesIO(raw)) as stream:
+            text = stream.read(limit + 1)
+    else:
+        return raw
+    if len(text) > limit:
+        raise FileFormatError(f"{path} grows more than {_MAX_RATIO} times when decompressed, which no BAL file does.")
+    return text
+
+
+def _split(text: bytes, path: Path) -> tuple[list[int], bytes]:
+    head = text[:200].split(None, 3)[:3]
+    if not looks_like_bal(text[:200]) or max(len(word) for word in head) > 15:
+        raise FileFormatError(
+            f"{path} must begin with three counts (cameras, points, observations); it begins with {text[:40]!r}."
+        )
+    end = 0
+    for word in head:
+        end = text.index(word, end) + len(word)
+    return [int(word) for word in head], text[end:]
+
+
+def _index(values: FloatArray, size: int, noun: str, path: Path) -> FloatArray:
+    good = (values >= 0) & (values < size) & (values == np.floor(values))
+    if not good.all():
+        row = int(np.flatnonzero(~good)[0])
+        raise FileFormatError(f"{path}: observation {row} names {noun} {values[row]:g}, but there are {size} {noun}s.")
+    return values.astype(np.int64)
+
+
+def _scene(image_idx: FloatArray, point_idx: FloatArray, pixel: FloatArray, camera: FloatArray, xyz: FloatArray) -> Scene:
+    count = len(camera)
+    angle = np.linalg.norm(camera[:, :3], axis=1) if count else np.zeros(0)
+    if count and angle.max() > 1e6:
+        raise FileFormatError(f"Camera {int(angle.argmax())} is turned by {angle.max():.3g} rad; not a rotation vector.")
+    turned = quaternion.multiply(_FLIP_QUATERNION, quaternion.exp(camera[:, :3]))
+    turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    cameras = Cameras(
+        ids=np.arange(count) + 1,
+        models=("BAL",) * count,
+        params=camera[:, 6:],
+        width=np.zeros(count, int),
+        height=np.zeros(count, int),
+    )
+    # The number of a 2D point within its image: the running count per image, in the order of the file.
+    order = np.argsort(image_idx, kind="stable")
+    first = np.searchsorted(image_idx[order], np.arange(count))
+    keypoint_idx = np.empty(len(order), np.int64)
+    keypoint_idx[order] = np.arange(len(order)) - first[image_idx[order]]
+    return Scene.from_images(
+        cameras,
+        [f"{index:05d}" for index in range(count)],
+        np.arange(count),
+        np.hstack([turned, camera[:, 3:6] * _FLIP]),
+        points=Points.at(xyz),
+        point_observations=PointObservations(image_idx, point_idx, pixel * [1, -1], keypoint_idx),
+    )
+
+
+__all__ = ["bal_params", "looks_like_bal", "read_bal", "write_bal"]

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The common form of everything a scene holds: a frozen table of equally long columns.
+
+A table is a frozen dataclass whose fields are made by :func:`column`. A column knows its dtype and the shape of one
+row, so that conversion, validation, selection of rows, comparison and storage are written once, here. Every column
+defaults to no rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import Field, dataclass, field, fields, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from groma.errors import InputError, ShapeError
+
+
+def column(dtype: type, *row: int | None) -> Any:
+    """Declare a column of arrays: dtype and the shape of one row (None: any, but the same in all rows)."""
+    empty = tuple(0 if size is None else size for size in row)
+    return field(default_factory=lambda: np.zeros((0, *empty), dtype), metadata={"dtype": np.dtype(dtype), "row": row})
+
+
+def text_column() -> Any:
+    """Declare a column of strings, kept as a tuple."""
+    return field(default=(), metadata={"dtype": None, "row": ()})
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Equally long columns; see the module. Compare tables with :func:`groma.scene.compare.equal`."""
+
+    #: What one row is called in messages.
+    noun: ClassVar[str] = "row"
+
+    def __post_init__(self) -> None:
+        length = None
+        for item in fields(self):
+            value = convert(f"{type(self).__name__}.{item.name}", getattr(self, item.name), item)
+            object.__setattr__(self, item.name, value)
+            if length is None:
+                length, first = len(value), item.name
+            elif len(value) != length:
+                raise ShapeError(
+                    f"All columns of {type(self).__name__} must be equally long; {first} has {length} rows, "
+                    f"{item.name} has {len(value)}. Pass one row per {self.noun} in both."
+                )
+        self._check()
+
+    def _check(self) -> None:
+        """Check what only this table knows."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def replace(self, **columns: Any) -> Self:
+        """Return a copy with some columns replaced."""
+        return replace(self, **columns)
+
+    def take(self, rows: npt.ArrayLike) -> Self:
+        """Return the chosen rows: integer indices or a boolean mask."""
+        chosen = np.asarray(rows)
+        if chosen.dtype == bool:
+            chosen = np.flatnonzero(chosen)
+        chosen = chosen.astype(np.int64, copy=False).reshape(-1)
+        columns = {}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            columns[item.name] = tuple(value[i] for i in chosen) if isinstance(value, tuple) else value[chosen]
+        return type(self)(**columns)
+
+
+def convert(name: str, value: Any, item: Field[Any]) -> Any:
+    """Return a column as its declaration wants it, or raise."""
+    dtype, row = item.metadata["dtype"], item.metadata["row"]
+    if dtype is None:
+        return _convert_text(name, value)
+    try:
+        source = np.asarray(value)
+    except ValueError as error:
+        raise ShapeError(f"{name} must be a regular array; got {error}.") from error
+    if source.size == 0 and source.ndim <= 1:
+        source = np.zeros((0, *(size or 0 for size in row)), dtype)
+    if source.dtype.kind not in ("biuf" if dtype.kind == "f" else "biu"):
+        wanted = "numbers" if dtype.kind == "f" else "integers"
+        raise InputError(f"{name} must hold {wanted}; got dtype {source.dtype}. Convert the array first.")
+    if source.ndim != 1 + len(row) or any(
+        size is not None and got != size for size, got in zip(row, source.shape[1:], strict=True)
+    ):
+        wanted = ", ".join(["N", *("K" if size is None else str(size) for size in row)])
+        raise ShapeError(f"{name} must have shape ({wanted}{',' if not row else ''}); got {source.shape}.")
+    array = np.ascontiguousarray(source, dtype)
+    if dtype.kind == "f":
+        # The sum is finite for nearly every good array and costs no temporary; only then look closer.
+        with np.errstate(over="ignore", invalid="ignore"):
+            suspicious = not np.isfinite(array.sum())
+        if suspicious and not np.isfinite(array).all():
+            first = int(np.argwhere(~np.isfinite(array))[0, 0])
+            raise InputError(f"{name} must be finite; row {first} is {array[first].tolist()}. Remove or repair that row.")
+    elif array.dtype != source.dtype and not np.array_equal(array, source):
+        raise InputError(f"{name} holds integers that do not fit {array.dtype}. Renumber them.")
+    return array
+
+
+def _convert_text(name: str, value: Any) -> tuple[str, ...]:
+    if isinstance(value, str) or not isinstance(value, (Sequence, np.ndarray)):
+        raise InputError(f"{name} must be a sequence of strings; got {type(value).__name__}.")
+    names = tuple(str(entry) for entry in value)
+    for index, entry in enumerate(names):
+        if any(character in entry for character in "\0\n\r"):
+            raise InputError(f"{name}[{index}] must not hold line breaks or NUL; got {entry!r}. Rename it.")
+    return names
+
+
+def check_unique(name: str, ids: npt.NDArray[np.int64]) -> None:
+    """Raise when an identifier occurs twice."""
+    if len(ids) < 2:
+        return
+    ordered = np.sort(ids)
+    same = np.flatnonzero(ordered[1:] == ordered[:-1])
+    if len(same):
+        raise InputError(f"{name} must be unique; {ordered[same[0]]} occurs more than once. Renumber them.")
+
+
+def check_index(name: str, index: npt.NDArray[np.int64], size: int, target: str) -> None:
+    """Raise when an index points outside ``0 .. size - 1``."""
+    if len(index) == 0 or (index.min() >= 0 and index.max() < size):
+        return
+    row = int(np.flatnonzero((index < 0) | (index >= size))[0])
+    there = f"{target}: 0-{size - 1}" if size else f"there are no {target}"
+    raise InputError(
+        f"{name}[{row}] is {index[row]}, which is not in the scene ({there}). "
+        f"Drop that row or add what it refers to."
+    )

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Cameras (calibrations), and the rigs that hold them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from groma import cameras as camera_models
+from groma._typing import FloatArray, IntArray
+from groma.errors import InputError, ShapeError
+from groma.scene._table import Table, check_unique, column, text_column
+
+#: Kinds of sensors in a rig.
+CAMERA, OTHER = 0, 1
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras(Table):
+    """Calibrations: model, parameters and image size. Several images may share one."""
+
+    noun: ClassVar[str] = "camera"
+    #: (C,) identifiers.
+    ids: IntArray = column(np.int64)
+    #: (C,) names of camera models, see :func:`groma.cameras.models`.
+    models: tuple[str, ...] = text_column()
+    #: (C, K) parameters, K that of the longest model; the rest of a row is zero. Pixels and pure numbers.
+    params: FloatArray = column(np.float64, None)
+    #: (C,) image width, pixels; 0 where unknown.
+    width: IntArray = column(np.int64)
+    #: (C,) image height, pixels; 0 where unknown.
+    height: IntArray = column(np.int64)
+
+    def _check(self) -> None:
+        check_unique("Cameras.ids", self.ids)
+        for row, count in enumerate(self.num_params):
+            if count > self.params.shape[1]:
+                raise ShapeError(
+                    f"Camera {self.ids[row]} has model {self.models[row]}, which takes {count} parameters; "
+                    f"got {self.params.shape[1]}."
+                )
+            if self.params[row, count:].any():
+                raise ShapeError(
+                    f"Camera {self.ids[row]} has model {self.models[row]}, which takes {count} parameters; "
+                    f"the rest of the row must be zero, got {self.params[row].tolist()}."
+                )
+        if len(self) and min(self.width.min(), self.height.min()) < 0:
+            raise InputError("Cameras.width and height must not be negative; use 0 where the size is unknown.")
+
+    @property
+    def num_params(self) -> list[int]:
+        """Number of parameters of each camera's model."""
+        known = {name: camera_models.model(name).num_parameters for name in set(self.models)}
+        return [known[name] for name in self.models]
+
+    def params_of(self, camera_idx: int) -> FloatArray:
+        """Return the parameters of one camera, without padding."""
+        return self.params[camera_idx, : self.num_params[camera_idx]].copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Rigs(Table):
+    """Bodies that carry sensors. A single camera is a rig with one sensor."""
+
+    noun: ClassVar[str] = "rig"
+    #: (G,) identifiers.
+    ids: IntArray = column(np.int64)
+
+    def _check(self) -> None:
+        check_unique("Rigs.ids", self.ids)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensors(Table):
+    """What is mounted on the rigs; the reference sensor of a rig defines the rig's frame."""
+
+    noun: ClassVar[str] = "sensor"
+    #: (S,) the rig it is mounted on.
+    rig_idx: IntArray = column(np.int64)
+    #: (S,) ``CAMERA`` (0) or ``OTHER`` (1, for example an inertial unit; carried along, not used).
+    kind: IntArray = column(np.int64)
+    #: (S,) identifier; for cameras that of the camera.
+    sensor_ids: IntArray = column(np.int64)
+    #: (S,) the camera; -1 for other sensors.
+    camera_idx: IntArray = column(np.int64)
+    #: (S, 7) pose [qx qy qz qw tx ty tz]; the identity for reference sensors and where unknown.
+    cam_from_rig: FloatArray = column(np.float64, 7)
+    #: (S,) 1 for the reference sensor of its rig.
+    is_reference: IntArray = column(np.int64)
+    #: (S,) 1 where ``cam_from_rig`` is known.
+    has_pose: IntArray = column(np.int64)

@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The solve itself.
+
+::
+
+    linearise and eliminate
+    repeat
+        propose a step                                   (levenberg_marquardt.py or dogleg.py)
+        move the states, evaluate the cost               -> gain ratio
+        if the cost fell:  keep the states, test for convergence, linearise and eliminate again
+        else:              shorten the step
+
+When no free variable is coupled to another, each is solved on its own: see :mod:`groma.solver.independent`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.problem._parallel import Workers, available_cores
+from groma.problem.layout import Layout, lay_out
+from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
+from groma.problem.problem import Problem
+from groma.solver._blas import one_blas_thread
+from groma.solver.dogleg import Dogleg
+from groma.solver.independent import IndependentBlocks
+from groma.solver.levenberg_marquardt import LevenbergMarquardt
+from groma.solver.linear import ConjugateGradients, choose
+from groma.solver.options import SolverOptions
+from groma.solver.report import Iteration, SolveReport, Stopwatch
+from groma.solver.schur import ReducedSystem
+from groma.solver.steps import States, gradient, largest, retract, size_of
+from groma.solver.termination import Termination
+
+#: From this many factors on, all cores are used unless the caller says otherwise.
+FACTORS_FOR_THREADS = 50_000
+
+#: Called after every step tried; returning False stops the solve.
+Progress = Callable[[Iteration], bool | None]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The problem at its new states, and how it got there."""
+
+    problem: Problem
+    report: SolveReport
+
+    def __getitem__(self, group: str) -> FloatArray:
+        """Return the states of a group of variables."""
+        return self.problem.variables[group].state
+
+
+def solve(problem: Problem, options: SolverOptions | None = None, progress: Progress | None = None) -> Solution:
+    r"""Minimise :math:`\tfrac12 \sum \rho(\lVert r \rVert^2)` over the free variables of a problem.
+
+    Parameters
+    ----------
+    problem
+        Variables and factors; not changed.
+    options
+        How to solve; the defaults suit bundle adjustment.
+    progress
+        Called with an :class:`Iteration` after every step tried; return False to stop.
+
+    Returns
+    -------
+    Solution
+        A new problem at the states found, and the report. Not converging is reported, not raised.
+
+    Raises
+    ------
+    ProblemError
+        If a factor couples two landmarks that were both to be eliminated.
+    """
+    options = options or SolverOptions()
+    report = SolveReport(num_factors=sum(map(len, problem.factors)), num_residuals=problem.num_residuals)
+    watch = Stopwatch(report)
+    with watch("setup"):
+        layout = lay_out(problem, options.eliminate)
+    report.warnings += layout.warnings
+    report.num_unknowns = _count_unknowns(problem)
+    if not layout.factors:
+        report.seconds["total"] = watch.elapsed()
+        return Solution(problem, report)
+    report.threads = options.threads or (available_cores() if report.num_factors >= FACTORS_FOR_THREADS else 1)
+    workers = Workers(report.threads)
+    try:
+        run = _solve_jointly if layout.kept else _solve_independently
+        with one_blas_thread():
+            states = run(layout, workers, options, report, watch, progress)
+    finally:
+        workers.close()
+    _note_oddities(report)
+    report.seconds["total"] = watch.elapsed()
+    return Solution(problem.with_states(to_original_order(layout, states)), report)
+
+
+def _solve_jointly(
+    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
+) -> States:
+    with watch("setup"):
+        equations = NormalEquations(layout, workers)
+        system = ReducedSystem(equations)
+        linear = choose(layout, options.linear_solver)
+        refiner = _landmark_refiner(layout, workers, options)
+        states = to_solver_order(layout)
+    report.linear_solver = linear.name
+    strategy = {"levenberg_marquardt": LevenbergMarquardt, "dogleg": Dogleg}[options.strategy](
+        equations, system, linear, watch, options.initial_damping
+    )
+    with watch("cost"):
+        inputs = equations.prepare(states)
+        cost = equations.cost(inputs)
+    _start(report, layout, equations, cost)
+    if not np.isfinite(cost):
+        report.termination = Termination.NOT_FINITE
+        return states
+    strategy.linearize(states, inputs)
+    termination = None
+    while termination is None:
+        slope = largest(gradient(equations))
+        if slope <= options.gradient_tolerance:
+            termination = Termination.GRADIENT_CONVERGED
+            break
+        if report.iterations == options.max_iterations:
+            termination = Termination.MAX_ITERATIONS
+            break
+        report.iterations += 1
+        damping = strategy.damping
+        proposal = strategy.propose()
+        new_cost, ratio, length = np.inf, 0.0, np.inf
+        if proposal is not None:
+            step, predicted = proposal
+            with watch("backsubstitute"):
+                candidate = retract(layout, states, step)
+            with watch("cost"):
+                new_inputs = equations.prepare(candidate)
+                new_cost = equations.cost(new_inputs)
+            length = step.norm()
+            ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
+        accepted = bool(new_cost < cost)
+        if accepted:
+            if refiner is not None:
+                with watch("backsubstitute"):
+                    candidate, new_cost = refiner.refine(equations, candidate, new_cost)
+                    new_inputs = equations.prepare(candidate)
+            decrease, old_cost = cost - new_cost, cost
+            states, cost, inputs = candidate, new_cost, new_inputs
+            strategy.accept(ratio)
+            if decrease <= options.function_tolerance * old_cost:
+                termination = Termination.COST_CONVERGED
+            elif length <= options.step_tolerance * size_of(states):
+                termination = Termination.STEP_CONVERGED
+        elif length <= 1e-14 * size_of(states) or not strategy.refuse():
+            termination = Termination.DAMPING_EXHAUSTED
+        record = Iteration(
+            report.iterations, float(new_cost), accepted, damping, float(ratio), float(length), slope,
+            linear.num_iterations if isinstance(linear, ConjugateGradients) else 0, watch.elapsed(),
+        )  # fmt: skip
+        report.history.append(record)
+        if progress is not None and progress(record) is False:
+            termination = Termination.STOPPED_BY_CALLER
+        if accepted and termination is None and report.iterations < options.max_iterations:
+            strategy.linearize(states, inputs)
+    report.termination = termination
+    with watch("cost"):
+        report.final_cost = equations.cost(inputs)
+    _finish(report, layout, equations, system.num_singular_landmarks)
+    return states
+
+
+# ------------------------------------------------------------------------------------------- landmarks on their own
+
+
+class _LandmarkRefiner:
+    """A few steps of each landmark on its own, cameras held; a step that does not lower its cost is undone."""
+
+    def __init__(self, layout: Layout, workers: Workers, groups: list[str], steps: int) -> None:
+        held = {
+            name: group if name in groups else replace(group, constant=True) for name, group in layout.problem.variables.items()
+        }
+        factors = [f for f in layout.problem.factors if any(ref.group in groups for _, ref in f.references())]
+        self._outer, self._steps = layout, steps
+        self._blocks = IndependentBlocks(lay_out(Problem(held, factors), tuple(groups)), workers, 1e-6)
+
+    def refine(self, equations: NormalEquations, states, cost: float):
+        """Return better states and their cost."""
+        inner = to_original_order(self._outer, states)
+        self._blocks.reset()
+        costs = self._blocks.costs(inner)
+        for _ in range(self._steps):
+            inner, costs, _, _ = self._blocks.step(inner, costs)
+        refined = dict(states)
+        for group in self._outer.eliminated:
+            refined[group.group] = np.ascontiguousarray(inner[group.group][group.order])
+        new_cost = equations.cost(equations.prepare(refined))
+        return (refined, new_cost) if new_cost < cost else (states, cost)
+
+
+def _landmark_refiner(layout: Layout, workers: Workers, options: SolverOptions) -> _LandmarkRefiner | None:
+    groups = [e.group for e in layout.eliminated]
+    if options.landmark_steps == 0 or not groups:
+        return None
+    return _LandmarkRefiner(layout, workers, groups, options.landmark_steps)
+
+
+def _solve_independently(
+    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
+) -> States:
+    with watch("setup"):
+        blocks = IndependentBlocks(layout, workers, options.initial_damping)
+        states = to_solver_order(layout)
+    report.linear_solver = "blocks"
+    with watch("cost"):
+        costs = blocks.costs(states)
+    cost = float(sum(blocks.equations.costs))
+    _start(report, layout, blocks.equations, cost)
+    if not np.isfinite(cost):
+        report.termination = Termination.NOT_FINITE
+        return states
+    report.termination = Termination.MAX_ITERATIONS
+    while report.iterations < options.max_iterations:
+        report.iterations += 1
+        with watch("linearize"):
+            states, new_costs, lengths, gradient = blocks.step(states, costs)
+        unfinished = blocks.unfinished(costs, new_costs, options.function_tolerance)
+        new_cost = cost + float(sum((a - b).sum() for a, b in zip(new_costs, costs, strict=True)))
+        length = float(np.sqrt(sum(float(x @ x) for x in lengths)))
+        damping = max((float(d.max()) for d in blocks.damping if d.size), default=0.0)
+        record = Iteration(
+            report.iterations, new_cost, new_cost < cost, damping, 0.0, length, gradient, 0, watch.elapsed()
+        )
+        report.history.append(record)
+        costs, cost = new_costs, new_cost
+        if gradient <= options.gradient_tolerance:
+            report.termination = Termination.GRADIENT_CONVERGED
+        elif unfinished == 0:
+            report.termination = Termination.COST_CONVERGED
+        if progress is not None and progress(record) is False:
+            report.termination = Termination.STOPPED_BY_CALLER
+        if report.termination is not Termination.MAX_ITERATIONS:
+            break
+    with watch("cost"):
+        report.final_cost = blocks.equations.cost(blocks.equations.prepare(states))
+    _finish(report, layout, blocks.equations, getattr(blocks, "num_singular", 0))
+    return states
+
+
+# ------------------------------------------------------------------------------------------------------- reporting
+
+
+def _count_unknowns(problem: Problem) -> int:
+    total = 0
+    used = {ref.group for factor in problem.factors if len(factor) for _, ref in factor.references()}
+    for name in used:
+        group = problem.variables[name]
+        free = group.free_coordinates()
+        total += len(group) * group.manifold.dof if free is None else int(free.sum())
+    return total
+
+
+def _by_type(layout: Layout, values: list) -> dict:
+    totals: dict = {}
+    for factor, value in zip(layout.factors, values, strict=True):
+        totals[factor.factor.type_name] = totals.get(factor.factor.type_name, 0) + value
+    return totals
+
+
+def _start(report: SolveReport, layout: Layout, equations: NormalEquations, cost: float) -> None:
+    report.initial_cost = report.final_cost = cost
+    report.initial_costs = report.final_costs = _by_type(layout, equations.costs)
+
+
+def _finish(report: SolveReport, layout: Layout, equations: NormalEquations, singular: int) -> None:
+    report.final_costs = _by_type(layout, equations.costs)
+    report.num_degenerate = {name: n for name, n in _by_type(layout, equations.num_degenerate).items() if n}
+    report.num_underdetermined_landmarks = singular
+
+
+def _note_oddities(report: SolveReport) -> None:
+    for name, count in report.num_degenerate.items():
+        report.warnings.append(
+            f"{count} factor(s) of type {name!r} could not be evaluated (degenerate geometry) and were left out."
+        )
+    if report.num_underdetermined_landmarks:
+        report.warnings.append(
+            f"{report.num_underdetermined_landmarks} landmark(s) have a direction that the observations do not "
+            "determine; it was left where it was."
+        )
+    if report.num_residuals < report.num_unknowns:
+        report.warnings.append(
+            f"There are fewer residuals ({report.num_residuals}) than unknowns ({report.num_unknowns}): the result is "
+            "one of many. Hold variables constant, add priors or add observations."
+        )
+

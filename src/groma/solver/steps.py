@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A step of all free variables: moving the states by it, and the quadratic model of the cost along it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.problem.layout import Layout
+from groma.problem.linearization import NormalEquations
+from groma.solver.linear import multiply
+from groma.solver.schur import MIN_DIAGONAL, ReducedSystem
+
+States = dict[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class Step:
+    """Increments, flat: of the kept blocks by class and of the landmarks by eliminated group."""
+
+    kept: list[FloatArray]
+    landmarks: list[FloatArray]
+
+    def parts(self) -> list[FloatArray]:
+        """Return all arrays of the step."""
+        return self.kept + self.landmarks
+
+    def dot(self, other: Step) -> float:
+        """Return the inner product with another step."""
+        return float(sum(a @ b for a, b in zip(self.parts(), other.parts(), strict=True)))
+
+    def norm(self) -> float:
+        """Return the Euclidean length."""
+        return float(np.sqrt(self.dot(self)))
+
+    def blend(self, weight: float, other: Step, other_weight: float) -> Step:
+        """Return weight * self + other_weight * other."""
+        return Step(
+            [weight * a + other_weight * b for a, b in zip(self.kept, other.kept, strict=True)],
+            [weight * a + other_weight * b for a, b in zip(self.landmarks, other.landmarks, strict=True)],
+        )
+
+
+def retract(layout: Layout, states: States, step: Step) -> States:
+    """Return the states moved by a step, each group through its chart."""
+    new = dict(states)
+    for kept, delta in zip(layout.kept, step.kept, strict=True):
+        blocks = delta.reshape(kept.count, kept.width)
+        for member in kept.members:
+            part = blocks[:, member.offset : member.offset + member.dof]
+            if member.block_of is not None:
+                part = part[member.block_of]
+            manifold = layout.problem.variables[member.group].manifold
+            new[member.group] = manifold.retract(states[member.group], np.ascontiguousarray(part))
+    for group, delta in zip(layout.eliminated, step.landmarks, strict=True):
+        manifold = layout.problem.variables[group.group].manifold
+        new[group.group] = manifold.retract(states[group.group], delta.reshape(group.count, group.dof))
+    return new
+
+
+def size_of(states: States) -> float:
+    """Return the Euclidean length of all states together."""
+    return float(np.sqrt(sum(float(np.vdot(state, state)) for state in states.values()))) + 1e-12
+
+
+def gradient(equations: NormalEquations) -> Step:
+    """Return the gradient of the cost."""
+    return Step(equations.g_kept, equations.g_landmarks)
+
+
+def largest(step: Step) -> float:
+    """Return the largest component of a step."""
+    return max((float(np.abs(part).max()) for part in step.parts() if part.size), default=0.0)
+
+
+def diagonal(equations: NormalEquations, system: ReducedSystem) -> Step:
+    """Return the diagonal of the normal equations, bounded from below as the damping takes it."""
+    kept = [np.maximum(system.diagonal(c).reshape(-1), MIN_DIAGONAL) for c in range(len(equations.layout.kept))]
+    landmarks = []
+    for e, eliminated in enumerate(equations.layout.eliminated):
+        dof = eliminated.dof
+        values = equations.V[e].reshape(-1, dof * dof)[:, :: dof + 1].reshape(-1)
+        landmarks.append(np.maximum(values, MIN_DIAGONAL))
+    return Step(kept, landmarks)
+
+
+def curvature(equations: NormalEquations, system: ReducedSystem, step: Step) -> float:
+    r"""Return :math:`\delta^\top J^\top J\,\delta` of the undamped normal equations."""
+    layout = equations.layout
+    direct = {
+        pair: equations.H[pair].reshape(-1, layout.kept[pair[0]].width, layout.kept[pair[1]].width)
+        for pair in layout.blocks
+    }
+    product = multiply(layout, direct, step.kept)
+    total = float(sum(a @ b for a, b in zip(step.kept, product, strict=True)))
+    for e, (t, delta) in enumerate(zip(system.incident_products(step.kept), step.landmarks, strict=True)):
+        dof = layout.eliminated[e].dof
+        V = equations.V[e].reshape(-1, dof, dof)
+        blocks = delta.reshape(-1, dof)
+        total += float(np.einsum("ni,nij,nj->", blocks, V, blocks)) + 2.0 * float(delta @ t)
+    return total

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The command line as a whole: help, version, usage errors, exit codes of known errors and of Ctrl-C."""
+
+import errno
+
+import pytest
+
+from groma.cli._guard import guard
+from groma.cli.app import app
+from groma.cli.main import run
+from groma.errors import InputError, OutputError
+
+COMMANDS = [[command.name] for command in app.registered_commands] + [["evaluate", "poses"]]
+
+
+@pytest.mark.parametrize("command", [[], ["evaluate"], *COMMANDS], ids=" ".join)
+def test_help(command, capsys):
+    assert run([*command, "--help"]) == 0
+    assert "Usage: groma" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+@pytest.mark.parametrize("option", ["--json", "--quiet", "--verbose", "--threads", "--force"])
+def test_every_command_has_the_common_options(command, option, capsys):
+    run([*command, "--help"])
+    assert option in capsys.readouterr().out
+
+
+def test_version(capsys):
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("groma 0.")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["no-such-command"],
+        ["adjust"],
+        ["adjust", "x", "--no-such-option"],
+        ["adjust", "x", "--linear-solver", "magic"],
+        ["adjust", "x", "--threads", "0"],
+        ["adjust", "x", "--max-iterations", "-1"],
+        ["synth"],
+        ["evaluate", "poses", "only-one"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_usage_is_exit_code_2(arguments, capsys):
+    assert run(arguments) == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (InputError("expected this,\ngot that."), 1, "groma: expected this, got that."),
+        (OutputError("cannot write."), 1, "groma: cannot write."),
+        (FileNotFoundError(errno.ENOENT, "No such file or directory", "a.txt"), 1, "groma: a.txt: No such file"),
+        (MemoryError(), 1, "memory"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_known_errors_are_one_line(error, code, words, capsys):
+    def command() -> None:
+        raise error
+
+    with pytest.raises(BaseException) as caught:
+        guard(command)()
+    assert caught.value.exit_code == code
+    text = capsys.readouterr().err
+    assert words in text
+    assert text.count("\n") == 1
+
+
+def test_our_own_errors_keep_their_traceback():
+    def command() -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        guard(command)()

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What is loaded by ``import groma`` and by ``groma --help``: nothing that is slow. No clock is read."""
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("numba", "llvmlite", "scipy", "pycolmap", "cv2", "viser")
+
+
+def _loaded_after(code: str) -> set[str]:
+    finished = subprocess.run(
+        [sys.executable, "-c", code + "\nimport sys\nprint('LOADED', *sorted(sys.modules))"],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    line = next(line for line in finished.stdout.splitlines() if line.startswith("LOADED"))
+    return set(line.split()[1:])
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import groma",
+        "from groma.cli.main import run\nassert run(['--help']) == 0",
+        "from groma.cli.main import run\nassert run(['adjust', '--help']) == 0",
+        "from groma.cli.main import run\nassert run(['evaluate', 'poses', '--help']) == 0",
+        "from groma.cli.main import run\nassert run(['--version']) == 0",
+    ],
+)
+def test_nothing_heavy_is_loaded(code):
+    assert not _loaded_after(code) & {*HEAVY, "numpy"}
+
+
+def test_the_viewer_is_loaded_only_when_asked_for():
+    assert "viser" not in _loaded_after("import groma\ngroma.adjust\ngroma.read_scene")
