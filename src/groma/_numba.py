@@ -17,5 +17,5 @@ _OPTIONS = {
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
 }
 
-kernel = njit(**_OPTIONS)
+kernel = njit(forceinline=True, **_OPTIONS)
 loop = njit(**_OPTIONS)

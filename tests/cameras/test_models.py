@@ -163,7 +163,7 @@ def test_fisheye_is_smooth_across_the_axis():
     [
         # g = r - 0.2 r^3 turns at r^2 = 1 / 0.6
         ("SIMPLE_RADIAL", [500.0, 0.0, 0.0, -0.2], (1 / 0.6) ** 0.5),
-        # strong barrel distortion with a second turn later on: 1 - 0.9 s + 0.5 * 0.3 s^2 = 0 at s = (0.9 - sqrt(0.21)) / 0.3
+        # grows again beyond a second turn: 1 - 0.9 s + 0.15 s^2 = 0 at s = (0.9 - sqrt(0.21)) / 0.3
         ("RADIAL", [500.0, 0.0, 0.0, -0.3, 0.03], ((0.9 - 0.21**0.5) / 0.3) ** 0.5),
         ("OPENCV", [500.0, 500.0, 0.0, 0.0, -0.3, 0.03, 0.0, 0.0], ((0.9 - 0.21**0.5) / 0.3) ** 0.5),
     ],

@@ -116,7 +116,7 @@ def test_errors_say_what_to_do():
         loss("hubert")
     with pytest.raises(InputError, match=r"positive number .* got 0.0"):
         Huber(0.0)
-    with pytest.raises(InputError, match="at most 2; got 2.5"):
+    with pytest.raises(InputError, match=r"at most 2; got 2\.5"):
         Barron(2.5)
     with pytest.raises(InputError, match="Leave it out"):
         loss("huber", alpha=1.0)

@@ -6,6 +6,7 @@ from groma.cameras.fisheye import OPENCV_FISHEYE
 from groma.cameras.opencv import FULL_OPENCV, OPENCV
 from groma.cameras.pinhole import PINHOLE, SIMPLE_PINHOLE
 from groma.cameras.radial import BAL, RADIAL, SIMPLE_RADIAL
+from groma.cameras.rig import Rig
 
 __all__ = [
     "BAL",
@@ -17,6 +18,7 @@ __all__ = [
     "SIMPLE_PINHOLE",
     "SIMPLE_RADIAL",
     "CameraModel",
+    "Rig",
     "model",
     "models",
     "register_camera",

@@ -152,11 +152,8 @@ class CameraModel:
         """
         points = _rows(points_in_cam, 3, "points_in_cam")
         count = len(points)
-        pixels, by_point, by_params = (
-            np.empty((count, 2)),
-            np.empty((count, 2, 3)),
-            np.empty((count, 2, self.num_parameters)),
-        )
+        pixels, by_point = np.empty((count, 2)), np.empty((count, 2, 3))
+        by_params = np.empty((count, 2, self.num_parameters))
         _project_jacobian_all(self.tag, self.check_parameters(params, count), points, pixels, by_point, by_params)
         return pixels, by_point, by_params
 
@@ -338,7 +335,7 @@ def register_camera(
     ----------
     camera : CameraModel
         The model. Its number must be free; groma uses 0 to 15. Keep it the same from run to run: compiled loops are
-        cached on disk by this number.
+        cached on disk by this number. Empty Numba's cache folder after changing the kernels.
     project, project_jacobian, unproject : callable
         Kernels (decorated with ``groma._numba.kernel``) as described in :mod:`groma.cameras._dispatch`, without the
         tag.
@@ -362,14 +359,8 @@ def register_camera(
                 f"but {other.name!r} has number {other.number}. Choose a free number from 16 upwards."
             )
     _MODELS[camera.name] = camera
-    set_kernels(
-        camera.number + 1,
-        project,
-        project_jacobian,
-        unproject,
-        pinhole_parameters,
-        pinhole_parameters_jacobian,
-    )
+    kernels = project, project_jacobian, unproject, pinhole_parameters, pinhole_parameters_jacobian
+    set_kernels(camera.number + 1, *kernels)
     return camera
 
 

@@ -44,9 +44,9 @@ def cam_from_world(cam_from_rig: FloatArray, rig_from_world: FloatArray) -> Floa
     Raises
     ------
     ShapeError
-        If a last axis is not 7.
+        If a last axis is not 7, or the leading axes do not broadcast.
     """
-    return se3.compose(*_broadcast(cam_from_rig, rig_from_world))
+    return se3.compose(*_broadcast(cam_from_rig, rig_from_world, "rig_from_world"))
 
 
 def rig_from_world(cam_from_rig: FloatArray, cam_from_world: FloatArray) -> FloatArray:
@@ -54,7 +54,7 @@ def rig_from_world(cam_from_rig: FloatArray, cam_from_world: FloatArray) -> Floa
 
     The inverse of :func:`cam_from_world` in its second argument; arguments and shapes as there.
     """
-    extrinsics, poses = _broadcast(cam_from_rig, cam_from_world)
+    extrinsics, poses = _broadcast(cam_from_rig, cam_from_world, "cam_from_world")
     return se3.compose(se3.inverse(extrinsics), poses)
 
 
@@ -85,10 +85,16 @@ class Rig:
         return cam_from_world(self.sensor_from_rig, _poses(rig_from_world, "rig_from_world")[..., None, :])
 
 
-def _broadcast(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
-    pair = _poses(first, "cam_from_rig"), _poses(second, "the second pose")
-    shape = np.broadcast_shapes(pair[0].shape, pair[1].shape)
-    return np.broadcast_to(pair[0], shape), np.broadcast_to(pair[1], shape)
+def _broadcast(first: FloatArray, second: FloatArray, second_name: str) -> tuple[FloatArray, FloatArray]:
+    first, second = _poses(first, "cam_from_rig"), _poses(second, second_name)
+    try:
+        shape = np.broadcast_shapes(first.shape, second.shape)
+    except ValueError as error:
+        raise ShapeError(
+            f"cam_from_rig and {second_name} must broadcast; got {first.shape} and {second.shape}. "
+            f"Add an axis of length 1 to combine each with each."
+        ) from error
+    return np.broadcast_to(first, shape), np.broadcast_to(second, shape)
 
 
 def _poses(array: FloatArray, name: str) -> FloatArray:

@@ -3,8 +3,6 @@
 
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,33 +40,12 @@ def check_output(path: Path, force: bool) -> None:
 
 @contextmanager
 def atomic_output(path: Path, force: bool) -> Iterator[Path]:
-    """Yield a place to write to; it becomes ``path`` when the block ends well, and vanishes when it does not.
+    """Yield a place to write a file or folder to; it becomes ``path`` when the block ends well, else it vanishes."""
+    from groma.io._atomic import atomic_output as complete_or_not_at_all
 
-    The place lies in a hidden temporary folder beside ``path``, so the last step is a rename. What is written may be
-    a file or a folder.
-    """
     check_output(path, force)
-    path = path.absolute()
-    try:
-        workshop = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    except OSError as error:
-        raise OutputError(f"Cannot write {path}: {error.strerror or error}. Choose another place.") from error
-    try:
-        draft = workshop / path.name
+    with complete_or_not_at_all(path, force) as draft:
         yield draft
-        if not draft.exists():
-            raise OutputError(f"Nothing was written for {path}.")
-        if path.is_dir() and not path.is_symlink():
-            os.replace(path, workshop / "previous")
-        elif draft.is_dir() and path.exists():
-            path.unlink()
-        os.replace(draft, path)
-    except OSError as error:
-        if isinstance(error, OutputError):
-            raise
-        raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from error
-    finally:
-        shutil.rmtree(workshop, ignore_errors=True)
 
 
 def check_json(target: str | None, force: bool) -> None:

@@ -104,8 +104,7 @@ def adjust(
     numbers = result.report.to_dict()
 
     if output is not None:
-        with _output.atomic_output(output, force) as draft:
-            write_scene(result.scene, draft)
+        write_scene(result.scene, output, force)
     if page is not None:
         from groma.viz.report import write_report
 

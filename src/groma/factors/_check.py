@@ -238,7 +238,7 @@ def check_factor(
     Parameters
     ----------
     factor : type of factor, factor or Example
-        What to check. Of a type, or an instance, :meth:`Factor.example` is drawn; an :class:`Example` is taken as it is.
+        What to check. Of a type or an instance, :meth:`Factor.example` is drawn; an :class:`Example` is taken as is.
     rng : numpy.random.Generator, optional
         Source of chance for the example; seeded with 0 if not given.
     tolerance : float
@@ -263,8 +263,8 @@ def check_factor(
         if not check.passed:
             with np.printoptions(precision=6, linewidth=160, suppress=True):
                 raise AssertionError(
-                    f"Factor {name!r}, block {check.block!r}, chart {check.chart!r}: the analytic Jacobian deviates from "
-                    f"differences by {check.deviation:.2e} of its largest entry (allowed: {check.tolerance:.0e}).\n"
+                    f"Factor {name!r}, block {check.block!r}, chart {check.chart!r}: the analytic Jacobian deviates "
+                    f"from differences by {check.deviation:.2e} of its largest entry (allowed {check.tolerance:.0e}).\n"
                     f"analytic\n{check.analytic}\nnumeric\n{check.numeric}"
                 )
     _check_ranges(name, example)

@@ -15,7 +15,7 @@ from groma.geometry._manifold import Euclidean, Manifold
 from groma.geometry.line_charts import LINE_CHARTS
 from groma.geometry.plane_charts import PLANE_CHARTS
 from groma.geometry.pose_charts import POSE_CHARTS
-from groma.geometry.unit3 import Unit3
+from groma.geometry.unit3 import DIRECTION_CHARTS
 
 #: Factors in one example.
 COUNT = 6
@@ -25,10 +25,8 @@ def charts(kind: str) -> tuple[Manifold, ...]:
     """Return every chart known for ``kind``, the default first; none for kinds of any size."""
     if kind == "point":
         return (Euclidean(3, "point"),)
-    if kind == "direction":
-        return (Unit3(),)
-    tables = {"pose": POSE_CHARTS, "line": LINE_CHARTS, "plane": PLANE_CHARTS}
-    return tuple(chart() for chart in tables[kind].values()) if kind in tables else ()
+    tables = {"pose": POSE_CHARTS, "line": LINE_CHARTS, "plane": PLANE_CHARTS, "direction": DIRECTION_CHARTS}
+    return tuple(tables[kind].values()) if kind in tables else ()
 
 
 def indices(rng: np.random.Generator, count: int) -> IntArray:

@@ -84,6 +84,11 @@ class Factor(ABC):
     def residual_size(self) -> int:
         """Rows m of one residual."""
 
+    @property
+    def residual_rank(self) -> int:
+        """Independent rows of one residual: less than ``residual_size`` where rows depend on each other."""
+        return self.residual_size
+
     def references(self) -> tuple[tuple[Slot, Ref], ...]:
         """The slots that are present, each with the variables it refers to, in order."""
         return tuple((slot, getattr(self, slot.name)) for slot in self.slots if getattr(self, slot.name) is not None)

@@ -63,6 +63,18 @@ def _move_vector(flat, k, h, vector):
 
 
 @kernel
+def _put_difference(up, down, h, J, k):
+    for i in range(up.shape[0]):
+        J[i, k] = (up[i] - down[i]) / h
+
+
+@kernel
+def _put_imaginary(up, h, J, k):
+    for i in range(up.shape[0]):
+        J[i, k] = up[i].imag / h
+
+
+@kernel
 def _is_finite(r):
     for i in range(r.shape[0]):
         if not np.isfinite(r[i]):
@@ -133,7 +145,7 @@ def _write_loops(slots: Sequence[Slot], sizes: Sequence[int], residual_size: int
                 lines += [
                     f"                h = {move}{_COMPLEX_STEP!r}j, z{b})",
                     f"                residual(data[f], {moved}, up)",
-                    f"                J{b}[:, k] = up.imag / h.imag",
+                    f"                _put_imaginary(up, h.imag, J{b}, k)",
                 ]
             else:
                 lines += [
@@ -142,7 +154,7 @@ def _write_loops(slots: Sequence[Slot], sizes: Sequence[int], residual_size: int
                     *reload,
                     f"                {move}{-_CENTRAL_STEP!r}, z{b})",
                     f"                residual(data[f], {moved}, down)",
-                    f"                J{b}[:, k] = (up - down) / (2.0 * h)",
+                    f"                _put_difference(up, down, 2.0 * h, J{b}, k)",
                 ]
     for b in numbers:
         lines += [
@@ -191,7 +203,10 @@ class Loops:
             "put_block": put_block,
             "put_residual": put_residual,
         }
-        helpers = (_load_pose, _load_vector, _move_pose, _move_vector, _is_finite, _block_is_finite)
+        helpers = (
+            _load_pose, _load_vector, _move_pose, _move_vector, _put_difference, _put_imaginary, _is_finite,
+            _block_is_finite,
+        )  # fmt: skip
         names.update({helper.__name__: helper for helper in helpers})
         if self.jacobian is not None:
             signature = (numba.float64[::1], *real, *[numba.float64[:, ::1]] * len(real))
@@ -206,7 +221,7 @@ class Loops:
         for signature in signatures:
             try:
                 compiled.compile(signature)
-            except numba.core.errors.NumbaError as error:
+            except Exception as error:  # Numba has no common root for them
                 complex_hint = ""
                 if self.derivative == "complex" and signature[-1].dtype == numba.complex128:
                     complex_hint = (

@@ -10,12 +10,13 @@ With the moment :math:`m_c = R m + t \times R d` of the line in the camera, and 
 .. math:: \frac{\partial r_i}{\partial \xi} = [\,(d_c \times g)^\top,\; (m_c \times g)^\top\,], \qquad
           \frac{\partial r_i}{\partial (m, d)} = [\,g^\top R,\; (g \times t)^\top R\,]
 
-for the left twist :math:`(\rho, \omega)`. Bearings come from any camera model (:meth:`groma.cameras.CameraModel.unproject`),
-so this is the line factor under distortion, and for fisheye cameras; the parameters of the camera are not estimated.
-Multiply by the focal length, through ``sqrt_information``, to get about pixels.
+for the left twist :math:`(\rho, \omega)`. Bearings come from any camera model
+(:meth:`groma.cameras.CameraModel.unproject`), so this is the line factor under distortion, and for fisheye cameras; the
+parameters of the camera are not estimated. Multiply by the focal length, through ``sqrt_information``, to get about
+pixels.
 
-Source: the motion of the line is Plücker notes, eq. (65); the residual is the one of eq. (76) on the unit sphere. It does
-not depend on the scale of (m, d), and changes its sign with that of (m, d).
+Source: the motion of the line is Plücker notes, eq. (65); the residual is the one of eq. (76) on the unit sphere. It
+does not depend on the scale of (m, d), and changes its sign with that of (m, d).
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ from groma.factors._rig import (
     clear_block,
     clear_residual,
     normalize_rows,
-    put_line_row,
+    put_line,
+    put_line_pose,
     transform_line,
     visible_scene,
 )
@@ -45,9 +47,8 @@ from groma.factors._rig import (
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
-def _linearize(L, inverse_norm, bearings, i, out):
-    """Write r and g = dr/dm (3,) to ``out`` (4,)."""
-    k = inverse_norm
+def _bearing_sine(L, k, bearings, i, out):
+    """Write r and g = dr/dm (3,) to ``out`` (4,); k = 1/|m|."""
     u0, u1, u2 = L[0] * k, L[1] * k, L[2] * k
     r = bearings[i, 0] * u0 + bearings[i, 1] * u1 + bearings[i, 2] * u2
     out[0] = r
@@ -66,11 +67,15 @@ def _linearize_all(poses, pose_index, lines, line_index, starts, ends, begin, en
         norm = math.sqrt(L[0] * L[0] + L[1] * L[1] + L[2] * L[2])
         if valid and norm < math.inf:
             for row in range(2):
-                _linearize(L, 1.0 / norm, starts if row == 0 else ends, i, out)
+                if row == 0:
+                    _bearing_sine(L, 1.0 / norm, starts, i, out)
+                else:
+                    _bearing_sine(L, 1.0 / norm, ends, i, out)
                 record[k, row, last] = out[0]
-                put_line_row(
-                    out[1], out[2], out[3], 0.0, 0.0, 0.0, poses, c, L, record, k, row, pose_column, line_column
-                )
+                if pose_column >= 0:
+                    put_line_pose(out[1], out[2], out[3], 0.0, 0.0, 0.0, L, record, k, row, pose_column)
+                if line_column >= 0:
+                    put_line(out[1], out[2], out[3], 0.0, 0.0, 0.0, poses, c, record, k, row, line_column)
         else:
             clear_block(record, k, pose_column, 6)
             clear_block(record, k, line_column, 6)
@@ -118,7 +123,7 @@ class LineBearing(CameraFactor):
         factor = cls(
             pose=Ref("poses", indices(rng, 3)),
             line=Ref("lines", indices(rng, 4)),
-            start_bearings=rng.normal(size=(6, 3)) + [0, 0, 3],
-            end_bearings=rng.normal(size=(6, 3)) + [0, 0, 3],
+            start_bearings=rng.normal((0.0, 0.0, 3.0), 1.0, (6, 3)),
+            end_bearings=rng.normal((0.0, 0.0, 3.0), 1.0, (6, 3)),
         )
         return make_example(factor, rng, states=visible_scene(rng))

@@ -17,9 +17,9 @@ With :math:`N = (I - v v^\top)\, n`, :math:`x = R\hat d`, :math:`n_w = R^\top n`
           \frac{\partial r}{\partial d} = \begin{bmatrix} (n_w - r_1 \hat d)^\top/\lVert d\rVert \\
               (m \times q - 2 (q \cdot p)\, d)^\top/\lVert d\rVert^2 \end{bmatrix} .
 
-Source: Free line notes, eqs. (3.1) to (3.6) for the residual and (4.5) to (4.38) for the pose, which is a right increment
-there. The derivative by the line, missing there, is taken by (m, d), so that any chart of lines will do. The residual
-does not depend on the scale of (m, d); :math:`r_1` changes its sign with that of (m, d).
+Source: Free line notes, eqs. (3.1) to (3.6) for the residual and (4.5) to (4.38) for the pose, a right increment there.
+The derivative by the line, missing there, is taken by (m, d), so that any chart of lines will do. The residual does not
+depend on the scale of (m, d); :math:`r_1` changes its sign with that of (m, d).
 """
 
 from __future__ import annotations

@@ -129,6 +129,19 @@ class _LineAndPlane(Factor):
     def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:
         return self.linearize(inputs, begin, end, (-1, -1), out[:, :, None])
 
+    def _evaluate(
+        self,
+        with_angle: bool,
+        anchors: FloatArray,
+        inputs: tuple[Any, ...],
+        begin: int,
+        end: int,
+        columns: tuple[int, ...],
+        record: FloatArray,
+    ) -> int:
+        (lines, planes), (i, j), lines_of, planes_of = inputs, columns, self.line.index, self.plane.index
+        return _linearize_all(with_angle, anchors, lines, planes, lines_of, planes_of, begin, end, i, j, record)
+
 
 @register("line_on_plane")
 @dataclass(frozen=True, kw_only=True)
@@ -150,13 +163,12 @@ class LineOnPlane(_LineAndPlane):
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
         anchors = np.zeros((len(self), 1, 3)) if self.anchor is None else self.anchor[:, None]
-        index = (self.line.index, self.plane.index)
-        return _linearize_all(True, anchors, *inputs, *index, begin, end, *columns, record)
+        return self._evaluate(True, anchors, inputs, begin, end, columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
-        refs = {"line": Ref("lines", indices(rng, 5)), "plane": Ref("planes", indices(rng, 3))}
-        return make_example(cls(**refs, anchor=rng.normal(size=(6, 3))), rng)
+        line, plane = Ref("lines", indices(rng, 5)), Ref("planes", indices(rng, 3))
+        return make_example(cls(line=line, plane=plane, anchor=rng.normal(size=(6, 3))), rng)
 
 
 @register("segment_on_plane")
@@ -176,10 +188,9 @@ class SegmentOnPlane(_LineAndPlane):
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        index = (self.line.index, self.plane.index)
-        return _linearize_all(False, self.ends, *inputs, *index, begin, end, *columns, record)
+        return self._evaluate(False, self.ends, inputs, begin, end, columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
-        refs = {"line": Ref("lines", indices(rng, 5)), "plane": Ref("planes", indices(rng, 3))}
-        return make_example(cls(**refs, ends=rng.normal(size=(6, 2, 3))), rng)
+        line, plane = Ref("lines", indices(rng, 5)), Ref("planes", indices(rng, 3))
+        return make_example(cls(line=line, plane=plane, ends=rng.normal(size=(6, 2, 3))), rng)

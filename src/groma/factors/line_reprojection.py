@@ -18,8 +18,8 @@ the principal point it is :math:`(a, b, m_z)` with :math:`a = m_x/f_x,\; b = m_y
 for the left twist :math:`(\rho, \omega)`. The residual does not depend on the scale of (m, d), and changes its sign
 with that of (m, d).
 
-Source: Plücker notes, eqs. (65) to (68), (75), (76), with (66) in the layout of (82), and the denominators of (81) squared
-as in Point-line-plane notes, eqs. (6) to (12). Written about the principal point there is less cancellation.
+Source: Plücker notes, eqs. (65) to (68), (75), (76), with (66) in the layout of (82), and the denominators of (81)
+squared as in Point-line-plane notes, eqs. (6) to (12). Written about the principal point there is less cancellation.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ from groma.factors._rig import (
     clear_block,
     clear_residual,
     load_row,
-    put_line_row,
+    put_line,
+    put_line_pose,
     transform_line,
     visible_scene,
 )
@@ -67,42 +68,30 @@ def image_line_norm(m0, m1, m2, K):
 
 
 @kernel
-def endpoint_distance(m0, m1, m2, K, h, u, v, out):
-    """Write to ``out`` (8,): r, the three numbers of g = dr/dm, and dr/d(fx, fy, cx, cy)."""
+def endpoint_distance(m0, m1, m2, K, h, u, v, out, row):
+    """Write to ``out[row]`` (8,): r, the three numbers of g = dr/dm, and dr/d(fx, fy, cx, cy)."""
     a, b, k = m0 / K[0], m1 / K[1], 1.0 / h
     x, y = u - K[2], v - K[3]
     r = (a * x + b * y + m2) * k
-    out[0] = r
-    out[1] = (x - r * a * k) * k / K[0]
-    out[2] = (y - r * b * k) * k / K[1]
-    out[3] = k
-    out[4] = -out[1] * a
-    out[5] = -out[2] * b
-    out[6] = -a * k
-    out[7] = -b * k
+    g0, g1 = (x - r * a * k) * k / K[0], (y - r * b * k) * k / K[1]
+    out[row, 0] = r
+    out[row, 1] = g0
+    out[row, 2] = g1
+    out[row, 3] = k
+    out[row, 4] = -g0 * a
+    out[row, 5] = -g1 * b
+    out[row, 6] = -a * k
+    out[row, 7] = -b * k
     return abs(r) < math.inf
 
 
 @kernel
-def put_pinhole_row(row_wrt_K, J_K, record, i, row, column):
-    """Write the derivative by the parameters of the camera, from out[4:8] of :func:`endpoint_distance`."""
-    if column >= 0:
-        for j in range(J_K.shape[1]):
-            total = 0.0
-            for k in range(4):
-                total += row_wrt_K[4 + k] * J_K[k, j]
-            record[i, row, column + j] = total
-
-
-@kernel
-def _linearize(m0, m1, m2, K, segments, i, first, second):
-    """Write residual and derivatives of both end points; False where the line has no image."""
-    h = image_line_norm(m0, m1, m2, K)
-    if not h > 0.0:
-        return False
-    return endpoint_distance(m0, m1, m2, K, h, segments[i, 0], segments[i, 1], first) and endpoint_distance(
-        m0, m1, m2, K, h, segments[i, 2], segments[i, 3], second
-    )
+def put_pinhole(out, J_K, record, i, row, column):
+    """Write the derivative by the parameters of the camera, from out[row, 4:8] of :func:`endpoint_distance`."""
+    for j in range(J_K.shape[1]):
+        record[i, row, column + j] = (
+            out[row, 4] * J_K[0, j] + out[row, 5] * J_K[1, j] + out[row, 6] * J_K[2, j] + out[row, 7] * J_K[3, j]
+        )
 
 
 @loop
@@ -113,24 +102,29 @@ def _linearize_all(
     size = intrinsics.shape[1]
     L, K, J_K, params, out = np.empty(6), np.empty(4), np.empty((4, size)), np.empty(size), np.empty((2, 8))
     camera, degenerate, last = -1, 0, record.shape[2] - 1
-    first, second = out[0], out[1]
     for i in range(begin, end):
         k, c = i - begin, pose_index[i]
         if intrinsics_index[i] != camera:
             camera = load_row(intrinsics, intrinsics_index[i], camera, params)
             pinhole_parameters(model_tag, params, K)
             pinhole_parameters_jacobian(model_tag, params, J_K)
-        if transform_line(poses, c, lines, line_index[i], L) and _linearize(
-            L[0], L[1], L[2], K, segments, i, first, second
+        valid = transform_line(poses, c, lines, line_index[i], L)
+        h = image_line_norm(L[0], L[1], L[2], K)
+        if (
+            valid
+            and h > 0.0
+            and endpoint_distance(L[0], L[1], L[2], K, h, segments[i, 0], segments[i, 1], out, 0)
+            and endpoint_distance(L[0], L[1], L[2], K, h, segments[i, 2], segments[i, 3], out, 1)
         ):
             for row in range(2):
+                g0, g1, g2 = out[row, 1], out[row, 2], out[row, 3]
                 record[k, row, last] = out[row, 0]
-                put_line_row(
-                    out[row, 1], out[row, 2], out[row, 3], 0.0, 0.0, 0.0, poses, c, L,
-                    record, k, row, pose_column, line_column,
-                )  # fmt: skip
-            put_pinhole_row(first, J_K, record, k, 0, intrinsics_column)
-            put_pinhole_row(second, J_K, record, k, 1, intrinsics_column)
+                if pose_column >= 0:
+                    put_line_pose(g0, g1, g2, 0.0, 0.0, 0.0, L, record, k, row, pose_column)
+                if line_column >= 0:
+                    put_line(g0, g1, g2, 0.0, 0.0, 0.0, poses, c, record, k, row, line_column)
+                if intrinsics_column >= 0:
+                    put_pinhole(out, J_K, record, k, row, intrinsics_column)
         else:
             clear_block(record, k, pose_column, 6)
             clear_block(record, k, line_column, 6)
@@ -176,8 +170,8 @@ class LineReprojection(CameraFactor):
     ) -> int:
         camera = as_camera_model(self.camera_model)
         check_intrinsics(camera, inputs[3])
-        indices = (self.line.index, self.intrinsics.index)
-        return _linearize_all(camera.tag, *inputs, *indices, self.segments, begin, end, *columns, record)
+        arrays = (self.line.index, self.intrinsics.index, self.segments)
+        return _linearize_all(camera.tag, *inputs, *arrays, begin, end, *columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

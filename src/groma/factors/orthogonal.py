@@ -44,12 +44,13 @@ def _linearize(d1, d2, r, J_first, J_second):
 
 
 @loop
-def _linearize_all(firsts, seconds, first_index, second_index, sizes, offsets, begin, end, columns, record):
+def _linearize_all(variables, indices, layout, begin, end, columns, record):
+    sizes, offsets = layout
     r, J_first, J_second = np.empty(1), np.empty((1, 3)), np.empty((1, 3))
     degenerate = 0
     for i in range(begin, end):
-        first = firsts[first_index[i], offsets[0] : offsets[0] + 3]
-        second = seconds[second_index[i], offsets[1] : offsets[1] + 3]
+        first = variables[0][indices[0][i], offsets[0] : offsets[0] + 3]
+        second = variables[1][indices[1][i], offsets[1] : offsets[1] + 3]
         if not _linearize(first, second, r, J_first, J_second):
             r[:], J_first[:], J_second[:] = 0.0, 0.0, 0.0
             degenerate += 1
@@ -74,8 +75,8 @@ class _Orthogonal(DirectionPair):
     def linearize(
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        index = (self.first.index, self.second.index)
-        return _linearize_all(*inputs, *index, self._sizes, self._offsets, begin, end, columns, record)
+        indices, layout = (self.first.index, self.second.index), (self._sizes, self._offsets)
+        return _linearize_all(inputs, indices, layout, begin, end, columns, record)
 
 
 @register("orthogonal_lines")

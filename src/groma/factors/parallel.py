@@ -74,12 +74,13 @@ def _linearize(d1, d2, r, J_first, J_second):
 
 
 @loop
-def _linearize_all(firsts, seconds, first_index, second_index, sizes, offsets, begin, end, columns, record):
+def _linearize_all(variables, indices, layout, begin, end, columns, record):
+    sizes, offsets = layout
     r, J_first, J_second = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     degenerate = 0
     for i in range(begin, end):
-        first = firsts[first_index[i], offsets[0] : offsets[0] + 3]
-        second = seconds[second_index[i], offsets[1] : offsets[1] + 3]
+        first = variables[0][indices[0][i], offsets[0] : offsets[0] + 3]
+        second = variables[1][indices[1][i], offsets[1] : offsets[1] + 3]
         if not _linearize(first, second, r, J_first, J_second):
             r[:], J_first[:], J_second[:] = 0.0, 0.0, 0.0
             degenerate += 1
@@ -111,7 +112,8 @@ class DirectionPair(Factor):
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
         # Groups of their own, so that no direction is paired with itself.
-        return make_example(cls(**{slot.name: Ref(slot.name, indices(rng, 4)) for slot in cls.slots}), rng)
+        refs: dict[str, Any] = {slot.name: Ref(slot.name, indices(rng, 4)) for slot in cls.slots}
+        return make_example(cls(**refs), rng)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,12 +124,16 @@ class ParallelDirectionPair(DirectionPair):
     def residual_size(self) -> int:  # noqa: D102
         return 3
 
+    @property
+    def residual_rank(self) -> int:  # noqa: D102
+        return 2
+
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
         (_, first), (_, second) = self.references()
-        sizes_and_offsets = (self._sizes, self._offsets)
-        return _linearize_all(*inputs, first.index, second.index, *sizes_and_offsets, begin, end, columns, record)
+        layout = self._sizes, self._offsets
+        return _linearize_all(inputs, (first.index, second.index), layout, begin, end, columns, record)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,10 +15,10 @@ The sign s = +-1 makes :math:`\tilde n \cdot n_c \ge 0`, because (n, w) and -(n,
           \frac{\partial r}{\partial (n, w)} = \frac{s}{\lVert n\rVert} \begin{bmatrix}
           B^\top R\,(I - \hat n \hat n^\top) & 0 \\ -(R^\top t + f \hat n)^\top & 1 \end{bmatrix} .
 
-The noise is stated where it arises, in the camera: angles of the normal, and the distance. So the weight does not depend
-on the origin of the world, unlike in :mod:`groma.factors.plane_quaternion`. The offset is the distance of the plane from the
-camera, so for planes seen far off the axis errors of normal and offset are correlated: pass the (3, 3) square root
-information in the basis B (:attr:`PlaneObservation.basis`).
+The noise is stated where it arises, in the camera: angles of the normal, and the distance. So the weight does not
+depend on the origin of the world, unlike in :mod:`groma.factors.plane_quaternion`. The offset is the distance of the
+plane from the camera, so where the seen part lies aside of the foot point, errors of normal and offset are correlated:
+pass the (3, 3) square root information in the basis B (:attr:`PlaneObservation.basis`).
 
 Source: the measurement of Point-line-plane notes, section IV, with another residual. It jumps where the angle between
 the normals reaches 90 degrees.

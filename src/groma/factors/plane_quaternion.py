@@ -19,9 +19,9 @@ left rotation vector,
 for the left twist :math:`(\rho, \omega)`. The residual does not depend on scale and sign of :math:`\pi_w`.
 
 Source: Point-line-plane notes, section IV. Eq. (13) there mixes a left and an additive increment, its parts
-:math:`\partial u/\partial\phi` and :math:`\partial\phi/\partial y` have wrong exponents and a wrong sign, and it is 0/0 at
-the identity; the product Q replaces the whole chain. The increment of the landmark there, exp(delta) times pi, is the chart
-``quaternion_left``.
+:math:`\partial u/\partial\phi` and :math:`\partial\phi/\partial y` have wrong exponents and a wrong sign, and it is 0/0
+at the identity; the map Q replaces the whole chain. The increment of the landmark there, exp(delta) times pi, is the
+chart ``quaternion_left``.
 
 The residual depends on the origin and the unit of length, gives little weight to normals of planes far away (about
 :math:`2/\sqrt{1 + w^2}`), and jumps where its norm reaches :math:`\pi`: :mod:`groma.factors.plane_observation` is the

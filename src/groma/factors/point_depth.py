@@ -32,7 +32,8 @@ from groma.factors._rig import (
     CameraFactor,
     clear_block,
     clear_residual,
-    put_point_row,
+    put_point,
+    put_point_pose,
     transform_point,
     visible_scene,
 )
@@ -48,7 +49,10 @@ def _linearize_all(poses, pose_index, points, point_index, depths, begin, end, p
         transform_point(poses, c, points, point_index[i], P)
         if abs(P[0]) + abs(P[1]) + abs(P[2]) < math.inf:
             record[k, 0, last] = P[2] - depths[i]
-            put_point_row(0.0, 0.0, 1.0, poses, c, P, record, k, 0, pose_column, point_column)
+            if pose_column >= 0:
+                put_point_pose(0.0, 0.0, 1.0, P, record, k, 0, pose_column)
+            if point_column >= 0:
+                put_point(0.0, 0.0, 1.0, poses, c, record, k, 0, point_column)
         else:
             clear_block(record, k, pose_column, 6)
             clear_block(record, k, point_column, 3)

@@ -93,13 +93,18 @@ class PointOnLine(Factor):
     def residual_size(self) -> int:  # noqa: D102
         return 3
 
+    @property
+    def residual_rank(self) -> int:  # noqa: D102
+        return 2
+
     def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
         return self.linearize(inputs, begin, end, (-1, -1), out[:, :, None])
 
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        return _linearize_all(*inputs, self.point.index, self.line.index, begin, end, *columns, record)
+        (points, lines), (i, j) = inputs, columns
+        return _linearize_all(points, lines, self.point.index, self.line.index, begin, end, i, j, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

@@ -78,7 +78,8 @@ class PointOnPlane(Factor):
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        return _linearize_all(*inputs, self.point.index, self.plane.index, begin, end, *columns, record)
+        (points, planes), (i, j) = inputs, columns
+        return _linearize_all(points, planes, self.point.index, self.plane.index, begin, end, i, j, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

@@ -39,8 +39,9 @@ from groma.factors._rig import (
     clear_block,
     clear_residual,
     load_row,
-    put_parameters_row,
-    put_point_row,
+    put_parameters,
+    put_point,
+    put_point_pose,
     transform_point,
     visible_scene,
 )
@@ -49,22 +50,8 @@ from groma.geometry._manifold import Euclidean
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
-def _residual(model_tag, poses, c, points, p, params, pixels, i, smallest_depth, P, uv):
-    """Write uv = projection - pixel; False where the point has none, or is not in front of the camera."""
-    transform_point(poses, c, points, p, P)
-    if not (P[2] > smallest_depth and project(model_tag, params, P, uv)):
-        return False
-    uv[0] -= pixels[i, 0]
-    uv[1] -= pixels[i, 1]
-    return abs(uv[0]) + abs(uv[1]) < math.inf
-
-
-@kernel
-def _linearize(model_tag, poses, c, points, p, params, pixels, i, smallest_depth, P, uv, A, J_params):
-    """As :func:`_residual`; also write A = d uv/d P (2, 3) and ``J_params`` (2, k)."""
-    transform_point(poses, c, points, p, P)
-    if not (P[2] > smallest_depth and project_jacobian(model_tag, params, P, uv, A, J_params)):
-        return False
+def _difference(uv, pixels, i):
+    """Subtract the measured pixel from ``uv``; False if the result is not a number, or infinite."""
     uv[0] -= pixels[i, 0]
     uv[1] -= pixels[i, 1]
     return abs(uv[0]) + abs(uv[1]) < math.inf
@@ -79,12 +66,12 @@ def _residual_all(
     camera, degenerate = -1, 0
     for i in range(begin, end):
         camera = load_row(intrinsics, intrinsics_index[i], camera, params)
-        if not _residual(
-            model_tag, poses, pose_index[i], points, point_index[i], params, pixels, i, smallest_depth, P, uv
-        ):
-            uv[0] = uv[1] = 0.0
+        transform_point(poses, pose_index[i], points, point_index[i], P)
+        if P[2] > smallest_depth and project(model_tag, params, P, uv) and _difference(uv, pixels, i):
+            out[i - begin, 0], out[i - begin, 1] = uv[0], uv[1]
+        else:
+            out[i - begin, 0], out[i - begin, 1] = 0.0, 0.0
             degenerate += 1
-        out[i - begin, 0], out[i - begin, 1] = uv[0], uv[1]
     return degenerate
 
 
@@ -99,13 +86,22 @@ def _linearize_all(
     for i in range(begin, end):
         k, c = i - begin, pose_index[i]
         camera = load_row(intrinsics, intrinsics_index[i], camera, params)
-        if _linearize(
-            model_tag, poses, c, points, point_index[i], params, pixels, i, smallest_depth, P, uv, A, J_params
+        transform_point(poses, c, points, point_index[i], P)
+        if (
+            P[2] > smallest_depth
+            and project_jacobian(model_tag, params, P, uv, A, J_params)
+            and _difference(uv, pixels, i)
         ):
-            for row in range(2):
-                record[k, row, last] = uv[row]
-                put_point_row(A[row, 0], A[row, 1], A[row, 2], poses, c, P, record, k, row, pose_column, point_column)
-                put_parameters_row(J_params, record, k, row, intrinsics_column)
+            record[k, 0, last], record[k, 1, last] = uv[0], uv[1]
+            if pose_column >= 0:
+                put_point_pose(A[0, 0], A[0, 1], A[0, 2], P, record, k, 0, pose_column)
+                put_point_pose(A[1, 0], A[1, 1], A[1, 2], P, record, k, 1, pose_column)
+            if point_column >= 0:
+                put_point(A[0, 0], A[0, 1], A[0, 2], poses, c, record, k, 0, point_column)
+                put_point(A[1, 0], A[1, 1], A[1, 2], poses, c, record, k, 1, point_column)
+            if intrinsics_column >= 0:
+                put_parameters(J_params, record, k, 0, intrinsics_column)
+                put_parameters(J_params, record, k, 1, intrinsics_column)
         else:
             clear_block(record, k, pose_column, 6)
             clear_block(record, k, point_column, 3)

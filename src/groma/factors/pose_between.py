@@ -116,7 +116,8 @@ class PoseBetween(Factor):
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        return _linearize_all(*inputs, self.first.index, self.second.index, begin, end, *columns, record)
+        (firsts, seconds, Z), (i, j) = inputs, columns
+        return _linearize_all(firsts, seconds, Z, self.first.index, self.second.index, begin, end, i, j, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

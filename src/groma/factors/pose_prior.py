@@ -200,7 +200,8 @@ class PosePrior(Factor):
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        return _linearize_all(*inputs, self.pose.index, begin, end, columns[0], record)
+        poses, priors = inputs
+        return _linearize_all(poses, priors, self.pose.index, begin, end, columns[0], record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

@@ -65,7 +65,8 @@ class PositionPrior(Factor):
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        return _linearize_all(*inputs, self.pose.index, begin, end, columns[0], record)
+        poses, positions = inputs
+        return _linearize_all(poses, positions, self.pose.index, begin, end, columns[0], record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

@@ -12,8 +12,8 @@ for the baseline b. With :math:`g = \partial r_i/\partial m_r` and :math:`h = \p
 .. math:: \frac{\partial r_i}{\partial \xi} = [\,(d_c \times g)^\top,\; (m_c \times g + d_c \times h)^\top\,], \qquad
           \frac{\partial r_i}{\partial (m, d)} = [\,g^\top R,\; (g \times t + h)^\top R\,] .
 
-The two segments need not show the same part of the line. A line parallel to the baseline has one image row only: the pair
-then says nothing about its distance, and another view must.
+The two segments need not show the same part of the line. A line in a plane with the baseline has the same image row
+in both: the pair then says nothing about its distance, and another view must.
 
 Source: Plücker notes, eqs. (65) to (76), with the corrections listed in :mod:`groma.factors.line_reprojection`.
 """
@@ -41,38 +41,23 @@ from groma.factors._rig import (
     clear_block,
     clear_residual,
     load_row,
-    put_line_row,
+    put_line,
+    put_line_pose,
     transform_line,
     visible_scene,
 )
-from groma.factors.line_reprojection import endpoint_distance, image_line_norm, put_pinhole_row
+from groma.factors.line_reprojection import endpoint_distance, image_line_norm, put_pinhole
 from groma.geometry._manifold import Euclidean
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
-def _linearize(L, baseline, K, segments, i, out):
-    """Write residuals and derivatives of the four end points to ``out`` (4, 8); False if one camera sees no line."""
-    # τ x d = (0, b d_z, -b d_y)
-    m1, m2 = L[1] + baseline * L[5], L[2] - baseline * L[4]
-    left, right = image_line_norm(L[0], L[1], L[2], K), image_line_norm(L[0], m1, m2, K)
-    if not (left > 0.0 and right > 0.0):
-        return False
-    valid = True
-    for row in range(2):
-        u, v = segments[i, 2 * row], segments[i, 2 * row + 1]
-        valid &= endpoint_distance(L[0], L[1], L[2], K, left, u, v, out[row])
-        u, v = segments[i, 4 + 2 * row], segments[i, 5 + 2 * row]
-        valid &= endpoint_distance(L[0], m1, m2, K, right, u, v, out[2 + row])
-    return valid
-
-
-@kernel
-def _passes_right_camera(L, baseline):
-    """Whether the line passes through the centre of the right camera, to 1e-9 of the terms of its moment there."""
-    m1, m2 = L[1] + baseline * L[5], L[2] - baseline * L[4]
-    terms = L[0] * L[0] + L[1] * L[1] + L[2] * L[2] + baseline * baseline * (L[4] * L[4] + L[5] * L[5])
-    return not L[0] * L[0] + m1 * m1 + m2 * m2 > 1e-18 * terms
+def _right_moment(L, baseline, right):
+    """Write the moment m + τ x d (3,) in the right camera; False if the line passes its centre, to rounding."""
+    m1, m2 = baseline * L[5], -baseline * L[4]
+    right[0], right[1], right[2] = L[0], L[1] + m1, L[2] + m2
+    terms = L[0] * L[0] + L[1] * L[1] + L[2] * L[2] + m1 * m1 + m2 * m2
+    return right[0] * right[0] + right[1] * right[1] + right[2] * right[2] > 1e-18 * terms
 
 
 @loop
@@ -81,7 +66,8 @@ def _linearize_all(
     begin, end, pose_column, line_column, intrinsics_column, record,
 ):  # fmt: skip
     size = intrinsics.shape[1]
-    L, K, J_K, params, out = np.empty(6), np.empty(4), np.empty((4, size)), np.empty(size), np.empty((4, 8))
+    L, right, K, params = np.empty(6), np.empty(3), np.empty(4), np.empty(size)
+    J_K, out = np.empty((4, size)), np.empty((4, 8))
     camera, degenerate, last = -1, 0, record.shape[2] - 1
     step = 1 if baselines.shape[0] > 1 else 0
     for i in range(begin, end):
@@ -90,15 +76,30 @@ def _linearize_all(
             camera = load_row(intrinsics, intrinsics_index[i], camera, params)
             pinhole_parameters(model_tag, params, K)
             pinhole_parameters_jacobian(model_tag, params, J_K)
-        valid = transform_line(poses, c, lines, line_index[i], L) and not _passes_right_camera(L, baseline)
-        if valid and _linearize(L, baseline, K, segments, i, out):
+        valid = transform_line(poses, c, lines, line_index[i], L)
+        valid &= _right_moment(L, baseline, right)
+        h = image_line_norm(L[0], L[1], L[2], K)
+        h_right = image_line_norm(right[0], right[1], right[2], K)
+        if valid and h > 0.0 and h_right > 0.0:
+            for row in range(2):
+                u, v = segments[i, 2 * row], segments[i, 2 * row + 1]
+                valid &= endpoint_distance(L[0], L[1], L[2], K, h, u, v, out, row)
+                u, v = segments[i, 4 + 2 * row], segments[i, 5 + 2 * row]
+                valid &= endpoint_distance(right[0], right[1], right[2], K, h_right, u, v, out, 2 + row)
+        else:
+            valid = False
+        if valid:
             for row in range(4):
                 record[k, row, last] = out[row, 0]
                 g0, g1, g2 = out[row, 1], out[row, 2], out[row, 3]
                 b = baseline if row >= 2 else 0.0
-                # g x τ = (0, -b g_z, b g_y)
-                put_line_row(g0, g1, g2, 0.0, -b * g2, b * g1, poses, c, L, record, k, row, pose_column, line_column)
-                put_pinhole_row(out[row], J_K, record, k, row, intrinsics_column)
+                # h = g x τ = (0, -b g_z, b g_y)
+                if pose_column >= 0:
+                    put_line_pose(g0, g1, g2, 0.0, -b * g2, b * g1, L, record, k, row, pose_column)
+                if line_column >= 0:
+                    put_line(g0, g1, g2, 0.0, -b * g2, b * g1, poses, c, record, k, row, line_column)
+                if intrinsics_column >= 0:
+                    put_pinhole(out, J_K, record, k, row, intrinsics_column)
         else:
             clear_block(record, k, pose_column, 6)
             clear_block(record, k, line_column, 6)

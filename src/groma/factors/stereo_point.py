@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""A point seen by a rectified stereo pair: column on the left, common row, column on the right.
 
-Both cameras have the pinhole parameters :math:`(f_x, f_y, c_x, c_y)`; the right one is displaced by the baseline b along
-the x axis of the left one. With :math:`P = (x, y, z) = R X_w + t` in the left camera
+Both cameras have the pinhole parameters :math:`(f_x, f_y, c_x, c_y)`; the right one is displaced by the baseline b
+along the x axis of the left one. With :math:`P = (x, y, z) = R X_w + t` in the left camera
 
 .. math:: r = \Big[\, f_x \frac xz + c_x - u_l,\;\; f_y \frac yz + c_y - v,\;\; f_x \frac{x - b}{z} + c_x - u_r \,\Big]
 
@@ -36,8 +36,9 @@ from groma.factors._rig import (
     clear_block,
     clear_residual,
     load_row,
-    put_parameters_row,
-    put_point_row,
+    put_parameters,
+    put_point,
+    put_point_pose,
     transform_point,
     visible_scene,
 )
@@ -94,8 +95,12 @@ def _linearize_all(
                 _parameters(P, baseline, J_K, J_params)
             for row in range(3):
                 record[k, row, last] = r[row]
-                put_point_row(A[row, 0], A[row, 1], A[row, 2], poses, c, P, record, k, row, pose_column, point_column)
-                put_parameters_row(J_params, record, k, row, intrinsics_column)
+                if pose_column >= 0:
+                    put_point_pose(A[row, 0], A[row, 1], A[row, 2], P, record, k, row, pose_column)
+                if point_column >= 0:
+                    put_point(A[row, 0], A[row, 1], A[row, 2], poses, c, record, k, row, point_column)
+                if intrinsics_column >= 0:
+                    put_parameters(J_params, record, k, row, intrinsics_column)
         else:
             clear_block(record, k, pose_column, 6)
             clear_block(record, k, point_column, 3)

@@ -36,14 +36,14 @@ moves by the left twist, :math:`T \leftarrow (I + h\,\hat\xi)\,T`):
 ``central``
     :math:`(r(x + h) - r(x - h)) / 2h` with :math:`h = \epsilon^{1/3} \max(1, |x|)`; about ten digits.
 ``complex``
-    :math:`\mathrm{Im}\, r(x + ih) / h` with :math:`h = 10^{-30}`; all digits, at half the evaluations. The function
-    must then be analytic: no ``abs``, no ``max``, no comparison of variables; ``transpose`` but no conjugate; ``norm``
-    written as a root of a sum of squares.
+    :math:`\mathrm{Im}\, r(x + ih) / h` with :math:`h = 10^{-30}`; all digits, half the evaluations, though of complex
+    numbers (``np.sqrt`` is then much faster than ``** 0.5``). The function must be analytic: no ``abs``, no ``max``, no
+    comparison of variables, no conjugate; a norm is the root of a sum of squares.
 
 or they come from a function of yours, ``jacobian(data, *variables, *blocks)``, with one block (m, columns) per slot.
 
 The loop around the function is written for its number of slots and compiled together with it when the first factor is
-evaluated (some seconds). It is not kept on disk: a function from a notebook has no file to belong to.
+evaluated (a second or two). It is not kept on disk: a function from a notebook has no file to belong to.
 """
 
 from __future__ import annotations

@@ -1,1 +1,133 @@
 # SPDX-License-Identifier: BSD-3-Clause
+"""Files: one format per module. :func:`read_scene` and :func:`write_scene` choose the module."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import os
+from pathlib import Path
+from typing import Literal
+
+from groma.errors import FileFormatError, InputError
+from groma.io._atomic import atomic_output
+from groma.io._reading import existing, reading
+from groma.io.archive import is_archive_name, looks_like_archive, read_archive, write_archive
+from groma.io.bal import looks_like_bal, read_bal, write_bal
+from groma.io.colmap import from_pycolmap, read_colmap, to_pycolmap, write_colmap
+from groma.io.ply import write_obj, write_ply
+from groma.io.tum import Trajectory, read_tum, write_tum
+from groma.scene import Scene
+
+Format = Literal["auto", "colmap", "colmap_text", "archive", "bal", "ply", "obj"]
+
+
+def read_scene(path: str | os.PathLike[str]) -> Scene:
+    """Read a scene: the folder of a COLMAP model, a BAL file or a groma archive, told apart by content.
+
+    Parameters
+    ----------
+    path : path
+        A folder (with the model in it, in ``sparse`` or in ``sparse/0``) or a file.
+
+    Raises
+    ------
+    InputError
+        If there is nothing at ``path``.
+    FileFormatError
+        If it is none of these, or damaged.
+    """
+    place = existing(path)
+    if place.is_dir():
+        return read_colmap(place)
+    if not place.is_file():
+        raise InputError(f"{place} is neither a file nor a folder. Pass a COLMAP model, a BAL file or a groma archive.")
+    with reading(place, "file"), place.open("rb") as file:
+        head = file.read(256)
+    if looks_like_archive(head) or is_archive_name(place):
+        return read_archive(place)
+    if looks_like_bal(_unpacked_head(place, head)):
+        return read_bal(place)
+    if place.suffix in (".bin", ".txt") and place.stem in ("cameras", "images", "points3D", "rigs", "frames"):
+        return read_colmap(place.parent)
+    raise FileFormatError(
+        f"{place} is not a scene: expected the folder of a COLMAP model, a BAL file (three counts in its first line) or "
+        f"a groma archive (.npz); it begins with {head[:20]!r}."
+    )
+
+
+def write_scene(scene: Scene, path: str | os.PathLike[str], format: Format = "auto", force: bool = False) -> None:
+    """Write a scene, whole or not at all.
+
+    Parameters
+    ----------
+    scene : Scene
+        What to write.
+    path : path
+        Where. With ``format="auto"`` the name says the format: ``.npz`` archive, ``.txt``, ``.bz2`` or ``.gz`` BAL,
+        ``.ply`` and ``.obj`` geometry only, no suffix a COLMAP model in a new folder.
+    format : str
+        ``colmap``, ``colmap_text``, ``archive``, ``bal``, ``ply`` or ``obj``, to override the name.
+    force : bool
+        Replace what is there.
+
+    Raises
+    ------
+    InputError
+        If the format is unknown or cannot hold the scene.
+    OutputError
+        If something is there already or the file system refuses.
+    """
+    suffixes = {".npz": "archive", ".txt": "bal", ".bz2": "bal", ".gz": "bal", ".ply": "ply", ".obj": "obj", "": "colmap"}
+    suffix = Path(path).suffix.lower()
+    chosen = suffixes.get(suffix, "colmap" if Path(path).is_dir() else None) if format == "auto" else format
+    if chosen == "archive":
+        write_archive(scene, path, force)
+    elif chosen == "bal":
+        write_bal(scene, path, force)
+    elif chosen == "colmap":
+        write_colmap(scene, path, "binary", force)
+    elif chosen == "colmap_text":
+        write_colmap(scene, path, "text", force)
+    elif chosen == "ply":
+        write_ply(scene, path, force)
+    elif chosen == "obj":
+        write_obj(scene, path, force)
+    else:
+        known = "a folder name for COLMAP, .npz for an archive, .txt, .bz2 or .gz for BAL, .ply or .obj"
+        what = f"format {format!r}" if format != "auto" else f"the ending {suffix!r}"
+        raise InputError(f"Cannot tell the format from {what} of {path}. Use {known}.")
+
+
+def _unpacked_head(path: Path, head: bytes) -> bytes:
+    """Return the beginning of the text in a file that may be compressed; empty when it cannot be unpacked."""
+    try:
+        if head[:3] == b"BZh":
+            with bz2.open(path) as stream:
+                return stream.read(256)
+        if head[:2] == b"\x1f\x8b":
+            with gzip.open(path) as stream:
+                return stream.read(256)
+    except Exception as error:  # OSError, EOFError, ValueError, and zlib.error, which derives from none of them
+        raise FileFormatError(f"{path} cannot be decompressed: {error}. Fetch it again.") from error
+    return head
+
+
+__all__ = [
+    "Trajectory",
+    "atomic_output",
+    "from_pycolmap",
+    "read_archive",
+    "read_bal",
+    "read_colmap",
+    "read_scene",
+    "read_tum",
+    "to_pycolmap",
+    "write_archive",
+    "write_bal",
+    "write_colmap",
+    "write_obj",
+    "write_ply",
+    "write_scene",
+    "write_tum",
+]

@@ -18,12 +18,13 @@ import bz2
 import gzip
 import io
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.errors import FileFormatError, InputError
+from groma.errors import FileFormatError, InputError, OutputError
 from groma.geometry import quaternion
 from groma.io._atomic import atomic_output
 from groma.io._reading import existing, reading
@@ -60,7 +61,7 @@ def read_bal(path: str | os.PathLike[str]) -> Scene:
                 f"{place} promises {num_cameras} cameras, {num_points} points and {num_observations} observations, "
                 f"which is {wanted} numbers, but holds only {len(body)} more characters. Fetch it again."
             )
-        numbers = np.fromstring(body, sep=" ") if body.strip() else np.zeros(0)
+        numbers = np.fromstring(body, sep=" ") if not body.isspace() and body else np.zeros(0)
         if len(numbers) != wanted:
             raise FileFormatError(f"{place} should hold {wanted} numbers after its first line; got {len(numbers)}.")
         if not np.isfinite(numbers).all():
@@ -105,6 +106,7 @@ def write_bal(scene: Scene, path: str | os.PathLike[str], force: bool = False) -
     if suffix == ".bz2":
         content = bz2.compress(content)
     elif suffix == ".gz":
+        _refuse_broken_zlib()
         content = gzip.compress(content, mtime=0)
     with atomic_output(path, force) as draft:
         draft.write_bytes(content)
@@ -143,6 +145,16 @@ def looks_like_bal(head: bytes) -> bool:
     """Tell from the first bytes of a file, decompressed where needed, whether three counts stand there."""
     words = head.split(None, 3)[:3]
     return len(words) == 3 and all(word.isdigit() for word in words)
+
+
+def _refuse_broken_zlib() -> None:
+    """Raise where compressing would end the process: see :mod:`groma.io.archive` on pycolmap and zlib."""
+    loaded = list(sys.modules)
+    if "pycolmap" in loaded and "zlib" in loaded and loaded.index("pycolmap") < loaded.index("zlib"):
+        raise OutputError(
+            "Cannot write .gz: pycolmap was imported before zlib, which breaks zlib in this process. Import groma.io "
+            "(or zlib) before pycolmap, or write .bz2 or plain text."
+        )
 
 
 def _load(path: Path) -> bytes:

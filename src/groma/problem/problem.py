@@ -66,5 +66,5 @@ class Problem:
 
     @property
     def num_residuals(self) -> int:
-        """Total number of residual rows."""
-        return sum(len(factor) * factor.residual_size for factor in self.factors)
+        """Total number of independent residual rows."""
+        return sum(len(factor) * factor.residual_rank for factor in self.factors)

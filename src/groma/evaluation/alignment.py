@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Similarity and rigid alignment of points and of camera poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import FloatArray
+from groma.errors import InputError, ShapeError
+from groma.geometry import quaternion
+from groma.scene import Similarity
+
+#: Second singular value of the centred points, relative to the first, below which they count as collinear.
+_COLLINEAR = 1e-8
+
+
+def align_points(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool = True) -> Similarity:
+    r"""Return the similarity (or rigid motion) that takes source points closest to target points.
+
+    .. math:: \min_{s, R, t} \sum_i \| y_i - (s R x_i + t) \|^2
+
+    Parameters
+    ----------
+    source, target : (N, 3) float
+        Corresponding points.
+    with_scale : bool
+        Estimate the scale too; otherwise it is one.
+
+    Returns
+    -------
+    Similarity
+        ``target_from_source``.
+
+    Raises
+    ------
+    ShapeError
+        If the shapes are not equal or not (N, 3).
+    InputError
+        If there are fewer than three points, or one of the sets is collinear: the rotation is then not determined.
+
+    References
+    ----------
+    S. Umeyama, *Least-squares estimation of transformation parameters between two point patterns*, 1991, eqs. 40-42.
+    """
+    x, y = _points("source", source), _points("target", target)
+    if x.shape != y.shape:
+        raise ShapeError(f"source and target must have the same shape; got {x.shape} and {y.shape}.")
+    for name, points in (("source", x), ("target", y)):
+        if len(points) < 3 or _rank(points) < 2:
+            raise InputError(
+                f"Alignment needs three points that are not on one line; the {len(points)} {name} points do not fix the "
+                "rotation. Use align_poses, which looks at the orientations too."
+            )
+    x0, y0 = x - x.mean(0), y - y.mean(0)
+    u, _, vt = np.linalg.svd(y0.T @ x0)
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return _with_rotation(x, y, u @ mirror @ vt, with_scale)
+
+
+def align_poses(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool = True) -> Similarity:
+    """Return the similarity that takes the camera centres of source closest to those of target.
+
+    Where the centres do not fix the rotation (fewer than three, or on one line, as on a straight road), it is the
+    mean of what the orientations say.
+
+    Parameters
+    ----------
+    source, target : (N, 7) float
+        Corresponding poses cam_from_world [qx qy qz qw tx ty tz].
+    with_scale : bool
+        Estimate the scale too; otherwise, and where all centres coincide, it is one.
+
+    Returns
+    -------
+    Similarity
+        ``target_from_source`` of the two worlds.
+    """
+    from_source, from_target = np.asarray(source, float), np.asarray(target, float)
+    if from_source.shape != from_target.shape or from_source.ndim != 2 or from_source.shape[1] != 7:
+        raise ShapeError(f"Poses must have shape (N, 7), twice; got {from_source.shape} and {from_target.shape}.")
+    if len(from_source) == 0:
+        raise InputError("Alignment needs at least one pose; got none.")
+    x, y = camera_centers(from_source), camera_centers(from_target)
+    if len(x) >= 3 and min(_rank(x), _rank(y)) >= 2:
+        return align_points(x, y, with_scale)
+    votes = quaternion.to_matrix(from_target[:, :4]).transpose(0, 2, 1) @ quaternion.to_matrix(from_source[:, :4])
+    u, _, vt = np.linalg.svd(votes.sum(0))
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return _with_rotation(x, y, u @ mirror @ vt, with_scale)
+
+
+def camera_centers(cam_from_world: npt.ArrayLike) -> FloatArray:
+    r"""Return the camera centres :math:`-R^\top t` of poses (N, 7), in the world."""
+    poses = np.asarray(cam_from_world, float)
+    return -quaternion.rotate(quaternion.conjugate(poses[:, :4]), poses[:, 4:])
+
+
+def _with_rotation(x: FloatArray, y: FloatArray, rotation: FloatArray, with_scale: bool) -> Similarity:
+    """Return the best scale and translation for a given rotation."""
+    x0, y0 = x - x.mean(0), y - y.mean(0)
+    scale, spread = 1.0, float((x0**2).sum())
+    if with_scale and spread > 0:
+        fitted = float(np.einsum("ij,ij->", y0, x0 @ rotation.T)) / spread
+        scale = fitted if fitted > 0 else 1.0
+    return Similarity(scale, rotation, y.mean(0) - scale * rotation @ x.mean(0))
+
+
+def _points(name: str, values: npt.ArrayLike) -> FloatArray:
+    points = np.asarray(values, float)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ShapeError(f"{name} must have shape (N, 3); got {points.shape}.")
+    if not np.isfinite(points).all():
+        raise InputError(f"{name} must be finite. Remove the rows that are not.")
+    return points
+
+
+def _rank(points: FloatArray) -> int:
+    """Return 0, 1, 2 or 3: the dimension that points span, with rounding relative to their distance to the origin."""
+    singular = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    noise = max(_COLLINEAR * singular[0], 1e-13 * np.abs(points).max() * np.sqrt(len(points)))
+    return int((singular > noise).sum())
+
+
+__all__ = ["align_points", "align_poses", "camera_centers"]

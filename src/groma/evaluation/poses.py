@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""How far camera poses are from reference poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import FloatArray
+from groma.errors import InputError
+from groma.evaluation.alignment import align_poses, camera_centers
+from groma.geometry import quaternion
+from groma.scene import Scene, Similarity
+
+#: Thresholds of the area under the curve of pairwise errors, degrees.
+THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0)
+
+
+@dataclass(frozen=True)
+class PoseScores:
+    """Errors of poses after alignment to the reference."""
+
+    #: Root mean square distance of the camera centres, units of the reference.
+    center_rmse: float
+    #: Largest distance of a camera centre, units of the reference.
+    center_max: float
+    #: Mean angle between the orientations, degrees.
+    rotation_deg_mean: float
+    #: Largest angle between the orientations, degrees.
+    rotation_deg_max: float
+    #: Area under the curve of pairwise errors up to each threshold (degrees), from 0 to 1. Needs no alignment.
+    auc: dict[float, float]
+    #: Number of images found in both scenes.
+    num_images: int
+    #: Number of images of the reference that the estimate lacks; their pairs count as wrong in ``auc``.
+    num_missing: int
+    #: ``reference_from_estimate``: the alignment that was applied.
+    alignment: Similarity = field(repr=False, compare=False)
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the scores for a machine-readable report."""
+        return {
+            "center_rmse": self.center_rmse,
+            "center_max": self.center_max,
+            "rotation_deg_mean": self.rotation_deg_mean,
+            "rotation_deg_max": self.rotation_deg_max,
+            "auc": {f"{degrees:g}": value for degrees, value in self.auc.items()},
+            "num_images": self.num_images,
+            "num_missing": self.num_missing,
+        }
+
+
+def evaluate_poses(estimate: Scene, reference: Scene, with_scale: bool = True) -> PoseScores:
+    """Compare the camera poses of two scenes; images are matched by name.
+
+    Parameters
+    ----------
+    estimate, reference : Scene
+        The scene to judge, and the one taken for true.
+    with_scale : bool
+        Align with a similarity; otherwise with a rigid motion.
+
+    Raises
+    ------
+    InputError
+        If no image is in both, or a name occurs twice in one scene.
+    """
+    rows = []
+    for name, scene in (("estimate", estimate), ("reference", reference)):
+        index = {image: row for row, image in enumerate(scene.images.names)}
+        if len(index) != scene.num_images:
+            raise InputError(f"Image names of the {name} are not unique; images are matched by name. Rename them.")
+        rows.append(index)
+    common = [name for name in reference.images.names if name in rows[0]]
+    if not common:
+        examples = [next(iter(index), "none") for index in rows]
+        raise InputError(
+            f"No image is in both scenes; names are for example {examples[0]!r} and {examples[1]!r}. "
+            "Images are matched by name: rename those of one scene."
+        )
+    estimated = estimate.cam_from_world[[rows[0][name] for name in common]]
+    true = reference.cam_from_world[[rows[1][name] for name in common]]
+    return score_poses(estimated, true, with_scale, num_missing=reference.num_images - len(common))
+
+
+def score_poses(
+    estimated: npt.ArrayLike, true: npt.ArrayLike, with_scale: bool = True, num_missing: int = 0
+) -> PoseScores:
+    """Compare corresponding poses cam_from_world, (N, 7) each; see :func:`evaluate_poses`."""
+    estimate, reference = np.asarray(estimated, float), np.asarray(true, float)
+    alignment = align_poses(estimate, reference, with_scale)
+    moved = alignment.poses(estimate)
+    distance = np.linalg.norm(camera_centers(moved) - camera_centers(reference), axis=1)
+    angle = np.rad2deg(rotation_angle(moved[:, :4], reference[:, :4]))
+    return PoseScores(
+        center_rmse=float(np.sqrt(np.mean(distance**2))),
+        center_max=float(distance.max()),
+        rotation_deg_mean=float(angle.mean()),
+        rotation_deg_max=float(angle.max()),
+        auc=pairwise_auc(estimate, reference, num_missing),
+        num_images=len(estimate),
+        num_missing=num_missing,
+        alignment=alignment,
+    )
+
+
+def rotation_angle(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the angle between rotations given as quaternions (..., 4), radians; accurate near zero and near pi."""
+    relative = quaternion.multiply(first, quaternion.conjugate(second))
+    return 2 * np.arctan2(np.linalg.norm(relative[..., :3], axis=-1), np.abs(relative[..., 3]))
+
+
+def pairwise_auc(
+    estimated: FloatArray, true: FloatArray, num_missing: int = 0, thresholds_deg: tuple[float, ...] = THRESHOLDS_DEG
+) -> dict[float, float]:
+    r"""Return the area under the recall curve of relative poses, per threshold.
+
+    The error of a pair of images is the larger of two angles: of the relative rotations, and of the directions of the
+    baselines. Up to the threshold :math:`\tau` the area is
+
+    .. math:: \mathrm{AUC}_\tau = \frac{1}{n} \sum_i \max(0,\ 1 - e_i / \tau)
+
+    over all pairs of the reference; pairs with a missing image have an infinite error. Where the reference's baseline
+    is zero only the rotation counts. No alignment takes part.
+    """
+    count = len(true) + num_missing
+    pairs = count * (count - 1) // 2
+    if pairs == 0:
+        return dict.fromkeys(thresholds_deg, float("nan"))
+    sums = dict.fromkeys(thresholds_deg, 0.0)
+    centers = [camera_centers(poses) for poses in (estimated, true)]
+    size = np.abs(centers[1] - centers[1].mean(0)).max() if len(true) else 0.0
+    for row in range(len(true) - 1):
+        rest = slice(row + 1, None)
+        turns, rays = [], []
+        for poses, center in zip((estimated, true), centers, strict=True):
+            turns.append(quaternion.multiply(poses[rest, :4], quaternion.conjugate(poses[row : row + 1, :4])))
+            away = center[rest] - center[row]
+            rays.append(quaternion.rotate(np.broadcast_to(poses[row, :4], (len(away), 4)), away))
+        error = rotation_angle(*turns)
+        cross = np.linalg.norm(np.cross(*rays), axis=1)
+        ray_angle = np.arctan2(cross, np.einsum("ij,ij->i", *rays))
+        ray_angle[np.linalg.norm(rays[0], axis=1) == 0] = np.pi
+        ray_angle[np.linalg.norm(rays[1], axis=1) <= 1e-12 * size] = 0.0
+        degrees = np.rad2deg(np.maximum(error, ray_angle))
+        for threshold in thresholds_deg:
+            sums[threshold] += float(np.maximum(0, 1 - degrees / threshold).sum())
+    return {threshold: total / pairs for threshold, total in sums.items()}
+
+
+__all__ = ["THRESHOLDS_DEG", "PoseScores", "evaluate_poses", "pairwise_auc", "rotation_angle", "score_poses"]

@@ -1,0 +1,417 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""COLMAP models, binary and text, through pycolmap. The only file that imports pycolmap.
+
+Kept: rigs, sensors, frames, images, 2D points with and without a 3D point, points with colour, error and track. Images
+and frames without a pose are left out: COLMAP does not write them to files either.
+
+A COLMAP model has no place for lines, planes, directions and relations. They are written beside it, to
+``structures/groma.npz``, and put back when the model is read: rows refer to images and points by identifier, so they
+survive changes made to the model by other programs.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib  # noqa: F401 - must be loaded before pycolmap, whose wheel (4.2) otherwise breaks it: heap corruption
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from groma import cameras as camera_models
+from groma._typing import FloatArray
+from groma.errors import FileFormatError, InputError
+from groma.io._atomic import atomic_output
+from groma.io._colmap_structure import check_binary_model
+from groma.io._reading import existing, reading
+from groma.io._structures import read_structures, write_structures
+from groma.scene import Cameras, Frames, Images, Keypoints, PointObservations, Points, Rigs, Scene, Sensors
+from groma.scene.camera import CAMERA, OTHER
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_KIND = "COLMAP model"
+_FILES = ("cameras", "images", "points3D")
+_NO_POINT = 2**64 - 1
+_IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+# Reading
+
+
+def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "text"]]:
+    """Return the folder of the model at ``path``, ``path/sparse`` or ``path/sparse/0``, and its form.
+
+    Raises
+    ------
+    FileFormatError
+        If none of them holds a complete model.
+    """
+    root = existing(path)
+    places = [root, root / "sparse", root / "sparse" / "0"]
+    for place in places:
+        for suffix, form in ((".bin", "binary"), (".txt", "text")):
+            if all((place / f"{name}{suffix}").is_file() for name in _FILES):
+                return place, form  # type: ignore[return-value]
+    raise FileFormatError(
+        f"No COLMAP model in {', '.join(map(str, places))}: expected cameras, images and points3D, all .bin or all .txt."
+    )
+
+
+def read_colmap(path: str | os.PathLike[str]) -> Scene:
+    """Read a COLMAP model, and the structures beside it where there are any.
+
+    Parameters
+    ----------
+    path : path
+        Folder of the model, or a folder with the model in ``sparse`` or ``sparse/0``.
+
+    Raises
+    ------
+    FileFormatError
+        If the files are not a consistent model.
+    InputError
+        If a camera model is not one of groma's.
+    """
+    import pycolmap
+
+    folder, form = find_model(path)
+    with reading(folder, _KIND), _quiet(pycolmap):
+        reconstruction = pycolmap.Reconstruction()
+        if form == "binary":
+            check_binary_model(folder, _num_params_by_number(pycolmap))
+            reconstruction.read_binary(str(folder))
+        else:
+            reconstruction.read_text(str(folder))
+        scene = from_pycolmap(reconstruction)
+    return read_structures(scene, folder)
+
+
+def from_pycolmap(reconstruction: pycolmap.Reconstruction) -> Scene:
+    """Return the scene that a :class:`pycolmap.Reconstruction` holds; frames without a pose are left out."""
+    cameras = _cameras(reconstruction)
+    camera_row = _rows(cameras.ids)
+    rigs = Rigs(np.array(sorted(reconstruction.rigs), np.int64))
+    sensors = _sensors(reconstruction, rigs, camera_row)
+    rig_row = _rows(rigs.ids)
+    sensor_row = {
+        (int(rig), int(sensor)): row
+        for row, (rig, kind, sensor) in enumerate(zip(sensors.rig_idx, sensors.kind, sensors.sensor_ids, strict=True))
+        if kind == CAMERA
+    }
+    posed = sorted(
+        (number, image)
+        for number, image in reconstruction.images.items()
+        if image.frame is not None
+        and image.frame.has_pose
+        and _mounted(sensors, sensor_row, rig_row[image.frame.rig_id], image.camera_id)
+    )
+    frames_used = sorted({image.frame_id: image.frame for _, image in posed}.items())
+    frame_row = _rows([number for number, _ in frames_used])
+    frames = Frames(
+        ids=np.array([number for number, _ in frames_used], np.int64),
+        rig_idx=np.array([rig_row[frame.rig_id] for _, frame in frames_used], np.int64),
+        rig_from_world=_poses([frame.rig_from_world for _, frame in frames_used]),
+    )
+    images = Images(
+        ids=np.array([number for number, _ in posed], np.int64),
+        names=tuple(image.name for _, image in posed),
+        camera_idx=np.array([camera_row[image.camera_id] for _, image in posed], np.int64),
+        frame_idx=np.array([frame_row[image.frame_id] for _, image in posed], np.int64),
+        sensor_idx=np.array([sensor_row[rig_row[image.frame.rig_id], image.camera_id] for _, image in posed], np.int64),
+    )
+    points = _points(reconstruction)
+    observations, keypoints = _observations([image for _, image in posed], points)
+    return Scene(cameras, rigs, sensors, frames, images, points, observations, keypoints)
+
+
+def _mounted(sensors: Sensors, sensor_row: dict[tuple[int, int], int], rig: int, camera: int) -> bool:
+    row = sensor_row.get((rig, camera))
+    if row is None:
+        raise FileFormatError(f"An image was taken by camera {camera}, which is not on its rig.")
+    return bool(sensors.has_pose[row])
+
+
+def _cameras(reconstruction: pycolmap.Reconstruction) -> Cameras:
+    known = {model.colmap_name: model.name for model in camera_models.models() if model.colmap_name}
+    found = sorted(reconstruction.cameras.items())
+    for number, camera in found:
+        if camera.model_name not in known:
+            raise InputError(
+                f"Camera {number} has model {camera.model_name}, which groma does not have (it has {', '.join(known)}). "
+                "Undistort the images, or register the model with groma.cameras.register_camera."
+            )
+    longest = max((len(camera.params) for _, camera in found), default=0)
+    params = np.zeros((len(found), longest))
+    for row, (_, camera) in enumerate(found):
+        params[row, : len(camera.params)] = camera.params
+    return Cameras(
+        ids=np.array([number for number, _ in found], np.int64),
+        models=tuple(known[camera.model_name] for _, camera in found),
+        params=params,
+        width=np.array([camera.width for _, camera in found], np.int64),
+        height=np.array([camera.height for _, camera in found], np.int64),
+    )
+
+
+def _sensors(reconstruction: pycolmap.Reconstruction, rigs: Rigs, camera_row: dict[int, int]) -> Sensors:
+    rows = []
+    for rig_idx, number in enumerate(rigs.ids.tolist()):
+        rig = reconstruction.rigs[number]
+        if rig.num_sensors() == 0:
+            continue
+        others = sorted(rig.non_ref_sensors.items(), key=lambda item: (int(item[0].type), item[0].id))
+        for sensor, pose in [(rig.ref_sensor_id, None), *others]:
+            is_camera = sensor.type.name == "CAMERA"
+            reference = sensor == rig.ref_sensor_id
+            state = _IDENTITY if pose is None else (*pose.rotation.quat, *pose.translation)
+            camera = camera_row[sensor.id] if is_camera else -1
+            known = reference or pose is not None
+            rows.append((rig_idx, CAMERA if is_camera else OTHER, sensor.id, camera, state, reference, known))
+    table = list(zip(*rows, strict=True)) or [()] * 7
+    return Sensors(
+        rig_idx=np.array(table[0], np.int64),
+        kind=np.array(table[1], np.int64),
+        sensor_ids=np.array(table[2], np.int64),
+        camera_idx=np.array(table[3], np.int64),
+        cam_from_rig=_unit(np.array(table[4], float).reshape(-1, 7)),
+        is_reference=np.array(table[5], np.int64),
+        has_pose=np.array(table[6], np.int64),
+    )
+
+
+def _points(reconstruction: pycolmap.Reconstruction) -> Points:
+    found = sorted(reconstruction.points3D.items())
+    if found and found[-1][0] > 2**63 - 1:
+        raise FileFormatError(f"Point identifier {found[-1][0]} is too large.")
+    return Points(
+        ids=np.array([number for number, _ in found], np.int64),
+        xyz=np.array([point.xyz for _, point in found], float).reshape(-1, 3),
+        color=np.array([point.color for _, point in found], np.uint8).reshape(-1, 3),
+        error=np.array([point.error for _, point in found], float),
+    )
+
+
+def _observations(images: list[Any], points: Points) -> tuple[PointObservations, Keypoints]:
+    """Return matched and unmatched 2D points, in the order of the images and within them."""
+    image_idx, keypoint_idx, pixel, point_ids = [], [], [], []
+    for row, image in enumerate(images):
+        found = list(image.points2D)
+        image_idx.append(np.full(len(found), row))
+        keypoint_idx.append(np.arange(len(found)))
+        pixel.append(np.array([point.xy for point in found], float).reshape(-1, 2))
+        point_ids.append(np.array([point.point3D_id for point in found], np.uint64))
+    if not images:
+        return PointObservations(), Keypoints()
+    image_all, keypoint_all = np.concatenate(image_idx), np.concatenate(keypoint_idx)
+    pixel_all, id_all = np.concatenate(pixel), np.concatenate(point_ids)
+    matched = id_all != _NO_POINT
+    wanted = id_all[matched].astype(np.int64)
+    point_idx = np.searchsorted(points.ids, wanted)
+    dangling = np.append(points.ids, -1)[np.minimum(point_idx, len(points))] != wanted
+    if dangling.any():
+        raise FileFormatError(f"A 2D point refers to point {wanted[dangling][0]}, which is not in the model.")
+    observations = PointObservations(image_all[matched], point_idx, pixel_all[matched], keypoint_all[matched])
+    return observations, Keypoints(image_all[~matched], pixel_all[~matched], keypoint_all[~matched])
+
+
+def _poses(rigid: list[Any]) -> FloatArray:
+    poses = np.array([[*pose.rotation.quat, *pose.translation] for pose in rigid], float).reshape(-1, 7)
+    return _unit(poses)
+
+
+def _unit(poses: FloatArray) -> FloatArray:
+    """Scale quaternions to length one where they are not; text files round them."""
+    length = np.linalg.norm(poses[:, :4], axis=1)
+    if not (length > 0.5).all():
+        raise FileFormatError(f"Pose {int(length.argmin())} has the quaternion {poses[length.argmin(), :4].tolist()}.")
+    off = np.abs(length - 1) > 1e-14
+    poses[off, :4] /= length[off, None]
+    return poses
+
+
+def _rows(ids: npt.ArrayLike) -> dict[int, int]:
+    return {int(number): row for row, number in enumerate(np.asarray(ids, np.int64).tolist())}
+
+
+def _num_params_by_number(pycolmap: Any) -> dict[int, int]:
+    return {
+        int(number): len(pycolmap.Camera.create_from_model_id(1, number, 1.0, 1, 1).params)
+        for name, number in pycolmap.CameraModelId.__members__.items()
+        if name != "INVALID"
+    }
+
+
+class _quiet:  # noqa: N801 - used like a function
+    """Keep pycolmap's own log off the terminal: what it reports comes back as one line of ours."""
+
+    def __init__(self, pycolmap: Any) -> None:
+        self.logging = pycolmap.logging
+
+    def __enter__(self) -> None:
+        self.level, self.logging.minloglevel = self.logging.minloglevel, 3
+
+    def __exit__(self, *_: object) -> None:
+        self.logging.minloglevel = self.level
+
+
+# Writing
+
+
+def write_colmap(
+    scene: Scene, path: str | os.PathLike[str], form: Literal["binary", "text"] = "binary", force: bool = False
+) -> None:
+    """Write a scene as a COLMAP model that pycolmap opens; structures go beside it.
+
+    Parameters
+    ----------
+    scene : Scene
+        What to write. Landmarks seen in no image are written too.
+    path : path
+        The new folder.
+    form : "binary" or "text"
+        Form of the files.
+    force : bool
+        Replace an existing folder.
+
+    Raises
+    ------
+    InputError
+        If a camera model is unknown to COLMAP (the BAL model is written as RADIAL, its centre at half the image size).
+    """
+    if form not in ("binary", "text"):
+        raise InputError(f"form must be 'binary' or 'text'; got {form!r}.")
+    reconstruction = to_pycolmap(scene)
+    with atomic_output(path, force) as draft:
+        draft.mkdir()
+        (reconstruction.write_binary if form == "binary" else reconstruction.write_text)(str(draft))
+        write_structures(scene, draft)
+
+
+def to_pycolmap(scene: Scene) -> pycolmap.Reconstruction:
+    """Return a :class:`pycolmap.Reconstruction` of cameras, rigs, frames, images and points of a scene."""
+    import pycolmap
+
+    reconstruction = pycolmap.Reconstruction()
+    for row, number in enumerate(scene.cameras.ids.tolist()):
+        name, params = _colmap_camera(scene.cameras, row)
+        reconstruction.add_camera(
+            pycolmap.Camera(
+                camera_id=number,
+                model=name,
+                width=int(scene.cameras.width[row]),
+                height=int(scene.cameras.height[row]),
+                params=params,
+            )
+        )
+    _add_rigs(pycolmap, reconstruction, scene)
+    pixels, keypoint_idx = _numbered(scene)
+    _add_images(pycolmap, reconstruction, scene, pixels)
+    _add_points(pycolmap, reconstruction, scene, keypoint_idx)
+    return reconstruction
+
+
+def _colmap_camera(cameras: Cameras, row: int) -> tuple[str, list[float]]:
+    name, params = cameras.models[row], cameras.params_of(row).tolist()
+    if name == "BAL":
+        return "RADIAL", [params[0], cameras.width[row] / 2, cameras.height[row] / 2, *params[1:]]
+    colmap_name = camera_models.model(name).colmap_name
+    if colmap_name is None:
+        raise InputError(
+            f"Camera {cameras.ids[row]} has model {name}, which COLMAP does not know. Write a groma archive (.npz)."
+        )
+    return colmap_name, params
+
+
+def _sensor(pycolmap: Any, sensors: Sensors, row: int) -> Any:
+    kind = pycolmap.SensorType.CAMERA if sensors.kind[row] == CAMERA else pycolmap.SensorType.IMU
+    return pycolmap.sensor_t(kind, int(sensors.sensor_ids[row]))
+
+
+def _add_rigs(pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: Scene) -> None:
+    sensors = scene.sensors
+    for rig_idx, number in enumerate(scene.rigs.ids.tolist()):
+        rig = pycolmap.Rig(rig_id=number)
+        rows = np.flatnonzero(sensors.rig_idx == rig_idx)
+        for row in rows[np.argsort(-sensors.is_reference[rows], kind="stable")].tolist():
+            if sensors.is_reference[row]:
+                rig.add_ref_sensor(_sensor(pycolmap, sensors, row))
+            else:
+                pose = _rigid(pycolmap, sensors.cam_from_rig[row]) if sensors.has_pose[row] else None
+                rig.add_sensor(_sensor(pycolmap, sensors, row), pose)
+        reconstruction.add_rig(rig)
+
+
+def _add_images(
+    pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: Scene, pixels: list[FloatArray]
+) -> None:
+    images = scene.images
+    for frame_idx, number in enumerate(scene.frames.ids.tolist()):
+        frame = pycolmap.Frame(frame_id=number, rig_id=int(scene.rigs.ids[scene.frames.rig_idx[frame_idx]]))
+        frame.rig_from_world = _rigid(pycolmap, scene.frames.rig_from_world[frame_idx])
+        for row in np.flatnonzero(images.frame_idx == frame_idx).tolist():
+            sensor = _sensor(pycolmap, scene.sensors, int(images.sensor_idx[row]))
+            frame.add_data_id(pycolmap.data_t(sensor, int(images.ids[row])))
+        reconstruction.add_frame(frame)
+    for row, number in enumerate(images.ids.tolist()):
+        image = pycolmap.Image(
+            name=images.names[row],
+            keypoints=pixels[row],
+            camera_id=int(scene.cameras.ids[images.camera_idx[row]]),
+            image_id=number,
+        )
+        image.frame_id = int(scene.frames.ids[images.frame_idx[row]])
+        reconstruction.add_image(image)
+    for number in scene.frames.ids.tolist():
+        reconstruction.register_frame(number)
+
+
+def _numbered(scene: Scene) -> tuple[list[FloatArray], npt.NDArray[np.int64]]:
+    """Return the 2D points of every image in the order of their numbers, and the number of each observation.
+
+    Numbers run 0, 1, 2, ... in a COLMAP model; where those of the scene have gaps (after a subset) they close up.
+    """
+    centre = np.zeros((scene.num_cameras, 2))
+    for row, name in enumerate(scene.cameras.models):
+        if name == "BAL":  # its pixels count from the image centre, COLMAP's from the corner
+            centre[row] = scene.cameras.width[row] / 2, scene.cameras.height[row] / 2
+    tables = (scene.point_observations, scene.keypoints)
+    image_idx = np.concatenate([table.image_idx for table in tables])
+    keypoint_idx = np.concatenate([table.keypoint_idx for table in tables])
+    pixel = np.concatenate([table.pixel for table in tables]) + centre[scene.images.camera_idx[image_idx]]
+    order = np.lexsort((keypoint_idx, image_idx))
+    ends = np.searchsorted(image_idx[order], np.arange(scene.num_images + 1))
+    number = np.empty(len(order), np.int64)
+    number[order] = np.arange(len(order)) - ends[image_idx[order]]
+    pixels = [pixel[order[start:end]] for start, end in zip(ends[:-1], ends[1:], strict=True)]
+    return pixels, number[: len(scene.point_observations)]
+
+
+def _add_points(
+    pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: Scene, keypoint_idx: npt.NDArray[np.int64]
+) -> None:
+    seen, points = scene.point_observations, scene.points
+    order = np.lexsort((keypoint_idx, seen.image_idx, seen.point_idx))
+    ends = np.searchsorted(seen.point_idx[order], np.arange(len(points) + 1)).tolist()
+    image_ids = scene.images.ids[seen.image_idx[order]].tolist()
+    keypoints = keypoint_idx[order].tolist()
+    images = {number: reconstruction.image(number) for number in scene.images.ids.tolist()}
+    numbers = points.ids.tolist()
+    for row, number in enumerate(numbers):
+        span = range(ends[row], ends[row + 1])
+        elements = [pycolmap.TrackElement(image_ids[k], keypoints[k]) for k in span]
+        point = pycolmap.Point3D(
+            xyz=points.xyz[row], color=points.color[row], error=points.error[row], track=pycolmap.Track(elements)
+        )
+        reconstruction.add_point3D_with_id(number, point)
+        for k in span:
+            images[image_ids[k]].set_point3D_for_point2D(keypoints[k], number)
+
+
+def _rigid(pycolmap: Any, pose: FloatArray) -> Any:
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:4]), pose[4:])
+
+
+__all__ = ["find_model", "from_pycolmap", "read_colmap", "to_pycolmap", "write_colmap"]

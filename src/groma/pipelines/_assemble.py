@@ -1,0 +1,330 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where the two columns meet: a scene becomes a problem, and a solution becomes a scene.
+
+Groups of variables: ``frames`` (rig_from_world), ``sensors`` (cam_from_rig, only in scenes with rigs), one
+``intrinsics/MODEL`` per camera model, ``points``, ``lines``, ``planes``, ``directions``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.cameras import model as camera_model
+from groma.errors import InputError
+from groma.factors._factor import Factor, Ref
+from groma.factors.line_bearing import LineBearing
+from groma.factors.line_direction import LineDirection
+from groma.factors.line_on_plane import SegmentOnPlane
+from groma.factors.line_reprojection import LineReprojection
+from groma.factors.losses import Loss, Trivial
+from groma.factors.point_on_line import PointOnLine
+from groma.factors.point_on_plane import PointOnPlane
+from groma.factors.point_reprojection import PointReprojection
+from groma.geometry import quaternion, se3
+from groma.geometry._manifold import Euclidean
+from groma.geometry.line_charts import LINE_CHARTS
+from groma.geometry.plane_charts import PLANE_CHARTS
+from groma.geometry.pose_charts import POSE_CHARTS
+from groma.geometry.unit3 import DIRECTION_CHARTS
+from groma.problem.problem import Problem
+from groma.problem.variables import Variables
+from groma.scene import Scene
+
+POINT_FACTORS = ("point_reprojection",)
+LINE_FACTORS = ("line_reprojection", "line_bearing")
+
+
+@dataclass(frozen=True)
+class AssemblyOptions:
+    """What of a scene takes part, and how it is weighted."""
+
+    points: bool = True
+    lines: bool = True
+    planes: bool = True
+    refine_poses: bool = True
+    refine_intrinsics: bool = False
+    refine_principal_point: bool = False
+    #: Estimate where cameras sit on their rig.
+    refine_rigs: bool = False
+    line_chart: str = "cartesian"
+    plane_chart: str = "normal_offset"
+    pose_chart: str = "left"
+    #: Standard deviation of points and of segment end points, pixels.
+    point_sigma_px: float = 1.0
+    line_sigma_px: float = 1.0
+    #: How well points and lines keep to their planes and lines, as a length in the images, pixels.
+    structure_sigma_px: float = 0.1
+    #: Loss of what comes from matching, and of the relations between landmarks.
+    loss: Loss = Trivial()
+    #: Leave out points that start behind their camera.
+    drop_behind: bool = True
+    #: ``free``: damping holds the scene; ``first_camera``: the first frame, and the scale by the farthest one, are held.
+    gauge: str = "free"
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """A problem made from a scene, and what was left out."""
+
+    problem: Problem
+    #: Sentences about observations that were left out.
+    notes: tuple[str, ...]
+
+
+def assemble(scene: Scene, options: AssemblyOptions) -> Assembly:
+    """Turn a scene into a problem."""
+    notes: list[str] = []
+    variables = _camera_variables(scene, options)
+    factors: list[Factor] = []
+    if options.points and scene.num_point_observations:
+        variables["points"] = Variables(Euclidean(3, "point"), scene.points.xyz)
+        factors += _point_factors(scene, options, notes)
+    if options.lines and scene.num_line_observations:
+        chart = _chart(LINE_CHARTS, options.line_chart, "line_chart")
+        variables["lines"] = Variables(chart, chart.from_ambient(scene.lines.plucker))
+        factors += _line_factors(scene, options, notes)
+    if options.planes and scene.num_planes:
+        chart = _chart(PLANE_CHARTS, options.plane_chart, "plane_chart")
+        variables["planes"] = Variables(chart, chart.from_ambient(scene.planes.hesse))
+    if options.planes and scene.num_directions:
+        chart = next(iter(DIRECTION_CHARTS.values()))
+        variables["directions"] = Variables(chart, chart.from_ambient(scene.directions.vectors))
+    factors += _structure_factors(scene, options, variables)
+    used = {ref.group for factor in factors for _, ref in factor.references()}
+    return Assembly(Problem({k: v for k, v in variables.items() if k in used}, factors), tuple(notes))
+
+
+def disassemble(scene: Scene, problem: Problem) -> Scene:
+    """Return the scene with the states of a solved problem."""
+    states = {name: group.state for name, group in problem.variables.items()}
+    if "frames" in states:
+        scene = scene.with_rig_poses(states["frames"], states.get("sensors"))
+    params = scene.cameras.params.copy()
+    for name, members in _cameras_by_model(scene).items():
+        group = f"intrinsics/{name}"
+        if group in states:
+            params[members, : states[group].shape[1]] = states[group]
+    scene = scene.with_params(params)
+    if "points" in states:
+        scene = scene.with_points(states["points"])
+    if "lines" in states:
+        scene = scene.with_lines(problem.variables["lines"].ambient())
+    if "planes" in states:
+        scene = scene.with_planes(problem.variables["planes"].ambient())
+    if "directions" in states:
+        scene = scene.replace(directions=scene.directions.replace(vectors=states["directions"]))
+    return scene
+
+
+# --------------------------------------------------------------------------------------------------------- cameras
+
+
+def _chart(charts: dict, name: str, option: str):
+    if name not in charts:
+        raise InputError(f"{option} must be one of {', '.join(sorted(charts))}; got {name!r}.")
+    return charts[name]
+
+
+def _cameras_by_model(scene: Scene) -> dict[str, IntArray]:
+    models = np.array(scene.cameras.models, dtype=object)
+    return {str(name): np.flatnonzero(models == name) for name in dict.fromkeys(models)}
+
+
+def _camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variables]:
+    chart = _chart(POSE_CHARTS, options.pose_chart, "pose_chart")
+    held: bool | BoolArray = not options.refine_poses
+    if options.refine_poses and options.gauge == "first_camera":
+        held = _first_camera_gauge(scene)
+    elif options.gauge not in ("free", "first_camera"):
+        raise InputError(f"gauge must be 'free' or 'first_camera'; got {options.gauge!r}.")
+    variables = {"frames": Variables(chart, scene.frames.rig_from_world, held)}
+    if not scene.has_trivial_rigs:
+        constant = (scene.sensors.is_reference == 1) | (not options.refine_rigs)
+        variables["sensors"] = Variables(chart, scene.sensors.cam_from_rig, constant)
+    for name, members in _cameras_by_model(scene).items():
+        model = camera_model(name)
+        state = scene.cameras.params[members, : model.num_parameters]
+        constant: bool | BoolArray = not options.refine_intrinsics
+        if options.refine_intrinsics and model.principal_point_indices and not options.refine_principal_point:
+            constant = np.zeros(state.shape, dtype=bool)
+            constant[:, list(model.principal_point_indices)] = True
+        variables[f"intrinsics/{name}"] = Variables(Euclidean(model.num_parameters, "intrinsics"), state, constant)
+    return variables
+
+
+def _first_camera_gauge(scene: Scene) -> BoolArray:
+    """Hold frame 0, and of the frame farthest from it the translation along the line between the two."""
+    poses = scene.frames.rig_from_world
+    held = np.zeros((len(poses), 6), dtype=bool)
+    if len(poses) == 0:
+        return held
+    held[0] = True
+    centers = se3.inverse(poses)[:, 4:]
+    away = centers - centers[0]
+    far = int(np.argmax(np.linalg.norm(away, axis=1)))
+    if far != 0:
+        in_camera = quaternion.rotate(poses[far, :4], away[far])
+        held[far, int(np.argmax(np.abs(in_camera)))] = True
+    return held
+
+
+def _camera_refs(scene: Scene, image_idx: IntArray) -> dict[str, Ref]:
+    refs = {"pose": Ref("frames", scene.images.frame_idx[image_idx])}
+    if not scene.has_trivial_rigs:
+        refs["extrinsics"] = Ref("sensors", scene.images.sensor_idx[image_idx])
+    return refs
+
+
+def _by_model(scene: Scene, image_idx: IntArray):
+    """Yield (model name, rows of the observations, index of each one's camera in the model's group)."""
+    camera_of = scene.images.camera_idx[image_idx]
+    for name, members in _cameras_by_model(scene).items():
+        position = np.full(len(scene.cameras), -1)
+        position[members] = np.arange(len(members))
+        rows = np.flatnonzero(position[camera_of] >= 0)
+        if len(rows):
+            yield name, rows, position[camera_of[rows]]
+
+
+# ------------------------------------------------------------------------------------------------------- landmarks
+
+
+def _point_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> list[Factor]:
+    table = scene.point_observations
+    keep = np.ones(len(table), dtype=bool)
+    if options.drop_behind:
+        in_camera = se3.transform_points(scene.cam_from_world[table.image_idx], scene.points.xyz[table.point_idx])
+        sees_behind = np.array([camera_model(name).sees_behind for name in scene.cameras.models])
+        keep = (in_camera[:, 2] > 0) | sees_behind[scene.images.camera_idx[table.image_idx]]
+        if not keep.all():
+            notes.append(f"{int((~keep).sum())} observation(s) of points behind their camera were left out.")
+    table = table.take(np.flatnonzero(keep)) if not keep.all() else table
+    factors: list[Factor] = []
+    for name, rows, camera in _by_model(scene, table.image_idx):
+        factors.append(
+            PointReprojection(
+                camera_model=name,
+                point=Ref("points", table.point_idx[rows]),
+                intrinsics=Ref(f"intrinsics/{name}", camera),
+                pixels=table.pixel[rows],
+                require_in_front=False,
+                sqrt_information=1.0 / options.point_sigma_px,
+                loss=options.loss,
+                **_camera_refs(scene, table.image_idx[rows]),
+            )
+        )
+    return factors
+
+
+def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> list[Factor]:
+    table = scene.line_observations
+    factors: list[Factor] = []
+    for name, rows, camera in _by_model(scene, table.image_idx):
+        model = camera_model(name)
+        line = Ref("lines", table.line_idx[rows])
+        poses = _camera_refs(scene, table.image_idx[rows])
+        if model.has_pinhole_parameters:
+            factors.append(
+                LineReprojection(
+                    camera_model=name,
+                    line=line,
+                    intrinsics=Ref(f"intrinsics/{name}", camera),
+                    segment=table.segment[rows],
+                    sqrt_information=1.0 / options.line_sigma_px,
+                    loss=options.loss,
+                    **poses,
+                )
+            )
+            continue
+        params = scene.cameras.params[scene.images.camera_idx[table.image_idx[rows]], : model.num_parameters]
+        first = model.unproject(params, table.segment[rows, :2])
+        second = model.unproject(params, table.segment[rows, 2:])
+        good = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+        if not good.all():
+            notes.append(f"{int((~good).sum())} segment(s) lie outside the range of the {name} model and were left out.")
+        focal = params[:, list(model.focal_indices)].mean(axis=1)
+        kept = rows[good]
+        factors.append(
+            LineBearing(
+                line=Ref("lines", table.line_idx[kept]),
+                start_bearings=first[good],
+                end_bearings=second[good],
+                sqrt_information=focal[good] / options.line_sigma_px,
+                loss=options.loss,
+                **_camera_refs(scene, table.image_idx[kept]),
+            )
+        )
+    return factors
+
+
+# ------------------------------------------------------------------------------------------------------- structure
+
+
+def _lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
+    """For each landmark the length that a pixel of its images spans at its distance, scene units; the median image."""
+    if kind == "point":
+        image_idx, index, places = (
+            scene.point_observations.image_idx, scene.point_observations.point_idx, scene.points.xyz,
+        )  # fmt: skip
+    else:
+        image_idx, index, places = (
+            scene.line_observations.image_idx, scene.line_observations.line_idx, scene.lines.segments.mean(axis=1),
+        )  # fmt: skip
+    focal_of = np.array(
+        [scene.cameras.params_of(c)[list(camera_model(name).focal_indices)].mean() for c, name in enumerate(scene.cameras.models)]
+    )
+    distance = np.linalg.norm(scene.cam_centers_in_world[image_idx] - places[index], axis=1)
+    length = distance / focal_of[scene.images.camera_idx[image_idx]]
+    count = np.bincount(index, minlength=len(places))
+    mean = np.bincount(index, weights=length, minlength=len(places)) / np.maximum(count, 1)
+    fallback = float(np.median(length)) if len(length) else 1.0
+    return np.where(count > 0, mean, fallback)
+
+
+def _structure_factors(scene: Scene, options: AssemblyOptions, variables: dict[str, Variables]) -> list[Factor]:
+    relations = scene.relations
+    factors: list[Factor] = []
+    have = {name: name in variables for name in ("points", "lines", "planes", "directions")}
+    if have["points"] and (have["planes"] or have["lines"]):
+        per_point = 1.0 / (options.structure_sigma_px * _lengths_per_pixel(scene, "point"))
+        if have["planes"] and len(relations.point_on_plane):
+            point, plane = relations.point_on_plane.T
+            factors.append(
+                PointOnPlane(
+                    point=Ref("points", point), plane=Ref("planes", plane), sqrt_information=per_point[point],
+                    loss=options.loss,
+                )  # fmt: skip
+            )
+        if have["lines"] and len(relations.point_on_line):
+            point, line = relations.point_on_line.T
+            factors.append(
+                PointOnLine(
+                    point=Ref("points", point), line=Ref("lines", line), sqrt_information=per_point[point],
+                    loss=options.loss,
+                )  # fmt: skip
+            )
+    if have["lines"] and (have["planes"] or have["directions"]):
+        per_line = 1.0 / (options.structure_sigma_px * _lengths_per_pixel(scene, "line"))
+        ends = scene.lines.segments
+        if have["planes"] and len(relations.line_on_plane):
+            line, plane = relations.line_on_plane.T
+            factors.append(
+                SegmentOnPlane(
+                    line=Ref("lines", line), plane=Ref("planes", plane),
+                    ends=ends[line],
+                    sqrt_information=per_line[line], loss=options.loss,
+                )  # fmt: skip
+            )
+        if have["directions"] and len(relations.line_along_direction):
+            line, direction = relations.line_along_direction.T
+            length = np.linalg.norm(ends[line, 1] - ends[line, 0], axis=1)
+            factors.append(
+                LineDirection(
+                    line=Ref("lines", line), direction=Ref("directions", direction),
+                    sqrt_information=per_line[line] * np.maximum(0.5 * length, 1e-12), loss=options.loss,
+                )  # fmt: skip
+            )
+    return factors

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Bundle adjustment of a scene: cameras, points, lines and planes together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from groma.errors import InputError
+from groma.factors.losses import Loss, Trivial
+from groma.factors.losses import loss as make_loss
+from groma.pipelines._assemble import LINE_FACTORS, POINT_FACTORS, AssemblyOptions, assemble, disassemble
+from groma.problem.problem import Problem
+from groma.scene import Scene
+from groma.solver.options import SolverOptions
+from groma.solver.report import SolveReport
+from groma.solver.solve import solve
+from groma.solver.termination import Termination
+
+#: Scale of the default loss, pixels: near the noise of good feature detectors.
+DEFAULT_LOSS_SCALE = 0.5
+
+
+@dataclass(frozen=True)
+class AdjustOptions:
+    """Options of :func:`adjust`. The defaults suit scenes that come from matching images."""
+
+    #: ``none``, ``huber``, ``soft_l1``, ``cauchy``, ``tukey``, ``geman_mcclure``, ``barron``, ``truncated``, or ``auto``:
+    #: none for BAL problems, else Cauchy, because matches contain outliers.
+    loss: str = "auto"
+    #: Where the loss begins to bend, pixels; None takes 0.5.
+    loss_scale: float | None = None
+    #: Estimate focal lengths and distortion; None: for BAL problems only.
+    refine_intrinsics: bool | None = None
+    #: Estimate principal points too, if intrinsics are refined.
+    refine_principal_point: bool = False
+    #: Estimate where cameras sit on their rig.
+    refine_rigs: bool = False
+    #: Which landmarks take part. Without planes, directions and all relations with them are left out too.
+    points: bool = True
+    lines: bool = True
+    planes: bool = True
+    #: Most steps tried.
+    max_iterations: int = 50
+    #: Stop when the cost falls by less than this fraction in a step.
+    function_tolerance: float = 1e-6
+    #: ``auto``, ``dense``, ``sparse`` or ``pcg``.
+    linear_solver: str = "auto"
+    #: ``cartesian``, ``orthonormal_right``, ``orthonormal_left``, ``free_right`` or ``free_left``.
+    line_chart: str = "cartesian"
+    #: ``free`` or ``first_camera``.
+    gauge: str = "free"
+    #: Steps of each landmark on its own after every joint step; None: 2 where lines meet a robust loss, else 0.
+    landmark_steps: int | None = None
+    threads: int | None = None
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress callback gets after every step."""
+
+    iteration: int
+    max_iterations: int
+    cost: float
+
+
+@dataclass(frozen=True)
+class AdjustReport:
+    """Outcome of :func:`adjust` in the terms of the scene."""
+
+    num_images: int
+    num_points: int
+    num_lines: int
+    num_planes: int
+    num_observations: int
+    #: Root mean square residual by kind of landmark, pixels: {kind: {before, after}}, without the loss.
+    rmse_px: dict[str, dict[str, float]]
+    solve: SolveReport
+    #: Sentences for the user.
+    warnings: tuple[str, ...]
+
+    @property
+    def termination(self) -> Termination:
+        """Why the solve stopped."""
+        return self.solve.termination
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        """One entry per step tried: iteration, cost, accepted, damping, step_norm, seconds and more."""
+        return [asdict(record) for record in self.solve.history]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as plain numbers and words, for JSON."""
+        solve = self.solve
+        return {
+            "num_images": self.num_images,
+            "num_points": self.num_points,
+            "num_lines": self.num_lines,
+            "num_planes": self.num_planes,
+            "num_observations": self.num_observations,
+            "num_residuals": solve.num_residuals,
+            "num_unknowns": solve.num_unknowns,
+            "initial_cost": solve.initial_cost,
+            "final_cost": solve.final_cost,
+            "initial_costs": solve.initial_costs,
+            "final_costs": solve.final_costs,
+            "reduced_chi_square": solve.reduced_chi_square,
+            "iterations": solve.iterations,
+            "termination": solve.termination.key,
+            "termination_sentence": solve.termination.sentence,
+            "converged": solve.converged,
+            "linear_solver": solve.linear_solver,
+            "threads": solve.threads,
+            "seconds": dict(solve.seconds),
+            "rmse_px": self.rmse_px,
+            "num_degenerate": solve.num_degenerate,
+            "num_underdetermined_landmarks": solve.num_underdetermined_landmarks,
+            "history": self.history,
+        }
+
+
+@dataclass(frozen=True)
+class AdjustResult:
+    """The adjusted scene and the report."""
+
+    scene: Scene
+    report: AdjustReport
+
+
+def adjust(
+    scene: Scene, options: AdjustOptions | None = None, progress: Callable[[Progress], bool | None] | None = None
+) -> AdjustResult:
+    """Adjust cameras, points, lines and planes of a scene together.
+
+    Parameters
+    ----------
+    scene
+        The scene; it is not changed.
+    options
+        See :class:`AdjustOptions`.
+    progress
+        Called after every step; return False to stop with the best state so far.
+
+    Returns
+    -------
+    AdjustResult
+        A new scene and a report.
+
+    Raises
+    ------
+    InputError
+        If the scene has nothing to adjust, or an option is not known.
+    """
+    options = options or AdjustOptions()
+    assembly = assemble(scene, _assembly_options(scene, options))
+    if not assembly.problem.factors:
+        raise InputError(
+            f"There is nothing to adjust: the scene has {scene.num_images} images, "
+            f"{scene.num_point_observations} point and {scene.num_line_observations} line observations, and the "
+            "options leave none of them. Check the input and --no-points / --no-lines."
+        )
+    steps = options.landmark_steps
+    if steps is None:
+        robust = any(not isinstance(factor.loss, Trivial) for factor in assembly.problem.factors)
+        steps = 2 if robust and "lines" in assembly.problem.variables else 0
+    solver_options = SolverOptions(
+        max_iterations=options.max_iterations,
+        function_tolerance=options.function_tolerance,
+        linear_solver=options.linear_solver,
+        landmark_steps=steps,
+        threads=options.threads,
+    )
+    report_progress = None
+    if progress is not None:
+
+        def report_progress(record) -> bool | None:
+            return progress(Progress(record.iteration, options.max_iterations, record.cost))
+
+    solution = solve(assembly.problem, solver_options, report_progress)
+    before, after = _rmse_px(assembly.problem), _rmse_px(solution.problem)
+    report = AdjustReport(
+        num_images=scene.num_images,
+        num_points=scene.num_points if "points" in assembly.problem.variables else 0,
+        num_lines=scene.num_lines if "lines" in assembly.problem.variables else 0,
+        num_planes=scene.num_planes if "planes" in assembly.problem.variables else 0,
+        num_observations=sum(
+            len(factor) for factor in assembly.problem.factors if factor.type_name in POINT_FACTORS + LINE_FACTORS
+        ),
+        rmse_px={kind: {"before": before[kind], "after": after[kind]} for kind in before},
+        solve=solution.report,
+        warnings=(*assembly.notes, *solution.report.warnings),
+    )
+    return AdjustResult(disassemble(scene, solution.problem), report)
+
+
+def _assembly_options(scene: Scene, options: AdjustOptions) -> AssemblyOptions:
+    is_bal = scene.num_cameras > 0 and all(name == "BAL" for name in scene.cameras.models)
+    name = options.loss
+    if name == "auto":
+        name = "none" if is_bal else "cauchy"
+    loss: Loss = Trivial() if name == "none" else make_loss(name, options.loss_scale or DEFAULT_LOSS_SCALE)
+    refine = is_bal if options.refine_intrinsics is None else options.refine_intrinsics
+    return AssemblyOptions(
+        points=options.points,
+        lines=options.lines,
+        planes=options.planes,
+        refine_intrinsics=refine,
+        refine_principal_point=options.refine_principal_point,
+        refine_rigs=options.refine_rigs,
+        line_chart=options.line_chart,
+        gauge=options.gauge,
+        loss=loss,
+        drop_behind=not is_bal,
+    )
+
+
+def _rmse_px(problem: Problem) -> dict[str, float]:
+    """Root mean square of the reprojection residuals by kind, unweighted and without the loss, pixels."""
+    sums: dict[str, list[float]] = {}
+    for factor in problem.factors:
+        kind = "points" if factor.type_name in POINT_FACTORS else "lines" if factor.type_name in LINE_FACTORS else None
+        if kind is None or len(factor) == 0:
+            continue
+        plain = replace(factor, loss=Trivial())
+        ambients = tuple(problem.variables[ref.group].ambient() for _, ref in plain.references())
+        residual = np.empty((len(plain), plain.residual_size))
+        plain.residuals(plain.prepare(ambients), 0, len(plain), residual)
+        scale = np.asarray(plain.sqrt_information) if factor.type_name == "line_bearing" else np.ones(1)
+        squares = (residual**2).sum(axis=1) * scale**2
+        entry = sums.setdefault(kind, [0.0, 0])
+        entry[0] += float(squares.sum())
+        entry[1] += len(plain)
+    return {kind: float(np.sqrt(total / count)) for kind, (total, count) in sums.items()}

@@ -1,0 +1,150 @@
+"""The eliminated step equals the dense step, for every mix of variables, chart and linear solver."""
+
+import numpy as np
+import pytest
+from problems import dense_normal_equations, scene_problem
+
+from groma.factors.losses import Cauchy
+from groma.problem._parallel import Workers
+from groma.problem.layout import lay_out
+from groma.problem.linearization import NormalEquations, to_solver_order
+from groma.solver.linear import choose
+from groma.solver.schur import MIN_DIAGONAL, ReducedSystem
+from groma.solver.steps import Step, curvature, diagonal, gradient, retract
+
+pytestmark = pytest.mark.kernels
+
+CASES = {
+    "points": dict(),
+    "points, shared intrinsics": dict(shared_intrinsics=True),
+    "points, own intrinsics": dict(shared_intrinsics=False),
+    "lines": dict(num_points=0, num_lines=12),
+    "points and lines": dict(num_lines=8),
+    "orthonormal lines": dict(num_points=0, num_lines=12, line_chart="orthonormal_left"),
+    "right poses": dict(pose_chart="right"),
+    "planes": dict(num_planes=2, num_lines=5, shared_intrinsics=True),
+    "robust": dict(loss=Cauchy(1.0), num_lines=6),
+}
+
+
+def eliminated_step(problem, damping, solver="dense", threads=1, eliminate="auto"):
+    layout = lay_out(problem, eliminate, chunk_size=16)
+    equations = NormalEquations(layout, Workers(threads))
+    system = ReducedSystem(equations)
+    states = to_solver_order(layout)
+    equations.linearize(states, equations.prepare(states))
+    system.eliminate(damping)
+    system.assemble(damping)
+    linear = choose(layout, solver)
+    if solver == "pcg":
+        linear.model_tolerance = 0.0
+    kept = linear.solve(system.S, system.rhs)
+    return layout, equations, system, states, Step(kept, system.landmark_steps(kept))
+
+
+def step_by_group(layout, step):
+    """Increments (count, dof) of each group in the order of the problem."""
+    result = {}
+    for kept, delta in zip(layout.kept, step.kept, strict=True):
+        blocks = delta.reshape(kept.count, kept.width)
+        for member in kept.members:
+            part = blocks[:, member.offset : member.offset + member.dof]
+            result[member.group] = part if member.block_of is None else part[member.block_of]
+    for group, delta in zip(layout.eliminated, step.landmarks, strict=True):
+        part = np.empty((group.count, group.dof))
+        part[group.order] = delta.reshape(group.count, group.dof)
+        result[group.group] = part
+    return result
+
+
+def dense_step(problem, damping):
+    H, g, columns = dense_normal_equations(problem)
+    step = np.linalg.solve(H + damping * np.diag(np.maximum(np.diag(H), MIN_DIAGONAL)), -g)
+    return {
+        name: step[first : first + len(problem.variables[name]) * dof].reshape(-1, dof)
+        for name, (first, dof) in columns.items()
+    }
+
+
+@pytest.mark.parametrize("solver", ["dense", "sparse", "pcg"])
+@pytest.mark.parametrize("case", CASES)
+def test_step_equals_dense_step(case, solver):
+    problem = scene_problem(**CASES[case])
+    layout, *_, step = eliminated_step(problem, 1e-2, solver)
+    got, expected = step_by_group(layout, step), dense_step(problem, 1e-2)
+    assert got.keys() == expected.keys()
+    tolerance = 1e-5 if solver == "pcg" else 1e-8
+    for name in expected:
+        np.testing.assert_allclose(got[name], expected[name], atol=tolerance * np.abs(expected[name]).max())
+
+
+def test_own_intrinsics_share_a_block_with_their_pose():
+    layout = lay_out(scene_problem(shared_intrinsics=False))
+    assert [kept.width for kept in layout.kept] == [10]
+    layout = lay_out(scene_problem(shared_intrinsics=True))
+    assert [kept.width for kept in layout.kept] == [6, 4]
+
+
+@pytest.mark.parametrize("eliminate", [(), ("points",), ("lines",)])
+def test_what_is_eliminated_does_not_change_the_step(eliminate):
+    problem = scene_problem(num_lines=6)
+    layout, *_, step = eliminated_step(problem, 1e-2, eliminate=eliminate)
+    got, expected = step_by_group(layout, step), dense_step(problem, 1e-2)
+    for name in expected:
+        np.testing.assert_allclose(got[name], expected[name], atol=1e-8 * np.abs(expected[name]).max())
+
+
+def test_threads_do_not_change_the_step():
+    problem = scene_problem(num_points=80, num_lines=40)
+    layout, *_, one = eliminated_step(problem, 1e-2)
+    _, *_, two = eliminated_step(problem, 1e-2, threads=2)
+    for first, second in zip(one.parts(), two.parts(), strict=True):
+        np.testing.assert_allclose(first, second, rtol=1e-9, atol=1e-12)
+
+
+def test_held_coordinates_do_not_move():
+    problem = scene_problem(num_lines=4)
+    constant = np.zeros((5, 6), dtype=bool)
+    constant[0] = True
+    constant[1, 2] = True
+    held_lines = np.array([True, False, False, False])
+    variables = dict(problem.variables)
+    for name, mask in (("poses", constant), ("lines", held_lines)):
+        variables[name] = type(variables[name])(variables[name].manifold, variables[name].state, mask)
+    problem = type(problem)(variables, problem.factors)
+    layout, *_, step = eliminated_step(problem, 1e-2)
+    got, expected = step_by_group(layout, step), dense_step(problem, 1e-2)
+    assert np.all(got["poses"][0] == 0)
+    assert got["poses"][1, 2] == 0
+    assert np.all(got["lines"][0] == 0)
+    for name in expected:
+        np.testing.assert_allclose(got[name], expected[name], atol=1e-8 * np.abs(expected[name]).max())
+
+
+@pytest.mark.parametrize("case", ["points", "planes"])
+def test_quadratic_model(case):
+    """Gradient, diagonal and curvature agree with the dense matrices."""
+    problem = scene_problem(**CASES[case])
+    layout, equations, system, states, step = eliminated_step(problem, 1e-2)
+    H, g, columns = dense_normal_equations(problem)
+
+    def flat(parts):
+        by_group = step_by_group(layout, parts)
+        return np.concatenate([by_group[name].reshape(-1) for name in columns])
+
+    delta = flat(step)
+    np.testing.assert_allclose(flat(gradient(equations)), g, atol=1e-9 * np.abs(g).max())
+    np.testing.assert_allclose(flat(diagonal(equations, system)), np.maximum(np.diag(H), MIN_DIAGONAL), rtol=1e-9)
+    np.testing.assert_allclose(curvature(equations, system, step), delta @ H @ delta, rtol=1e-9)
+
+
+def test_linearisation_predicts_the_cost():
+    """A tiny step changes the cost by the gradient's share."""
+    problem = scene_problem(num_lines=8, num_planes=1, loss=Cauchy(2.0))
+    layout, equations, system, states, step = eliminated_step(problem, 1e-2)
+    g = gradient(equations)
+    h = 1e-6
+    costs = [
+        equations.cost(equations.prepare(retract(layout, states, step.blend(sign * h, step, 0.0)))) for sign in (1, -1)
+    ]
+    np.testing.assert_allclose((costs[0] - costs[1]) / (2 * h), g.dot(step), rtol=1e-6)

@@ -1,0 +1,181 @@
+"""Whole solves: convergence, strategies, robust losses, motion only, structure only, and every odd case."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from problems import dense_normal_equations, scene_problem
+
+from groma.errors import ProblemError
+from groma.factors import PointOnLine, VectorPrior
+from groma.factors._factor import Ref
+from groma.factors.losses import Cauchy, Truncated
+from groma.geometry._manifold import Euclidean
+from groma.problem.problem import Problem
+from groma.problem.variables import Variables
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
+from groma.solver.termination import Termination
+
+
+@pytest.mark.parametrize("strategy", ["levenberg_marquardt", "dogleg"])
+@pytest.mark.parametrize("linear_solver", ["dense", "sparse", "pcg"])
+def test_reaches_the_noise_floor(strategy, linear_solver):
+    problem = scene_problem(num_cameras=6, num_points=150, num_lines=40, disturb=0.02)
+    options = SolverOptions(strategy=strategy, linear_solver=linear_solver, function_tolerance=1e-10)
+    solution = solve(problem, options)
+    report = solution.report
+    assert report.converged
+    # seven unknowns of the frame do not use up residuals; 2 sigma of the chi-square mean
+    redundancy = report.num_residuals - report.num_unknowns + 7
+    assert abs(2 * report.final_cost / redundancy - 1) < 2 * np.sqrt(2 / redundancy)
+    _, g, _ = dense_normal_equations(solution.problem)
+    assert np.abs(g).max() < 1e-2 * np.abs(dense_normal_equations(problem)[1]).max()
+
+
+def test_same_minimum_from_every_solver_and_strategy():
+    problem = scene_problem(num_cameras=6, num_points=60, shared_intrinsics=True)
+    costs = [
+        solve(problem, SolverOptions(strategy=s, linear_solver=k, function_tolerance=1e-12, max_iterations=100)).report
+        for s in ("levenberg_marquardt", "dogleg")
+        for k in ("dense", "sparse", "pcg")
+    ]
+    np.testing.assert_allclose([r.final_cost for r in costs], costs[0].final_cost, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "chart", ["cartesian", "orthonormal_right", "orthonormal_left", "free_right", "free_left"]
+)
+def test_line_charts_reach_the_same_minimum(chart):
+    reference = solve(scene_problem(num_points=20, num_lines=30), SolverOptions(function_tolerance=1e-12))
+    problem = scene_problem(num_points=20, num_lines=30, line_chart=chart)
+    solution = solve(problem, SolverOptions(function_tolerance=1e-12, max_iterations=100))
+    np.testing.assert_allclose(solution.report.final_cost, reference.report.final_cost, rtol=1e-6)
+
+
+def test_robust_loss_ignores_an_outlier():
+    problem = scene_problem(num_cameras=6, num_points=60)
+    clean = solve(problem)
+    factor = problem.factors[0]
+    pixels = factor.pixels.copy()
+    pixels[7] += 300.0
+    spoiled = Problem(problem.variables, [dataclasses.replace(factor, pixels=pixels, loss=Cauchy(1.0))])
+    robust = solve(spoiled)
+    plain = solve(Problem(problem.variables, [dataclasses.replace(factor, pixels=pixels)]))
+
+    def error(solution):
+        """Distance of the cameras from the clean solution, relative poses only."""
+        from groma.geometry import se3
+
+        first = se3.compose(solution["poses"][1:], se3.inverse(solution["poses"][:1]))
+        second = se3.compose(clean["poses"][1:], se3.inverse(clean["poses"][:1]))
+        return np.abs(se3.log(se3.compose(first, se3.inverse(second)))[:, 3:]).max()
+
+    assert error(robust) < 0.1 * error(plain)
+
+
+def test_landmark_steps_keep_or_lower_the_cost():
+    problem = scene_problem(num_points=20, num_lines=40, loss=Cauchy(1.0), disturb=0.03)
+    plain = solve(problem, SolverOptions(max_iterations=6))
+    refined = solve(problem, SolverOptions(max_iterations=6, landmark_steps=3))
+    assert refined.report.final_cost <= plain.report.final_cost * (1 + 1e-9)
+
+
+def test_motion_only_and_structure_only_find_the_minimum():
+    for fixed in (dict(constant_landmarks=True), dict(constant_poses=True)):
+        problem = scene_problem(num_points=40, num_lines=20, **fixed)
+        solution = solve(problem, SolverOptions(function_tolerance=1e-12))
+        assert solution.report.linear_solver == "blocks"
+        assert solution.report.converged
+        H, g, _ = dense_normal_equations(solution.problem)
+        newton = np.linalg.lstsq(H, -g, rcond=1e-12)[0]
+        assert np.abs(newton).max() < 1e-5
+
+
+def test_nothing_is_changed_in_place():
+    problem = scene_problem(num_lines=5)
+    before = {name: group.state.copy() for name, group in problem.variables.items()}
+    solve(problem)
+    for name, state in before.items():
+        np.testing.assert_array_equal(problem.variables[name].state, state)
+
+
+def test_progress_can_stop():
+    seen = []
+    solution = solve(scene_problem(disturb=0.05), progress=lambda record: seen.append(record) or len(seen) < 2)
+    assert len(seen) == 2
+    assert solution.report.termination is Termination.STOPPED_BY_CALLER
+
+
+# ------------------------------------------------------------------------------------------------------- odd cases
+
+
+def test_empty_problem_and_everything_constant():
+    assert solve(Problem({}, [])).report.termination is Termination.NOTHING_TO_DO
+    problem = scene_problem(constant_poses=True, constant_landmarks=True)
+    assert solve(problem).report.termination is Termination.NOTHING_TO_DO
+
+
+def test_empty_groups_are_ignored():
+    problem = scene_problem(num_points=20)
+    empty = problem.factors[0].take(np.zeros(0, dtype=int))
+    variables = {**problem.variables, "nobody": Variables(Euclidean(3, "point"), np.zeros((0, 3)))}
+    solution = solve(Problem(variables, [*problem.factors, empty]))
+    assert solution.report.converged
+
+
+def test_one_camera_one_point():
+    problem = scene_problem(num_cameras=1, num_points=1, views=1)
+    report = solve(problem).report
+    assert report.final_cost < 1e-6
+    assert any("fewer residuals" in warning for warning in report.warnings)
+
+
+def test_factor_between_eliminated_landmarks_is_refused_or_kept():
+    problem = scene_problem(num_points=20, num_lines=10)
+    link = PointOnLine(point=Ref("points", np.arange(3)), line=Ref("lines", np.arange(3)), sqrt_information=0.1)
+    coupled = Problem(problem.variables, [*problem.factors, link])
+    with pytest.raises(ProblemError, match=r"couples two eliminated landmarks.*eliminate=\('points',\)"):
+        solve(coupled, SolverOptions(eliminate=("points", "lines")))
+    report = solve(coupled).report
+    assert report.converged
+    assert any("stays in the reduced system" in warning for warning in report.warnings)
+
+
+def test_landmark_without_information_stays():
+    """All observations of a point lie beyond a truncated loss: its weight is zero, it must not move or spoil others."""
+    problem = scene_problem(num_points=30, loss=Truncated(20.0))
+    factor = problem.factors[0]
+    pixels = factor.pixels.copy()
+    pixels[factor.point.index == 3] += 5000.0
+    spoiled = Problem(problem.variables, [dataclasses.replace(factor, pixels=pixels)])
+    solution = solve(spoiled)
+    assert np.isfinite(solution["points"]).all()
+    np.testing.assert_array_equal(solution["points"][3], problem.variables["points"].state[3])
+    assert solution.report.num_underdetermined_landmarks == 1
+    assert any("do not determine" in warning for warning in solution.report.warnings)
+
+
+def test_not_finite_start_is_an_outcome():
+    problem = scene_problem(num_points=10)
+    factor = dataclasses.replace(problem.factors[0], sqrt_information=np.inf)
+    report = solve(Problem(problem.variables, [factor])).report
+    assert report.termination is Termination.NOT_FINITE
+
+
+def test_unknown_group_and_bad_index_are_refused():
+    problem = scene_problem(num_points=10)
+    with pytest.raises(ProblemError, match="has the groups"):
+        Problem({"poses": problem.variables["poses"]}, problem.factors)
+    bad = dataclasses.replace(problem.factors[0], point=Ref("points", problem.factors[0].point.index + 5))
+    with pytest.raises(ProblemError, match="which has 10"):
+        Problem(problem.variables, [bad])
+    with pytest.raises(ProblemError, match="takes variables of kind"):
+        Problem({**problem.variables, "points": problem.variables["poses"]}, problem.factors)
+
+
+def test_prior_alone_is_solved():
+    state = np.zeros((4, 2))
+    prior = VectorPrior(variable=Ref("x", np.arange(4)), measured=np.arange(8.0).reshape(4, 2))
+    solution = solve(Problem({"x": Variables(Euclidean(2), state)}, [prior]), SolverOptions(function_tolerance=1e-14))
+    np.testing.assert_allclose(solution["x"], np.arange(8.0).reshape(4, 2), atol=1e-6)
