@@ -97,7 +97,7 @@ def scene_problem(
                 line=Ref("lines", line),
                 intrinsics=Ref("intrinsics", camera if num_sets > 1 else np.zeros_like(camera)),
                 camera_model="PINHOLE",
-                segment=segment,
+                segments=segment,
                 sqrt_information=1.0 / max(noise, 1e-3),
                 loss=loss,
             )

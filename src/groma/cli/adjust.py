@@ -41,16 +41,23 @@ def adjust(
             help="Estimate the calibration too. Default: yes for BAL files, no otherwise.",
         ),
     ] = None,
+    refine_principal_point: Annotated[
+        bool, typer.Option("--refine-principal-point", help="With the intrinsics: principal points too.")
+    ] = False,
+    refine_rigs: Annotated[
+        bool, typer.Option("--refine-rigs", help="Estimate where the cameras sit on their rig.")
+    ] = False,
     points: Annotated[bool, typer.Option("--points/--no-points", help="Use points.")] = True,
     lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Use lines.")] = True,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Use planes.")] = True,
     max_iterations: Annotated[int | None, typer.Option(min=0, metavar="N", help="Stop after N steps.")] = None,
     linear_solver: Annotated[LinearSolver, typer.Option(help="How each step is solved.")] = "auto",
     line_chart: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Parametrisation of lines: cartesian, orthonormal, ...")
+        str | None,
+        typer.Option(metavar="NAME", help="cartesian, orthonormal_left, orthonormal_right, free_left, free_right."),
     ] = None,
     gauge: Annotated[
-        str | None, typer.Option(metavar="NAME", help="What holds the scene in place; see the page How to choose.")
+        str | None, typer.Option(metavar="NAME", help="free, or first_camera to hold the first camera where it is.")
     ] = None,
     page: Annotated[
         Path | None, typer.Option("--report", metavar="FILE", help="Also write an HTML page: before and after.")
@@ -91,6 +98,8 @@ def adjust(
     }
     options = AdjustOptions(
         loss=loss,
+        refine_principal_point=refine_principal_point,
+        refine_rigs=refine_rigs,
         points=points,
         lines=lines,
         planes=planes,
@@ -104,7 +113,7 @@ def adjust(
     numbers = result.report.to_dict()
 
     if output is not None:
-        write_scene(result.scene, output, force)
+        write_scene(result.scene, output, force=force)
     if page is not None:
         from groma.viz.report import write_report
 

@@ -37,6 +37,6 @@ def convert(
     from groma.io import read_scene, write_scene
 
     scene = read_scene(source)
-    write_scene(scene, target, force)
+    write_scene(scene, target, force=force)
     console.say(f"Wrote {target}: {sentence_of(scene)}")
     _output.write_json(json_target, {"input": str(source), "output": str(target), **counts_of(scene)}, force)

@@ -232,7 +232,7 @@ def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> l
                     camera_model=name,
                     line=line,
                     intrinsics=Ref(f"intrinsics/{name}", camera),
-                    segment=table.segment[rows],
+                    segments=table.segment[rows],
                     sqrt_information=1.0 / options.line_sigma_px,
                     loss=options.loss,
                     **poses,

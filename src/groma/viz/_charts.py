@@ -78,6 +78,11 @@ def _shares(values: FloatArray, edges: FloatArray) -> FloatArray:
     return counts / max(len(values), 1)
 
 
+def entry(step: Any) -> Mapping[str, Any]:
+    """Return a step of a history as a mapping, whether it is one or an object."""
+    return step if isinstance(step, Mapping) else vars(step)
+
+
 def convergence(history: Sequence[Any]) -> str:
     """Return the cost after each accepted step, on a logarithmic axis; rejected steps are hollow.
 
@@ -86,7 +91,7 @@ def convergence(history: Sequence[Any]) -> str:
     history : sequence
         Mappings or objects with ``iteration``, ``cost``, ``accepted``.
     """
-    rows = [row if isinstance(row, Mapping) else vars(row) for row in history]
+    rows = [entry(row) for row in history]
     steps = [
         (int(row["iteration"]), float(row["cost"]), bool(row["accepted"]))
         for row in rows

@@ -185,6 +185,12 @@ def _footer() -> str:
 # ---------------------------------------------------------------------------------------------------------- Charts
 
 
+def _with_start(report: Report) -> list[Any]:
+    """Return the history with the cost at the start as step 0."""
+    start = {"iteration": 0, "cost": report.to_dict()["initial_cost"], "accepted": True}
+    return [start, *(step for step in report.history if _charts.entry(step)["iteration"] > 0)]
+
+
 def _chart_cards(before: Drawable | None, after: Drawable, report: Report | None) -> str:
     key = '<span class="key" style="--c:var(--after)">after</span>'
     if before is not None:
@@ -204,7 +210,7 @@ def _chart_cards(before: Drawable | None, after: Drawable, report: Report | None
             (
                 "Convergence",
                 "Cost after each step, logarithmic. Hollow: a step that was refused.",
-                _charts.convergence(report.history),
+                _charts.convergence(_with_start(report)),
             )
         )
     if len(after.residuals):
