@@ -35,7 +35,7 @@ problem = groma.Problem(
             tag=groma.Ref("tags", tag_idx),
             data=measured[:, None],
             sqrt_information=1 / 0.02,
-            loss=Cauchy(1.0),
+            loss=Cauchy(3.0),
         )
     ],
 )

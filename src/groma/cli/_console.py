@@ -37,10 +37,12 @@ class Console:
         if not self.quiet:
             print(f"warning: {text}", file=sys.stderr, flush=True)
 
-    def announce_compilation(self) -> None:
+    def announce_compilation(self) -> bool:
         """Say so when kernels are about to be compiled for the first time, because it takes a while."""
-        if not _cache_is_filled():
+        fresh = not _cache_is_filled()
+        if fresh:
             self.say("First run: compiling for this machine. Later runs start at once.")
+        return fresh
 
     def progress(self) -> "Progress":
         """Return a progress line; silent when not on a terminal."""

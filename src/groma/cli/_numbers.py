@@ -7,7 +7,7 @@ from typing import Any
 _KINDS = (("images", "num_images"), ("points", "num_points"), ("lines", "num_lines"), ("planes", "num_planes"))
 
 
-def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False) -> list[str]:
+def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, fresh: bool = False) -> list[str]:
     """Return what a reader wants to know after an adjustment, most important first.
 
     Parameters
@@ -18,6 +18,8 @@ def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False) -
         Why the solver stopped.
     verbose : bool
         Add the seconds per stage.
+    fresh : bool
+        Say that the time includes compilation.
     """
     counts = ", ".join(f"{numbers[key]:,} {name}" for name, key in _KINDS if numbers.get(key))
     lines = [f"{counts}, {numbers['num_observations']:,} observations"]
@@ -26,7 +28,8 @@ def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False) -
             lines.append(f"  {kind + ' error':<16}{rmse['before']:>10.3f} px  ->{rmse['after']:>9.3f} px   (rms)")
     lines.append(f"  {'cost':<16}{numbers['initial_cost']:>10.5g}     ->{numbers['final_cost']:>9.5g}")
     seconds = numbers["seconds"]
-    lines.append(f"  {numbers['iterations']} steps in {seconds['total']:.2f} s. {sentence}")
+    compiled = " (with compilation)" if fresh else ""
+    lines.append(f"  {numbers['iterations']} steps in {seconds['total']:.2f} s{compiled}. {sentence}")
     if verbose:
         stages = ", ".join(f"{name} {value:.3f} s" for name, value in seconds.items() if name != "total")
         lines.append(f"  stages: {stages}")

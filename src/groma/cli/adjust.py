@@ -107,7 +107,7 @@ def adjust(
         **{name: value for name, value in chosen.items() if value is not None},  # type: ignore[arg-type]
     )
     before = read_scene(source)
-    console.announce_compilation()
+    fresh = console.announce_compilation()
     with console.progress() as progress:
         result = run_adjust(before, options, progress)
     numbers = result.report.to_dict()
@@ -119,7 +119,7 @@ def adjust(
 
         with _output.atomic_output(page, force) as draft:
             write_report(draft, before, result.scene, result.report)
-    for line in describe(numbers, result.report.termination.sentence, verbose=console.verbose):
+    for line in describe(numbers, result.report.termination.sentence, verbose=console.verbose, fresh=fresh):
         console.say(line)
     for sentence in result.report.warnings:
         console.warn(sentence)

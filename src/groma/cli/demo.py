@@ -40,7 +40,7 @@ def demo(
     from groma.viz.report import write_report
 
     console.say("Bundle adjustment of a real scene: Dubrovnik, from the data set Bundle Adjustment in the Large.")
-    console.announce_compilation()
+    fresh = console.announce_compilation()
     with as_file(files("groma") / "data" / "problem-16-22106-pre.txt.bz2") as path:
         before = read_scene(path)
     with console.progress() as progress:
@@ -51,7 +51,7 @@ def demo(
         write_report(draft / "report.html", before, result.scene, result.report, title="Dubrovnik, 16 photographs")
         write_scene(result.scene, draft / "adjusted.npz")
         _output.write_json(str(draft / "report.json"), numbers)
-    for line in describe(numbers, result.report.termination.sentence, verbose=console.verbose):
+    for line in describe(numbers, result.report.termination.sentence, verbose=console.verbose, fresh=fresh):
         console.say(line)
     for sentence in result.report.warnings:
         console.warn(sentence)

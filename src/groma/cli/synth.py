@@ -20,7 +20,10 @@ def synth(
         typer.Option(help="holistic: cameras on a sphere look into a cube of points, lines, planes. corridor: a walk."),
     ] = "holistic",
     cameras: Annotated[int, typer.Option("--cameras", "-n", min=2, metavar="N", help="Number of cameras.")] = 50,
-    noise: Annotated[float, typer.Option(min=0.0, metavar="PX", help="Noise of the measurements, pixels.")] = 1.0,
+    noise: Annotated[
+        float | None,
+        typer.Option(min=0.0, metavar="PX", help="Noise of the measurements, pixels. Default: that of the benchmark."),
+    ] = None,
     seed: _options.Seed = 0,
     force: _options.Force = False,
     threads: _options.Threads = None,
@@ -45,10 +48,12 @@ def synth(
     from groma.scene import synthetic
 
     make = synthetic.holistic if kind == "holistic" else synthetic.corridor
-    made = make(cameras, noise_px=noise, seed=seed)
+    made = make(cameras, seed=seed) if noise is None else make(cameras, seed=seed, noise_px=noise)
     with _output.atomic_output(output, force) as draft:
         draft.mkdir()
         write_scene(made.truth, draft / "truth.npz")
         write_scene(made.start, draft / "start.npz")
     console.say(f"Wrote {output}/truth.npz and start.npz: {sentence_of(made.truth)}")
-    _output.write_json(json_target, {"kind": kind, "seed": seed, "noise_px": noise, **counts_of(made.truth)}, force)
+    _output.write_json(
+        json_target, {"kind": kind, "seed": seed, "noise_px": made.noise_px, **counts_of(made.truth)}, force
+    )

@@ -137,9 +137,8 @@ class Chart(Manifold):
         # Scaled first, so that no square underflows or overflows.
         names = "(m, d)" if self.kind == "line" else "(n, w)"
         remedy = f"Drop it, or build the {self.kind} again from other data."
-        reject(
-            ~np.isfinite(ambient).all(axis=1), ambient, f"A {self.kind} {names} must consist of finite numbers", remedy
-        )
+        infinite = np.asarray(~np.isfinite(ambient).all(axis=1))
+        reject(infinite, ambient, f"A {self.kind} {names} must consist of finite numbers", remedy)
         largest = np.abs(ambient).max(axis=1, keepdims=True, initial=0.0)
         reject(largest[:, 0] == 0.0, ambient, f"A {self.kind} {names} must not be all zeros", remedy)
         return ambient / largest

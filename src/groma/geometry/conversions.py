@@ -75,6 +75,9 @@ def conversion_jacobian(state: FloatArray, source: Manifold, target: Manifold) -
 
     Notes
     -----
+    The increments in ``target`` start from ``convert(state, source, target)``, whose axes are those of the target's own
+    rule. A closest point has no orientation: on the way back the plane may have the other sign, and other axes.
+
     J has full rank where both charts are regular. Where ``target`` is singular, its rows are those of least norm;
     where ``source`` is singular, J has the rank of the source.
     """

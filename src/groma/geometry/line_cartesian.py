@@ -142,7 +142,7 @@ class CartesianLine(Chart):
         )
         d = unit(scaled[:, 3:])
         foot = np.cross(d, scaled[:, :3] / length)
-        return np.hstack([np.cross(foot, d), d])
+        return np.hstack([np.asarray(np.cross(foot, d), dtype=np.float64), d])
 
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (m, d) with respect to the increment, (N, 6, 4)."""

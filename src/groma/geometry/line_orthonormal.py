@@ -39,7 +39,7 @@ from typing import ClassVar
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.geometry import quaternion
 from groma.geometry._chart import Chart, perpendicular, random_lines, turn_kernel, unit
 from groma.geometry.quaternion import to_matrix_kernel
@@ -124,7 +124,7 @@ _TURNS = np.eye(4)
 _PHI = np.array([[-1.0, 0.0], [-1.0, np.pi], [1.0, np.pi], [1.0, 0.0]])
 
 
-def _turned(state: FloatArray, which: FloatArray) -> FloatArray:
+def _turned(state: FloatArray, which: IntArray) -> FloatArray:
     """Apply the symmetry ``which`` (N,) to each state: another state of the same oriented line."""
     q = quaternion.multiply(state[:, :4], _TURNS[which])
     return np.column_stack([q, _PHI[which, 0] * state[:, 4] + _PHI[which, 1]])

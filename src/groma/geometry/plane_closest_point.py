@@ -6,10 +6,10 @@ State (3,): :math:`c = -w\,n / \lVert n\rVert^2` in scene units. The factors rea
 
 .. math:: c \leftarrow c + \delta, \qquad B = \begin{bmatrix} I \\ -2 c^\top \end{bmatrix} .
 
-The chart cannot hold planes through the origin: there c = 0 whatever the normal is, and (n, w) = 0 is no plane. Near the
-origin it is badly scaled, since a step of the length of c turns the normal by a right angle. Use it where all planes
-stay away from the origin, in the units of the scene; otherwise take ``"normal_offset"``. The chart has no orientation:
-normals always point from the origin to the plane.
+The chart cannot hold planes through the origin: there c = 0 whatever the normal is, and (n, w) = 0 is no plane. Near
+the origin it is badly scaled, since a step of the length of c turns the normal by a right angle. Use it where all
+planes stay away from the origin, in the units of the scene; otherwise take ``"normal_offset"``. The chart has no
+orientation: normals always point from the origin to the plane.
 """
 
 from __future__ import annotations

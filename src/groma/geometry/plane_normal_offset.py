@@ -16,39 +16,23 @@ turns about its foot point of the origin: far from it, a small angle is a large 
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar
 
 import numpy as np
 
-from groma._numba import kernel, loop
+from groma._numba import loop
 from groma._typing import FloatArray
 from groma.geometry._chart import Chart, perpendicular, perpendicular_kernel, random_planes, reject
+from groma.geometry.unit3 import retract_kernel
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
-@kernel
-def _retract(plane, delta, b, out):
-    perpendicular_kernel(plane[0], plane[1], plane[2], b)
-    angle2 = delta[0] * delta[0] + delta[1] * delta[1]
-    if angle2 < 1e-8:
-        c, s = 1.0 - 0.5 * angle2, 1.0 - angle2 / 6.0
-    else:
-        angle = math.sqrt(angle2)
-        c, s = math.cos(angle), math.sin(angle) / angle
-    for j in range(3):
-        out[j] = c * plane[j] + s * (delta[0] * b[0, j] + delta[1] * b[1, j])
-    k = 1.0 / math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
-    for j in range(3):
-        out[j] *= k
-    out[3] = plane[3] + delta[2]
-
-
 @loop
 def _retract_all(state, delta, out):
     b = np.empty((2, 3))
     for i in range(state.shape[0]):
-        _retract(state[i], delta[i], b, out[i])
+        retract_kernel(state[i, :3], delta[i, 0], delta[i, 1], b, out[i, :3])
+        out[i, 3] = state[i, 3] + delta[i, 2]
 
 
 @loop

@@ -10,8 +10,8 @@ State (4,): :math:`\pi = (n, w)` with :math:`\lVert\pi\rVert = 1`, read as the q
 
 (upper sign left). B has orthogonal columns of length 1/2 for every plane: the charts are regular everywhere, also for
 planes through the origin and for the plane at infinity. What the three numbers *mean* changes with the plane:
-they mix angle and offset. A plane at the distance r has :math:`\lVert n\rVert = 1/\sqrt{1 + r^2}`, so far planes pile up
-at :math:`\pm(0, 0, 0, 1)` and a given increment turns their normals more; the unit of length matters.
+they mix angle and offset. A plane at the distance r has :math:`\lVert n\rVert = 1/\sqrt{1 + r^2}`, so far planes pile
+up at :math:`\pm(0, 0, 0, 1)` and a given increment turns their normals more; the unit of length matters.
 
 :math:`\pi` and :math:`-\pi` are the same plane; :meth:`local` takes the shorter way.
 

@@ -4,7 +4,14 @@ r"""Unit quaternions, Hamilton product, stored as [x, y, z, w]. Batched over lea
 .. math:: \exp(\omega) = \begin{bmatrix} \sin(\theta/2)\,\hat\omega \\ \cos(\theta/2) \end{bmatrix}, \qquad
           \log(q) = 2\,\mathrm{atan2}(\lVert q_v \rVert, q_w)\,\frac{q_v}{\lVert q_v \rVert}\quad (q_w \ge 0).
 
-Point-line-plane notes, section I; the exponential there lacks the normalisation of the axis.
+Both are accurate for all angles: the logarithm never sees an arc cosine, and at small angles it takes the series
+:math:`2\,q_v/q_w\,(1 - \lVert q_v\rVert^2/(3 q_w^2))`.
+
+References
+----------
+Point-line-plane notes, section on unit quaternions. Deviations: there the exponential multiplies the unit axis by
+:math:`\tfrac12\mathrm{sinc}(\theta/2)`, which must multiply the rotation vector itself, and the logarithm holds for
+:math:`q_w \ge 0` only; here q and -q give the same.
 """
 
 from __future__ import annotations
@@ -15,7 +22,7 @@ import numpy as np
 
 from groma._numba import kernel
 from groma._typing import FloatArray
-from groma.errors import ShapeError
+from groma.errors import InputError, ShapeError
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 
@@ -61,12 +68,12 @@ def exp_kernel(w, q):
 
 @kernel
 def log_kernel(q, w):
-    """Rotation vector, of length at most pi, of the unit quaternion q (4,); q and -q give the same."""
+    """Rotation vector, of length at most pi, of the unit quaternion q (4,); q and -q give the same; zeros for zeros."""
     sign = 1.0 if q[3] >= 0.0 else -1.0
     x, y, z, c = sign * q[0], sign * q[1], sign * q[2], sign * q[3]
     s2 = x * x + y * y + z * z
     if s2 < 1e-12:
-        scale = 2.0 / c * (1.0 - s2 / (3.0 * c * c))
+        scale = 0.0 if c == 0.0 else 2.0 / c * (1.0 - s2 / (3.0 * c * c))
     else:
         s = math.sqrt(s2)
         scale = 2.0 * math.atan2(s, c) / s
@@ -85,6 +92,13 @@ def _quaternions(q: FloatArray) -> FloatArray:
     return q
 
 
+def _vectors(vector: FloatArray) -> FloatArray:
+    vector = np.asarray(vector, dtype=np.float64)
+    if vector.ndim == 0 or vector.shape[-1] != 3:
+        raise ShapeError(f"A vector must have shape (..., 3); got {vector.shape}.")
+    return vector
+
+
 def multiply(first: FloatArray, second: FloatArray) -> FloatArray:
     """Hamilton product (..., 4): R(first second) = R(first) R(second)."""
     a, b = _quaternions(first), _quaternions(second)
@@ -94,19 +108,31 @@ def multiply(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def conjugate(q: FloatArray) -> FloatArray:
-    """Conjugate; the inverse of a unit quaternion."""
+    """Conjugate (..., 4); the inverse of a unit quaternion."""
     return _quaternions(q) * np.array([-1.0, -1.0, -1.0, 1.0])
 
 
 def normalize(q: FloatArray) -> FloatArray:
-    """Scale to unit length."""
+    """Quaternions (..., 4) scaled to unit length.
+
+    Raises
+    ------
+    InputError
+        If one of them is zero.
+    """
     q = _quaternions(q)
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    length = np.linalg.norm(q, axis=-1, keepdims=True)
+    if (length == 0).any():
+        raise InputError(
+            "A quaternion x, y, z, w must not be zero; got [0, 0, 0, 0]. No rotation is [0, 0, 0, 1]; "
+            "drop the pose if it was never estimated."
+        )
+    return q / length
 
 
 def rotate(q: FloatArray, vector: FloatArray) -> FloatArray:
-    """Vectors (..., 3) turned by unit quaternions."""
-    q, v = _quaternions(q), np.asarray(vector, dtype=np.float64)
+    """Vectors (..., 3) turned by unit quaternions (..., 4); both broadcast."""
+    q, v = _quaternions(q), _vectors(vector)
     t = 2.0 * np.cross(q[..., :3], v)
     return v + q[..., 3:] * t + np.cross(q[..., :3], t)
 
@@ -123,7 +149,22 @@ def to_matrix(q: FloatArray) -> FloatArray:
 
 
 def from_matrix(rotation: FloatArray) -> FloatArray:
-    """Unit quaternion (..., 4) with w >= 0 of rotation matrices, through the largest of its four components."""
+    """Unit quaternion of a rotation matrix, through the largest of its four components.
+
+    Parameters
+    ----------
+    rotation : (..., 3, 3) float64
+        Rotation matrices; they are not checked for orthonormality.
+
+    Returns
+    -------
+    (..., 4) float64
+        Quaternions [x, y, z, w] with w >= 0.
+
+    References
+    ----------
+    Shepperd, *Quaternion from Rotation Matrix*, Journal of Guidance and Control, 1978.
+    """
     R = np.asarray(rotation, dtype=np.float64)
     if R.shape[-2:] != (3, 3):
         raise ShapeError(f"A rotation must have shape (..., 3, 3); got {R.shape}.")
@@ -147,21 +188,32 @@ def from_matrix(rotation: FloatArray) -> FloatArray:
 
 
 def exp(omega: FloatArray) -> FloatArray:
-    """Unit quaternion (..., 4) of a rotation vector (..., 3) in radians."""
-    omega = np.asarray(omega, dtype=np.float64)
+    """Unit quaternion (..., 4) of a rotation vector (..., 3) in radians; w >= 0 for angles up to pi."""
+    omega = _vectors(omega)
     theta = np.linalg.norm(omega, axis=-1, keepdims=True)
     scale = 0.5 * np.sinc(theta / (2 * np.pi))
     return np.concatenate([scale * omega, np.cos(theta / 2)], axis=-1)
 
 
 def log(q: FloatArray) -> FloatArray:
-    """Rotation vector (..., 3), of length at most pi; q and -q give the same."""
+    """Rotation vector of a quaternion: the shorter of the two ways round.
+
+    Parameters
+    ----------
+    q : (..., 4) float64
+        Quaternions [x, y, z, w], of unit length up to rounding.
+
+    Returns
+    -------
+    (..., 3) float64
+        Rotation vectors, radians, of length at most pi; q and -q give the same, except at pi itself.
+    """
     q = _quaternions(q)
     q = np.where(q[..., 3:] < 0, -q, q)
     s = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
     c = q[..., 3:]
     small = s < 1e-6
-    safe_s, safe_c = np.where(small, 1.0, s), np.where(small, c, 1.0)
+    safe_s, safe_c = np.where(small, 1.0, s), np.where(small & (c > 0), c, 1.0)
     scale = np.where(small, 2 / safe_c * (1 - (s / safe_c) ** 2 / 3), 2 * np.arctan2(s, c) / safe_s)
     return scale * q[..., :3]
 
@@ -174,3 +226,17 @@ def from_wxyz(q: FloatArray) -> FloatArray:
 def to_wxyz(q: FloatArray) -> FloatArray:
     """Change the order to [w, x, y, z]."""
     return np.roll(_quaternions(q), 1, axis=-1)
+
+
+__all__ = [
+    "conjugate",
+    "exp",
+    "from_matrix",
+    "from_wxyz",
+    "log",
+    "multiply",
+    "normalize",
+    "rotate",
+    "to_matrix",
+    "to_wxyz",
+]

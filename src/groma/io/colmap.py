@@ -279,10 +279,13 @@ def write_colmap(
     Raises
     ------
     InputError
-        If a camera model is unknown to COLMAP (the BAL model is written as RADIAL, its centre at half the image size).
+        If an image name has white space in a text model, or a camera model is unknown to COLMAP (the BAL model is written as RADIAL, its centre at half the image size).
     """
     if form not in ("binary", "text"):
         raise InputError(f"form must be 'binary' or 'text'; got {form!r}.")
+    spaced = [name for name in scene.images.names if name.split() != [name]]
+    if form == "text" and spaced:
+        raise InputError(f"A COLMAP text model cannot hold the image name {spaced[0]!r}: it is cut at white space. Use binary.")
     reconstruction = to_pycolmap(scene)
     with atomic_output(path, force) as draft:
         draft.mkdir()

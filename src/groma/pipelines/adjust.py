@@ -10,18 +10,22 @@ from typing import Any
 import numpy as np
 
 from groma.errors import InputError
+from groma.factors._factor import Factor
 from groma.factors.losses import Loss, Trivial
 from groma.factors.losses import loss as make_loss
 from groma.pipelines._assemble import LINE_FACTORS, POINT_FACTORS, AssemblyOptions, assemble, disassemble
 from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.solver.options import SolverOptions
-from groma.solver.report import SolveReport
+from groma.solver.report import Iteration, SolveReport
 from groma.solver.solve import solve
 from groma.solver.termination import Termination
 
-#: Scale of the default loss, pixels: near the noise of good feature detectors.
-DEFAULT_LOSS_SCALE = 0.5
+#: The default for what comes from matching: first a loss that pulls from afar, then one that ignores what stayed far.
+#: Losses by name and scale in pixels; see the page *How to choose* for the measurements behind them.
+ROBUST_STAGES = (("cauchy", 1.0), ("geman_mcclure", 2.0))
+#: Relative decrease of the cost at which a stage that is not the last ends.
+STAGE_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -29,9 +33,9 @@ class AdjustOptions:
     """Options of :func:`adjust`. The defaults suit scenes that come from matching images."""
 
     #: ``none``, ``huber``, ``soft_l1``, ``cauchy``, ``tukey``, ``geman_mcclure``, ``barron``, ``truncated``, or ``auto``:
-    #: none for BAL problems, else Cauchy, because matches contain outliers.
+    #: none for BAL problems, else Cauchy and then Geman-McClure, because matches contain outliers.
     loss: str = "auto"
-    #: Where the loss begins to bend, pixels; None takes 0.5.
+    #: Where the loss begins to bend, pixels; None takes 1, and 2 in the second stage of ``auto``.
     loss_scale: float | None = None
     #: Estimate focal lengths and distortion; None: for BAL problems only.
     refine_intrinsics: bool | None = None
@@ -53,7 +57,7 @@ class AdjustOptions:
     line_chart: str = "cartesian"
     #: ``free`` or ``first_camera``.
     gauge: str = "free"
-    #: Steps of each landmark on its own after every joint step; None: 2 where lines meet a robust loss, else 0.
+    #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss, else 0.
     landmark_steps: int | None = None
     threads: int | None = None
 
@@ -155,33 +159,39 @@ def adjust(
         If the scene has nothing to adjust, or an option is not known.
     """
     options = options or AdjustOptions()
-    assembly = assemble(scene, _assembly_options(scene, options))
+    stages = _stages(scene, options)
+    assembly = assemble(scene, _assembly_options(scene, options, stages[-1]))
     if not assembly.problem.factors:
         raise InputError(
             f"There is nothing to adjust: the scene has {scene.num_images} images, "
             f"{scene.num_point_observations} point and {scene.num_line_observations} line observations, and the "
             "options leave none of them. Check the input and --no-points / --no-lines."
         )
-    steps = options.landmark_steps
-    if steps is None:
-        robust = any(not isinstance(factor.loss, Trivial) for factor in assembly.problem.factors)
-        steps = 2 if robust and "lines" in assembly.problem.variables else 0
-    solver_options = SolverOptions(
-        max_iterations=options.max_iterations,
-        function_tolerance=options.function_tolerance,
-        linear_solver=options.linear_solver,
-        landmark_steps=steps,
-        threads=options.threads,
-    )
-    report_progress = None
-    if progress is not None:
+    problem, reports = assembly.problem, []
+    for number, loss in enumerate(stages):
+        last = number + 1 == len(stages)
+        spent = sum(report.iterations for report in reports)
+        solver_options = SolverOptions(
+            max_iterations=options.max_iterations - spent,
+            function_tolerance=options.function_tolerance if last else STAGE_TOLERANCE,
+            linear_solver=options.linear_solver,
+            landmark_steps=_landmark_steps(options, loss),
+            threads=options.threads,
+        )
 
-        def report_progress(record) -> bool | None:
-            return progress(Progress(record.iteration, options.max_iterations, record.cost))
+        def tell(record, spent=spent) -> bool | None:
+            event = Progress(spent + record.iteration, options.max_iterations, record.cost)
+            return None if progress is None else progress(event)
 
-    solution = solve(assembly.problem, solver_options, report_progress)
-    before, after = _rmse_px(assembly.problem), _rmse_px(solution.problem)
-    report = AdjustReport(
+        staged = Problem(problem.variables, [_with_loss(factor, loss) for factor in problem.factors])
+        solution = solve(staged, solver_options, tell)
+        problem = solution.problem
+        reports.append(solution.report)
+        if solution.report.termination is Termination.STOPPED_BY_CALLER:
+            break
+    report = _combined(reports, assembly.problem, stages)
+    before, after = _rmse_px(assembly.problem), _rmse_px(problem)
+    outcome = AdjustReport(
         num_images=scene.num_images,
         num_points=scene.num_points if "points" in assembly.problem.variables else 0,
         num_lines=scene.num_lines if "lines" in assembly.problem.variables else 0,
@@ -190,18 +200,65 @@ def adjust(
             len(factor) for factor in assembly.problem.factors if factor.type_name in POINT_FACTORS + LINE_FACTORS
         ),
         rmse_px={kind: {"before": before[kind], "after": after[kind]} for kind in before},
-        solve=solution.report,
-        warnings=(*assembly.notes, *solution.report.warnings),
+        solve=report,
+        warnings=(*assembly.notes, *report.warnings),
     )
-    return AdjustResult(disassemble(scene, solution.problem), report)
+    return AdjustResult(disassemble(scene, problem), outcome)
 
 
-def _assembly_options(scene: Scene, options: AdjustOptions) -> AssemblyOptions:
-    is_bal = scene.num_cameras > 0 and all(name == "BAL" for name in scene.cameras.models)
-    name = options.loss
-    if name == "auto":
-        name = "none" if is_bal else "cauchy"
-    loss: Loss = Trivial() if name == "none" else make_loss(name, options.loss_scale or DEFAULT_LOSS_SCALE)
+def _is_bal(scene: Scene) -> bool:
+    return scene.num_cameras > 0 and all(name == "BAL" for name in scene.cameras.models)
+
+
+def _stages(scene: Scene, options: AdjustOptions) -> list[Loss]:
+    """Return the losses to solve with, one after the other."""
+    if options.loss == "none" or (options.loss == "auto" and _is_bal(scene)):
+        return [Trivial()]
+    if options.loss == "auto":
+        scale = 1.0 if options.loss_scale is None else options.loss_scale
+        return [make_loss(name, scale * factor) for name, factor in ROBUST_STAGES]
+    return [make_loss(options.loss, 1.0 if options.loss_scale is None else options.loss_scale)]
+
+
+def _landmark_steps(options: AdjustOptions, loss: Loss) -> int:
+    if options.landmark_steps is not None:
+        return options.landmark_steps
+    return 0 if isinstance(loss, Trivial) else 2
+
+
+def _with_loss(factor: Factor, loss: Loss) -> Factor:
+    return replace(factor, loss=loss)
+
+
+def _combined(reports: list[SolveReport], start: Problem, stages: list[Loss]) -> SolveReport:
+    """Return one report of all stages: costs under the last loss, times and steps summed."""
+    last = reports[-1]
+    if len(reports) == 1:
+        return last
+    first = solve(
+        Problem(start.variables, [_with_loss(factor, stages[len(reports) - 1]) for factor in start.factors]),
+        SolverOptions(max_iterations=0),
+    ).report
+    history: list[Iteration] = []
+    for report in reports:
+        steps, seconds = len(history), history[-1].seconds if history else 0.0
+        history += [
+            replace(record, iteration=record.iteration + steps, seconds=record.seconds + seconds)
+            for record in report.history
+        ]
+    seconds = {stage: sum(report.seconds[stage] for report in reports) for stage in last.seconds}
+    return replace(
+        last,
+        initial_cost=first.initial_cost,
+        initial_costs=first.initial_costs,
+        iterations=sum(report.iterations for report in reports),
+        history=history,
+        seconds=seconds,
+    )
+
+
+def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss) -> AssemblyOptions:
+    is_bal = _is_bal(scene)
     refine = is_bal if options.refine_intrinsics is None else options.refine_intrinsics
     return AssemblyOptions(
         points=options.points,

@@ -17,6 +17,8 @@ from groma.solver.schur import ReducedSystem
 from groma.solver.steps import States, Step, diagonal, gradient
 
 MAX_DAMPING = 1e16
+#: A scene that is free to move has a singular system; this much damping keeps its factorisation stable.
+MIN_DAMPING = 1e-10
 
 
 class LevenbergMarquardt:
@@ -56,7 +58,7 @@ class LevenbergMarquardt:
 
     def accept(self, gain_ratio: float) -> None:
         """Lower the damping after an accepted step."""
-        self.damping = max(self.damping * max(1.0 / 3.0, 1.0 - (2.0 * gain_ratio - 1.0) ** 3), 1e-16)
+        self.damping = max(self.damping * max(1.0 / 3.0, 1.0 - (2.0 * gain_ratio - 1.0) ** 3), MIN_DAMPING)
         self._growth = 2.0
 
     def refuse(self) -> bool:

@@ -33,11 +33,15 @@ from groma.solver.linear import ConjugateGradients, choose
 from groma.solver.options import SolverOptions
 from groma.solver.report import Iteration, SolveReport, Stopwatch
 from groma.solver.schur import ReducedSystem
-from groma.solver.steps import States, gradient, largest, retract, size_of
+from groma.solver.steps import States, Step, gradient, largest, retract, size_of
 from groma.solver.termination import Termination
 
 #: From this many factors on, all cores are used unless the caller says otherwise.
 FACTORS_FOR_THREADS = 50_000
+
+#: A gain ratio above this means the cost falls faster than the quadratic model says, and a longer step may do better.
+STRETCH_GAIN_RATIO = 1.5
+MAX_STRETCH = 8.0
 
 #: Called after every step tried; returning False stops the solve.
 Progress = Callable[[Iteration], bool | None]
@@ -145,6 +149,11 @@ def _solve_jointly(
             ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
         accepted = bool(new_cost < cost)
         if accepted:
+            if ratio > STRETCH_GAIN_RATIO:
+                with watch("cost"):
+                    candidate, new_inputs, new_cost = _stretch(
+                        layout, equations, states, step, ratio, (candidate, new_inputs, new_cost)
+                    )
             if refiner is not None:
                 with watch("backsubstitute"):
                     candidate, new_cost = refiner.refine(equations, candidate, new_cost)
@@ -172,6 +181,19 @@ def _solve_jointly(
         report.final_cost = equations.cost(inputs)
     _finish(report, layout, equations, system.num_singular_landmarks)
     return states
+
+
+def _stretch(layout: Layout, equations: NormalEquations, states: States, step: Step, ratio: float, best: tuple):
+    r"""Try a multiple of an accepted step, and return the better (states, inputs, cost).
+
+    Robust losses bend the cost down, so reweighted least squares overestimates the curvature. If the curvature along the
+    step is the fraction c of the model's, the gain ratio is 2 - c and the minimum lies at 1 / c times the step.
+    """
+    factor = min(1.0 / max(2.0 - ratio, 1.0 / MAX_STRETCH), MAX_STRETCH)
+    candidate = retract(layout, states, step.blend(factor, step, 0.0))
+    inputs = equations.prepare(candidate)
+    cost = equations.cost(inputs)
+    return (candidate, inputs, cost) if cost < best[2] else best
 
 
 # ------------------------------------------------------------------------------------------- landmarks on their own

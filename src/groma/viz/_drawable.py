@@ -52,6 +52,8 @@ class Drawable:
     residual_image: IntArray
     residual_kind: IntArray
     residual_kinds: tuple[str, ...]
+    #: Observations: points and segments.
+    num_observations: int
     #: (P,) root mean square residual of each point, pixels; NaN where it is not observed.
     point_errors: FloatArray
 
@@ -82,7 +84,7 @@ def drawable(scene: Scene) -> Drawable:
     points, lines = scene.point_observations, scene.line_observations
     point_residuals = _point_residuals(scene, poses)
     line_residuals, line_places = _line_residuals(scene, poses)
-    kinds = [("points", len(points)), ("lines", 2 * len(lines))]
+    kinds = [("points", len(points)), ("line ends", 2 * len(lines))]
     color = scene.points.color
     camera_idx = scene.images.camera_idx
     return Drawable(
@@ -98,6 +100,7 @@ def drawable(scene: Scene) -> Drawable:
         residual_image=np.concatenate([points.image_idx, np.repeat(lines.image_idx, 2)]),
         residual_kind=np.repeat([0, 1], [count for _, count in kinds]),
         residual_kinds=tuple(name for name, _ in kinds),
+        num_observations=scene.num_observations,
         point_errors=_rms_by_group(
             np.linalg.norm(point_residuals, axis=1), points.point_idx, len(scene.points), empty=np.nan
         ),

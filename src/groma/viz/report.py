@@ -123,7 +123,7 @@ def _counts(scene: Drawable) -> list[tuple[str, int]]:
         ("points", len(scene.points)),
         ("lines", len(scene.segments)),
         ("planes", len(scene.quads)),
-        ("observations", len(scene.residuals)),
+        ("observations", scene.num_observations),
     ]
 
 

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Small vector helpers shared by the line and plane algebra: checks at the door, products over the last axis."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import BoolArray, FloatArray
+from groma.errors import InputError, ShapeError
+
+
+def vectors(value: npt.ArrayLike, size: int, name: str) -> FloatArray:
+    """``value`` as float64, refused with a ShapeError unless its last axis has ``size`` entries."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != size:
+        hint = f" Did you mean {name}.T?" if array.ndim == 2 and array.shape[0] == size else ""
+        raise ShapeError(f"{name} must have shape (..., {size}); got {array.shape}. Pass one row per item.{hint}")
+    return array
+
+
+def matrices(value: npt.ArrayLike, rows: int, columns: int, name: str) -> FloatArray:
+    """``value`` as float64, refused with a ShapeError unless it ends in ``rows`` x ``columns``."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape[-2:] != (rows, columns):
+        raise ShapeError(
+            f"{name} must have shape (..., {rows}, {columns}); got {array.shape}. Pass one matrix per item."
+        )
+    return array
+
+
+def positive(value: float, name: str) -> float:
+    """``value``, refused with an InputError unless it is zero or greater."""
+    if not value >= 0.0:
+        raise InputError(f"{name} must be zero or greater; got {value}. Pass a tolerance such as 1e-9.")
+    return float(value)
+
+
+def dot(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Dot product over the last axis, the leading axes broadcast."""
+    return np.asarray(np.einsum("...i,...i->...", first, second))
+
+
+def norm(vector: FloatArray) -> FloatArray:
+    """Euclidean length over the last axis."""
+    return np.asarray(np.sqrt(dot(vector, vector)))
+
+
+def apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    """Matrix times vector, the leading axes broadcast."""
+    return np.asarray(np.einsum("...ij,...j->...i", matrix, vector))
+
+
+def ratio(numerator: FloatArray, denominator: FloatArray, valid: BoolArray, otherwise: float = np.nan) -> FloatArray:
+    """``numerator / denominator`` where ``valid``, else ``otherwise``; never a warning."""
+    shape = np.broadcast_shapes(np.shape(numerator), np.shape(denominator), np.shape(valid))
+    out = np.full(shape, otherwise)
+    np.divide(numerator, denominator, out=out, where=np.broadcast_to(valid, shape))
+    return out
+
+
+def unit(vector: FloatArray) -> FloatArray:
+    """Vector divided by its length, without overflow or underflow; zero where it is zero or not finite."""
+    largest = np.abs(vector).max(axis=-1, keepdims=True, initial=0.0)
+    scaled = ratio(vector, largest, (largest > 0.0) & np.isfinite(largest), 0.0)
+    return scaled / np.maximum(norm(scaled), 1.0)[..., None]
+
+
+def stack(*parts: FloatArray) -> FloatArray:
+    """Concatenate over the last axis, the leading axes broadcast."""
+    leading = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    return np.concatenate([np.broadcast_to(part, (*leading, part.shape[-1])) for part in parts], axis=-1)
+
+
+def perpendicular(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors b1, b2 such that (b1, b2, d/|d|) is a right-handed orthonormal frame.
+
+    b1 lies across the smallest component of d, so no direction is nearly singular.
+    """
+    axis = np.zeros(direction.shape)
+    np.put_along_axis(axis, np.argmin(np.abs(direction), axis=-1)[..., None], 1.0, axis=-1)
+    first = unit(np.cross(direction, axis))
+    return first, np.cross(unit(direction), first)
+
+
+def cofactor(matrix: FloatArray) -> FloatArray:
+    r"""Cofactor matrix of a 3x3 matrix, :math:`\det(N) N^{-\top}` also where N is singular.
+
+    Its rows are the cross products of the other two rows: ``cofactor(N) @ (a x b) = (N a) x (N b)``.
+    """
+    first, second, third = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
+    return np.stack([np.cross(second, third), np.cross(third, first), np.cross(first, second)], axis=-2)
