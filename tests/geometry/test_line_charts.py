@@ -203,6 +203,8 @@ def test_distance_passes_through_zero(chart):
     same_oriented_line(chart.ambient(fixed), chart.ambient(moved))
     np.testing.assert_allclose(chart.local(moved, fixed), 0.0, atol=1e-14)
     np.testing.assert_allclose(chart.local(state, fixed), [[0, 0, 0, -0.5]], atol=1e-14)
+    delta = np.array([[0.2, -0.1, 0.3, -0.4]])  # across zero with a turn, then stored in the other form
+    np.testing.assert_allclose(chart.local(state, chart.canonical(chart.retract(state, delta))), delta, atol=1e-14)
     assert isinstance(chart, FreeLineRight)
     np.testing.assert_array_equal(chart.canonical(state), state)
 
@@ -310,11 +312,23 @@ def test_moment_not_orthogonal_to_direction(chart):
     spoilt = ambient.copy()
     spoilt[0, :3] += 0.1 * ambient[0, 3:]
     same_oriented_line(chart.ambient(chart.from_ambient(spoilt)), ambient)
+    # However little moment is left, the direction is kept.
+    d = ambient[0, 3:]
+    for size in (1e-9, 1e-13, 1e-15):
+        a = chart.ambient(chart.from_ambient(np.hstack([d + size * np.array([2.0, 1, 0]), d])[None]))[0]
+        np.testing.assert_allclose(np.cross(a[3:] / np.linalg.norm(a[3:]), d), 0.0, atol=1e-15)
     # A moment along d is no moment at all, up to rounding.
     d = np.array([0.3, -0.5, 0.1])
     a = chart.ambient(chart.from_ambient(np.hstack([d, d])[None]))
     np.testing.assert_allclose(a[0, :3], 0.0, atol=1e-15)
     assert abs(a[0, :3] @ a[0, 3:]) < 1e-16
+
+
+@pytest.mark.parametrize("chart", SINGULAR, ids=by_name)
+def test_retract_restores_a_unit_quaternion(chart):
+    state = chart.random(np.random.default_rng(11), 5)
+    spoilt = state * [1 + 1e-6, 1 + 1e-6, 1 + 1e-6, 1 + 1e-6, 1]
+    np.testing.assert_allclose(chart.retract(spoilt, np.zeros((5, 4))), state, rtol=1e-14, atol=1e-16)
 
 
 # ------------------------------------------------------------------------------------------------------------- Errors

@@ -10,8 +10,8 @@ from groma.scene import (
     Frames,
     Images,
     Keypoints,
-    Lines,
     LineObservations,
+    Lines,
     Planes,
     PointObservations,
     Points,
@@ -46,8 +46,13 @@ def rig_scene(seed: int = 0) -> Scene:
         rigs=Rigs([4, 7]),
         sensors=Sensors([0, 0, 1], [0, 0, 0], [2, 5, 9], [0, 1, 2], mounted, [1, 0, 1], [1, 1, 1]),
         frames=Frames([3, 6, 8], [0, 0, 1], poses(3)),
-        images=Images([10, 11, 12, 13, 20], ("a/1.png", "b/1.png", "a/2.png", "b/2.png", "mono_é.png"),
-                      [0, 1, 0, 1, 2], [0, 0, 1, 1, 2], [0, 1, 0, 1, 2]),
+        images=Images(
+            [10, 11, 12, 13, 20],
+            ("a/1.png", "b/1.png", "a/2.png", "b/2.png", "mono_é.png"),
+            [0, 1, 0, 1, 2],
+            [0, 0, 1, 1, 2],
+            [0, 1, 0, 1, 2],
+        ),
         points=Points([1, 4, 1000], rng.normal(0, 3, (3, 3)), rng.integers(0, 256, (3, 3)), [0.25, -1.0, 1.5]),
         point_observations=PointObservations(
             images[is_point], numbers[is_point], rng.uniform(0, 160, (15, 2)), numbers[is_point]

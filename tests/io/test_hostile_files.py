@@ -26,7 +26,19 @@ EXAMPLES = settings(max_examples=500)
 
 NUMBERS = [struct.pack("<d", value) for value in (float("nan"), float("inf"), 1e308, -1.0, 0.0)]
 NUMBERS += [struct.pack("<Q", value) for value in (2**64 - 1, 2**63, 2**40, 2**31, 2**20, 0, 1)]
-WORDS = [b" nan ", b" inf ", b" -1 ", b" 1e400 ", b" 99999999999999999999 ", b" ", b"\n", b"\0", b"#", b"\xff\xfe", b" x "]
+WORDS = [
+    b" nan ",
+    b" inf ",
+    b" -1 ",
+    b" 1e400 ",
+    b" 99999999999999999999 ",
+    b" ",
+    b"\n",
+    b"\0",
+    b"#",
+    b"\xff\xfe",
+    b" x ",
+]
 
 
 @st.composite

@@ -49,8 +49,8 @@ def align_points(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool 
     for name, points in (("source", x), ("target", y)):
         if len(points) < 3 or _rank(points) < 2:
             raise InputError(
-                f"Alignment needs three points that are not on one line; the {len(points)} {name} points do not fix the "
-                "rotation. Use align_poses, which looks at the orientations too."
+                f"Alignment needs three points that are not on one line; the {len(points)} {name} points do not "
+                "fix the rotation. Use align_poses, which looks at the orientations too."
             )
     x0, y0 = x - x.mean(0), y - y.mean(0)
     u, _, vt = np.linalg.svd(y0.T @ x0)
@@ -99,9 +99,9 @@ def camera_centers(cam_from_world: npt.ArrayLike) -> FloatArray:
 def _with_rotation(x: FloatArray, y: FloatArray, rotation: FloatArray, with_scale: bool) -> Similarity:
     """Return the best scale and translation for a given rotation."""
     x0, y0 = x - x.mean(0), y - y.mean(0)
-    scale, spread = 1.0, float((x0**2).sum())
-    if with_scale and spread > 0:
-        fitted = float(np.einsum("ij,ij->", y0, x0 @ rotation.T)) / spread
+    scale = 1.0
+    if with_scale and min(_rank(x), _rank(y)) > 0:
+        fitted = float(np.einsum("ij,ij->", y0, x0 @ rotation.T)) / float((x0**2).sum())
         scale = fitted if fitted > 0 else 1.0
     return Similarity(scale, rotation, y.mean(0) - scale * rotation @ x.mean(0))
 

@@ -83,7 +83,7 @@ def _pose(q: FloatArray, t: FloatArray) -> FloatArray:
     return np.hstack([q / np.linalg.norm(q, axis=1, keepdims=True), t])
 
 
-def _refs(count: int, *names: str) -> dict[str, Ref]:
+def _refs(count: int, *names: str) -> dict[str, Any]:
     return {name: Ref(name, np.arange(count)) for name in names}
 
 

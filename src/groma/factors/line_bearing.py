@@ -116,7 +116,8 @@ class LineBearing(CameraFactor):
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
         bearings = (self.start_bearings, self.end_bearings)
-        return _linearize_all(*inputs, self.line.index, *bearings, begin, end, *columns, record)
+        arguments: tuple[Any, ...] = (*inputs, self.line.index, *bearings, begin, end, *columns, record)
+        return _linearize_all(*arguments)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

@@ -135,7 +135,8 @@ class LineNormal(CameraFactor):
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        return _linearize_all(*inputs, self.line.index, self.normals, begin, end, *columns, record)
+        arguments: tuple[Any, ...] = (*inputs, self.line.index, self.normals, begin, end, *columns, record)
+        return _linearize_all(*arguments)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

@@ -171,7 +171,8 @@ class LineReprojection(CameraFactor):
         camera = as_camera_model(self.camera_model)
         check_intrinsics(camera, inputs[3])
         arrays = (self.line.index, self.intrinsics.index, self.segments)
-        return _linearize_all(camera.tag, *inputs, *arrays, begin, end, *columns, record)
+        arguments: tuple[Any, ...] = (camera.tag, *inputs, *arrays, begin, end, *columns, record)
+        return _linearize_all(*arguments)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

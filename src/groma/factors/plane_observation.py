@@ -148,7 +148,8 @@ class PlaneObservation(CameraFactor):
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        return _linearize_all(*inputs, self.plane.index, self.planes_in_cam, begin, end, *columns, record)
+        arguments: tuple[Any, ...] = (*inputs, self.plane.index, self.planes_in_cam, begin, end, *columns, record)
+        return _linearize_all(*arguments)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

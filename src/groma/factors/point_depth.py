@@ -82,7 +82,8 @@ class PointDepth(CameraFactor):
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        return _linearize_all(*inputs, self.point.index, self.depths, begin, end, *columns, record)
+        arguments: tuple[Any, ...] = (*inputs, self.point.index, self.depths, begin, end, *columns, record)
+        return _linearize_all(*arguments)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

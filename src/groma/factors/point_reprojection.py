@@ -151,12 +151,14 @@ class PointReprojection(CameraFactor):
         return camera.tag, smallest_depth, *inputs, self.point.index, self.intrinsics.index, self.pixels
 
     def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
-        return _residual_all(*self._arguments(inputs[1:]), begin, end, out)
+        arguments: tuple[Any, ...] = (*self._arguments(inputs[1:]), begin, end, out)
+        return _residual_all(*arguments)
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        return _linearize_all(*self._arguments(inputs), begin, end, *columns, record)
+        arguments: tuple[Any, ...] = (*self._arguments(inputs), begin, end, *columns, record)
+        return _linearize_all(*arguments)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

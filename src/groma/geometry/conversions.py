@@ -8,9 +8,10 @@ alike *modulo scale*,
 .. math:: B_2\,\delta_2 = s\,B_1\,\delta_1 + \kappa\,a_2 ,
 
 for some number :math:`\kappa`: a change of :math:`(m, d)` or :math:`(n, w)` along itself moves nothing. With the
-projection :math:`P = I - a_2 a_2^\top / \lVert a_2\rVert^2` the number drops out, and
+projection :math:`P = I - a_2 a_2^\top / \lVert a_2\rVert^2` the number drops out, and since
+:math:`(P B_2)^{+} P = (P B_2)^{+}`,
 
-.. math:: J = \frac{\partial \delta_2}{\partial \delta_1} = s\,(P B_2)^{+} P B_1, \qquad
+.. math:: J = \frac{\partial \delta_2}{\partial \delta_1} = s\,(P B_2)^{+} B_1, \qquad
           \Sigma_2 = J\,\Sigma_1\,J^\top .
 
 Both sides lie in the same tangent space, so the pseudo-inverse is exact wherever the second chart is regular, and rows
@@ -54,7 +55,7 @@ def conversion_jacobian(state: FloatArray, source: Manifold, target: Manifold) -
     r"""Derivative of the increments in ``target`` with respect to those in ``source``.
 
     .. math:: J = \frac{\partial\,\delta_{target}}{\partial\,\delta_{source}}
-                = s\,(P B_{target})^{+} P B_{source}
+                = s\,(P B_{target})^{+} B_{source}
 
     Parameters
     ----------
@@ -90,8 +91,9 @@ def conversion_jacobian(state: FloatArray, source: Manifold, target: Manifold) -
     first, second = first / lengths, second / lengths
     scale = np.sum(first * second, axis=1) / np.sum(first * first, axis=1)
     unit = second / np.linalg.norm(second, axis=1, keepdims=True)
-    right = _across(unit, basis_first / lengths[:, :, None]) * scale[:, None, None]
-    left = _across(unit, basis_second / lengths[:, :, None])
+    right = basis_first / lengths[:, :, None] * scale[:, None, None]
+    left = basis_second / lengths[:, :, None]
+    left = left - unit[:, :, None] * (unit[:, None, :] @ left)
     # Columns: of equal length, so that only a true loss of rank is cut off.
     norms = np.linalg.norm(left, axis=1)
     norms = np.where(norms > 1e-14 * norms.max(axis=1, keepdims=True, initial=0.0), norms, np.inf)[:, :, None]
@@ -153,11 +155,6 @@ def _row_lengths(ambient: FloatArray, kind: str) -> FloatArray:
     distance = np.linalg.norm(ambient[:, far], axis=1, keepdims=True) / np.where(direction > 0.0, direction, np.inf)
     lengths[:, far] = np.maximum(distance, 1.0)
     return lengths
-
-
-def _across(unit: FloatArray, basis: FloatArray) -> FloatArray:
-    """The part of the columns of ``basis`` (N, k, dof) that is orthogonal to ``unit`` (N, k)."""
-    return basis - unit[:, :, None] * (unit[:, None, :] @ basis)
 
 
 __all__ = ["conversion_jacobian", "convert", "convert_covariance"]

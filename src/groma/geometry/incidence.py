@@ -41,8 +41,8 @@ class LineRelation(IntEnum):
 def side(first: FloatArray, second: FloatArray) -> FloatArray:
     r"""Side operator :math:`(L|\hat L) = d^\top \hat m + m^\top \hat d` of lines (..., 6).
 
-    Zero exactly for coplanar lines; positive where the second line passes the first like a left-handed screw, so its
-    sign says on which side it passes. Divided by ``|d x d^|`` it is the signed distance.
+    Zero for coplanar lines. Positive where the second line passes the first anticlockwise, seen with the first pointing
+    at the viewer; its size is ``|d x d^|`` times the distance.
 
     References
     ----------
@@ -169,7 +169,8 @@ def closest_points(
         Distance up to which lines count as meeting, or as the same line; scene units.
     parallel_sine : float
         Sine of the angle up to which lines count as parallel. The points of nearly parallel lines lose digits like one
-        over the sine; below 1e-8 the parallel formulas are the more accurate ones.
+        over the sine; below 1e-8 the parallel formulas are the more accurate ones. With a larger value the distance of
+        such pairs is the one near the origin.
 
     Returns
     -------
@@ -196,9 +197,9 @@ def closest_points(
     parallel = sine <= parallel_sine
     oblique = ~parallel[..., None]
     foot = np.cross(d1, m1)
-    c1 = ratio(
-        np.cross(np.cross(d2, k), m1) + dot(m2, k)[..., None] * d1, squared[..., None], oblique, 0.0
-    ) + np.where(oblique, 0.0, foot)
+    c1 = ratio(np.cross(np.cross(d2, k), m1) + dot(m2, k)[..., None] * d1, squared[..., None], oblique, 0.0) + np.where(
+        oblique, 0.0, foot
+    )
     c2 = ratio(np.cross(m2, np.cross(d1, k)) - dot(m1, k)[..., None] * d2, squared[..., None], oblique, 0.0)
     c2 = np.where(oblique, c2, line3.closest_point(second, foot))
     gap = c2 - c1
@@ -235,7 +236,8 @@ class LineJoin:
 
     #: (..., 4) plane in Hesse form; zero where the status is IDENTICAL or INVALID.
     plane: FloatArray
-    #: (...) largest distance of either line from the plane near their closest points, scene units.
+    #: (...) distance of either line from the plane, scene units: half the lines' own where they are SKEW, else 0;
+    #: infinity where there is no plane.
     distance: FloatArray
     #: (...) :class:`LineRelation`; for SKEW lines the plane lies half-way between them, parallel to both.
     status: IntArray
@@ -325,10 +327,12 @@ def meet_lines(
     ----------
     Plücker notes, eq. (46), (47). W is printed as d·d^, which cannot be: it is m·d^.
     """
-    pair = closest_points(first, second, distance_tolerance, min_sine)
+    pair = closest_points(first, second, distance_tolerance)
     first, second = np.broadcast_arrays(vectors(first, 6, "first"), vectors(second, 6, "second"))
     finite = np.isin(pair.status, (LineRelation.CROSSING, LineRelation.SKEW))
-    parallel = pair.status == LineRelation.PARALLEL
+    status = np.where(finite & (pair.sine < positive(min_sine, "min_sine")), LineRelation.PARALLEL, pair.status)
+    finite &= status != LineRelation.PARALLEL
+    parallel = status == LineRelation.PARALLEL
     d1, d2 = unit(first[..., 3:]), unit(second[..., 3:])
     along = unit(d1 + np.where(dot(d1, d2) < 0.0, -1.0, 1.0)[..., None] * d2)
     position = np.where(finite[..., None], pair.midpoint, np.where(parallel[..., None], along, 0.0))
@@ -336,5 +340,5 @@ def meet_lines(
         point=stack(position, finite[..., None].astype(np.float64)),
         distance=pair.distance,
         sine=pair.sine,
-        status=pair.status,
+        status=status,
     )

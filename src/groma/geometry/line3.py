@@ -297,6 +297,16 @@ def is_finite(line: FloatArray) -> BoolArray:
     return np.isfinite(line).all(axis=-1) & (length_d > INFINITY_RATIO * length_m)
 
 
+def _or_infinity(distance: FloatArray) -> FloatArray:
+    return np.where(np.isnan(distance), np.inf, distance)
+
+
+def _points_or_nan(line: FloatArray) -> FloatArray:
+    """Checked lines; those without points become NaN, which later arithmetic passes on without a warning."""
+    line = vectors(line, 6, "line")
+    return np.where(is_finite(line)[..., None], line, np.nan)
+
+
 def distance_to_origin(line: FloatArray) -> FloatArray:
     """Distance ``|m|/|d|`` of lines (..., 6) to the origin; infinity for lines at infinity.
 
@@ -304,8 +314,8 @@ def distance_to_origin(line: FloatArray) -> FloatArray:
     ----------
     Plücker notes, eq. (19).
     """
-    line = vectors(line, 6, "line")
-    return ratio(norm(line[..., :3]), norm(line[..., 3:]), is_finite(line), np.inf)
+    line = _points_or_nan(line)
+    return _or_infinity(norm(line[..., :3]) / norm(line[..., 3:]))
 
 
 def foot_point(line: FloatArray) -> FloatArray:
@@ -315,15 +325,15 @@ def foot_point(line: FloatArray) -> FloatArray:
     ----------
     Plücker notes, eq. (16)-(18); the sign follows m = p x d, not the printed (17).
     """
-    line = vectors(line, 6, "line")
+    line = _points_or_nan(line)
     along = line[..., 3:]
-    return ratio(np.cross(along, line[..., :3]), dot(along, along)[..., None], is_finite(line)[..., None])
+    return np.cross(along, line[..., :3]) / dot(along, along)[..., None]
 
 
 def distance_to_point(line: FloatArray, point: FloatArray) -> FloatArray:
     r"""Distance of points (..., 3) to lines (..., 6), :math:`\|p \times d - m\| / \|d\|`; infinity for lines at infinity."""
-    line, point = vectors(line, 6, "line"), vectors(point, 3, "point")
-    return ratio(norm(np.cross(point, line[..., 3:]) - line[..., :3]), norm(line[..., 3:]), is_finite(line), np.inf)
+    line, point = _points_or_nan(line), vectors(point, 3, "point")
+    return _or_infinity(norm(np.cross(point, line[..., 3:]) - line[..., :3]) / norm(line[..., 3:]))
 
 
 def closest_point(line: FloatArray, point: FloatArray) -> FloatArray:
@@ -331,10 +341,10 @@ def closest_point(line: FloatArray, point: FloatArray) -> FloatArray:
 
     NaN for lines at infinity.
     """
-    line, point = vectors(line, 6, "line"), vectors(point, 3, "point")
+    line, point = _points_or_nan(line), vectors(point, 3, "point")
     along = line[..., 3:]
     step = np.cross(along, line[..., :3] - np.cross(point, along))
-    return point + ratio(step, dot(along, along)[..., None], is_finite(line)[..., None])
+    return point + step / dot(along, along)[..., None]
 
 
 def point_at(line: FloatArray, parameter: FloatArray | float) -> FloatArray:
@@ -356,11 +366,17 @@ def point_at(line: FloatArray, parameter: FloatArray | float) -> FloatArray:
     ----------
     Plücker notes, eq. (16), with a unit direction.
     """
-    line = vectors(line, 6, "line")
-    return foot_point(line) + np.asarray(parameter, dtype=np.float64)[..., None] * unit(line[..., 3:])
+    line = _points_or_nan(line)
+    return (
+        foot_point(line)
+        + np.asarray(parameter, dtype=np.float64)[..., None] * line[..., 3:] / norm(line[..., 3:])[..., None]
+    )
 
 
 def parameter_of(line: FloatArray, point: FloatArray) -> FloatArray:
-    """Signed distance from the foot point to the foot of points (..., 3) on lines (..., 6): inverse of `point_at`."""
-    line, point = vectors(line, 6, "line"), vectors(point, 3, "point")
-    return dot(unit(line[..., 3:]), point)
+    """Signed distance from the foot point to the foot of points (..., 3) on lines (..., 6): inverse of `point_at`.
+
+    NaN for lines at infinity.
+    """
+    line, point = _points_or_nan(line), vectors(point, 3, "point")
+    return dot(line[..., 3:], point) / norm(line[..., 3:])

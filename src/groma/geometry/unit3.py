@@ -20,7 +20,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
-from groma.geometry._chart import perpendicular, perpendicular_kernel, unit
+from groma.geometry._chart import as_rows, perpendicular, perpendicular_kernel, unit
 from groma.geometry._manifold import Manifold
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -81,6 +81,7 @@ def log(direction: FloatArray, other: FloatArray) -> FloatArray:
     u, v = _vectors(direction), _vectors(other)
     cosine = np.sum(u * v, axis=-1, keepdims=True)
     across = v - cosine * u
+    across = across - np.sum(across * u, axis=-1, keepdims=True) * u  # exactly tangent, also for opposite vectors
     sine = np.linalg.norm(across, axis=-1, keepdims=True)
     angle = np.arctan2(sine, cosine)
     opposite = (sine < 1e-15) & (cosine < 0)
@@ -99,30 +100,47 @@ class Unit3(Manifold):
     def __repr__(self) -> str:
         return "Unit3()"
 
-    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:  # noqa: D102
+    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
+        """Move unit vectors (N, 3) by angles (N, 2), radians, along the tangent basis."""
+        state, delta = as_rows(state, 3, "state"), as_rows(delta, 2, "delta")
+        if len(state) != len(delta):
+            raise ShapeError(f"state and delta must have as many rows; got {len(state)} and {len(delta)}.")
         out = np.empty_like(state)
-        _retract_all(state, np.ascontiguousarray(delta), out)
+        _retract_all(state, delta, out)
         return out
 
-    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:  # noqa: D102
+    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
+        """Angles (N, 2) that lead from ``state`` to ``other``."""
         return np.einsum("nkj,nj->nk", tangent_basis(state), log(state, other))
 
-    def ambient(self, state: FloatArray) -> FloatArray:  # noqa: D102
+    def ambient(self, state: FloatArray) -> FloatArray:
+        """The unit vectors themselves, (N, 3)."""
         return state
 
-    def from_ambient(self, ambient: FloatArray) -> FloatArray:  # noqa: D102
-        ambient = _vectors(ambient)
+    def from_ambient(self, ambient: FloatArray) -> FloatArray:
+        """Unit vectors (N, 3) of vectors of any length.
+
+        Raises
+        ------
+        InputError
+            If a vector is zero or not finite.
+        """
+        ambient = as_rows(ambient, 3, "ambient")
         length = np.linalg.norm(ambient, axis=-1)
         if not (length > 0).all() or not np.isfinite(length).all():
             raise InputError("A direction must be a finite vector that is not zero. Drop it, or build it again.")
         return unit(ambient)
 
-    def basis(self, state: FloatArray) -> FloatArray:  # noqa: D102
+    def basis(self, state: FloatArray) -> FloatArray:
+        """The tangent basis as columns, (N, 3, 2)."""
         return np.ascontiguousarray(np.swapaxes(tangent_basis(state), -1, -2))
 
-    def random(self, rng: np.random.Generator, count: int) -> FloatArray:  # noqa: D102
+    def random(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Unit vectors, uniform on the sphere."""
         return unit(rng.normal(size=(count, 3)))
 
 
 #: Charts of directions by name.
 DIRECTION_CHARTS: dict[str, Manifold] = {Unit3.name: Unit3()}
+
+__all__ = ["DIRECTION_CHARTS", "Unit3", "exp", "log", "tangent_basis"]

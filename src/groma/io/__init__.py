@@ -51,8 +51,8 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     if place.suffix in (".bin", ".txt") and place.stem in ("cameras", "images", "points3D", "rigs", "frames"):
         return read_colmap(place.parent)
     raise FileFormatError(
-        f"{place} is not a scene: expected the folder of a COLMAP model, a BAL file (three counts in its first line) or "
-        f"a groma archive (.npz); it begins with {head[:20]!r}."
+        f"{place} is not a scene: expected the folder of a COLMAP model, a BAL file (three counts in its first line) "
+        f"or a groma archive (.npz); it begins with {head[:20]!r}."
     )
 
 
@@ -78,7 +78,15 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], format: Format = "au
     OutputError
         If something is there already or the file system refuses.
     """
-    suffixes = {".npz": "archive", ".txt": "bal", ".bz2": "bal", ".gz": "bal", ".ply": "ply", ".obj": "obj", "": "colmap"}
+    suffixes = {
+        ".npz": "archive",
+        ".txt": "bal",
+        ".bz2": "bal",
+        ".gz": "bal",
+        ".ply": "ply",
+        ".obj": "obj",
+        "": "colmap",
+    }
     suffix = Path(path).suffix.lower()
     chosen = suffixes.get(suffix, "colmap" if Path(path).is_dir() else None) if format == "auto" else format
     if chosen == "archive":

@@ -54,7 +54,10 @@ def atomic_output(path: str | os.PathLike[str], force: bool = False) -> Iterator
 
 
 def _put(draft: Path, target: Path, workshop: Path) -> None:
-    """Rename the draft to its place. A folder cannot replace anything in one step; what was there is put back on failure."""
+    """Rename the draft to its place.
+
+    A folder cannot replace anything in one step: what was there moves away first, and back if the rename fails.
+    """
     previous = None
     if (target.exists() or target.is_symlink()) and (draft.is_dir() or (target.is_dir() and not target.is_symlink())):
         previous = workshop / "previous"

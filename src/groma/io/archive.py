@@ -68,7 +68,9 @@ def read_archive(path: str | os.PathLike[str]) -> Scene:
         tables = {}
         for table in fields(Scene):
             kind: Any = table.default_factory
-            columns = {item.name: _read_column(file, members, f"{table.name}.{item.name}", item) for item in fields(kind)}
+            columns = {
+                item.name: _read_column(file, members, f"{table.name}.{item.name}", item) for item in fields(kind)
+            }
             tables[table.name] = kind(**columns)
         return Scene(**tables)
 
@@ -106,11 +108,13 @@ def _read_array(file: zipfile.ZipFile, info: zipfile.ZipInfo, shape: tuple[int |
             size is not None and size != got for size, got in zip(shape, got_shape, strict=True)
         ):
             raise FileFormatError(f"Array {info.filename} must have shape {shape} (None: any); got {got_shape}.")
-        if dtype.kind not in "iufU" or fortran and len(got_shape) > 1:
+        if dtype.kind not in "iufU" or (fortran and len(got_shape) > 1):
             raise FileFormatError(f"Array {info.filename} must hold numbers or text in C order; got dtype {dtype}.")
         size = math.prod(got_shape) * dtype.itemsize
         if size != info.file_size - header_size:
-            raise FileFormatError(f"Array {info.filename} needs {size} bytes but {info.file_size - header_size} follow.")
+            raise FileFormatError(
+                f"Array {info.filename} needs {size} bytes but {info.file_size - header_size} follow."
+            )
         content = stream.read(size + 1)  # one more, so that the checksum at the end is verified
         if len(content) != size:
             raise FileFormatError(f"Array {info.filename} ends after {len(content)} of {size} bytes.")

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.errors import FileFormatError, InputError, OutputError
 from groma.geometry import quaternion
 from groma.io._atomic import atomic_output
@@ -185,7 +185,7 @@ def _split(text: bytes, path: Path) -> tuple[list[int], bytes]:
     return [int(word) for word in head], text[end:]
 
 
-def _index(values: FloatArray, size: int, noun: str, path: Path) -> FloatArray:
+def _index(values: FloatArray, size: int, noun: str, path: Path) -> IntArray:
     good = (values >= 0) & (values < size) & (values == np.floor(values))
     if not good.all():
         row = int(np.flatnonzero(~good)[0])
@@ -193,11 +193,13 @@ def _index(values: FloatArray, size: int, noun: str, path: Path) -> FloatArray:
     return values.astype(np.int64)
 
 
-def _scene(image_idx: FloatArray, point_idx: FloatArray, pixel: FloatArray, camera: FloatArray, xyz: FloatArray) -> Scene:
+def _scene(image_idx: IntArray, point_idx: IntArray, pixel: FloatArray, camera: FloatArray, xyz: FloatArray) -> Scene:
     count = len(camera)
     angle = np.linalg.norm(camera[:, :3], axis=1) if count else np.zeros(0)
     if count and angle.max() > 1e6:
-        raise FileFormatError(f"Camera {int(angle.argmax())} is turned by {angle.max():.3g} rad; not a rotation vector.")
+        raise FileFormatError(
+            f"Camera {int(angle.argmax())} is turned by {angle.max():.3g} rad; not a rotation vector."
+        )
     turned = quaternion.multiply(_FLIP_QUATERNION, quaternion.exp(camera[:, :3]))
     turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
     cameras = Cameras(

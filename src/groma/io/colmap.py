@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 import zlib  # noqa: F401 - must be loaded before pycolmap, whose wheel (4.2) otherwise breaks it: heap corruption
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -56,7 +57,8 @@ def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "t
             if all((place / f"{name}{suffix}").is_file() for name in _FILES):
                 return place, form  # type: ignore[return-value]
     raise FileFormatError(
-        f"No COLMAP model in {', '.join(map(str, places))}: expected cameras, images and points3D, all .bin or all .txt."
+        f"No COLMAP model in {', '.join(map(str, places))}: expected cameras, images and points3D, "
+        "all .bin or all .txt."
     )
 
 
@@ -105,7 +107,7 @@ def from_pycolmap(reconstruction: pycolmap.Reconstruction) -> Scene:
         (number, image)
         for number, image in reconstruction.images.items()
         if image.frame is not None
-        and image.frame.has_pose
+        and image.frame.has_pose()
         and _mounted(sensors, sensor_row, rig_row[image.frame.rig_id], image.camera_id)
     )
     frames_used = sorted({image.frame_id: image.frame for _, image in posed}.items())
@@ -140,7 +142,8 @@ def _cameras(reconstruction: pycolmap.Reconstruction) -> Cameras:
     for number, camera in found:
         if camera.model_name not in known:
             raise InputError(
-                f"Camera {number} has model {camera.model_name}, which groma does not have (it has {', '.join(known)}). "
+                f"Camera {number} has model {camera.model_name}, which groma does not have (it has "
+                f"{', '.join(known)}). "
                 "Undistort the images, or register the model with groma.cameras.register_camera."
             )
     longest = max((len(camera.params) for _, camera in found), default=0)
@@ -279,13 +282,16 @@ def write_colmap(
     Raises
     ------
     InputError
-        If an image name has white space in a text model, or a camera model is unknown to COLMAP (the BAL model is written as RADIAL, its centre at half the image size).
+        If an image name has white space in a text model, or a camera model is unknown to COLMAP. The BAL model is
+        written as RADIAL, its centre at half the image size.
     """
     if form not in ("binary", "text"):
         raise InputError(f"form must be 'binary' or 'text'; got {form!r}.")
     spaced = [name for name in scene.images.names if name.split() != [name]]
     if form == "text" and spaced:
-        raise InputError(f"A COLMAP text model cannot hold the image name {spaced[0]!r}: it is cut at white space. Use binary.")
+        raise InputError(
+            f"A COLMAP text model cannot hold the image name {spaced[0]!r}: it is cut at white space. Use binary."
+        )
     reconstruction = to_pycolmap(scene)
     with atomic_output(path, force) as draft:
         draft.mkdir()
@@ -347,9 +353,7 @@ def _add_rigs(pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: Sce
         reconstruction.add_rig(rig)
 
 
-def _add_images(
-    pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: Scene, pixels: list[FloatArray]
-) -> None:
+def _add_images(pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: Scene, pixels: list[FloatArray]) -> None:
     images = scene.images
     for frame_idx, number in enumerate(scene.frames.ids.tolist()):
         frame = pycolmap.Frame(frame_id=number, rig_id=int(scene.rigs.ids[scene.frames.rig_idx[frame_idx]]))
@@ -388,7 +392,7 @@ def _numbered(scene: Scene) -> tuple[list[FloatArray], npt.NDArray[np.int64]]:
     ends = np.searchsorted(image_idx[order], np.arange(scene.num_images + 1))
     number = np.empty(len(order), np.int64)
     number[order] = np.arange(len(order)) - ends[image_idx[order]]
-    pixels = [pixel[order[start:end]] for start, end in zip(ends[:-1], ends[1:], strict=True)]
+    pixels = [pixel[order[start:end]] for start, end in pairwise(ends.tolist())]
     return pixels, number[: len(scene.point_observations)]
 
 

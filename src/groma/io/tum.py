@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
+# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """Trajectories in TUM format: ``time tx ty tz qx qy qz qw`` per line, world_from_cam, ``#`` starts a comment."""
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ def read_tum(path: str | os.PathLike[str]) -> Trajectory:
         length = np.linalg.norm(table[:, 4:], axis=1)
         if not ((length > 0.5) & (length < 2)).all():
             row = int(np.flatnonzero(~((length > 0.5) & (length < 2)))[0])
-            raise FileFormatError(f"{place}: pose {row} has the quaternion {table[row, 4:].tolist()}, far from unit length.")
+            raise FileFormatError(
+                f"{place}: pose {row} has the quaternion {table[row, 4:].tolist()}, far from unit length."
+            )
         return Trajectory(table[:, 0], np.hstack([table[:, 4:] / length[:, None], table[:, 1:4]]))
 
 

@@ -7,7 +7,7 @@ Groups of variables: ``frames`` (rig_from_world), ``sensors`` (cam_from_rig, onl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -61,8 +61,10 @@ class AssemblyOptions:
     loss: Loss = Trivial()
     #: Leave out points that start behind their camera.
     drop_behind: bool = True
-    #: ``free``: damping holds the scene; ``first_camera``: the first frame, and the scale by the farthest one, are held.
-    gauge: str = "free"
+    #: ``free``: damping holds the scene; ``first_camera``: the first frame, and the scale by the farthest one, are held;
+    #: ``auto``: ``first_camera`` where relations between landmarks are measured in lengths, which would shrink a scene
+    #: of free scale, else ``free``.
+    gauge: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,9 @@ class Assembly:
 def assemble(scene: Scene, options: AssemblyOptions) -> Assembly:
     """Turn a scene into a problem."""
     notes: list[str] = []
+    if options.gauge == "auto":
+        metric = options.planes and len(scene.relations) > 0
+        options = replace(options, gauge="first_camera" if metric else "free")
     variables = _camera_variables(scene, options)
     factors: list[Factor] = []
     if options.points and scene.num_point_observations:
@@ -139,7 +144,7 @@ def _camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Varia
     if options.refine_poses and options.gauge == "first_camera":
         held = _first_camera_gauge(scene)
     elif options.gauge not in ("free", "first_camera"):
-        raise InputError(f"gauge must be 'free' or 'first_camera'; got {options.gauge!r}.")
+        raise InputError(f"gauge must be 'auto', 'free' or 'first_camera'; got {options.gauge!r}.")
     variables = {"frames": Variables(chart, scene.frames.rig_from_world, held)}
     if not scene.has_trivial_rigs:
         constant = (scene.sensors.is_reference == 1) | (not options.refine_rigs)

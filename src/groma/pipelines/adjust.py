@@ -55,8 +55,8 @@ class AdjustOptions:
     linear_solver: str = "auto"
     #: ``cartesian``, ``orthonormal_right``, ``orthonormal_left``, ``free_right`` or ``free_left``.
     line_chart: str = "cartesian"
-    #: ``free`` or ``first_camera``.
-    gauge: str = "free"
+    #: ``auto``, ``free`` or ``first_camera``: see :class:`groma.pipelines._assemble.AssemblyOptions`.
+    gauge: str = "auto"
     #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss, else 0.
     landmark_steps: int | None = None
     threads: int | None = None

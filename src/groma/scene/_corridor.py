@@ -218,9 +218,7 @@ def _visible(pixel: FloatArray, depth: FloatArray) -> BoolArray:
     return inside & (depth > NEAR) & (depth < FAR)
 
 
-def _thin(
-    rng: np.random.Generator, owner: IntArray, count: int, mean: int, least: int
-) -> tuple[IntArray, BoolArray]:
+def _thin(rng: np.random.Generator, owner: IntArray, count: int, mean: int, least: int) -> tuple[IntArray, BoolArray]:
     """Keep at random about ``mean`` observations of each landmark; drop landmarks left with fewer than ``least``."""
     order = np.lexsort((rng.random(len(owner)), owner))
     first = np.searchsorted(owner[order], np.arange(count))

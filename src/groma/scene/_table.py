@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import numpy.typing as npt
 
+from groma._typing import IntArray
 from groma.errors import InputError, ShapeError
 
 
@@ -99,7 +100,9 @@ def convert(name: str, value: Any, item: Field[Any]) -> Any:
             suspicious = not np.isfinite(array.sum())
         if suspicious and not np.isfinite(array).all():
             first = int(np.argwhere(~np.isfinite(array))[0, 0])
-            raise InputError(f"{name} must be finite; row {first} is {array[first].tolist()}. Remove or repair that row.")
+            raise InputError(
+                f"{name} must be finite; row {first} is {array[first].tolist()}. Remove or repair that row."
+            )
     elif array.dtype != source.dtype and not np.array_equal(array, source):
         raise InputError(f"{name} holds integers that do not fit {array.dtype}. Renumber them.")
     return array
@@ -115,7 +118,7 @@ def _convert_text(name: str, value: Any) -> tuple[str, ...]:
     return names
 
 
-def check_unique(name: str, ids: npt.NDArray[np.int64]) -> None:
+def check_unique(name: str, ids: IntArray) -> None:
     """Raise when an identifier occurs twice."""
     if len(ids) < 2:
         return
@@ -125,13 +128,12 @@ def check_unique(name: str, ids: npt.NDArray[np.int64]) -> None:
         raise InputError(f"{name} must be unique; {ordered[same[0]]} occurs more than once. Renumber them.")
 
 
-def check_index(name: str, index: npt.NDArray[np.int64], size: int, target: str) -> None:
+def check_index(name: str, index: IntArray, size: int, target: str) -> None:
     """Raise when an index points outside ``0 .. size - 1``."""
     if len(index) == 0 or (index.min() >= 0 and index.max() < size):
         return
     row = int(np.flatnonzero((index < 0) | (index >= size))[0])
     there = f"{target}: 0-{size - 1}" if size else f"there are no {target}"
     raise InputError(
-        f"{name}[{row}] is {index[row]}, which is not in the scene ({there}). "
-        f"Drop that row or add what it refers to."
+        f"{name}[{row}] is {index[row]}, which is not in the scene ({there}). Drop that row or add what it refers to."
     )

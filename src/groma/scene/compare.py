@@ -57,7 +57,7 @@ def near(first: Scene, second: Scene, tolerance: float = 1e-9) -> Comparison:
         if reason := _shape_difference(name, one, two):
             return Comparison(False, reason)
         if isinstance(one, tuple) or one.dtype.kind != "f":
-            if isinstance(one, tuple) and one == two or not isinstance(one, tuple) and np.array_equal(one, two):
+            if (isinstance(one, tuple) and one == two) or (not isinstance(one, tuple) and np.array_equal(one, two)):
                 continue
             return Comparison(False, f"{name} differs")
         if one.size == 0:

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
+# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """Landmarks in the world: points, lines, planes, directions."""
 
 from __future__ import annotations
@@ -98,7 +99,9 @@ class Lines(Table):
             raise InputError(f"Segment {int(length.argmin())} has no length. Remove it.")
         direction = direction / length
         # The point nearest to the origin among the two ends loses the least to rounding.
-        near = np.where((np.abs(ends[:, :1]).sum((1, 2)) <= np.abs(ends[:, 1:]).sum((1, 2)))[:, None], *ends.swapaxes(0, 1))
+        near = np.where(
+            (np.abs(ends[:, :1]).sum((1, 2)) <= np.abs(ends[:, 1:]).sum((1, 2)))[:, None], *ends.swapaxes(0, 1)
+        )
         plucker = np.hstack([np.cross(near, direction), direction])
         return cls(np.arange(len(ends)) + 1 if ids is None else np.asarray(ids), plucker, ends)
 

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
+# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
 """What was measured in the images, and which landmarks belong together."""
 
 from __future__ import annotations

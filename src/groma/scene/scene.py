@@ -100,7 +100,12 @@ class Scene:
 
     @classmethod
     def from_images(
-        cls, cameras: Cameras, names: Sequence[str], camera_idx: npt.ArrayLike, cam_from_world: npt.ArrayLike, **tables: Any
+        cls,
+        cameras: Cameras,
+        names: Sequence[str],
+        camera_idx: npt.ArrayLike,
+        cam_from_world: npt.ArrayLike,
+        **tables: Any,
     ) -> Self:
         """Return a scene in which every image stands alone: one rig per camera, one frame per image.
 
@@ -269,7 +274,11 @@ class Scene:
     def points_only(self) -> Self:
         """Return the scene without lines, planes, directions and relations."""
         return self.replace(
-            lines=Lines(), line_observations=LineObservations(), planes=Planes(), directions=Directions(), relations=Relations()
+            lines=Lines(),
+            line_observations=LineObservations(),
+            planes=Planes(),
+            directions=Directions(),
+            relations=Relations(),
         )
 
     def transformed(self, new_from_old: Similarity) -> Self:
@@ -309,10 +318,18 @@ class Scene:
         new_image = _new_index(chosen, self.num_images)
         kept_frames, frame_idx = np.unique(self.images.frame_idx[chosen], return_inverse=True)
         points_seen, new_point = _still_seen(
-            new_image, self.point_observations.image_idx, self.point_observations.point_idx, self.num_points, min_observations
+            new_image,
+            self.point_observations.image_idx,
+            self.point_observations.point_idx,
+            self.num_points,
+            min_observations,
         )
         lines_seen, new_line = _still_seen(
-            new_image, self.line_observations.image_idx, self.line_observations.line_idx, self.num_lines, min_observations
+            new_image,
+            self.line_observations.image_idx,
+            self.line_observations.line_idx,
+            self.num_lines,
+            min_observations,
         )
         new = {"point": new_point, "line": new_line}
         new |= {"plane": np.arange(self.num_planes), "direction": np.arange(self.num_directions)}

@@ -79,5 +79,7 @@ class Similarity:
         inverse = np.broadcast_to(quaternion.from_matrix(self.rotation.T), old[..., :4].shape)
         turned = quaternion.multiply(old[..., :4], inverse)
         turned = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
-        moved = self.scale * old[..., 4:] - quaternion.rotate(turned, np.broadcast_to(self.translation, old[..., 4:].shape))
+        moved = self.scale * old[..., 4:] - quaternion.rotate(
+            turned, np.broadcast_to(self.translation, old[..., 4:].shape)
+        )
         return np.concatenate([turned, moved], -1)

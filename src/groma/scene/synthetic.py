@@ -99,7 +99,7 @@ def holistic(
 
     line_plane = np.full(num_images, -1)
     line_plane[: LINES_PER_PLANE * len(planes)] = np.repeat(np.arange(len(planes)), LINES_PER_PLANE)
-    segments, line_obs = _draw_until_seen(rng, choose, line_plane, planes, track, _draw_segments)
+    segments, line_obs = _draw_until_seen(rng, choose, line_plane, planes, track, _draw_segments, 2)
 
     on_line = POINTS_PER_LINE * num_images
     point_line = np.repeat(np.arange(num_images), POINTS_PER_LINE)
@@ -109,18 +109,22 @@ def holistic(
     free_plane = np.full(10 * num_images - on_line, -1)
     extra = POINTS_PER_PLANE - POINTS_PER_LINE * LINES_PER_PLANE
     free_plane[: extra * len(planes)] = np.repeat(np.arange(len(planes)), extra)
-    free_points, free_obs = _draw_until_seen(rng, choose, free_plane, planes, track, _draw_points)
+    free_points, free_obs = _draw_until_seen(rng, choose, free_plane, planes, track, _draw_points, 1)
 
     xyz = np.concatenate([edge_points, free_points[:, 0]])
     point_plane = np.concatenate([line_plane[point_line], free_plane])
-    point_obs = np.concatenate([edge_obs, free_obs + [on_line, 0]])
+    point_obs = np.concatenate([edge_obs, free_obs + np.array([on_line, 0])])
     relations = Relations(
         point_on_plane=_pairs(point_plane),
         line_on_plane=_pairs(line_plane),
         point_on_line=np.column_stack([np.arange(on_line), point_line]),
     )
     camera = Cameras(
-        np.array([1]), ("PINHOLE",), np.array([[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]]), np.array([WIDTH]), np.array([HEIGHT])
+        np.array([1]),
+        ("PINHOLE",),
+        np.array([[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]]),
+        np.array([WIDTH]),
+        np.array([HEIGHT]),
     )
     truth = assemble(rng, camera, poses, xyz, point_obs, segments, line_obs, None, planes, relations, noise_px)
 
@@ -258,7 +262,8 @@ class _ViewChoice:
     def _choose(
         self, names: IntArray, features: FloatArray, wanted: IntArray, least: int, tries: int
     ) -> tuple[IntArray, BoolArray]:
-        pairs, enough = [np.zeros((0, 2), np.int64)], np.zeros(len(features), bool)
+        pairs: list[IntArray] = [np.zeros((0, 2), np.int64)]
+        enough = np.zeros(len(features), bool)
         step = max(1, _CHUNK // (tries * features.shape[1] * 9))
         for begin in range(0, len(features), step):
             rows = slice(begin, begin + step)
@@ -303,14 +308,14 @@ def _repeats(images: IntArray) -> BoolArray:
     return again
 
 
-def _draw_until_seen(rng, choose, on_plane, planes, track, draw):  # noqa: ANN001, ANN202 - private, see holistic
+def _draw_until_seen(rng, choose, on_plane, planes, track, draw):
     """Draw features; draw those again that leave the cube or are seen too little."""
-    features, pairs = None, [np.zeros((0, 2), np.int64)]
+    features = np.zeros((len(on_plane), points, 3))
+    pairs: list[IntArray] = [np.zeros((0, 2), np.int64)]
     wanted = rng.integers(track[0], track[1] + 1, len(on_plane))
     waiting = np.arange(len(on_plane))
     while len(waiting):
         drawn = draw(rng, on_plane[waiting], planes)
-        features = np.zeros((len(on_plane), *drawn.shape[1:])) if features is None else features
         features[waiting] = drawn
         inside = np.abs(drawn).max((1, 2)) <= HALF_EXTENT + 1e-9
         seen, enough = choose(drawn[inside], wanted[waiting[inside]], track[0])

@@ -372,7 +372,7 @@ def _view(scene: Drawable, middle: FloatArray) -> _View:
         low, high = np.minimum(low, cameras.min(axis=0)), np.maximum(high, cameras.max(axis=0))
     half = (high - low) / 2
     # The viewer's focal length is 1.1 times its height, and it is about twice as wide as high.
-    distance = float(1.15 * max(2.2 * half[1], 1.1 * half[0]) + half[2]) or 1.0
+    distance = float(1.15 * max(2.2 * half[1], 1.1 * half[0]) + 0.6 * half[2]) or 1.0
     return _View(
         pivot=center + (low + half) @ frame,
         up=up,
