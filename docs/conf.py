@@ -2,8 +2,12 @@
 """Settings of the documentation. Build: sphinx-build -W -b html docs docs/_build/html."""
 
 import os
+import re
 import sys
 from pathlib import Path
+
+from sphinx.application import Sphinx
+from sphinx.ext.napoleon.docstring import NumpyDocstring
 
 import groma
 
@@ -32,6 +36,9 @@ autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_preserve_defaults = True
+# Words in the prose of a parameter's type ("name", "kind") are looked up as if they were types; more than one class has
+# an attribute of that name, and none is meant.
+suppress_warnings = ["ref.python"]
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_preprocess_types = False
@@ -39,3 +46,30 @@ napoleon_preprocess_types = False
 html_theme = "furo"
 html_title = f"groma {release}"
 exclude_patterns = ["_build"]
+
+_PIPES = re.compile(r"(`[^`]*`)|(?<!\\)\|([^|\s][^|]*?)\|")
+
+
+def _escape_signs(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Let ``|d|`` be an absolute value and ``*shape`` a shape in running text; formulas and literals stay."""
+    in_math = False
+    for index, line in enumerate(lines):
+        if line.strip() and not line.startswith(" "):
+            in_math = False
+        if ".. math::" in line or line.rstrip().endswith("::"):
+            in_math = True
+        if not in_math:
+            line = _PIPES.sub(lambda match: match[1] or rf"\|{match[2]}\|", line)
+            line = re.sub(r"(?<=[( ])\*(?=\w+[,)])", r"\\*", line)
+            lines[index] = line
+
+
+def _parse_attribute_as_text(self: NumpyDocstring) -> list[str]:
+    """Parse the comment of an attribute as text; napoleon takes what stands before a colon for its type."""
+    return NumpyDocstring(list(self._lines), self._config, self._app, "method", self._name, self._obj).lines()
+
+
+def setup(app: Sphinx) -> None:
+    """Register the two above."""
+    NumpyDocstring._parse_attribute_docstring = _parse_attribute_as_text
+    app.connect("autodoc-process-docstring", _escape_signs)

@@ -13,6 +13,8 @@ With ``NUMBA_DISABLE_JIT=1`` the same names are plain NumPy.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numba
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -157,14 +159,13 @@ def _add_matvec_plain(y, y0, A, a0, x, x0, rows, lanes):
     y[y0 : y0 + p] += A[a0 : a0 + p * q].reshape(p, q) @ x[x0 : x0 + q]
 
 
-if numba.config.DISABLE_JIT:
-    add_product, set_product, add_matvec = _add_product_plain, _set_product_plain, _add_matvec_plain
-else:
-    #: ``add_product(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)``: C += A^T B for flat float64 arrays
-    #: at element offsets. A is depth x rows and B depth x lanes, with the given distances between their rows; C is
-    #: rows x lanes without gaps. The last three arguments are widths.
-    add_product = _add_product
-    #: As :data:`add_product`, but C = A^T B.
-    set_product = _set_product
-    #: ``add_matvec(y, y0, A, a0, x, x0, rows, lanes)``: y += A x for the rows x lanes block A, without gaps.
-    add_matvec = _add_matvec
+_plain = bool(numba.config.DISABLE_JIT)
+
+#: ``add_product(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)``: C += A^T B for flat float64 arrays
+#: at element offsets. A is depth x rows and B depth x lanes, with the given distances between their rows; C is
+#: rows x lanes without gaps. The last three arguments are widths.
+add_product: Callable[..., None] = _add_product_plain if _plain else _add_product
+#: As :data:`add_product`, but C = A^T B.
+set_product: Callable[..., None] = _set_product_plain if _plain else _set_product
+#: ``add_matvec(y, y0, A, a0, x, x0, rows, lanes)``: y += A x for the rows x lanes block A, without gaps.
+add_matvec: Callable[..., None] = _add_matvec_plain if _plain else _add_matvec

@@ -54,7 +54,8 @@ def check_manifold(
 
     With the retraction :math:`\boxplus` and its inverse :math:`\boxminus`, on random states x and y:
 
-    * :math:`x \boxplus 0 = x`, :math:`(x \boxplus \delta) \boxminus x = \delta`, :math:`x \boxplus (y \boxminus x) = y`;
+    * :math:`x \boxplus 0 = x`, :math:`(x \boxplus \delta) \boxminus x = \delta` and
+      :math:`x \boxplus (y \boxminus x) = y`;
     * ``from_ambient(ambient(x))`` is the same object as x;
     * ``basis`` equals the differences of the factor coordinates through ``retract``, and has full rank;
     * states near singular places (a plane through the origin, a rotation by pi, ...) give finite numbers;
@@ -134,7 +135,9 @@ def _basis(manifold: Manifold, state: FloatArray) -> FloatArray:
 def _check_sizes(manifold: Manifold, rng: np.random.Generator, count: int) -> None:
     for sizes, size in ((AMBIENT_SIZE, manifold.ambient_size), (FACTOR_COLUMNS, manifold.factor_columns)):
         if sizes.get(manifold.kind, size) != size:
-            raise AssertionError(f"{manifold!r}: kind {manifold.kind!r} needs {sizes[manifold.kind]} numbers, not {size}.")
+            raise AssertionError(
+                f"{manifold!r}: kind {manifold.kind!r} needs {sizes[manifold.kind]} numbers, not {size}."
+            )
     for rows in (count, 0):
         state = manifold.random(rng, rows)
         results = {

@@ -32,7 +32,7 @@ def full_covariance(problem, keep=None):
 
 
 @pytest.mark.parametrize(
-    "case", [dict(), dict(num_lines=8), dict(num_lines=8, num_planes=1), dict(shared_intrinsics=True, num_points=60)]
+    "case", [{}, {"num_lines": 8}, {"num_lines": 8, "num_planes": 1}, {"shared_intrinsics": True, "num_points": 60}]
 )
 def test_equals_inverse_of_full_matrix(case):
     problem = solve(held(scene_problem(**case)), SolverOptions(function_tolerance=1e-12)).problem
@@ -63,14 +63,14 @@ def test_inner_gauge_is_the_pseudo_inverse_of_the_cameras():
 
 
 def test_free_scene_is_refused_with_the_remedy():
-    with pytest.raises(ProblemError, match="rank deficient by 7.*gauge='inner'"):
+    with pytest.raises(ProblemError, match=r"rank deficient by 7.*gauge='inner'"):
         Covariances(scene_problem(num_points=40))
 
 
 def test_structure_only():
     problem = scene_problem(num_points=20, constant_poses=True)
     covariances = Covariances(problem)
-    expected, columns = full_covariance(problem)
+    expected, _columns = full_covariance(problem)
     got = covariances.of("points")
     for k in range(20):
         block = expected[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]

@@ -15,15 +15,15 @@ from groma.solver.steps import Step, curvature, diagonal, gradient, retract
 pytestmark = pytest.mark.kernels
 
 CASES = {
-    "points": dict(),
-    "points, shared intrinsics": dict(shared_intrinsics=True),
-    "points, own intrinsics": dict(shared_intrinsics=False),
-    "lines": dict(num_points=0, num_lines=12),
-    "points and lines": dict(num_lines=8),
-    "orthonormal lines": dict(num_points=0, num_lines=12, line_chart="orthonormal_left"),
-    "right poses": dict(pose_chart="right"),
-    "planes": dict(num_planes=2, num_lines=5, shared_intrinsics=True),
-    "robust": dict(loss=Cauchy(1.0), num_lines=6),
+    "points": {},
+    "points, shared intrinsics": {"shared_intrinsics": True},
+    "points, own intrinsics": {"shared_intrinsics": False},
+    "lines": {"num_points": 0, "num_lines": 12},
+    "points and lines": {"num_lines": 8},
+    "orthonormal lines": {"num_points": 0, "num_lines": 12, "line_chart": "orthonormal_left"},
+    "right poses": {"pose_chart": "right"},
+    "planes": {"num_planes": 2, "num_lines": 5, "shared_intrinsics": True},
+    "robust": {"loss": Cauchy(1.0), "num_lines": 6},
 }
 
 
@@ -96,7 +96,7 @@ def test_what_is_eliminated_does_not_change_the_step(eliminate):
 
 def test_threads_do_not_change_the_step():
     problem = scene_problem(num_points=80, num_lines=40)
-    layout, *_, one = eliminated_step(problem, 1e-2)
+    _layout, *_, one = eliminated_step(problem, 1e-2)
     _, *_, two = eliminated_step(problem, 1e-2, threads=2)
     for first, second in zip(one.parts(), two.parts(), strict=True):
         np.testing.assert_allclose(first, second, rtol=1e-9, atol=1e-12)
@@ -125,7 +125,7 @@ def test_held_coordinates_do_not_move():
 def test_quadratic_model(case):
     """Gradient, diagonal and curvature agree with the dense matrices."""
     problem = scene_problem(**CASES[case])
-    layout, equations, system, states, step = eliminated_step(problem, 1e-2)
+    layout, equations, system, _states, step = eliminated_step(problem, 1e-2)
     H, g, columns = dense_normal_equations(problem)
 
     def flat(parts):
@@ -141,7 +141,7 @@ def test_quadratic_model(case):
 def test_linearisation_predicts_the_cost():
     """A tiny step changes the cost by the gradient's share."""
     problem = scene_problem(num_lines=8, num_planes=1, loss=Cauchy(2.0))
-    layout, equations, system, states, step = eliminated_step(problem, 1e-2)
+    layout, equations, _system, states, step = eliminated_step(problem, 1e-2)
     g = gradient(equations)
     h = 1e-6
     costs = [

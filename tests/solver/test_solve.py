@@ -43,9 +43,7 @@ def test_same_minimum_from_every_solver_and_strategy():
     np.testing.assert_allclose([r.final_cost for r in costs], costs[0].final_cost, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "chart", ["cartesian", "orthonormal_right", "orthonormal_left", "free_right", "free_left"]
-)
+@pytest.mark.parametrize("chart", ["cartesian", "orthonormal_right", "orthonormal_left", "free_right", "free_left"])
 def test_line_charts_reach_the_same_minimum(chart):
     reference = solve(scene_problem(num_points=20, num_lines=30), SolverOptions(function_tolerance=1e-12))
     problem = scene_problem(num_points=20, num_lines=30, line_chart=chart)
@@ -82,7 +80,7 @@ def test_landmark_steps_keep_or_lower_the_cost():
 
 
 def test_motion_only_and_structure_only_find_the_minimum():
-    for fixed in (dict(constant_landmarks=True), dict(constant_poses=True)):
+    for fixed in ({"constant_landmarks": True}, {"constant_poses": True}):
         problem = scene_problem(num_points=40, num_lines=20, **fixed)
         solution = solve(problem, SolverOptions(function_tolerance=1e-12))
         assert solution.report.linear_solver == "blocks"

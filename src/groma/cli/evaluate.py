@@ -28,10 +28,12 @@ def poses(
     from groma.evaluation.poses import evaluate_poses
     from groma.io import read_scene
 
-    scores = evaluate_poses(read_scene(estimate), read_scene(reference)).to_dict()
-    console.say(f"{scores['num_images']} images in both, after similarity alignment")
-    console.say(f"  camera centres   {scores['center_rmse']:.6g} rms, in units of the reference")
-    console.say(f"  rotations        {scores['rotation_deg_mean']:.4g} deg mean, {scores['rotation_deg_max']:.4g} max")
-    areas = ", ".join(f"{value:.3f} at {degrees} deg" for degrees, value in scores["auc"].items())
+    scores = evaluate_poses(read_scene(estimate), read_scene(reference))
+    console.say(f"{scores.num_images} images in both, after similarity alignment")
+    if scores.num_missing:
+        console.warn(f"{scores.num_missing} images of the reference are missing in the estimate.")
+    console.say(f"  camera centres   {scores.center_rmse:.6g} rms, in units of the reference")
+    console.say(f"  rotations        {scores.rotation_deg_mean:.4g} deg mean, {scores.rotation_deg_max:.4g} max")
+    areas = ", ".join(f"{value:.3f} at {degrees:g} deg" for degrees, value in scores.auc.items())
     console.say(f"  pose error AUC   {areas}")
-    _output.write_json(json_target, scores, force)
+    _output.write_json(json_target, scores.to_dict(), force)

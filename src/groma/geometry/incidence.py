@@ -78,7 +78,9 @@ def meet_line_plane(line: FloatArray, plane: FloatArray) -> FloatArray:
 
 
 def join_line_point(line: FloatArray, point: FloatArray) -> FloatArray:
-    r"""Plane through lines (..., 6) and homogeneous points (..., 4), :math:`L^* X = [\,d \times X + W m,\; -m^\top X\,]`.
+    r"""Plane (..., 4) through lines (..., 6) and homogeneous points (..., 4).
+
+    .. math:: \pi = L^* X = [\,d \times \tilde X + W m,\; -m^\top \tilde X\,]
 
     Zero where the point lies on the line.
 
@@ -180,8 +182,8 @@ def closest_points(
 
     References
     ----------
-    Plücker notes, section 5.1, eq. (40)-(43) for the coplanarity test; the points are derived from m = p x d. Y.-B. Jia,
-    *Plücker coordinates for lines in the space*, section 4.2, has the same formulas.
+    Plücker notes, section 5.1, eq. (40)-(43) for the coplanarity test; the points are derived from m = p x d.
+    Y.-B. Jia, *Plücker coordinates for lines in the space*, section 4.2, has the same formulas.
     """
     first, second = np.broadcast_arrays(vectors(first, 6, "first"), vectors(second, 6, "second"))
     positive(distance_tolerance, "distance_tolerance")

@@ -201,7 +201,7 @@ def klein_residual(line: FloatArray) -> FloatArray:
 def is_line(line: FloatArray, tolerance: float = 1e-9) -> BoolArray:
     """Whether 6-vectors are finite, not zero, and on the Klein quadric: ``|klein_residual| <= tolerance``."""
     line = vectors(line, 6, "line")
-    finite = np.isfinite(line).all(axis=-1)
+    finite = np.asarray(np.isfinite(line).all(axis=-1))
     usable = np.where(finite[..., None], line, 0.0)
     return finite & (usable != 0.0).any(axis=-1) & (np.abs(klein_residual(usable)) <= positive(tolerance, "tolerance"))
 
@@ -331,7 +331,10 @@ def foot_point(line: FloatArray) -> FloatArray:
 
 
 def distance_to_point(line: FloatArray, point: FloatArray) -> FloatArray:
-    r"""Distance of points (..., 3) to lines (..., 6), :math:`\|p \times d - m\| / \|d\|`; infinity for lines at infinity."""
+    r"""Distance of points (..., 3) to lines (..., 6), :math:`\|p \times d - m\| / \|d\|`.
+
+    Infinity for lines at infinity.
+    """
     line, point = _points_or_nan(line), vectors(point, 3, "point")
     return _or_infinity(norm(np.cross(point, line[..., 3:]) - line[..., :3]) / norm(line[..., 3:]))
 

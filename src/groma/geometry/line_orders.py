@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.geometry import line3, quaternion
 from groma.geometry._algebra import dot, matrices, norm, perpendicular, stack, unit, vectors
@@ -53,7 +53,7 @@ _ORDERS: dict[str, tuple[int, ...]] = {
 ORDERS = tuple(_ORDERS)
 
 
-def _signed_permutation(order: str) -> tuple[FloatArray, FloatArray]:
+def _signed_permutation(order: str) -> tuple[IntArray, FloatArray]:
     if order not in _ORDERS:
         raise InputError(f"order must be one of {', '.join(ORDERS)}; got {order!r}. Pass one of these names.")
     places = np.array(_ORDERS[order])
@@ -146,7 +146,7 @@ def to_limap_minimal(line: FloatArray) -> tuple[FloatArray, FloatArray]:
     :func:`groma.geometry.quaternion.to_wxyz`. Direction first, unlike Plücker notes (70), where m comes first.
     """
     direction, moment = to_limap(line)
-    usable = np.isfinite(direction).all(axis=-1)[..., None]
+    usable = line3.is_finite(line)[..., None]
     along = np.where(usable, direction, (1.0, 0.0, 0.0))
     across = np.where(usable, moment, 0.0)
     distance = norm(across)
@@ -202,8 +202,8 @@ def to_gtsam(line: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     r"""GTSAM's ``Line3``: rotation R (..., 3, 3) and a, b (...).
 
     The line is the z axis, moved by (a, b) in its xy plane and turned: foot point :math:`R\,(a, b, 0)`, direction
-    :math:`R e_3`. The roll about the line is free; R's first column is chosen by a rule that depends on d only, so lines
-    through the origin are no exception. NaN for lines at infinity.
+    :math:`R e_3`. The roll about the line is free; R's first column is chosen by a rule that depends on d only, so
+    lines through the origin are no exception. NaN for lines at infinity.
 
     References
     ----------

@@ -47,7 +47,7 @@ def camera_matrix(intrinsic_matrix: FloatArray, cam_from_world: Rigid) -> FloatA
 
 
 def line_intrinsics(intrinsic_matrix: FloatArray) -> FloatArray:
-    r"""Intrinsic matrix of lines (..., 3, 3), :math:`\mathcal{K} = \det(K) K^{-\top}`, with :math:`l = \mathcal{K} m_c`.
+    r"""Intrinsic matrix of lines (..., 3, 3), :math:`\mathcal{K} = \det(K) K^{-\top}`: l is :math:`\mathcal{K} m_c`.
 
     .. math:: \mathcal{K} = \begin{bmatrix} f_y & 0 & 0 \\ 0 & f_x & 0 \\ -f_y c_x & -f_x c_y & f_x f_y \end{bmatrix}
 
@@ -65,8 +65,8 @@ def line_projection_matrix(camera: FloatArray) -> FloatArray:
 
     References
     ----------
-    Plücker notes, eq. (55)-(57). Deviation: the cofactor matrix in place of :math:`\det(N) N^{-\top}`, so affine cameras
-    are not excluded.
+    Plücker notes, eq. (55)-(57). Deviation: the cofactor matrix in place of :math:`\det(N) N^{-\top}`, so affine
+    cameras are not excluded.
     """
     camera = matrices(camera, 3, 4, "camera")
     left = camera[..., :3]
@@ -182,7 +182,7 @@ def line_of_skew(skew: FloatArray) -> FloatArray:
     return vee(matrices(skew, 3, 3, "skew"))
 
 
-# -------------------------------------------------------------------------------------------- Vanishing points, horizons
+# ------------------------------------------------------------------------------------------- Vanishing points, horizons
 def vanishing_points(camera: FloatArray, direction: FloatArray) -> FloatArray:
     """Homogeneous image points (..., 3) where lines of directions (..., 3) vanish, N d.
 
@@ -195,7 +195,7 @@ def vanishing_points(camera: FloatArray, direction: FloatArray) -> FloatArray:
 def horizons(camera: FloatArray, normal: FloatArray) -> FloatArray:
     r"""Image lines (..., 3) where planes with normals (..., 3) vanish, :math:`\mathrm{cof}(N)\, n`.
 
-    They hold the vanishing points of all directions in the plane; for a plane [n, w] pass its n. For a plane parallel to
-    the image plane it is the line at infinity.
+    They hold the vanishing points of all directions in the plane; for a plane [n, w] pass its n. For a plane parallel
+    to the image plane it is the line at infinity.
     """
     return apply(cofactor(matrices(camera, 3, 4, "camera")[..., :3]), vectors(normal, 3, "normal"))

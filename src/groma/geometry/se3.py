@@ -51,7 +51,7 @@ def exp_kernel(xi, T):
 
 @kernel
 def compose_kernel(A, B, out):
-    """out = A B for row-major 3x4 matrices (12,); out must not be A or B."""
+    """Write A B to out, row-major 3x4 matrices (12,); out must not be A or B."""
     for i in range(3):
         for j in range(4):
             out[4 * i + j] = A[4 * i] * B[j] + A[4 * i + 1] * B[4 + j] + A[4 * i + 2] * B[8 + j]

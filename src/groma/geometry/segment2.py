@@ -74,7 +74,7 @@ def to_line(segment: FloatArray) -> FloatArray:
 
 
 def project_onto_line(segment: FloatArray, line: FloatArray) -> FloatArray:
-    """Segments (..., 4) whose end points are moved to their feet on homogeneous lines (..., 3): from a line to a segment.
+    """Segments (..., 4) whose end points are moved to their feet on homogeneous lines (..., 3).
 
     NaN where the line is zero or at infinity (l1 = l2 = 0).
     """
@@ -162,7 +162,10 @@ def overlap(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def endpoint_distance(first: FloatArray, second: FloatArray, oriented: bool = False) -> FloatArray:
-    """Mean distance (...) in pixels of corresponding end points; unless ``oriented``, for the better of the two orders."""
+    """Mean distance (...) in pixels of corresponding end points.
+
+    Unless ``oriented``, for the better of the two orders of the end points.
+    """
     (a, b), (c, d) = _ends(first, "first"), _ends(second, "second")
     straight = 0.5 * (norm(a - c) + norm(b - d))
     return straight if oriented else np.minimum(straight, 0.5 * (norm(a - d) + norm(b - c)))

@@ -8,11 +8,11 @@ A tangent vector is :math:`\zeta = (\rho, \omega, \sigma)`: translation, rotatio
    V = \int_0^1 e^{a\sigma}\,\mathrm{Exp}(a\,\omega)\,\mathrm{d}a, \\
    \mathrm{Ad}_S &= \begin{bmatrix} sR & t^\wedge R & -t \\ 0 & R & 0 \\ 0 & 0 & 1 \end{bmatrix}, \qquad
    S\,\mathrm{Exp}(\zeta) = \mathrm{Exp}(\mathrm{Ad}_S\,\zeta)\,S, \\
-   J_l(\zeta) &= \int_0^1 \mathrm{Ad}_{\mathrm{Exp}(a\zeta)}\,\mathrm{d}a = \sum_{k \ge 0} \frac{\mathrm{ad}_\zeta^k}{(k+1)!},
-   \qquad J_r(\zeta) = J_l(-\zeta) .
+   J_l(\zeta) &= \int_0^1 \mathrm{Ad}_{\mathrm{Exp}(a\zeta)}\,\mathrm{d}a
+   = \sum_{k \ge 0} \frac{\mathrm{ad}_\zeta^k}{(k+1)!}, \qquad J_r(\zeta) = J_l(-\zeta) .
 
-The closed forms of V and :math:`J_l` divide by :math:`\sigma^2 + \theta^2` and by :math:`\theta^2`, and need a series for
-each of three ways to approach zero. Here both are the integrals themselves, by Gauss's rule with 32 nodes: the
+The closed forms of V and :math:`J_l` divide by :math:`\sigma^2 + \theta^2` and by :math:`\theta^2`, and need a series
+for each of three ways to approach zero. Here both are the integrals themselves, by Gauss's rule with 32 nodes: the
 integrands are entire functions, and the rule is exact to rounding for :math:`\lvert\sigma\rvert \le 40` and rotations
 up to :math:`2\pi`. Within :math:`\theta \le \pi` no digits cancel.
 
@@ -125,7 +125,7 @@ def vee(matrix: FloatArray) -> FloatArray:
 
 
 def _coupling(omega: FloatArray, sigma: FloatArray) -> FloatArray:
-    r"""V (..., 3, 3): :math:`\sum_i w_i e^{a_i \sigma}\,(I + a_i A\,W + a_i^2 B\,W^2)` with A, B at the angle a_i theta."""
+    r"""V (..., 3, 3): :math:`\sum_i w_i e^{a_i \sigma}\,(I + a_i A W + a_i^2 B W^2)`, A and B at a_i theta."""
     theta2 = np.sum(omega * omega, axis=-1)[..., None]
     a, b, *_ = so3.coefficients(theta2 * _NODES**2)
     growth = _WEIGHTS * np.exp(sigma[..., None] * _NODES)
@@ -168,7 +168,7 @@ def log(similarity: FloatArray) -> FloatArray:
     """
     similarity = _similarities(similarity)
     omega, sigma = quaternion.log(similarity[..., :4]), np.log(similarity[..., 7])
-    rho = np.linalg.solve(_coupling(omega, sigma), similarity[..., 4:7, None])[..., 0]
+    rho = np.linalg.solve(_coupling(omega, sigma), similarity[..., 4:7, None])[..., 0].astype(np.float64, copy=False)
     return np.concatenate([rho, omega, sigma[..., None]], axis=-1)
 
 
@@ -194,7 +194,7 @@ def left_jacobian(zeta: FloatArray) -> FloatArray:
 
 def left_jacobian_inverse(zeta: FloatArray) -> FloatArray:
     """Inverse of :func:`left_jacobian`, (..., 7, 7); singular at an angle of 2 pi."""
-    return np.linalg.inv(left_jacobian(zeta))
+    return np.linalg.inv(left_jacobian(zeta)).astype(np.float64, copy=False)
 
 
 def right_jacobian(zeta: FloatArray) -> FloatArray:
@@ -204,7 +204,7 @@ def right_jacobian(zeta: FloatArray) -> FloatArray:
 
 def right_jacobian_inverse(zeta: FloatArray) -> FloatArray:
     """Inverse of :func:`right_jacobian`, (..., 7, 7); singular at an angle of 2 pi."""
-    return np.linalg.inv(right_jacobian(zeta))
+    return left_jacobian_inverse(-_tangents(zeta))
 
 
 __all__ = [

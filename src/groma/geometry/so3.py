@@ -119,8 +119,9 @@ def coefficients(theta2: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray
     theta2 = np.asarray(theta2, dtype=np.float64)
     small = theta2 < _SERIES
     x = np.where(small, theta2, 0.0)
-    d = np.polynomial.polynomial.polyval(x, _SERIES_D)
-    e = np.polynomial.polynomial.polyval(x, _SERIES_E)
+    d, e = np.zeros_like(x), np.zeros_like(x)
+    for k in reversed(range(_TERMS)):
+        d, e = d * x + _SERIES_D[k], e * x + _SERIES_E[k]
     c = 1 / 6 - x * e
     b = 0.5 - x * d
     a = 1 - x * c
@@ -230,7 +231,7 @@ def adjoint(rotation: FloatArray) -> FloatArray:
 
 
 def left_jacobian(omega: FloatArray) -> FloatArray:
-    r"""Left Jacobian (..., 3, 3): :math:`\mathrm{Exp}(\omega + h) \approx \mathrm{Exp}(J_l h)\,\mathrm{Exp}(\omega)`."""
+    r"""Left Jacobian (..., 3, 3): :math:`\mathrm{Exp}(\omega + h) \approx \mathrm{Exp}(J_l h)\mathrm{Exp}(\omega)`."""
     omega = _vectors(omega)
     _, b, c, *_ = coefficients(np.sum(omega * omega, axis=-1))
     return _quadratic(omega, b, c)
@@ -244,7 +245,7 @@ def left_jacobian_inverse(omega: FloatArray) -> FloatArray:
 
 
 def right_jacobian(omega: FloatArray) -> FloatArray:
-    r"""Right Jacobian (..., 3, 3): :math:`\mathrm{Exp}(\omega + h) \approx \mathrm{Exp}(\omega)\,\mathrm{Exp}(J_r h)`."""
+    r"""Right Jacobian (..., 3, 3): :math:`\mathrm{Exp}(\omega + h) \approx \mathrm{Exp}(\omega)\mathrm{Exp}(J_r h)`."""
     return left_jacobian(-_vectors(omega))
 
 

@@ -172,7 +172,10 @@ def similarity_lines(b_from_a: Similarity, lines_in_a: FloatArray) -> FloatArray
 
 
 def similarity_plane_matrix(b_from_a: Similarity) -> FloatArray:
-    r"""Matrix (..., 4, 4) on planes, :math:`\begin{bmatrix} R & 0 \\ -t^\top R & s \end{bmatrix}`; keeps the length of n."""
+    r"""Matrix (..., 4, 4) on planes, :math:`\begin{bmatrix} R & 0 \\ -t^\top R & s \end{bmatrix}`.
+
+    The common factor is chosen to keep the length of n.
+    """
     scale, rotation, translation = _similarity(b_from_a)
     leading = np.broadcast_shapes(scale.shape, rotation.shape[:-2], translation.shape[:-1])
     out = np.zeros((*leading, 4, 4))
@@ -244,7 +247,7 @@ def projective_planes(b_from_a: FloatArray, planes_in_a: FloatArray) -> FloatArr
 def _inverse(homography: FloatArray) -> FloatArray:
     homography = matrices(homography, 4, 4, "b_from_a")
     try:
-        return np.linalg.inv(homography)
+        return np.asarray(np.linalg.inv(homography), dtype=np.float64)
     except np.linalg.LinAlgError as error:
         raise InputError(
             "b_from_a must hold homographies of rank 4; got a singular one, under which planes have no image. Leave "

@@ -77,7 +77,7 @@ def exp(direction: FloatArray, tangent: FloatArray) -> FloatArray:
 
 
 def log(direction: FloatArray, other: FloatArray) -> FloatArray:
-    """Tangent vector (..., 3) that leads from ``direction`` to ``other``; some vector of length pi for opposite ones."""
+    """Tangent vector (..., 3) that leads from ``direction`` to ``other``; one of length pi if they are opposite."""
     u, v = _vectors(direction), _vectors(other)
     cosine = np.sum(u * v, axis=-1, keepdims=True)
     across = v - cosine * u

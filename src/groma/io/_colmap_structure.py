@@ -44,7 +44,7 @@ def check_binary_model(folder: Path, num_params: Mapping[int, int]) -> None:
         data = path.read_bytes()
         try:
             end = walk(data)
-        except (struct.error, IndexError, ValueError) as error:
+        except (struct.error, IndexError, OverflowError, ValueError) as error:
             raise FileFormatError(f"{path} is incomplete or damaged: {error}. Fetch or export it again.") from error
         if end != len(data):
             what = "ends too early" if end > len(data) else f"holds {len(data) - end} bytes too many"
@@ -72,7 +72,9 @@ def _walk_cameras(data: bytes, num_params: Mapping[int, int]) -> int:
 def _walk_images(data: bytes) -> int:
     at = 8
     for _ in range(_count(data, 73)):
-        at = data.index(b"\0", at + 64) + 1  # id, pose, camera, name
+        at = data.find(b"\0", at + 64) + 1  # id, pose, camera, name
+        if at == 0:
+            raise ValueError("it ends within an image name")
         at += 8 + 24 * _COUNT.unpack_from(data, at)[0]
     return at
 

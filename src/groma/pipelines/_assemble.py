@@ -7,7 +7,7 @@ Groups of variables: ``frames`` (rig_from_world), ``sensors`` (cam_from_rig, onl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -58,10 +58,10 @@ class AssemblyOptions:
     #: How well points and lines keep to their planes and lines, as a length in the images, pixels.
     structure_sigma_px: float = 0.1
     #: Loss of what comes from matching, and of the relations between landmarks.
-    loss: Loss = Trivial()
+    loss: Loss = field(default_factory=Trivial)
     #: Leave out points that start behind their camera.
     drop_behind: bool = True
-    #: ``free``: damping holds the scene; ``first_camera``: the first frame, and the scale by the farthest one, are held;
+    #: ``free``: damping holds the scene; ``first_camera``: the first frame is held, and the scale by the farthest one;
     #: ``auto``: ``first_camera`` where relations between landmarks are measured in lengths, which would shrink a scene
     #: of free scale, else ``free``.
     gauge: str = "auto"
@@ -249,7 +249,9 @@ def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> l
         second = model.unproject(params, table.segment[rows, 2:])
         good = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
         if not good.all():
-            notes.append(f"{int((~good).sum())} segment(s) lie outside the range of the {name} model and were left out.")
+            notes.append(
+                f"{int((~good).sum())} segment(s) lie outside the range of the {name} model and were left out."
+            )
         focal = params[:, list(model.focal_indices)].mean(axis=1)
         kept = rows[good]
         factors.append(
@@ -279,7 +281,10 @@ def _lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
             scene.line_observations.image_idx, scene.line_observations.line_idx, scene.lines.segments.mean(axis=1),
         )  # fmt: skip
     focal_of = np.array(
-        [scene.cameras.params_of(c)[list(camera_model(name).focal_indices)].mean() for c, name in enumerate(scene.cameras.models)]
+        [
+            scene.cameras.params_of(c)[list(camera_model(name).focal_indices)].mean()
+            for c, name in enumerate(scene.cameras.models)
+        ]
     )
     distance = np.linalg.norm(scene.cam_centers_in_world[image_idx] - places[index], axis=1)
     length = distance / focal_of[scene.images.camera_idx[image_idx]]
@@ -299,17 +304,21 @@ def _structure_factors(scene: Scene, options: AssemblyOptions, variables: dict[s
             point, plane = relations.point_on_plane.T
             factors.append(
                 PointOnPlane(
-                    point=Ref("points", point), plane=Ref("planes", plane), sqrt_information=per_point[point],
+                    point=Ref("points", point),
+                    plane=Ref("planes", plane),
+                    sqrt_information=per_point[point],
                     loss=options.loss,
-                )  # fmt: skip
+                )
             )
         if have["lines"] and len(relations.point_on_line):
             point, line = relations.point_on_line.T
             factors.append(
                 PointOnLine(
-                    point=Ref("points", point), line=Ref("lines", line), sqrt_information=per_point[point],
+                    point=Ref("points", point),
+                    line=Ref("lines", line),
+                    sqrt_information=per_point[point],
                     loss=options.loss,
-                )  # fmt: skip
+                )
             )
     if have["lines"] and (have["planes"] or have["directions"]):
         per_line = 1.0 / (options.structure_sigma_px * _lengths_per_pixel(scene, "line"))
@@ -318,18 +327,22 @@ def _structure_factors(scene: Scene, options: AssemblyOptions, variables: dict[s
             line, plane = relations.line_on_plane.T
             factors.append(
                 SegmentOnPlane(
-                    line=Ref("lines", line), plane=Ref("planes", plane),
+                    line=Ref("lines", line),
+                    plane=Ref("planes", plane),
                     ends=ends[line],
-                    sqrt_information=per_line[line], loss=options.loss,
-                )  # fmt: skip
+                    sqrt_information=per_line[line],
+                    loss=options.loss,
+                )
             )
         if have["directions"] and len(relations.line_along_direction):
             line, direction = relations.line_along_direction.T
             length = np.linalg.norm(ends[line, 1] - ends[line, 0], axis=1)
             factors.append(
                 LineDirection(
-                    line=Ref("lines", line), direction=Ref("directions", direction),
-                    sqrt_information=per_line[line] * np.maximum(0.5 * length, 1e-12), loss=options.loss,
-                )  # fmt: skip
+                    line=Ref("lines", line),
+                    direction=Ref("directions", direction),
+                    sqrt_information=per_line[line] * np.maximum(0.5 * length, 1e-12),
+                    loss=options.loss,
+                )
             )
     return factors

@@ -28,7 +28,9 @@ GAUGE_NAMES = (
 _STEP = 1e-6
 
 
-def move_world(kind: str, ambient: FloatArray, translation: FloatArray, rotation: FloatArray, scale: float) -> FloatArray:
+def move_world(
+    kind: str, ambient: FloatArray, translation: FloatArray, rotation: FloatArray, scale: float
+) -> FloatArray:
     r"""Ambient numbers of objects after the world frame moved by :math:`X' = s R X + a`.
 
     Poses keep their metric form: :math:`R'_{cw} = R_{cw} R^\top`, :math:`t'_{cw} = s\,t_{cw} - R'_{cw} a`.

@@ -134,7 +134,8 @@ class FactorLayout:
     #: Eliminated group and its column, or None.
     eliminated: int | None = None
     landmark_column: int = -1
-    landmark: IntArray | None = None
+    #: (N,) position of each factor's landmark; empty if there is none.
+    landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.int32))
 
 
 @dataclass(frozen=True)
@@ -175,9 +176,7 @@ def lay_out(problem: Problem, eliminate: str | tuple[str, ...] = "auto", chunk_s
     warnings: list[str] = []
     landmarks = _choose_landmarks(problem, eliminate, warnings)
     kept, member_of = _kept_classes(problem, landmarks)
-    tables = {
-        (a, b): PairTable(kept[a].count, kept[b].count) for a in range(len(kept)) for b in range(a, len(kept))
-    }
+    tables = {(a, b): PairTable(kept[a].count, kept[b].count) for a in range(len(kept)) for b in range(a, len(kept))}
     for c, kept_class in enumerate(kept):
         diagonal = np.arange(kept_class.count, dtype=np.int32)
         tables[c, c].add_list(diagonal, diagonal)
@@ -266,7 +265,9 @@ def _private_intrinsics(problem: Problem, group: str, kept: list[str]) -> tuple[
             continue
         if len(mine) > 1:
             return None
-        poses = [ref for ref in refs.values() if ref.group in kept and problem.variables[ref.group].manifold.kind == "pose"]
+        poses = [
+            ref for ref in refs.values() if ref.group in kept and problem.variables[ref.group].manifold.kind == "pose"
+        ]
         if len(factor.references()) > 1:
             if len(poses) != 1 or (partner is not None and poses[0].group != partner):
                 return None
@@ -336,7 +337,7 @@ class _Draft:
         self.landmark_column = -1
         column = 0
         placed: list[int] = []
-        for slot, ref in references:  # kept blocks come first
+        for _slot, ref in references:  # kept blocks come first
             if ref.group not in member_of:
                 placed.append(-1)
                 continue
@@ -374,7 +375,9 @@ class _Draft:
         self.columns, self.chains, self.masked = tuple(columns), tuple(chains), tuple(masked)
         self.entries, self.width = entries, column + 1
         written = sum(
-            problem.variables[ref.group].manifold.dof for (_, ref), start in zip(references, placed, strict=True) if start >= 0
+            problem.variables[ref.group].manifold.dof
+            for (_, ref), start in zip(references, placed, strict=True)
+            if start >= 0
         )
         self.has_gaps = written + sum(chain.raw_size for chain in chains) < column
         self.is_free = bool(entries) or self.landmark_group is not None
@@ -383,7 +386,7 @@ class _Draft:
     def sort(self, orders) -> None:
         """Sort by landmark and kept block, and renumber the landmarks by their position."""
         if self.landmark_group is None:
-            self.landmark = None
+            self.landmark = np.zeros(0, np.int32)
             return
         _, position = orders[self.landmark_group]
         slot, ref = self.factor.references()[self.landmark_reference]
@@ -466,7 +469,7 @@ def _incidences(problem, group, e, order, layouts: list[FactorLayout], kept, tab
         for f, k in uses:
             n = len(layouts[f].factor)
             entry = dataclasses.replace(layouts[f].kept[k], incidence=slot[offset : offset + n].copy())
-            entries = layouts[f].kept[:k] + (entry,) + layouts[f].kept[k + 1 :]
+            entries = (*layouts[f].kept[:k], entry, *layouts[f].kept[k + 1 :])
             layouts[f] = dataclasses.replace(layouts[f], kept=entries)
             offset += n
     cross = {}
@@ -484,7 +487,7 @@ def _chunks(layouts: list[FactorLayout], eliminated: list[Eliminated], chunk_siz
     for e, group in enumerate(eliminated):
         mine = [f for f, layout in enumerate(layouts) if layout.eliminated == e]
         starts = [np.searchsorted(layouts[f].landmark, np.arange(group.count + 1)) for f in mine]
-        total = sum(starts) if starts else np.zeros(group.count + 1, np.int64)
+        total = np.sum([np.zeros(group.count + 1, np.int64), *starts], axis=0)
         begin = 0
         while begin < group.count:
             end = int(np.searchsorted(total, total[begin] + chunk_size, side="right")) - 1

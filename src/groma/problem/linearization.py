@@ -288,9 +288,7 @@ class NormalEquations:
         if noise.matrices is not None:
             value = _cost_whitened(out, begin, noise.matrices, noise.code, noise.first, noise.second, rho)
         else:
-            value = _cost_scaled(
-                out, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, rho
-            )
+            value = _cost_scaled(out, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, rho)
         return value, rho
 
     def _record(self, share: int, f: int) -> FloatArray:
@@ -448,4 +446,3 @@ def to_solver_order(layout: Layout) -> dict[str, FloatArray]:
     for e in layout.eliminated:
         states[e.group] = np.ascontiguousarray(states[e.group][e.order])
     return states
-

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A least-squares problem: groups of variables and groups of factors.
+r"""A least-squares problem: groups of variables and groups of factors.
 
 The cost is :math:`\\tfrac12 \\sum_i \\rho_i(\\lVert \\Sigma_i^{-1/2} r_i \\rVert^2)` over all factors.
 """
@@ -16,6 +16,9 @@ from groma._typing import FloatArray
 from groma.errors import ProblemError
 from groma.factors._factor import Factor
 from groma.problem.variables import Variables
+
+#: Kinds of variables that are plain numbers; a slot of kind ``vector`` takes any of them.
+PLAIN_KINDS = ("vector", "intrinsics", "point")
 
 
 @dataclass(frozen=True, init=False)
@@ -41,9 +44,10 @@ class Problem:
                     f"the problem has the groups {sorted(self.variables)}."
                 )
             variables = self.variables[ref.group]
-            if slot.kind not in (variables.manifold.kind, "vector"):
+            takes = PLAIN_KINDS if slot.kind == "vector" else (slot.kind,)
+            if variables.manifold.kind not in takes:
                 raise ProblemError(
-                    f"Slot {slot.name!r} of factor {name!r} takes variables of kind {slot.kind!r}; "
+                    f"Slot {slot.name!r} of factor {name!r} takes variables of kind {' or '.join(takes)}; "
                     f"group {ref.group!r} holds {variables.manifold.kind!r}."
                 )
             if len(ref.index) != len(factor):

@@ -38,11 +38,11 @@ class Table:
     noun: ClassVar[str] = "row"
 
     def __post_init__(self) -> None:
-        length = None
+        length, first = -1, ""
         for item in fields(self):
             value = convert(f"{type(self).__name__}.{item.name}", getattr(self, item.name), item)
             object.__setattr__(self, item.name, value)
-            if length is None:
+            if not first:
                 length, first = len(value), item.name
             elif len(value) != length:
                 raise ShapeError(

@@ -7,6 +7,7 @@ corridor. Both give the truth and a perturbed start; the measurements, with thei
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -308,8 +309,16 @@ def _repeats(images: IntArray) -> BoolArray:
     return again
 
 
-def _draw_until_seen(rng, choose, on_plane, planes, track, draw):
-    """Draw features; draw those again that leave the cube or are seen too little."""
+def _draw_until_seen(
+    rng: np.random.Generator,
+    choose: _ViewChoice,
+    on_plane: IntArray,
+    planes: FloatArray,
+    track: tuple[int, int],
+    draw: Callable[[np.random.Generator, IntArray, FloatArray], FloatArray],
+    points: int,
+) -> tuple[FloatArray, IntArray]:
+    """Draw features of some points each; draw those again that leave the cube or are seen too little."""
     features = np.zeros((len(on_plane), points, 3))
     pairs: list[IntArray] = [np.zeros((0, 2), np.int64)]
     wanted = rng.integers(track[0], track[1] + 1, len(on_plane))

@@ -40,7 +40,7 @@ FREE_TOLERANCE = 1e-9
 def _add_landmark_covariances(
     landmarks, N, dl, pointer_a, block_a, W_a, start_a, da, pointer_b, block_b, W_b, start_b, db, sigma, out
 ):
-    """out += (N W_a) Sigma_ab (N W_b)^T for the listed landmarks."""
+    """Out += (N W_a) Sigma_ab (N W_b)^T for the listed landmarks."""
     left, right = np.zeros((dl, da)), np.zeros((dl, db))
     for i in range(landmarks.shape[0]):
         p = landmarks[i]
@@ -142,7 +142,9 @@ class Covariances:
         variables = self.problem.variables[group]
         index = np.arange(len(variables)) if index is None else np.atleast_1d(np.asarray(index))
         if len(index) and (index.min() < 0 or index.max() >= len(variables)):
-            raise InputError(f"Group {group!r} has variables 0 to {len(variables) - 1}; asked for {index.tolist()[:5]}.")
+            raise InputError(
+                f"Group {group!r} has variables 0 to {len(variables) - 1}; asked for {index.tolist()[:5]}."
+            )
         dof = variables.manifold.dof
         for c in self._layout.kept:
             for member in c.members:

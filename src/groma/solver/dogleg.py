@@ -34,7 +34,7 @@ class Dogleg:
         self._equations, self._system, self._linear, self._watch = equations, system, linear, watch
         #: Reported in place of a damping: the inverse of the radius.
         self.damping = damping
-        self._radius: float | None = None
+        self._radius = 0.0
         self._newton: Step | None = None
 
     def linearize(self, states: States, inputs: list[tuple]) -> None:
@@ -62,11 +62,13 @@ class Dogleg:
             length = -g.dot(descent) / bend if bend > 0 else 0.0
             self._cauchy = descent.blend(length, descent, 0.0)
             self._newton = Step(kept, self._system.landmark_steps(kept)) if kept is not None else None
-            if self._radius is None:
+            if self._radius == 0.0:
                 self._radius = max(self._length(self._newton or self._cauchy), 1e-12)
 
     def _length(self, step: Step) -> float:
-        return float(np.sqrt(sum(float((r * d) @ (r * d)) for r, d in zip(self._root.parts(), step.parts(), strict=True))))
+        return float(
+            np.sqrt(sum(float((r * d) @ (r * d)) for r, d in zip(self._root.parts(), step.parts(), strict=True)))
+        )
 
     def propose(self) -> tuple[Step, float] | None:
         """Return the dogleg step for the present radius and the decrease of the quadratic model."""
@@ -85,7 +87,9 @@ class Dogleg:
             return cauchy.blend(min(1.0, radius / max(cauchy_length, 1e-300)), cauchy, 0.0)
         leg = newton.blend(1.0, cauchy, -1.0)
         a, c = self._length(leg) ** 2, cauchy_length**2 - radius**2
-        b = sum(float((r * x) @ (r * y)) for r, x, y in zip(self._root.parts(), leg.parts(), cauchy.parts(), strict=True))
+        b = sum(
+            float((r * x) @ (r * y)) for r, x, y in zip(self._root.parts(), leg.parts(), cauchy.parts(), strict=True)
+        )
         t = -c / (b + np.sqrt(b * b - a * c)) if b > 0 else (-b + np.sqrt(b * b - a * c)) / a
         return cauchy.blend(1.0, leg, float(t))
 

@@ -69,7 +69,9 @@ class IndependentBlocks:
             candidate[group.group] = np.where(better_rows, candidate[group.group], states[group.group])
             lengths.append(np.where(better, np.linalg.norm(deltas[e], axis=1), 0.0))
             new_costs[e] = np.where(better, new_costs[e], costs[e])
-            self.damping[e] = np.where(better, np.maximum(self.damping[e] / 5.0, 1e-15), self.damping[e] * self._growth[e])
+            self.damping[e] = np.where(
+                better, np.maximum(self.damping[e] / 5.0, 1e-15), self.damping[e] * self._growth[e]
+            )
             self._growth[e] = np.where(better, 2.0, np.minimum(2.0 * self._growth[e], 1e6))
         gradient = max((float(np.abs(g).max()) for g in equations.g_landmarks if g.size), default=0.0)
         return candidate, new_costs, lengths, gradient

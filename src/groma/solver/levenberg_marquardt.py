@@ -36,10 +36,10 @@ class LevenbergMarquardt:
         linearize_and_eliminate(self._equations, self._system, states, inputs, self.damping, self._watch)
 
     def propose(self) -> tuple[Step, float] | None:
-        r"""Return a step and the decrease of the quadratic model, :math:`-g^\top\delta - \tfrac12\delta^\top J^\top J\delta`.
+        r"""Return a step and the decrease of the quadratic model.
 
-        From :math:`(J^\top J + \lambda D)\,\delta = -g - e`, with e the residual that an iterative solver leaves, the
-        decrease is :math:`\tfrac12(-g^\top\delta + \lambda\,\delta^\top D\,\delta + e^\top\delta)`.
+        The decrease is :math:`-g^\top\delta - \tfrac12\delta^\top J^\top J\delta`. From :math:`(J^\top J + \lambda D)\,\delta = -g - e`, with e the residual that an iterative solver
+        leaves, it is :math:`\tfrac12(-g^\top\delta + \lambda\,\delta^\top D\,\delta + e^\top\delta)`.
         """
         with self._watch("schur"):
             self._system.assemble(self.damping)
@@ -49,7 +49,10 @@ class LevenbergMarquardt:
             return None
         with self._watch("backsubstitute"):
             step = Step(kept, self._system.landmark_steps(kept))
-            scaled = [d * delta for d, delta in zip(diagonal(self._equations, self._system).parts(), step.parts(), strict=True)]
+            scaled = [
+                d * delta
+                for d, delta in zip(diagonal(self._equations, self._system).parts(), step.parts(), strict=True)
+            ]
             total = self.damping * sum(float(a @ b) for a, b in zip(scaled, step.parts(), strict=True))
             total -= gradient(self._equations).dot(step)
             if isinstance(self._linear, ConjugateGradients):
@@ -72,7 +75,12 @@ class LevenbergMarquardt:
 
 
 def linearize_and_eliminate(
-    equations: NormalEquations, system: ReducedSystem, states: States, inputs: list[tuple], damping: float, watch: Stopwatch
+    equations: NormalEquations,
+    system: ReducedSystem,
+    states: States,
+    inputs: list[tuple],
+    damping: float,
+    watch: Stopwatch,
 ) -> None:
     """Form the normal equations; eliminate each chunk's landmarks right after, while they are in cache."""
     spent = [0.0]

@@ -18,9 +18,9 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
+from scipy.linalg import get_lapack_funcs
 
 from groma._numba import loop
 from groma._simd import add_matvec, add_product, width
@@ -118,16 +118,16 @@ class Dense:
         self._layout = layout
         n = layout.num_kept_unknowns
         self._M = np.zeros((n, n))
-        self.factor: FloatArray | None = None
 
     def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
         self._M[:] = 0.0
         self.fill(blocks, self._M)
         # the upper triangle in C order is the lower triangle of the transpose, which LAPACK takes without a copy
-        self.factor, info = scipy.linalg.lapack.dpotrf(self._M.T, lower=1, overwrite_a=1, clean=0)
+        potrf, potrs = get_lapack_funcs(("potrf", "potrs"), (self._M,))
+        factor, info = potrf(self._M.T, lower=1, overwrite_a=1, clean=0)
         if info != 0:
             return None
-        x, info = scipy.linalg.lapack.dpotrs(self.factor, np.concatenate(rhs), lower=1)
+        x, info = potrs(factor, np.concatenate(rhs), lower=1)
         return _split(self._layout, x) if np.isfinite(x).all() else None
 
     def fill(self, blocks: Blocks, M: FloatArray) -> None:
@@ -168,18 +168,17 @@ class Sparse:
         matrix.sort_indices()
         self._source = (matrix.data - 1).astype(np.int64)
         self._matrix = matrix
-        self.factor: scipy.sparse.linalg.SuperLU | None = None
 
     def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
         values = np.concatenate([blocks[pair].reshape(-1) for pair in self._order])
         self._matrix.data = values[self._source]
         try:
-            self.factor = scipy.sparse.linalg.splu(
+            factor = scipy.sparse.linalg.splu(
                 self._matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
             )
         except RuntimeError:  # exactly singular
             return None
-        x = self.factor.solve(np.concatenate(rhs))
+        x = factor.solve(np.concatenate(rhs))
         return _split(self._layout, x) if np.isfinite(x).all() else None
 
 
@@ -245,5 +244,3 @@ class ConjugateGradients:
 
 def _dot(x: list[FloatArray], y: list[FloatArray]) -> float:
     return float(sum(a @ b for a, b in zip(x, y, strict=True)))
-
-

@@ -240,9 +240,7 @@ class ReducedSystem:
                 if held.any():
                     blocks[:, steps, steps] += held
             self.S[pair] = S
-        self.rhs = [
-            -(g + sum_of([parts[c] for parts in self._g])) for c, g in enumerate(self.equations.g_kept)
-        ]
+        self.rhs = [-(g + sum_of([parts[c] for parts in self._g])) for c, g in enumerate(self.equations.g_kept)]
 
     def diagonal(self, c: int) -> FloatArray:
         """Return the diagonal of H for one class, (count, width)."""

@@ -136,41 +136,35 @@ def _solve_jointly(
             break
         report.iterations += 1
         damping = strategy.damping
-        proposal = strategy.propose()
-        new_cost, ratio, length = np.inf, 0.0, np.inf
-        if proposal is not None:
-            step, predicted = proposal
-            with watch("backsubstitute"):
-                candidate = retract(layout, states, step)
-            with watch("cost"):
-                new_inputs = equations.prepare(candidate)
-                new_cost = equations.cost(new_inputs)
-            length = step.norm()
-            ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
-        accepted = bool(new_cost < cost)
-        if accepted:
-            if ratio > STRETCH_GAIN_RATIO:
+        trial = _try_step(layout, equations, strategy, watch, states, cost)
+        accepted = trial is not None and trial.cost < cost
+        if trial is not None and accepted:
+            if trial.gain_ratio > STRETCH_GAIN_RATIO:
                 with watch("cost"):
-                    candidate, new_inputs, new_cost = _stretch(
-                        layout, equations, states, step, ratio, (candidate, new_inputs, new_cost)
-                    )
+                    trial = _stretched(layout, equations, states, trial)
             if refiner is not None:
                 with watch("backsubstitute"):
-                    candidate, new_cost = refiner.refine(equations, candidate, new_cost)
-                    new_inputs = equations.prepare(candidate)
-            decrease, old_cost = cost - new_cost, cost
-            states, cost, inputs = candidate, new_cost, new_inputs
-            strategy.accept(ratio)
+                    trial = refiner.refine(equations, trial)
+            decrease, old_cost = cost - trial.cost, cost
+            states, cost, inputs = trial.states, trial.cost, trial.inputs
+            strategy.accept(trial.gain_ratio)
             if decrease <= options.function_tolerance * old_cost:
                 termination = Termination.COST_CONVERGED
-            elif length <= options.step_tolerance * size_of(states):
+            elif trial.length <= options.step_tolerance * size_of(states):
                 termination = Termination.STEP_CONVERGED
-        elif length <= 1e-14 * size_of(states) or not strategy.refuse():
+        elif (trial is not None and trial.length <= 1e-14 * size_of(states)) or not strategy.refuse():
             termination = Termination.DAMPING_EXHAUSTED
         record = Iteration(
-            report.iterations, float(new_cost), accepted, damping, float(ratio), float(length), slope,
-            linear.num_iterations if isinstance(linear, ConjugateGradients) else 0, watch.elapsed(),
-        )  # fmt: skip
+            iteration=report.iterations,
+            cost=trial.cost if trial is not None else float("inf"),
+            accepted=accepted,
+            damping=damping,
+            gain_ratio=trial.gain_ratio if trial is not None else 0.0,
+            step_norm=trial.length if trial is not None else float("inf"),
+            gradient_max=slope,
+            linear_iterations=linear.num_iterations if isinstance(linear, ConjugateGradients) else 0,
+            seconds=watch.elapsed(),
+        )
         report.history.append(record)
         if progress is not None and progress(record) is False:
             termination = Termination.STOPPED_BY_CALLER
@@ -183,17 +177,52 @@ def _solve_jointly(
     return states
 
 
-def _stretch(layout: Layout, equations: NormalEquations, states: States, step: Step, ratio: float, best: tuple):
-    r"""Try a multiple of an accepted step, and return the better (states, inputs, cost).
+@dataclass(frozen=True)
+class _Trial:
+    """States after a step, with what was found there."""
 
-    Robust losses bend the cost down, so reweighted least squares overestimates the curvature. If the curvature along the
-    step is the fraction c of the model's, the gain ratio is 2 - c and the minimum lies at 1 / c times the step.
+    step: Step
+    states: States
+    inputs: list[tuple]
+    cost: float
+    #: Actual over predicted decrease of the cost.
+    gain_ratio: float
+    length: float
+
+
+def _try_step(
+    layout: Layout,
+    equations: NormalEquations,
+    strategy: LevenbergMarquardt | Dogleg,
+    watch,
+    states: States,
+    cost: float,
+) -> _Trial | None:
+    """Propose a step and evaluate the cost after it; None if the linear system could not be solved."""
+    proposal = strategy.propose()
+    if proposal is None:
+        return None
+    step, predicted = proposal
+    with watch("backsubstitute"):
+        moved = retract(layout, states, step)
+    with watch("cost"):
+        inputs = equations.prepare(moved)
+        new_cost = equations.cost(inputs)
+    ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
+    return _Trial(step, moved, inputs, new_cost, float(ratio), step.norm())
+
+
+def _stretched(layout: Layout, equations: NormalEquations, states: States, trial: _Trial) -> _Trial:
+    r"""Try a multiple of an accepted step, and return the better trial.
+
+    Robust losses bend the cost down, so reweighted least squares overestimates the curvature. If the curvature along
+    the step is the fraction c of the model's, the gain ratio is 2 - c and the minimum lies at 1 / c times the step.
     """
-    factor = min(1.0 / max(2.0 - ratio, 1.0 / MAX_STRETCH), MAX_STRETCH)
-    candidate = retract(layout, states, step.blend(factor, step, 0.0))
-    inputs = equations.prepare(candidate)
+    factor = min(1.0 / max(2.0 - trial.gain_ratio, 1.0 / MAX_STRETCH), MAX_STRETCH)
+    moved = retract(layout, states, trial.step.blend(factor, trial.step, 0.0))
+    inputs = equations.prepare(moved)
     cost = equations.cost(inputs)
-    return (candidate, inputs, cost) if cost < best[2] else best
+    return replace(trial, states=moved, inputs=inputs, cost=cost) if cost < trial.cost else trial
 
 
 # ------------------------------------------------------------------------------------------- landmarks on their own
@@ -204,24 +233,26 @@ class _LandmarkRefiner:
 
     def __init__(self, layout: Layout, workers: Workers, groups: list[str], steps: int) -> None:
         held = {
-            name: group if name in groups else replace(group, constant=True) for name, group in layout.problem.variables.items()
+            name: group if name in groups else replace(group, constant=True)
+            for name, group in layout.problem.variables.items()
         }
         factors = [f for f in layout.problem.factors if any(ref.group in groups for _, ref in f.references())]
         self._outer, self._steps = layout, steps
         self._blocks = IndependentBlocks(lay_out(Problem(held, factors), tuple(groups)), workers, 1e-6)
 
-    def refine(self, equations: NormalEquations, states, cost: float):
-        """Return better states and their cost."""
-        inner = to_original_order(self._outer, states)
+    def refine(self, equations: NormalEquations, trial: _Trial) -> _Trial:
+        """Return the trial with better landmarks."""
+        inner = to_original_order(self._outer, trial.states)
         self._blocks.reset()
         costs = self._blocks.costs(inner)
         for _ in range(self._steps):
             inner, costs, _, _ = self._blocks.step(inner, costs)
-        refined = dict(states)
+        refined = dict(trial.states)
         for group in self._outer.eliminated:
             refined[group.group] = np.ascontiguousarray(inner[group.group][group.order])
-        new_cost = equations.cost(equations.prepare(refined))
-        return (refined, new_cost) if new_cost < cost else (states, cost)
+        inputs = equations.prepare(refined)
+        cost = equations.cost(inputs)
+        return replace(trial, states=refined, inputs=inputs, cost=cost) if cost < trial.cost else trial
 
 
 def _landmark_refiner(layout: Layout, workers: Workers, options: SolverOptions) -> _LandmarkRefiner | None:
@@ -319,4 +350,3 @@ def _note_oddities(report: SolveReport) -> None:
             f"There are fewer residuals ({report.num_residuals}) than unknowns ({report.num_unknowns}): the result is "
             "one of many. Hold variables constant, add priors or add observations."
         )
-

@@ -162,7 +162,7 @@ def bars(names: Sequence[str], before: FloatArray | None, after: FloatArray) -> 
         longest = 0.0
         for kind, series, offset in (("before", before, 0), ("after", after, 9 if before is not None else 4)):
             if series is not None:
-                length = min(series[index] * scale, WIDTH - left - right)
+                length = min(float(series[index]) * scale, WIDTH - left - right)
                 longest = max(longest, length)
                 body.append(
                     f'<rect class="{kind}" x="{left}" y="{y + offset}" width="{length:.1f}" height="8" rx="2"/>'

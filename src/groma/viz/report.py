@@ -13,7 +13,7 @@ import html
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -37,12 +37,20 @@ MAX_RESIDUALS = 60_000
 class Report(Protocol):
     """What the page reads of the report of an adjustment."""
 
-    #: Steps: mappings or objects with iteration, cost, accepted.
-    history: Sequence[Any]
-    #: Sentences for the user.
-    warnings: Sequence[str]
-    #: An enumeration member with a ``sentence``.
-    termination: Any
+    @property
+    def history(self) -> Sequence[Any]:
+        """Steps: mappings or objects with iteration, cost, accepted."""
+        ...
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Sentences for the user."""
+        ...
+
+    @property
+    def termination(self) -> Any:
+        """An enumeration member with a ``sentence``."""
+        ...
 
     def to_dict(self) -> dict[str, Any]:
         """Return the numbers of the machine-readable report."""
@@ -149,14 +157,10 @@ def _tiles(before: Drawable | None, after: Drawable, numbers: dict[str, Any] | N
         start = f"{_short(first)} <i>→</i> " if first is not None else ""
         return f"{start}{_short(second)}{unit}"
 
-    lengths = [scene.lengths if scene is not None else None for scene in (before, after)]
-    tiles = [
-        (
-            change(None if lengths[0] is None else _rms(lengths[0]), _rms(lengths[1]), " px"),
-            "residual, root mean square",
-        ),
-        (change(None if lengths[0] is None else _median(lengths[0]), _median(lengths[1]), " px"), "residual, median"),
-    ]
+    def summary(statistic: Callable[[FloatArray], float]) -> str:
+        return change(statistic(before.lengths) if before is not None else None, statistic(after.lengths), " px")
+
+    tiles = [(summary(_rms), "residual, root mean square"), (summary(_median), "residual, median")]
     if numbers is not None:
         tiles += [
             (change(numbers["initial_cost"], numbers["final_cost"], ""), "cost"),
