@@ -74,10 +74,8 @@ PROBLEMS = (
     BenchmarkProblem("trafalgar-21", "Trafalgar-21", "points", "problem-21-11315-pre", quick=True),
     BenchmarkProblem("dubrovnik-16", "Dubrovnik-16", "points", "problem-16-22106-pre", quick=True),
     BenchmarkProblem("corridor-300", "Corridor, 300 cameras, 50 000 points", "points", "medium"),
-    BenchmarkProblem(
-        "lines-50", "Corridor, 50 cameras, 5 000 points, 2 000 lines", "points_lines", "small", quick=True
-    ),
-    BenchmarkProblem("lines-300", "Corridor, 300 cameras, 50 000 points, 20 000 lines", "points_lines", "medium"),
+    BenchmarkProblem("lines-50", "Corridor, 50 cameras, points and 2 000 lines", "points_lines", "small", quick=True),
+    BenchmarkProblem("lines-300", "Corridor, 300 cameras, points and 20 000 lines", "points_lines", "medium"),
 )
 
 

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the Python contestants share: one thread, clocks, peak memory, the line of JSON they print."""
+"""What the Python contestants share: clocks, peak memory, the line of JSON they print.
+
+They run on one thread when the environment says so before they start, as ``run.py`` does.
+"""
 
 from __future__ import annotations
 
 import json
-import os
 import resource
 import time
-
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ[_name] = "1"
 
 
 def peak_memory_mib() -> float:

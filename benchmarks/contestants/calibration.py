@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from _common import Clock, report  # first: it sets the number of threads
-
 import numpy as np
+from _common import Clock, report
 
 
 def main() -> None:

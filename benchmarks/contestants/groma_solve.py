@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-from _common import Clock, report  # first: it sets the number of threads
+from _common import Clock, report
 
 import groma
 from groma.io import read_scene

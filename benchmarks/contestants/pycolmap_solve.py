@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import sys
 
-from _common import Clock, report  # first: it sets the number of threads
-
 import numpy as np
 import pycolmap
+from _common import Clock, report
 from pycolmap._core import pyceres
 
 

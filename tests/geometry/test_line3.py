@@ -133,11 +133,11 @@ def test_closest_line_is_stationary_and_equals_the_singular_value_recipe(rng):
     vector = rng.normal(size=(COUNT, 6))
     closest = line3.closest_line(vector)
     assert np.abs(line3.klein_residual(closest)).max() < 1e-14
-    # Bartoli and Sturm: [m d] = U S V', T = S V', the pair of columns with equal rotation part closest to T
+    # Bartoli and Sturm: [m d] = U Z; the rotation D with the smallest off-diagonal part of D' Z, which is T v
     for row, answer in zip(vector, closest, strict=True):
         U, s, Vt = np.linalg.svd(np.column_stack([row[:3], row[3:]]), full_matrices=False)
         Z = np.diag(s) @ Vt
-        T = np.array([[Z[1, 0], Z[1, 1]], [Z[0, 1], -Z[0, 0]]])
+        T = np.array([[Z[0, 1], Z[1, 1]], [Z[1, 0], -Z[0, 0]]])
         v = np.linalg.svd(T)[2][-1]
         D = np.array([[v[0], -v[1]], [v[1], v[0]]])
         V = U @ D @ np.diag(np.diag(D.T @ Z))

@@ -3,18 +3,31 @@
 
 import numpy as np
 import pytest
-from manifold_cases import CASES, TABLES
 
 from groma import testing
 from groma.errors import InputError
-from groma.geometry.line_cartesian import CartesianLine
-from groma.geometry.plane_charts import NormalOffsetPlane
-from groma.geometry.point3 import from_homogeneous, to_homogeneous
-from groma.geometry.pose_charts import PoseBody, PoseLeft, PoseRight
-from groma.geometry.unit3 import Unit3
+from groma.geometry._manifold import Euclidean
+from groma.geometry.line_charts import LINE_CHARTS, CartesianLine
+from groma.geometry.plane_charts import PLANE_CHARTS, NormalOffsetPlane
+from groma.geometry.point3 import POINT_CHARTS, from_homogeneous, to_homogeneous
+from groma.geometry.pose_charts import POSE_CHARTS, PoseBody, PoseLeft, PoseRight
+from groma.geometry.unit3 import DIRECTION_CHARTS, Unit3
 from groma.testing import check_manifold
 
 pytestmark = pytest.mark.kernels
+
+TABLES = {
+    "pose": POSE_CHARTS,
+    "line": LINE_CHARTS,
+    "plane": PLANE_CHARTS,
+    "direction": DIRECTION_CHARTS,
+    "point": POINT_CHARTS,
+    "intrinsics": {"euclidean": Euclidean(4, "intrinsics")},
+    "vector": {"euclidean": Euclidean(9)},
+}
+CASES = [
+    pytest.param(manifold, id=f"{kind}-{name}") for kind, table in TABLES.items() for name, manifold in table.items()
+]
 
 
 @pytest.mark.parametrize("manifold", CASES)

@@ -6,7 +6,7 @@ from problems import dense_normal_equations, scene_problem
 
 from groma.factors.losses import Cauchy
 from groma.problem._parallel import Workers
-from groma.problem.layout import lay_out
+from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.solver.linear import choose
 from groma.solver.schur import MIN_DIAGONAL, ReducedSystem

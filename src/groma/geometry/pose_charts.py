@@ -124,10 +124,10 @@ class _PoseChart(Manifold):
         """
         ambient = as_rows(ambient, 12, "ambient")
         matrix = ambient.reshape(-1, 3, 4)
-        finite = np.isfinite(matrix).all(axis=(1, 2), keepdims=True)
-        R = np.where(finite, matrix[:, :, :3], 0.0)
+        finite = np.isfinite(ambient).min(axis=1)
+        R = np.where(finite[:, None, None], matrix[:, :, :3], 0.0)
         off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-        good = finite[:, 0, 0] & (off < 1e-6) & (np.linalg.det(R) > 0)
+        good = finite & (off < 1e-6) & (np.linalg.det(R) > 0)
         reject(
             ~good,
             ambient,

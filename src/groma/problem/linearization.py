@@ -16,113 +16,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from groma._numba import loop
-from groma._simd import add_product, set_product, width
+from groma._simd import add_product, width
 from groma._typing import FloatArray
-from groma.factors.losses import loss_derivatives, loss_value
 from groma.problem._parallel import Workers
+from groma.problem._records import cost_scaled, cost_whitened, mask, weigh, whiten
 from groma.problem.layout import Chunk, FactorLayout, Layout
 
 States = Mapping[str, FloatArray]
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
-
-
-@loop
-def _whiten(record, begin, information):
-    """Multiply each record from the left by its square root information matrix."""
-    n, m, columns = record.shape
-    old = np.empty(m)
-    for i in range(n):
-        for c in range(columns):
-            for a in range(m):
-                old[a] = record[i, a, c]
-            for a in range(m):
-                total = 0.0
-                for b in range(m):
-                    total += information[begin + i, a, b] * old[b]
-                record[i, a, c] = total
-
-
-@loop
-def _weigh(record, begin, scale, step, code, first, second, norms):
-    """Scale each record by 1/sigma and by the root of the loss' weight; return sum of rho, write the squared norms."""
-    n, m, columns = record.shape
-    cost = 0.0
-    for i in range(n):
-        s = scale[(begin + i) * step]
-        norm = 0.0
-        for a in range(m):
-            norm += record[i, a, columns - 1] * record[i, a, columns - 1]
-        norm *= s * s
-        norms[i] = norm
-        if code == 0:
-            cost += norm
-        else:
-            rho, weight, _ = loss_derivatives(code, first, second, norm)
-            cost += rho
-            s *= np.sqrt(weight)
-        if s != 1.0:
-            for a in range(m):
-                for c in range(columns):
-                    record[i, a, c] *= s
-    return cost
-
-
-@loop
-def _cost_scaled(residual, begin, scale, step, code, first, second, rho):
-    n, m = residual.shape
-    cost = 0.0
-    for i in range(n):
-        s = scale[(begin + i) * step]
-        norm = 0.0
-        for a in range(m):
-            norm += residual[i, a] * residual[i, a]
-        value = loss_value(code, first, second, norm * s * s)
-        rho[i] = value
-        cost += value
-    return cost
-
-
-@loop
-def _cost_whitened(residual, begin, information, code, first, second, rho):
-    n, m = residual.shape
-    cost = 0.0
-    for i in range(n):
-        norm = 0.0
-        for a in range(m):
-            total = 0.0
-            for b in range(m):
-                total += information[begin + i, a, b] * residual[i, b]
-            norm += total * total
-        value = loss_value(code, first, second, norm)
-        rho[i] = value
-        cost += value
-    return cost
-
-
-@loop
-def _chain(record, begin, raw, column, index, basis, raw_width, dof_width, one):
-    """Columns of the chart = columns in factor coordinates times the basis of the chart."""
-    n, m, columns = record.shape
-    flat, bases = record.reshape(record.size), basis.reshape(basis.size)
-    size, dof = len(raw_width), len(dof_width)
-    for i in range(n):
-        b = np.int64(index[begin + i]) * (size * dof)
-        for a in range(m):
-            row = (i * m + a) * columns
-            set_product(flat, row + column, flat, row + raw, 1, bases, b, dof, raw_width, one, dof_width)
-
-
-@loop
-def _mask(record, begin, column, index, free):
-    """Zero the columns of coordinates that are held constant."""
-    n, m, _ = record.shape
-    for i in range(n):
-        k = index[begin + i]
-        for c in range(free.shape[1]):
-            if not free[k, c]:
-                for a in range(m):
-                    record[i, a, column + c] = 0.0
 
 
 @loop
@@ -286,9 +188,9 @@ class NormalEquations:
         rho = flat[n * m : n * m + n]
         layout.factor.residuals(inputs, begin, end, out)
         if noise.matrices is not None:
-            value = _cost_whitened(out, begin, noise.matrices, noise.code, noise.first, noise.second, rho)
+            value = cost_whitened(out, begin, noise.matrices, noise.code, noise.first, noise.second, rho)
         else:
-            value = _cost_scaled(out, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, rho)
+            value = cost_scaled(out, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, rho)
         return value, rho
 
     def _record(self, share: int, f: int) -> FloatArray:
@@ -360,18 +262,18 @@ class NormalEquations:
             record[:] = 0.0
         degenerate = layout.factor.linearize(inputs, begin, end, layout.columns, record)
         if noise.matrices is not None:
-            _whiten(record, begin, noise.matrices)
-        cost = _weigh(record, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, norms)
+            whiten(record, begin, noise.matrices)
+        cost = weigh(record, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, norms)
         references = layout.factor.references()
         for chain in layout.chains:
             ref = references[chain.reference][1]
-            _chain(
+            chain_rule(
                 record, begin, chain.raw_column, chain.column, ref.index, bases[ref.group],
                 width(chain.raw_size), width(chain.dof), _ONE,
             )  # fmt: skip
         for reference, column, _ in layout.masked:
             ref = references[reference][1]
-            _mask(record, begin, column, ref.index, self._free[ref.group])
+            mask(record, begin, column, ref.index, self._free[ref.group])
         self._sum(share, layout, record, begin)
         return cost, degenerate
 

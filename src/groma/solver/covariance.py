@@ -24,7 +24,8 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ProblemError
 from groma.problem._parallel import Workers
 from groma.problem.gauge import gauge_directions
-from groma.problem.layout import Layout, lay_out
+from groma.problem.lay_out import lay_out
+from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.problem import Problem
 from groma.solver.linear import Dense

@@ -38,8 +38,9 @@ class LevenbergMarquardt:
     def propose(self) -> tuple[Step, float] | None:
         r"""Return a step and the decrease of the quadratic model.
 
-        The decrease is :math:`-g^\top\delta - \tfrac12\delta^\top J^\top J\delta`. From :math:`(J^\top J + \lambda D)\,\delta = -g - e`, with e the residual that an iterative solver
-        leaves, it is :math:`\tfrac12(-g^\top\delta + \lambda\,\delta^\top D\,\delta + e^\top\delta)`.
+        The decrease is :math:`-g^\top\delta - \tfrac12\delta^\top J^\top J\delta`. From
+        :math:`(J^\top J + \lambda D)\,\delta = -g - e`, with e the residual that an iterative solver leaves, it is
+        :math:`\tfrac12(-g^\top\delta + \lambda\,\delta^\top D\,\delta + e^\top\delta)`.
         """
         with self._watch("schur"):
             self._system.assemble(self.damping)

@@ -22,7 +22,8 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.problem._parallel import Workers, available_cores
-from groma.problem.layout import Layout, lay_out
+from groma.problem.lay_out import lay_out
+from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
 from groma.problem.problem import Problem
 from groma.solver._blas import one_blas_thread

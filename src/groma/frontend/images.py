@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the front-end accepts as an image: grey 8 bit, made from what callers have."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from groma.errors import InputError, ShapeError
+
+GrayImage = npt.NDArray[np.uint8]
+
+
+def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
+    """Grey 8-bit image (H, W), contiguous.
+
+    Parameters
+    ----------
+    image : (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) uint8, uint16, bool or float
+        Grey, or colour in OpenCV's order blue, green, red (, alpha). Floats are grey levels from 0 to 1 where nothing
+        exceeds 1, otherwise 0 to 255; 16 bits are divided by 257.
+
+    Raises
+    ------
+    ShapeError
+        If it is not an image of at least one pixel.
+    InputError
+        If its numbers are of another type or not finite.
+    """
+    image = np.asarray(image)
+    if image.ndim not in (2, 3) or 0 in image.shape or (image.ndim == 3 and image.shape[2] not in (1, 3, 4)):
+        raise ShapeError(
+            f"image must have shape (H, W) or (H, W, 3), at least one pixel; got {image.shape}. "
+            "Did the file open? cv2.imread gives None for files it cannot read."
+        )
+    if image.dtype == np.bool_:
+        image = image.astype(np.uint8) * 255
+    elif image.dtype == np.uint16:
+        image = np.round(image / 257.0).astype(np.uint8)
+    elif np.issubdtype(image.dtype, np.floating):
+        if not np.isfinite(image).all():
+            raise InputError("image must be finite; got NaN or infinity. Replace them, e.g. with numpy.nan_to_num.")
+        image = np.clip(np.round(image * (255.0 if image.max() <= 1.0 else 1.0)), 0, 255).astype(np.uint8)
+    elif image.dtype != np.uint8:
+        raise InputError(f"image must be uint8, uint16, bool or float; got {image.dtype}. Convert it with astype.")
+    if image.ndim == 3:
+        if image.shape[2] == 1:
+            image = image[..., 0]
+        else:
+            code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
+            image = cv2.cvtColor(np.ascontiguousarray(image), code)
+    return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+__all__ = ["GrayImage", "to_gray"]

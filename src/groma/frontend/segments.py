@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The line segments of one image.
+
+Pixels count from the corner of the image: the first pixel's centre is (0.5, 0.5). A segment is directed from its first
+to its second end point so that the **darker side lies to its left** as seen in the image (v pointing down): a person
+walking along it has the dark on the left hand. The same physical edge is therefore directed alike in all images, and
+the two edges of a dark bar on a bright wall are told apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.errors import InputError, ShapeError
+from groma.geometry import segment2
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Line segments of one image, in the order the detector gives them: longest first."""
+
+    ends: FloatArray
+    """(N, 4) end points u1 v1 u2 v2, pixels; darker side to the left."""
+
+    sigma: FloatArray
+    """(N,) standard deviation of each end point across the segment, pixels."""
+
+    strength: FloatArray
+    """(N,) mean gradient across the segment, grey levels (of 255) per pixel."""
+
+    def __post_init__(self) -> None:
+        ends = np.asarray(self.ends, dtype=np.float64)
+        if ends.ndim != 2 or ends.shape[1] != 4:
+            raise ShapeError(f"ends must have shape (N, 4): u1 v1 u2 v2; got {ends.shape}. Reshape it to (-1, 4).")
+        object.__setattr__(self, "ends", ends)
+        for name in ("sigma", "strength"):
+            values = np.asarray(getattr(self, name), dtype=np.float64)
+            if values.shape != (len(ends),):
+                raise ShapeError(f"{name} must have shape ({len(ends)},), one value a segment; got {values.shape}.")
+            object.__setattr__(self, name, values)
+        if not (np.isfinite(ends).all() and np.isfinite(self.strength).all()):
+            raise InputError("Segments must be finite; got NaN or infinity. Select the finite rows first.")
+        if not (np.isfinite(self.sigma).all() and (self.sigma > 0.0).all()):
+            raise InputError("sigma must be positive and finite, in pixels. Pass 0.3 where nothing is known.")
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    @property
+    def length(self) -> FloatArray:
+        """(N,) lengths in pixels."""
+        return segment2.length(self.ends)
+
+    @property
+    def midpoint(self) -> FloatArray:
+        """(N, 2) midpoints in pixels."""
+        return segment2.midpoint(self.ends)
+
+    @property
+    def direction(self) -> FloatArray:
+        """(N, 2) unit directions."""
+        return segment2.direction(self.ends)
+
+    @property
+    def line(self) -> FloatArray:
+        """(N, 3) homogeneous lines; positive on the right, the brighter side."""
+        return segment2.to_line(self.ends)
+
+    def select(self, rows: IntArray | BoolArray) -> Segments:
+        """Segments of the given rows: indices or a mask."""
+        return Segments(self.ends[rows], self.sigma[rows], self.strength[rows])
+
+    @staticmethod
+    def from_ends(ends: FloatArray, sigma: float = 0.3, strength: float = 0.0) -> Segments:
+        """Segments from end points (N, 4) of another detector, with one sigma in pixels and one strength for all.
+
+        Their direction is kept as given; the darker side must lie on the left where matching is to use it.
+        """
+        ends = np.asarray(ends, dtype=np.float64).reshape(-1, 4)
+        return Segments(ends, np.full(len(ends), float(sigma)), np.full(len(ends), float(strength)))
+
+    @staticmethod
+    def empty() -> Segments:
+        """No segments."""
+        return Segments(np.zeros((0, 4)), np.zeros(0), np.zeros(0))
+
+
+__all__ = ["Segments"]

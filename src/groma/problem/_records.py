@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What happens to the records of a factor group between the factors and the sums: noise, loss, chart, constants.
+
+A record is ``[J_1 | J_2 | ... | r]`` for each residual row; see :mod:`groma.factors._factor`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._numba import loop
+from groma._simd import set_product
+from groma.factors.losses import loss_derivatives, loss_value
+
+# ---------------------------------------------------------------------------------------------------------- Kernels
+
+
+@loop
+def whiten(record, begin, information):
+    """Multiply each record from the left by its square root information matrix."""
+    n, m, columns = record.shape
+    old = np.empty(m)
+    for i in range(n):
+        for c in range(columns):
+            for a in range(m):
+                old[a] = record[i, a, c]
+            for a in range(m):
+                total = 0.0
+                for b in range(m):
+                    total += information[begin + i, a, b] * old[b]
+                record[i, a, c] = total
+
+
+@loop
+def weigh(record, begin, scale, step, code, first, second, norms):
+    """Scale each record by 1/sigma and by the root of the loss' weight; return sum of rho, write the squared norms."""
+    n, m, columns = record.shape
+    cost = 0.0
+    for i in range(n):
+        s = scale[(begin + i) * step]
+        norm = 0.0
+        for a in range(m):
+            norm += record[i, a, columns - 1] * record[i, a, columns - 1]
+        norm *= s * s
+        norms[i] = norm
+        if code == 0:
+            cost += norm
+        else:
+            rho, weight, _ = loss_derivatives(code, first, second, norm)
+            cost += rho
+            s *= np.sqrt(weight)
+        if s != 1.0:
+            for a in range(m):
+                for c in range(columns):
+                    record[i, a, c] *= s
+    return cost
+
+
+@loop
+def cost_scaled(residual, begin, scale, step, code, first, second, rho):
+    n, m = residual.shape
+    cost = 0.0
+    for i in range(n):
+        s = scale[(begin + i) * step]
+        norm = 0.0
+        for a in range(m):
+            norm += residual[i, a] * residual[i, a]
+        value = loss_value(code, first, second, norm * s * s)
+        rho[i] = value
+        cost += value
+    return cost
+
+
+@loop
+def cost_whitened(residual, begin, information, code, first, second, rho):
+    n, m = residual.shape
+    cost = 0.0
+    for i in range(n):
+        norm = 0.0
+        for a in range(m):
+            total = 0.0
+            for b in range(m):
+                total += information[begin + i, a, b] * residual[i, b]
+            norm += total * total
+        value = loss_value(code, first, second, norm)
+        rho[i] = value
+        cost += value
+    return cost
+
+
+@loop
+def chain_rule(record, begin, raw, column, index, basis, raw_width, dof_width, one):
+    """Columns of the chart = columns in factor coordinates times the basis of the chart."""
+    n, m, columns = record.shape
+    flat, bases = record.reshape(record.size), basis.reshape(basis.size)
+    size, dof = len(raw_width), len(dof_width)
+    for i in range(n):
+        b = np.int64(index[begin + i]) * (size * dof)
+        for a in range(m):
+            row = (i * m + a) * columns
+            set_product(flat, row + column, flat, row + raw, 1, bases, b, dof, raw_width, one, dof_width)
+
+
+@loop
+def mask(record, begin, column, index, free):
+    """Zero the columns of coordinates that are held constant."""
+    n, m, _ = record.shape
+    for i in range(n):
+        k = index[begin + i]
+        for c in range(free.shape[1]):
+            if not free[k, c]:
+                for a in range(m):
+                    record[i, a, column + c] = 0.0
