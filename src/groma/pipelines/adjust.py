@@ -32,8 +32,8 @@ STAGE_TOLERANCE = 1e-4
 class AdjustOptions:
     """Options of :func:`adjust`. The defaults suit scenes that come from matching images."""
 
-    #: ``none``, ``huber``, ``soft_l1``, ``cauchy``, ``tukey``, ``geman_mcclure``, ``barron`` or ``truncated``; ``auto`` is
-    #: none for BAL problems, else Cauchy and then Geman-McClure, because matches contain outliers.
+    #: ``none``, ``huber``, ``soft_l1``, ``cauchy``, ``tukey``, ``geman_mcclure``, ``barron`` or ``truncated``;
+    #: ``auto`` is none for BAL problems, else Cauchy and then Geman-McClure, because matches contain outliers.
     loss: str = "auto"
     #: Where the loss begins to bend, pixels; None takes 1, and 2 in the second stage of ``auto``.
     loss_scale: float | None = None

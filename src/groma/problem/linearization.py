@@ -19,7 +19,7 @@ from groma._numba import loop
 from groma._simd import add_product, width
 from groma._typing import FloatArray
 from groma.problem._parallel import Workers
-from groma.problem._records import cost_scaled, cost_whitened, mask, weigh, whiten
+from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
 from groma.problem.layout import Chunk, FactorLayout, Layout
 
 States = Mapping[str, FloatArray]

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Which images look at the same part of the scene from usefully different places.
+
+Images are compared through the points they share. Pair (i, j) scores
+
+.. math:: n_{ij}\,\min(1,\ \alpha_{ij}/\alpha_0)\,\min(1,\ \alpha_1/\alpha_{ij})
+
+with :math:`n_{ij}` the number of shared points and :math:`\alpha_{ij}` the median angle under which their rays meet:
+too small an angle says nothing about depth, too large an angle changes what is seen. Where a scene has no points, the
+angle between viewing directions and the distance of the cameras take their place.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+
+from groma._typing import FloatArray, IntArray
+from groma.geometry import quaternion
+from groma.scene import Scene
+
+#: Rays of shared points that meet under less than this count less; radians.
+MIN_ANGLE = np.deg2rad(4.0)
+#: Rays of shared points that meet under more than this count less; radians.
+MAX_ANGLE = np.deg2rad(25.0)
+#: Points looked at per pair of images for the angle.
+_SAMPLE = 64
+
+
+def covisible_neighbors(scene: Scene, num_neighbors: int, min_shared: int = 8) -> list[IntArray]:
+    """Choose for every image its neighbours, best first.
+
+    Parameters
+    ----------
+    scene : Scene
+        Images with poses; points and their observations if there are any.
+    num_neighbors : int
+        At most this many per image.
+    min_shared : int
+        Shared points below which two images are no neighbours.
+
+    Returns
+    -------
+    list of C arrays (n_i,) int
+        Indices of images, n_i <= num_neighbors. Empty where nothing is shared.
+
+    Notes
+    -----
+    Work and memory grow with the number of pairs of images that share points, not with the square of images.
+    """
+    if len(scene.point_observations) == 0:
+        return _by_geometry(scene, num_neighbors)
+    observations, centers = scene.point_observations, scene.cam_centers_in_world
+    ones = np.ones(len(observations), np.int32)
+    shape = (scene.num_images, scene.num_points)
+    sees = sparse.csr_array((ones, (observations.image_idx, observations.point_idx)), shape=shape)
+    sees.sum_duplicates()
+    sees.sort_indices()
+    sees.data[:] = 1
+    shared = (sees @ sees.T).tocsr()
+    neighbors = []
+    for i in range(scene.num_images):
+        row = slice(shared.indptr[i], shared.indptr[i + 1])
+        others, counts = shared.indices[row], shared.data[row]
+        keep = (others != i) & (counts >= min_shared)
+        others, counts = others[keep], counts[keep]
+        order = np.argsort(-counts, kind="stable")[: 4 * num_neighbors]
+        others, counts = others[order], counts[order]
+        points_i = sees.indices[sees.indptr[i] : sees.indptr[i + 1]]
+        angles = np.zeros(len(others))
+        for k, j in enumerate(others):
+            common = np.intersect1d(points_i, sees.indices[sees.indptr[j] : sees.indptr[j + 1]], assume_unique=True)
+            xyz = scene.points.xyz[common[:: max(1, len(common) // _SAMPLE)]]
+            angles[k] = np.median(_angles(xyz - centers[i], xyz - centers[j]))
+        safe = np.maximum(angles, 1e-6)
+        score = counts * np.minimum(1.0, safe / MIN_ANGLE) * np.minimum(1.0, MAX_ANGLE / safe)
+        chosen = np.argsort(-score, kind="stable")[:num_neighbors]
+        neighbors.append(others[chosen].astype(np.int64))
+    return neighbors
+
+
+def _angles(first: FloatArray, second: FloatArray) -> FloatArray:
+    cross = np.linalg.norm(np.cross(first, second), axis=-1)
+    return np.arctan2(cross, np.einsum("...i,...i->...", first, second))
+
+
+def _by_geometry(scene: Scene, num_neighbors: int) -> list[IntArray]:
+    """Neighbours without points: similar viewing direction, near by, not at the same place."""
+    poses, centers = scene.cam_from_world, scene.cam_centers_in_world
+    axis = quaternion.rotate(quaternion.conjugate(poses[:, :4]), np.broadcast_to([0.0, 0.0, 1.0], (len(poses), 3)))
+    extent = np.linalg.norm(centers - centers.mean(0), axis=1).max(initial=0.0) if len(centers) else 0.0
+    neighbors = []
+    for i in range(len(poses)):
+        distance = np.linalg.norm(centers - centers[i], axis=1)
+        turn = _angles(axis, np.broadcast_to(axis[i], axis.shape))
+        usable = (distance > 1e-6 * extent) & (turn < np.deg2rad(60.0))
+        usable[i] = False
+        others = np.flatnonzero(usable)
+        spread = np.median(np.sort(distance[others])[:num_neighbors]) if len(others) else 1.0
+        cost = turn[others] / np.deg2rad(20.0) + distance[others] / spread
+        neighbors.append(others[np.argsort(cost, kind="stable")[:num_neighbors]])
+    return neighbors
