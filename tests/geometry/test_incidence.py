@@ -74,7 +74,7 @@ def test_homogeneous_answers_where_nothing_meets(rng):
     across = np.cross(d, rng.normal(size=(COUNT, 3)))
     holding = plane3.from_point_and_normal(p, across)
     np.testing.assert_allclose(incidence.meet_line_plane(line, holding), 0.0, atol=1e-12)
-    parallel = holding + [0, 0, 0, 1.0]
+    parallel = holding + np.array([0, 0, 0, 1.0])
     met = incidence.meet_line_plane(line, parallel)
     np.testing.assert_allclose(met[:, :3], d, atol=1e-11)
     np.testing.assert_allclose(met[:, 3], 0.0, atol=1e-13)

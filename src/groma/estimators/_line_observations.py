@@ -21,13 +21,13 @@ class TriangulationStatus(IntEnum):
     #: Fewer than two usable observations: zero line.
     TOO_FEW_VIEWS = 1
     #: All planes nearly coincide: the line lies in the epipolar plane of all its views, or the camera moved along it.
-    #: The line is the best that can be had, and uncertain by noise / sine.
+    #: The line is the best that can be had, and uncertain by noise / sine; zero where the planes share no finite line.
     DEGENERATE_BASELINE = 2
     #: A line, but in front of fewer than two of its cameras.
     BEHIND_CAMERA = 3
     #: A line, but the refinement had not converged when it stopped.
     NOT_CONVERGED = 4
-    #: A number is not finite, or the planes share no finite line: zero line.
+    #: A number is not finite, or there is no finite line: zero line.
     INVALID = 5
 
 

@@ -10,6 +10,8 @@ Observations are ragged and stored by line: those of line i are ``line_pointers[
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
@@ -56,6 +58,76 @@ def _basis(along: FloatArray, foot: FloatArray) -> FloatArray:
     out[:, :3, 2], out[:, :3, 3] = np.cross(first, along), np.cross(second, along)
     out[:, 3:, 0], out[:, 3:, 1] = first, second
     return out
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Observations in local frames: line projection matrices, end points, weights, stored by line."""
+
+    matrix: FloatArray
+    ends: FloatArray
+    weights: FloatArray
+    pointers: IntArray
+
+    def evaluate(
+        self, rows: IntArray, along: FloatArray, foot: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Cost, normal matrix and gradient of the lines ``rows`` only, so that finished ones cost nothing."""
+        counts = np.diff(self.pointers)[rows]
+        pointers = np.concatenate([[0], np.cumsum(counts)])
+        take = np.arange(pointers[-1]) + np.repeat(self.pointers[rows] - pointers[:-1], counts)
+        owner = np.repeat(np.arange(len(rows)), counts)
+        line = stack(np.cross(foot, along), along)
+        residual, slope = _residuals(self.matrix[take], line[owner], self.ends[take], self.weights[take])
+        jacobian = slope @ _basis(along, foot)[owner]
+        hessian = sum_by_line(np.swapaxes(jacobian, 1, 2) @ jacobian, pointers)
+        gradient = sum_by_line(np.einsum("mea,me->ma", jacobian, residual), pointers)
+        return sum_by_line((residual * residual).sum(axis=1), pointers), hessian, gradient
+
+
+@dataclass(frozen=True)
+class _State:
+    """Lines in the Cartesian chart, with their cost and normal matrix."""
+
+    along: FloatArray
+    foot: FloatArray
+    cost: FloatArray
+    hessian: FloatArray
+    converged: BoolArray
+    iterations: IntArray
+
+
+def _iterate(views: _Views, along: FloatArray, active: BoolArray, max_iterations: int, tolerance: float) -> _State:
+    """Levenberg-Marquardt on all active lines at once, from lines through their local origins."""
+    count = len(along)
+    along, foot, active = along.copy(), np.zeros((count, 3)), active.copy()
+    damping, iterations = np.full(count, 1e-4), np.zeros(count, dtype=np.int64)
+    converged = np.zeros(count, dtype=bool)
+    cost, hessian, gradient = views.evaluate(np.arange(count), along, foot)
+    diagonal = np.eye(4, dtype=bool)
+    for _ in range(max_iterations):
+        rows = np.flatnonzero(active)
+        if not len(rows):
+            break
+        damped = hessian[rows]
+        entries = damped[:, diagonal]
+        size = entries.max(axis=1)
+        floor = 1e-6 * np.where(size > 0.0, size, 1.0)
+        damped[:, diagonal] += damping[rows, None] * np.maximum(entries, floor[:, None])
+        step = -np.linalg.solve(damped, gradient[rows][..., None])[..., 0]
+        trial_along, trial_foot = _retract(along[rows], foot[rows], step)
+        trial_cost, trial_hessian, trial_gradient = views.evaluate(rows, trial_along, trial_foot)
+        better = trial_cost <= cost[rows]
+        done = (norm(step) <= tolerance) | (better & (cost[rows] - trial_cost <= tolerance * cost[rows]))
+        iterations[rows] += 1
+        damping[rows] = np.clip(np.where(better, 0.1, 10.0) * damping[rows], 1e-9, 1e12)
+        accepted = rows[better]
+        along[accepted], foot[accepted] = trial_along[better], trial_foot[better]
+        cost[accepted], hessian[accepted] = trial_cost[better], trial_hessian[better]
+        gradient[accepted] = trial_gradient[better]
+        converged[rows] = done
+        active[rows] = ~done
+    return _State(along, foot, cost, hessian, converged, iterations)
 
 
 def refine_lines(
@@ -119,7 +191,7 @@ def refine_lines(
     weights = np.ones(len(segments)) if weights is None else np.asarray(weights, dtype=np.float64)
     if weights.shape != (len(segments),):
         raise ShapeError(f"weights must have shape ({len(segments)},); got {weights.shape}. Pass one per observation.")
-    usable = np.isfinite(segments).all(axis=1) & np.isfinite(weights) & (weights > 0.0)
+    usable = np.asarray(np.isfinite(segments).all(axis=1) & np.isfinite(weights) & (weights > 0.0))
     weights = np.where(usable, weights, 0.0)
     ends = np.ones((len(segments), 2, 3))
     ends[:, :, :2] = np.where(usable[:, None], segments, 0.0).reshape(-1, 2, 2)
@@ -143,43 +215,10 @@ def refine_lines(
     matrix = projection.line_projection_matrix(local)
     matrix /= np.maximum(np.abs(matrix).max(axis=(1, 2), initial=0.0), np.finfo(float).tiny)[:, None, None]
 
-    along, foot = start[:, 3:], np.zeros((len(line), 3))
-    damping, iterations = np.full(len(line), 1e-4), np.zeros(len(line), dtype=np.int64)
+    along = start[:, 3:]
     active = valid & (count >= 2)
-    converged = np.zeros(len(line), dtype=bool)
-
-    def evaluate(d: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        r, slope = _residuals(matrix, stack(np.cross(p, d), d)[owner], ends, weights)
-        jacobian = slope @ _basis(d, p)[owner]
-        hessian = sum_by_line(np.swapaxes(jacobian, 1, 2) @ jacobian, pointers)
-        gradient = sum_by_line(np.einsum("mea,me->ma", jacobian, r), pointers)
-        return sum_by_line((r * r).sum(axis=1), pointers), hessian, gradient
-
-    cost, hessian, gradient = evaluate(along, foot)
-    diagonal = np.eye(4, dtype=bool)
-    for _ in range(max_iterations):
-        if not active.any():
-            break
-        size = hessian[:, diagonal].max(axis=1)
-        size = np.where(size > 0.0, size, 1.0)
-        damped = hessian.copy()
-        damped[:, diagonal] += damping[:, None] * np.maximum(hessian[:, diagonal], 1e-6 * size[:, None])
-        damped = np.where(active[:, None, None], damped, np.eye(4))
-        step = np.where(active[:, None], -np.linalg.solve(damped, gradient[..., None])[..., 0], 0.0)
-        trial_along, trial_foot = _retract(along, foot, step)
-        trial_cost, trial_hessian, trial_gradient = evaluate(trial_along, trial_foot)
-        better = active & (trial_cost <= cost)
-        iterations += active
-        done = active & (norm(step) <= tolerance)
-        done |= better & (cost - trial_cost <= tolerance * cost)
-        along, foot = np.where(better[:, None], trial_along, along), np.where(better[:, None], trial_foot, foot)
-        hessian = np.where(better[:, None, None], trial_hessian, hessian)
-        gradient = np.where(better[:, None], trial_gradient, gradient)
-        cost = np.where(better, trial_cost, cost)
-        damping = np.clip(np.where(better, 0.1 * damping, 10.0 * damping), 1e-9, 1e12)
-        converged |= done
-        active &= ~done
-
+    state = _iterate(_Views(matrix, ends, weights, pointers), along, active, max_iterations, tolerance)
+    along, foot, hessian = state.along, state.foot, state.hessian
     refined = to_world(stack(np.cross(foot, along), along), scale, origin)
     eigenvalues = np.asarray(np.linalg.eigvalsh(hessian), dtype=np.float64)
     largest = eigenvalues[:, -1]
@@ -187,7 +226,7 @@ def refine_lines(
     enough = count >= 2
     singular = determined < 1e-7
     status = np.select(
-        [~enough, ~valid, singular, ~converged],
+        [~enough, ~valid, singular, ~state.converged],
         [
             TriangulationStatus.TOO_FEW_VIEWS,
             TriangulationStatus.INVALID,
@@ -203,10 +242,10 @@ def refine_lines(
     return LineTriangulation(
         line=np.where(known[:, None], refined, 0.0),
         sine=np.where(known, determined, 0.0),
-        residual=np.sqrt(cost / np.maximum(2.0 * count, 1.0)),
+        residual=np.sqrt(state.cost / np.maximum(2.0 * count, 1.0)),
         status=status,
         covariance=covariance,
-        iterations=iterations,
+        iterations=state.iterations,
     )
 
 

@@ -84,8 +84,8 @@ def triangulate_two_planes(first: FloatArray, second: FloatArray, min_sine: floa
     sine = np.minimum(norm(line[..., 3:]), 1.0)
     finite = usable & line3.is_finite(line)
     status = np.select(
-        [~finite, sine < min_sine],
-        [TriangulationStatus.INVALID, TriangulationStatus.DEGENERATE_BASELINE],
+        [~usable, sine < min_sine, ~finite],
+        [TriangulationStatus.INVALID, TriangulationStatus.DEGENERATE_BASELINE, TriangulationStatus.INVALID],
         TriangulationStatus.OK,
     )
     line = np.where(finite[..., None], line3.normalize(line), 0.0)
@@ -172,8 +172,8 @@ def _linear(bundle: _Bundle, pair: str, min_sine: float) -> LineTriangulation:
     off = dot(bundle.planes[:, :3], foot[bundle.owner]) + bundle.planes[:, 3] / scale[bundle.owner]
     residual = np.sqrt(sum_by_line(bundle.weights**2 * off**2, bundle.pointers) / total)
     status = np.select(
-        [~enough, ~finite, sine < min_sine],
-        [TriangulationStatus.TOO_FEW_VIEWS, TriangulationStatus.INVALID, TriangulationStatus.DEGENERATE_BASELINE],
+        [~enough, sine < min_sine, ~finite],
+        [TriangulationStatus.TOO_FEW_VIEWS, TriangulationStatus.DEGENERATE_BASELINE, TriangulationStatus.INVALID],
         TriangulationStatus.OK,
     )
     known = (enough & finite)[:, None]

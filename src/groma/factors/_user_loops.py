@@ -14,7 +14,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from groma._numba import _OPTIONS, kernel
+from groma._numba import kernel, uncached
 from groma.errors import InputError
 from groma.factors._factor import Slot
 from groma.factors._record import put_block, put_residual
@@ -190,8 +190,7 @@ class Loops:
         return self._compiled
 
     def _compile(self) -> tuple[Callable, Callable]:
-        # Not the decorators of groma._numba: what is written here has no file, and cannot be cached on disk.
-        compiler = numba.njit(**(_OPTIONS | {"cache": False}))
+        compiler = uncached  # what is written here has no file, and cannot be cached on disk
         real = [numba.float64[:, ::1] if slot.kind == "pose" else numba.float64[::1] for slot in self.slots]
         signatures = [(numba.float64[::1], *real, numba.float64[::1])]
         if self.derivative == "complex":

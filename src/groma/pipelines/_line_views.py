@@ -114,9 +114,9 @@ def build_views(
         seen = by_image[starts[i] : starts[i + 1]]
         xyz = scene.points.xyz[scene.point_observations.point_idx[seen]]
         depth = xyz @ rotation[i, 2] + poses[i, 6]
-        pixel = scene.point_observations.pixel[seen]
-        pixel, depth = pixel[depth > 0], depth[depth > 0]
+        xyz, depth = xyz[depth > 0], depth[depth > 0]
         if len(depth):
+            pixel = (xyz @ camera[i, :2, :3].T + camera[i, :2, 3]) / depth[:, None]
             inverse = 1.0 / depth
             low, high = np.quantile(inverse, [0.01, 0.99])
             depths[i] = low / depth_margin, high * depth_margin

@@ -1,0 +1,423 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Directions that many features share: perpendicular to plane normals, or parallel to measured directions.
+
+A segment in an image fixes a plane through the camera centre; the direction of its 3D line is perpendicular to the
+plane's normal, whatever the camera model. Lines that are parallel in space therefore share a direction v with
+
+.. math:: z_i = \frac{n_i^\top v}{\sqrt{v^\top \Sigma_i v + \sigma_0^2}} \sim N(0, 1),
+
+and directions of 3D lines, with :math:`B_i` two unit vectors across :math:`d_i`, have
+
+.. math:: z_i = (B_i^\top \Sigma_i B_i + \sigma_0^2 I)^{-1/2} B_i^\top v \sim N(0, I_2).
+
+:math:`\sigma_0` says how parallel things are that are built to be parallel. Directions are found one after the other:
+the candidate that explains most, refined by robust least squares, then taken out. A feature agrees with a random
+direction by chance, with probability :math:`p_i`; it counts by its information :math:`-\log p_i`, so that long
+segments count more, and a direction is kept when fewer than ``max_false_alarms`` such coincidences are to be expected
+among all that could be tried:
+
+.. math:: N_\text{tried}\; P(\text{Poisson}(\textstyle\sum p_i) \ge k) < N_\text{false}.
+
+The sign of a direction has no meaning.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from scipy import stats
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.errors import InputError, ShapeError
+from groma.geometry._algebra import dot, norm, perpendicular, unit, vectors
+
+#: Steps of the robust refinement.
+_REFINE_STEPS = 12
+#: Candidates and features that take part in one round of the search.
+_MAX_CANDIDATES, _MAX_SCORED = 512, 4096
+
+
+@dataclass(frozen=True)
+class DirectionOptions:
+    """What counts as a common direction."""
+
+    #: How parallel things are that are meant to be, radians; added to the measured noise. 0.05 degrees.
+    parallel_sigma: float = 8.7e-4
+    #: A feature agrees when the chi-square test of its residual passes at this level.
+    level: float = 0.95
+    #: Least number of features that agree.
+    min_support: int = 5
+    #: Least number of groups (images, for segments) among them.
+    min_groups: int = 1
+    #: Expected number of directions found where there are none.
+    max_false_alarms: float = 1e-4
+    #: Most directions.
+    max_directions: int = 12
+    #: Directions whose standard deviation is larger are dropped, radians. 2 degrees.
+    max_sigma: float = 0.035
+    #: Where the random choice of candidates begins.
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class DirectionSet:
+    """Directions found, the strongest first."""
+
+    #: (D, 3) unit vectors.
+    vectors: FloatArray
+    #: (D, 3, 3) covariances, square radians, of rank 2: the vector itself is in the null space.
+    covariance: FloatArray
+    #: (D,) number of features that agree.
+    support: IntArray
+    #: (D,) base-10 logarithm of the expected number of false alarms.
+    log10_false_alarms: FloatArray
+    #: (N,) the direction of each feature, -1 for none.
+    label: IntArray
+    #: (M, 2) pairs of directions that are orthogonal within their uncertainty.
+    orthogonal: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+
+    def __len__(self) -> int:
+        return len(self.vectors)
+
+
+class _Features(Protocol):
+    """How features judge directions."""
+
+    #: Degrees of freedom of the residual.
+    freedom: int
+
+    def take(self, rows: IntArray | BoolArray) -> _Features:
+        """Return some of the features."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def squared(self, directions: FloatArray) -> FloatArray:
+        """Squared whitened residuals (H, N)."""
+        ...
+
+    def chance(self, directions: FloatArray, gate: float) -> FloatArray:
+        """Probabilities (H, N), or (1, N), to agree with a random direction within ``gate``."""
+        ...
+
+    def rows(self, direction: FloatArray) -> FloatArray:
+        """Whitened rows (N, freedom, 3): residuals are their products with the direction."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Perpendicular:
+    """Normals to which the direction is perpendicular."""
+
+    normals: FloatArray
+    factors: FloatArray
+    sigma: float
+    freedom: int = 1
+
+    def take(self, rows: IntArray | BoolArray) -> _Perpendicular:
+        return _Perpendicular(self.normals[rows], self.factors[rows], self.sigma)
+
+    def __len__(self) -> int:
+        return len(self.normals)
+
+    def _variance(self, directions: FloatArray) -> FloatArray:
+        return (directions @ self.factors[..., 0].T) ** 2 + (directions @ self.factors[..., 1].T) ** 2 + self.sigma**2
+
+    def squared(self, directions: FloatArray) -> FloatArray:
+        return (directions @ self.normals.T) ** 2 / self._variance(directions)
+
+    def chance(self, directions: FloatArray, gate: float) -> FloatArray:
+        # n.v of a random direction is uniform in -1 .. 1.
+        return np.minimum(np.sqrt(gate * self._variance(directions)), 1.0)
+
+    def rows(self, direction: FloatArray) -> FloatArray:
+        return (self.normals / np.sqrt(self._variance(direction[None])[0])[:, None])[:, None]
+
+
+@dataclass(frozen=True)
+class _Parallel:
+    """Directions to which the direction is parallel: whitened bases and the square roots of their determinants."""
+
+    whitened: FloatArray
+    area: FloatArray
+    freedom: int = 2
+
+    @classmethod
+    def of(cls, directions: FloatArray, covariance: FloatArray, sigma: float) -> _Parallel:
+        basis = np.stack(perpendicular(directions), axis=1)
+        inner = basis @ covariance @ np.swapaxes(basis, 1, 2) + sigma**2 * np.eye(2)
+        values, axes = np.linalg.eigh(inner)
+        scaled = np.swapaxes(axes, 1, 2) / np.sqrt(values)[..., None]
+        return cls(scaled @ basis, np.sqrt(values.prod(axis=1)))
+
+    def take(self, rows: IntArray | BoolArray) -> _Parallel:
+        return _Parallel(self.whitened[rows], self.area[rows])
+
+    def __len__(self) -> int:
+        return len(self.area)
+
+    def squared(self, directions: FloatArray) -> FloatArray:
+        return (directions @ self.whitened[:, 0].T) ** 2 + (directions @ self.whitened[:, 1].T) ** 2
+
+    def chance(self, directions: FloatArray, gate: float) -> FloatArray:
+        # An ellipse of area pi gate area on the half sphere of area 2 pi.
+        return np.minimum(0.5 * gate * self.area, 1.0)[None]
+
+    def rows(self, direction: FloatArray) -> FloatArray:
+        return self.whitened
+
+
+# -------------------------------------------------------------------------------------------------------------- Public
+def directions_from_normals(
+    normals: FloatArray,
+    factors: FloatArray,
+    options: DirectionOptions | None = None,
+    groups: IntArray | None = None,
+    candidates: FloatArray | None = None,
+) -> DirectionSet:
+    """Find directions perpendicular to many unit normals: vanishing directions of segments.
+
+    Parameters
+    ----------
+    normals : (N, 3) float64
+        Unit normals of the planes through camera centre and segment, in one common frame: a camera's, or the world's
+        for segments of several images (their translations play no part).
+    factors : (N, 3, 2) float64
+        Square roots of the normals' covariances, :math:`F F^\top`, radians.
+    options : DirectionOptions, optional
+        What counts as a direction.
+    groups : (N,) int, optional
+        Group of each normal, for ``min_groups``: the image.
+    candidates : (H, 3) float64, optional
+        Directions to try; by default cross products of pairs of normals drawn by their information.
+
+    Returns
+    -------
+    DirectionSet
+        The strongest direction first.
+
+    Raises
+    ------
+    ShapeError, InputError
+        If shapes do not fit, or a number is not finite.
+    """
+    options = options or DirectionOptions()
+    normals = vectors(normals, 3, "normals")
+    factors = np.asarray(factors, dtype=np.float64)
+    if normals.ndim != 2 or factors.shape != (len(normals), 3, 2):
+        raise ShapeError(
+            f"normals and factors must have shapes (N, 3) and (N, 3, 2); got {normals.shape} and {factors.shape}."
+        )
+    _check_finite(normals, factors)
+    return _search(_Perpendicular(normals, factors, options.parallel_sigma), options, groups, candidates)
+
+
+def directions_from_lines(
+    directions: FloatArray,
+    covariance: FloatArray,
+    options: DirectionOptions | None = None,
+    candidates: FloatArray | None = None,
+    groups: IntArray | None = None,
+) -> DirectionSet:
+    """Find directions shared by 3D lines; either sign of a line's direction is the same.
+
+    Parameters
+    ----------
+    directions : (N, 3) float64
+        Unit directions.
+    covariance : (N, 3, 3) float64
+        Their covariances, square radians; only the part across the direction counts.
+    options : DirectionOptions, optional
+        What counts as a direction.
+    candidates : (H, 3) float64, optional
+        Further directions to try, such as vanishing directions of images.
+    groups : (N,) int, optional
+        Group of each line, for ``min_groups``.
+
+    Returns
+    -------
+    DirectionSet
+        The strongest direction first.
+
+    Raises
+    ------
+    ShapeError, InputError
+        If shapes do not fit, or a number is not finite.
+    """
+    options = options or DirectionOptions()
+    directions = vectors(directions, 3, "directions")
+    covariance = np.asarray(covariance, dtype=np.float64)
+    if directions.ndim != 2 or covariance.shape != (len(directions), 3, 3):
+        raise ShapeError(
+            f"directions and covariance must have shapes (N, 3) and (N, 3, 3); got {directions.shape} and "
+            f"{covariance.shape}."
+        )
+    _check_finite(directions, covariance)
+    features = _Parallel.of(unit(directions), covariance, options.parallel_sigma)
+    best = np.argsort(features.area, kind="stable")[:_MAX_CANDIDATES]
+    tried = unit(directions)[best]
+    if candidates is not None:
+        tried = np.concatenate([tried, unit(vectors(candidates, 3, "candidates"))])
+    return _search(features, options, groups, tried)
+
+
+def orthogonal_pairs(
+    directions: FloatArray, covariance: FloatArray, sigma: float = 2.6e-3, level: float = 0.95, max_sigma: float = 0.01
+) -> IntArray:
+    r"""Pairs of directions that are orthogonal within their uncertainty.
+
+    .. math:: \frac{(v_1^\top v_2)^2}{v_1^\top\Sigma_2 v_1 + v_2^\top\Sigma_1 v_2 + \sigma^2} < \chi^2_1
+
+    Parameters
+    ----------
+    directions : (D, 3) float64
+        Unit vectors.
+    covariance : (D, 3, 3) float64
+        Their covariances.
+    sigma : float
+        How orthogonal things are that are meant to be, radians. Default 0.15 degrees.
+    level : float
+        Level of the test.
+    max_sigma : float
+        Pairs whose angle is less certain are left out, radians: passing the test would say nothing.
+
+    Returns
+    -------
+    (M, 2) int
+        Pairs of indices, smaller first. Three directions that are pairwise in the list are a Manhattan frame.
+    """
+    directions = vectors(directions, 3, "directions").reshape(-1, 3)
+    first, second = np.triu_indices(len(directions), 1)
+    cosine = dot(directions[first], directions[second])
+    variance = np.einsum("mi,mij,mj->m", directions[first], covariance[second], directions[first])
+    variance += np.einsum("mi,mij,mj->m", directions[second], covariance[first], directions[second])
+    passed = cosine**2 < stats.chi2.ppf(level, 1) * (variance + sigma**2)
+    passed &= variance < max_sigma**2
+    return np.column_stack([first, second])[passed]
+
+
+# -------------------------------------------------------------------------------------------------------------- Search
+def _check_finite(*arrays: FloatArray) -> None:
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise InputError("Directions, normals and covariances must be finite. Remove the rows that are not.")
+
+
+def _search(
+    features: _Perpendicular | _Parallel,
+    options: DirectionOptions,
+    groups: IntArray | None,
+    candidates: FloatArray | None,
+) -> DirectionSet:
+    """Take directions one after the other; see the module."""
+    rng = np.random.default_rng(options.seed)
+    gate = float(stats.chi2.ppf(options.level, features.freedom))
+    # Features out to where one in 10^4 ends are taken out together: what is left must not repeat the direction.
+    wide = float(stats.chi2.ppf(0.9999, features.freedom))
+    tried = max(len(features), 2) ** (3 - features.freedom)
+    remaining = np.arange(len(features))
+    found: list[FloatArray] = []
+    covariances: list[FloatArray] = []
+    supports: list[int] = []
+    alarms: list[float] = []
+    while len(found) < options.max_directions and len(remaining) >= max(options.min_support, 2):
+        pool = features.take(remaining)
+        guesses = candidates if candidates is not None else _crossings(pool, rng)
+        if len(guesses) == 0:
+            break
+        scored = pool
+        if len(remaining) > _MAX_SCORED:
+            scored = pool.take(rng.choice(len(remaining), _MAX_SCORED, replace=False))
+        accepted = None
+        order = np.argsort(-_score(scored, guesses, gate), kind="stable")
+        for start in guesses[order[:3]]:
+            direction, covariance = _refine(pool, start, gate)
+            inside = pool.squared(direction[None])[0] < gate
+            count = int(inside.sum())
+            expected = float(np.broadcast_to(pool.chance(direction[None], gate), (1, len(pool))).sum())
+            tail = float(stats.poisson.logsf(count - 1, expected)) / np.log(10) + np.log10(tried)
+            spread = count if groups is None else len(np.unique(groups[remaining[inside]]))
+            certain = float(np.linalg.eigvalsh(covariance)[-1]) < options.max_sigma**2
+            strong = tail < np.log10(options.max_false_alarms) and count >= options.min_support
+            new = all(abs(float(direction @ other)) < np.cos(3 * options.parallel_sigma) for other in found)
+            if strong and certain and new and spread >= options.min_groups:
+                accepted = direction, covariance, count, tail
+                break
+        if accepted is None:
+            break
+        direction, covariance, count, tail = accepted
+        found.append(direction)
+        covariances.append(covariance)
+        supports.append(count)
+        alarms.append(tail)
+        remaining = remaining[pool.squared(direction[None])[0] >= wide]
+    return _collect(features, found, covariances, supports, alarms, gate, options)
+
+
+def _collect(features, found, covariances, supports, alarms, gate: float, options: DirectionOptions) -> DirectionSet:
+    label = np.full(len(features), -1)
+    if not found:
+        return DirectionSet(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64), np.zeros(0), label)
+    directions, covariance = np.array(found), np.array(covariances)
+    squared = features.squared(directions)
+    nearest = squared.argmin(axis=0)
+    agrees = squared.min(axis=0) < gate
+    label[agrees] = nearest[agrees]
+    support = np.bincount(label[agrees], minlength=len(found))
+    pairs = orthogonal_pairs(directions, covariance, 3 * options.parallel_sigma)
+    return DirectionSet(directions, covariance, support, np.array(alarms), label, pairs)
+
+
+def _crossings(pool: _Perpendicular | _Parallel, rng: np.random.Generator) -> FloatArray:
+    """Candidates: cross products of pairs of normals, drawn by their certainty."""
+    assert isinstance(pool, _Perpendicular)
+    certainty = 1.0 / np.sqrt((pool.factors**2).sum(axis=(1, 2)) + pool.sigma**2)
+    pairs = rng.choice(len(pool), (_MAX_CANDIDATES, 2), p=certainty / certainty.sum())
+    crossed = np.cross(pool.normals[pairs[:, 0]], pool.normals[pairs[:, 1]])
+    return unit(crossed[norm(crossed) > 0.02])
+
+
+def _score(pool: _Perpendicular | _Parallel, candidates: FloatArray, gate: float) -> FloatArray:
+    """Information (H,) that candidates explain: certain features count more, those near the gate less."""
+    agreement = np.maximum(1.0 - pool.squared(candidates) / gate, 0.0)
+    return -(agreement * np.log(np.maximum(pool.chance(candidates, gate), 1e-12))).sum(axis=1)
+
+
+def _refine(pool: _Perpendicular | _Parallel, start: FloatArray, gate: float) -> tuple[FloatArray, FloatArray]:
+    """Robust least squares: Gauss-Newton with Geman-McClure weights inside twice the gate's radius."""
+    direction = unit(start)
+    information = np.eye(2)
+    basis = np.stack(perpendicular(direction))
+    scale = 1.0
+    for step in range(_REFINE_STEPS):
+        squared = pool.squared(direction[None])[0]
+        near = squared < 4.0 * gate
+        last = step == _REFINE_STEPS - 1
+        if last:
+            near = squared < gate
+        rows = pool.take(near).rows(direction)
+        weight = np.ones(near.sum()) if last else 1.0 / (1.0 + squared[near] / gate) ** 2
+        basis = np.stack(perpendicular(direction))
+        slope = rows @ basis.T
+        residual = rows @ direction
+        information = np.einsum("n,nka,nkb->ab", weight, slope, slope)
+        information += 1e-6 * max(np.trace(information), 1e-300) * np.eye(2)
+        if last:
+            scale = max(1.0, float((residual**2).sum()) / max(residual.size - 2, 1))
+            break
+        move = -np.linalg.solve(information, np.einsum("n,nka,nk->a", weight, slope, residual))
+        move *= min(1.0, 0.05 / max(float(norm(move)), 1e-300))
+        direction = unit(direction + move @ basis)
+        if float(norm(move)) < 1e-10 and step < _REFINE_STEPS - 2:
+            continue
+    return direction, scale * basis.T @ np.linalg.inv(information) @ basis
+
+
+__all__ = [
+    "DirectionOptions",
+    "DirectionSet",
+    "directions_from_lines",
+    "directions_from_normals",
+    "orthogonal_pairs",
+]

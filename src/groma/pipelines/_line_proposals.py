@@ -1,0 +1,484 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Where each segment may lie in space, and which places several images agree on.
+
+A 3D segment behind a segment of image i is two numbers: the inverse depths :math:`q = (q_1, q_2)` of its end points on
+their rays :math:`f_1, f_2`. A segment of image j with line :math:`l` proposes the q at which the reference segment's
+plane meets the plane of :math:`l`. With the epipole :math:`a = P_j [c_i; 1]` and :math:`b_k = M_j f_k`,
+
+.. math:: l^\top (q_k a + b_k) = 0 \quad\Rightarrow\quad q_k = -\frac{l^\top b_k}{l^\top a},
+
+linear, without an intersection to solve. Its covariance follows from the distance of the projected end point to l,
+:math:`\partial \mathrm{dist}_k / \partial q_k = l^\top a / x_{k,3}`, and from the noise of both segments' end points.
+Where the line runs along the epipolar line, :math:`l^\top a \to 0`: the covariance explodes, and the proposal is left
+out of the decision; the track picks such segments up again when others have fixed the line.
+
+Proposals from different neighbours support each other by their Mahalanobis distance. The best supported ones are fused
+in information form, compared again, and the one that most images agree on is kept.
+
+References
+----------
+Plücker notes, eq. (33) for the two planes. The parametrisation by inverse depths is ours.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._numba import kernel, loop
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.pipelines._line_views import LineViews
+
+#: Mahalanobis distance up to which two proposals agree: 99.7 % for two degrees of freedom.
+GATE = 11.6
+#: Hypotheses per segment that are fused and compared.
+NUM_SEEDS = 3
+#: Bins of the angle about the baseline.
+NUM_BINS = 2048
+# Why a candidate was refused; the furthest any candidate of a segment got is reported.
+NOTHING, OUT_OF_BEAM, WEAK, PROPOSED = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """Two-view proposals for the segments of one image."""
+
+    #: (M,) segment within the image.
+    segment: IntArray
+    #: (M,) which neighbour, 0 to n - 1; n stands for the known points near the segment.
+    neighbor: IntArray
+    #: (M,) row of the other segment in the table of all images; -1 for points.
+    other: IntArray
+    #: (M, 6) q1, q2, their variances and covariance (c11, c12, c22), and the score of the match.
+    values: FloatArray
+    #: (n_segments,) the furthest that any candidate got.
+    reached: IntArray
+
+
+# ------------------------------------------------------------------------------------------------------------ Kernels
+@kernel
+def _propose(ray, across, sigma, q_low, q_high, line, ends, sigma_j, M, a, directed, min_overlap, max_relative, out):
+    """One pair of segments: fill out = q1 q2 c11 c12 c22; return how far it got."""
+    gain = line[0] * a[0] + line[1] * a[1] + line[2] * a[2]
+    if gain == 0.0:
+        return WEAK
+    ux, uy = ends[2] - ends[0], ends[3] - ends[1]
+    length2 = ux * ux + uy * uy
+    n0 = M[0, 0] * across[0] + M[0, 1] * across[1] + M[0, 2] * across[2]
+    n1 = M[1, 0] * across[0] + M[1, 1] * across[1] + M[1, 2] * across[2]
+    n2 = M[2, 0] * across[0] + M[2, 1] * across[1] + M[2, 2] * across[2]
+    shift = line[0] * n0 + line[1] * n1 + line[2] * n2
+    t1 = t2 = g1 = g2 = h1 = h2 = 0.0
+    for k in range(2):
+        b0 = M[0, 0] * ray[k, 0] + M[0, 1] * ray[k, 1] + M[0, 2] * ray[k, 2]
+        b1 = M[1, 0] * ray[k, 0] + M[1, 1] * ray[k, 1] + M[1, 2] * ray[k, 2]
+        b2 = M[2, 0] * ray[k, 0] + M[2, 1] * ray[k, 1] + M[2, 2] * ray[k, 2]
+        q = -(line[0] * b0 + line[1] * b1 + line[2] * b2) / gain
+        if not (q >= q_low and q <= q_high):
+            return OUT_OF_BEAM
+        z = q * a[2] + b2
+        if z <= 0.05:
+            return OUT_OF_BEAM
+        x, y = (q * a[0] + b0) / z, (q * a[1] + b1) / z
+        t = ((x - ends[0]) * ux + (y - ends[1]) * uy) / length2
+        out[k] = q
+        if k == 0:
+            t1, g1, h1 = t, gain / z, shift / z
+        else:
+            t2, g2, h2 = t, gain / z, shift / z
+    if directed and t2 <= t1:
+        return OUT_OF_BEAM
+    low, high = min(t1, t2), max(t1, t2)
+    overlap = min(high, 1.0) - max(low, 0.0)
+    if overlap < min_overlap * min(high - low, 1.0):
+        return OUT_OF_BEAM
+    s2, r2 = sigma_j * sigma_j, sigma * sigma
+    out[2] = (s2 * ((1.0 - t1) * (1.0 - t1) + t1 * t1) + r2 * h1 * h1) / (g1 * g1)
+    out[3] = s2 * ((1.0 - t1) * (1.0 - t2) + t1 * t2) / (g1 * g2)
+    out[4] = (s2 * ((1.0 - t2) * (1.0 - t2) + t2 * t2) + r2 * h2 * h2) / (g2 * g2)
+    if out[2] > (max_relative * out[0]) ** 2 or out[4] > (max_relative * out[1]) ** 2:
+        return WEAK
+    return PROPOSED
+
+
+@loop
+def _propose_beam(
+    rows_i, rows_j, ray, across, sigma, search, line, ends, beam_i, beam_j, bin_pointers, bin_members, M, a,
+    directed, min_overlap, max_relative, first, neighbor, out_index, out, reached,
+):  # fmt: skip
+    """All pairs whose angles about the baseline overlap; return the number written, or needed if out is too short."""
+    count = first
+    work = np.empty(5)
+    size = 2.0 * math.pi / NUM_BINS
+    for i in range(len(rows_i)):
+        s = rows_i[i]
+        low, high = beam_i[i, 0], beam_i[i, 1]
+        bin_low, bin_high = int(math.floor(low / size)), int(math.floor(high / size))
+        for k in range(bin_low, min(bin_high, bin_low + NUM_BINS - 1) + 1):
+            b = k % NUM_BINS
+            for e in range(bin_pointers[b], bin_pointers[b + 1]):
+                j = bin_members[e]
+                # A pair that shares several bins counts in the first of them.
+                if k != bin_low and int(math.floor(beam_j[j, 0] / size)) % NUM_BINS != b:
+                    continue
+                away = 0.5 * (low + high) - 0.5 * (beam_j[j, 0] + beam_j[j, 1])
+                away -= 2.0 * math.pi * math.floor(away / (2.0 * math.pi) + 0.5)
+                if abs(away) > 0.5 * (high - low + beam_j[j, 1] - beam_j[j, 0]):
+                    continue
+                r = rows_j[j]
+                got = _propose(
+                    ray[s], across[s], sigma[s], search[s, 0], search[s, 1], line[r], ends[r], sigma[r], M, a,
+                    directed, min_overlap, max_relative, work,
+                )  # fmt: skip
+                reached[i] = max(reached[i], got)
+                if got == PROPOSED:
+                    if count < len(out):
+                        out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor, r
+                        out[count, :5], out[count, 5] = work, 1.0
+                    count += 1
+    return count
+
+
+@loop
+def _propose_pairs(
+    pairs, score, start_i, start_j, ray, across, sigma, search, line, ends, usable, M, a, min_overlap, max_relative,
+    first, neighbor, out_index, out, reached,
+):  # fmt: skip
+    """Given pairs of segments; return the number written, or needed if out is too short."""
+    count = first
+    work = np.empty(5)
+    for k in range(len(pairs)):
+        i, s, r = pairs[k, 0], start_i + pairs[k, 0], start_j + pairs[k, 1]
+        if not (usable[s] and usable[r]):
+            continue
+        got = _propose(
+            ray[s], across[s], sigma[s], search[0], search[1], line[r], ends[r], sigma[r], M, a,
+            False, min_overlap, max_relative, work,
+        )  # fmt: skip
+        reached[i] = max(reached[i], got)
+        if got == PROPOSED:
+            if count < len(out):
+                out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor, r
+                out[count, :5], out[count, 5] = work, score[k]
+            count += 1
+    return count
+
+
+@kernel
+def _distance(d1, d2, c11, c12, c22):
+    """Squared Mahalanobis distance."""
+    return (c22 * d1 * d1 - 2.0 * c12 * d1 * d2 + c11 * d2 * d2) / max(c11 * c22 - c12 * c12, 1e-300)
+
+
+@loop
+def _support(pointers, order, neighbor, values, num_neighbors, gate, total):
+    """Support of every proposal of every segment by the proposals of other neighbours: total (M,)."""
+    best = np.zeros(num_neighbors + 1)
+    for i in range(len(pointers) - 1):
+        begin, end = pointers[i], pointers[i + 1]
+        largest = 0.0
+        for k in range(begin, end):
+            largest = max(largest, values[order[k], 2])
+        for k in range(begin, end):
+            p = order[k]
+            reach = math.sqrt(gate * (values[p, 2] + largest))
+            best[:] = 0.0
+            best[neighbor[p]] = values[p, 5]
+            for side in range(-1, 2, 2):
+                m = k + side
+                while begin <= m < end:
+                    r = order[m]
+                    d1 = values[r, 0] - values[p, 0]
+                    if abs(d1) > reach:
+                        break
+                    m += side
+                    if neighbor[r] == neighbor[p]:
+                        continue
+                    d2 = values[r, 1] - values[p, 1]
+                    c11, c22 = values[r, 2] + values[p, 2], values[r, 4] + values[p, 4]
+                    if d1 * d1 > gate * c11 or d2 * d2 > gate * c22:
+                        continue
+                    distance = _distance(d1, d2, c11, values[r, 3] + values[p, 3], c22)
+                    if distance < gate:
+                        weight = values[r, 5] * (1.0 - distance / gate)
+                        if weight > best[neighbor[r]]:
+                            best[neighbor[r]] = weight
+            total[p] = best.sum()
+
+
+@loop
+def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate, min_support, q, covariance, score,
+            supporters, rival):  # fmt: skip
+    """Fuse the best supported proposals of each segment and keep the one that most neighbours agree on."""
+    chosen = np.empty(num_neighbors + 1, np.int64)
+    nearest = np.empty(num_neighbors + 1)
+    for i in range(len(pointers) - 1):
+        begin, end = pointers[i], pointers[i + 1]
+        used = np.zeros(end - begin, np.bool_)
+        for _ in range(NUM_SEEDS):
+            seed, top = -1, 0.0
+            for k in range(begin, end):
+                if not used[k - begin] and total[order[k]] > top:
+                    seed, top = k, total[order[k]]
+            if seed < 0 or top <= score[i] - 1.0:
+                break
+            p = order[seed]
+            q1, q2, c11, c12, c22 = values[p, 0], values[p, 1], values[p, 2], values[p, 3], values[p, 4]
+            number, points, value = 0, 0, 0.0
+            for step in range(3):
+                nearest[:] = gate
+                chosen[:] = -1
+                for k in range(begin, end):
+                    r = order[k]
+                    d1, d2 = values[r, 0] - q1, values[r, 1] - q2
+                    v11, v22 = values[r, 2] + c11, values[r, 4] + c22
+                    if d1 * d1 > gate * v11 or d2 * d2 > gate * v22:
+                        continue
+                    distance = _distance(d1, d2, v11, values[r, 3] + c12, v22)
+                    if distance < gate:
+                        used[k - begin] = True
+                    if distance < nearest[neighbor[r]]:
+                        nearest[neighbor[r]], chosen[neighbor[r]] = distance, r
+                number, points, value = 0, 0, 0.0
+                i11 = i12 = i22 = y1 = y2 = 0.0
+                for n in range(num_neighbors + 1):
+                    r = chosen[n]
+                    if r < 0:
+                        continue
+                    if n == num_neighbors:
+                        points = 1
+                    else:
+                        number += 1
+                    weight = 1.0 / (1.0 + nearest[n] / 4.0)
+                    value += values[r, 5] * (1.0 - nearest[n] / gate)
+                    determinant = values[r, 2] * values[r, 4] - values[r, 3] * values[r, 3]
+                    if not determinant > 0.0:
+                        continue
+                    w11, w12, w22 = values[r, 4] / determinant, -values[r, 3] / determinant, values[r, 2] / determinant
+                    i11, i12, i22 = i11 + weight * w11, i12 + weight * w12, i22 + weight * w22
+                    y1 += weight * (w11 * values[r, 0] + w12 * values[r, 1])
+                    y2 += weight * (w12 * values[r, 0] + w22 * values[r, 1])
+                determinant = i11 * i22 - i12 * i12
+                if not determinant > 0.0:
+                    break
+                c11, c12, c22 = i22 / determinant, -i12 / determinant, i11 / determinant
+                q1, q2 = c11 * y1 + c12 * y2, c12 * y1 + c22 * y2
+            if number < min_support or number + points < 2:
+                continue
+            if value > score[i]:
+                rival[i] = score[i]
+                score[i] = value
+                q[i, 0], q[i, 1] = q1, q2
+                covariance[i, 0], covariance[i, 1], covariance[i, 2] = c11, c12, c22
+                for n in range(num_neighbors):
+                    supporters[i, n] = other[chosen[n]] if chosen[n] >= 0 else -1
+            elif value > rival[i]:
+                rival[i] = value
+
+
+@loop
+def _bin_beams(beams, pointers, members):
+    """Members of every bin of the angle about the baseline; members is None-sized on the first call (counts only)."""
+    size = 2.0 * math.pi / NUM_BINS
+    fill = np.zeros(NUM_BINS, np.int64)
+    for j in range(len(beams)):
+        low, high = int(math.floor(beams[j, 0] / size)), int(math.floor(beams[j, 1] / size))
+        for k in range(low, min(high, low + NUM_BINS - 1) + 1):
+            b = k % NUM_BINS
+            if len(members):
+                members[pointers[b] + fill[b]] = j
+            fill[b] += 1
+    if not len(members):
+        for b in range(NUM_BINS):
+            pointers[b + 1] = pointers[b] + fill[b]
+
+
+@loop
+def _point_lines(ends, line, sigma, near, search, pixel, inverse, tolerance, neighbor, out_index, out):
+    """Lines through known points that lie on a segment in the image: inverse depth affine along the segment."""
+    count = 0
+    t, q = np.empty(16), np.empty(16)
+    for i in range(len(ends)):
+        if near[i] == 0:
+            continue
+        ux, uy = ends[i, 2] - ends[i, 0], ends[i, 3] - ends[i, 1]
+        length2 = ux * ux + uy * uy
+        reach = 4.0 / math.sqrt(length2)
+        number = 0
+        for p in range(len(pixel)):
+            if abs(line[i, 0] * pixel[p, 0] + line[i, 1] * pixel[p, 1] + line[i, 2]) > 2.0:
+                continue
+            at = ((pixel[p, 0] - ends[i, 0]) * ux + (pixel[p, 1] - ends[i, 1]) * uy) / length2
+            if -reach <= at <= 1.0 + reach and number < 16:
+                t[number], q[number] = at, inverse[p]
+                number += 1
+        best, first, second = 2, -1, -1
+        for m in range(number):
+            for n in range(m):
+                if abs(t[m] - t[n]) < 0.3:
+                    continue
+                slope = (q[m] - q[n]) / (t[m] - t[n])
+                agree = 0
+                for p in range(number):
+                    if abs(q[n] + slope * (t[p] - t[n]) - q[p]) < tolerance * q[p]:
+                        agree += 1
+                if agree > best:
+                    best, first, second = agree, m, n
+        if first < 0:
+            continue
+        slope = (q[first] - q[second]) / (t[first] - t[second])
+        s0 = s1 = s2 = y0 = y1 = 0.0
+        for p in range(number):
+            if abs(q[second] + slope * (t[p] - t[second]) - q[p]) < tolerance * q[p]:
+                u, v = 1.0 - t[p], t[p]
+                s0, s1, s2 = s0 + u * u, s1 + u * v, s2 + v * v
+                y0, y1 = y0 + u * q[p], y1 + v * q[p]
+        determinant = s0 * s2 - s1 * s1
+        if not determinant > 1e-6:
+            continue
+        q1, q2 = (s2 * y0 - s1 * y1) / determinant, (s0 * y1 - s1 * y0) / determinant
+        if min(q1, q2) < search[i, 0] or max(q1, q2) > search[i, 1]:
+            continue
+        variance = (0.5 * tolerance * max(q1, q2)) ** 2
+        out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor, -1
+        out[count, 0], out[count, 1], out[count, 5] = q1, q2, 0.5
+        out[count, 2], out[count, 3] = variance * s2 / determinant, -variance * s1 / determinant
+        out[count, 4] = variance * s0 / determinant
+        count += 1
+    return count
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
+def angles_about_baseline(ray: FloatArray, baseline: FloatArray) -> FloatArray:
+    """Intervals (n, 2) of the angles about a baseline that segments with rays (n, 2, 3) cover, low first.
+
+    The angle of a ray about the baseline is the same for all points of an epipolar plane, whichever of the two images
+    they are seen in. Intervals start in [-pi, pi) and are at most pi wide.
+    """
+    unit = baseline / np.linalg.norm(baseline)
+    u = np.cross(unit, np.eye(3)[np.abs(unit).argmin()])
+    u /= np.linalg.norm(u)
+    angle = np.arctan2(ray @ np.cross(unit, u), ray @ u)
+    turn = angle[:, 1] - angle[:, 0]
+    turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
+    low = np.where(turn < 0, angle[:, 0] + turn, angle[:, 0])
+    return np.column_stack([low, low + np.abs(turn)])
+
+
+class Proposer:
+    """Makes the proposals of one image at a time; keeps the room for them between images."""
+
+    def __init__(self, views: LineViews, directed: bool, min_overlap: float, max_relative_sigma: float) -> None:
+        self.views, self.directed = views, directed
+        self.min_overlap, self.max_relative = min_overlap, max_relative_sigma
+        self._index, self._values = np.empty((1 << 14, 3), np.int64), np.empty((1 << 14, 6))
+
+    def propose(self, image: int, neighbors: IntArray, matches: list, near_points: tuple | None) -> Proposals:
+        """Proposals for the segments of an image.
+
+        Parameters
+        ----------
+        image : int
+            The reference image.
+        neighbors : (n,) int
+            Its neighbours.
+        matches : list of n (pairs, score) or None
+            Matched segments (m, 2) and scores (m,); None for a neighbour takes all segments in the epipolar beam.
+        near_points : (pixel (p, 2), inverse depth (p,)) or None
+            Known points seen in the image.
+        """
+        views, rows = self.views, self.views.rows(image)
+        usable = np.flatnonzero(views.usable[rows])
+        reached = np.zeros(rows.stop - rows.start, np.int64)
+        count = 0
+        if near_points is not None and len(near_points[0]):
+            self._reserve(0, reached.size)
+            count = _point_lines(
+                views.ends[rows], views.line[rows], views.sigma[rows], views.usable[rows], views.range[rows],
+                *near_points, 0.01, len(neighbors), self._index, self._values,
+            )  # fmt: skip
+        for n, (j, given) in enumerate(zip(neighbors, matches, strict=True)):
+            M, a = views.camera[j, :, :3].copy(), views.camera[j] @ np.append(views.center[image], 1.0)
+            while True:
+                if given is None:
+                    needed = self._beam(image, int(j), n, count, rows, usable, reached, M, a)
+                else:
+                    search = views.inverse_depth[image]
+                    needed = _propose_pairs(
+                        given[0], given[1], rows.start, views.rows(j).start, views.ray, views.across, views.sigma,
+                        search, views.line, views.ends, views.usable, M, a, self.min_overlap, self.max_relative,
+                        count, n, self._index, self._values, reached,
+                    )  # fmt: skip
+                if needed <= len(self._values):
+                    break
+                self._reserve(count, needed)
+            count = needed
+        index = self._index[:count].copy()
+        return Proposals(index[:, 0], index[:, 1], index[:, 2], self._values[:count].copy(), reached)
+
+    def _reserve(self, keep: int, needed: int) -> None:
+        if needed > len(self._values):
+            index, values = np.empty((2 * needed, 3), np.int64), np.empty((2 * needed, 6))
+            index[:keep], values[:keep] = self._index[:keep], self._values[:keep]
+            self._index, self._values = index, values
+
+    def _beam(self, image, j, n, count, rows, usable, reached, M, a) -> int:
+        views = self.views
+        baseline = views.center[j] - views.center[image]
+        if not np.linalg.norm(baseline) > 0.0:
+            return count
+        rows_i, rows_j = rows.start + usable, views.rows(j).start + np.flatnonzero(views.usable[views.rows(j)])
+        beam_i = angles_about_baseline(views.ray[rows_i], baseline)
+        beam_j = angles_about_baseline(views.ray[rows_j], baseline)
+        pointers = np.zeros(NUM_BINS + 1, np.int64)
+        _bin_beams(beam_j, pointers, np.empty(0, np.int64))
+        members = np.empty(pointers[-1], np.int64)
+        if len(members):
+            _bin_beams(beam_j, pointers, members)
+        local = np.zeros(len(rows_i), np.int64)
+        needed = _propose_beam(
+            rows_i, rows_j, views.ray, views.across, views.sigma, views.range, views.line, views.ends, beam_i, beam_j,
+            pointers, members, M, a, self.directed, self.min_overlap, self.max_relative, count, n, self._index,
+            self._values, local,
+        )  # fmt: skip
+        self._index[count : min(needed, len(self._index)), 0] = usable[
+            self._index[count : min(needed, len(self._index)), 0]
+        ]
+        reached[usable] = np.maximum(reached[usable], local)
+        return needed
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The place chosen for each segment of an image."""
+
+    #: (n,) whether enough neighbours agree on one.
+    found: BoolArray
+    #: (n, 2) inverse depths of the end points.
+    q: FloatArray
+    #: (n, 3) their variances and covariance, c11 c12 c22.
+    covariance: FloatArray
+    #: (n,) summed support.
+    score: FloatArray
+    #: (n,) support of the best place that disagrees.
+    rival: FloatArray
+    #: (n, num_neighbors) rows of the supporting segments, -1 for none.
+    supporters: IntArray
+
+
+def choose(proposals: Proposals, num_segments: int, num_neighbors: int, min_support: int) -> Choice:
+    """Choose the place of each segment by the summed support of distinct neighbours."""
+    by_segment = np.lexsort([proposals.values[:, 0], proposals.segment])
+    pointers = np.searchsorted(proposals.segment[by_segment], np.arange(num_segments + 1))
+    total = np.zeros(len(proposals.segment))
+    _support(pointers, by_segment, proposals.neighbor, proposals.values, num_neighbors, GATE, total)
+    q, covariance = np.zeros((num_segments, 2)), np.zeros((num_segments, 3))
+    score, rival = np.zeros(num_segments), np.zeros(num_segments)
+    supporters = np.full((num_segments, num_neighbors), -1, np.int64)
+    _choose(
+        pointers, by_segment, proposals.neighbor, proposals.other, proposals.values, total, num_neighbors, GATE,
+        min_support, q, covariance, score, supporters, rival,
+    )  # fmt: skip
+    return Choice(score > 0.0, q, covariance, score, rival, supporters)
