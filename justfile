@@ -35,9 +35,10 @@ test-plain:
 docs:
     .venv/bin/sphinx-build -W --keep-going -b html docs docs/_build/html
 
-# measurements against the committed baseline
+# measurements, then the comparison with the committed baseline
 bench *arguments:
-    {{python}} -m benchmarks.suite {{arguments}}
+    {{python}} benchmarks/run.py {{arguments}}
+    {{python}} benchmarks/check.py
 
 # forget compiled kernels
 fresh:

@@ -57,7 +57,8 @@ def adjust(
         typer.Option(metavar="NAME", help="cartesian, orthonormal_left, orthonormal_right, free_left, free_right."),
     ] = None,
     gauge: Annotated[
-        str | None, typer.Option(metavar="NAME", help="free, or first_camera to hold the first camera where it is.")
+        str | None,
+        typer.Option(metavar="NAME", help="auto, free, or first_camera to hold the first camera and the scale."),
     ] = None,
     page: Annotated[
         Path | None, typer.Option("--report", metavar="FILE", help="Also write an HTML page: before and after.")

@@ -114,7 +114,7 @@ def _iterate(views: _Views, along: FloatArray, active: BoolArray, max_iterations
         size = entries.max(axis=1)
         floor = 1e-6 * np.where(size > 0.0, size, 1.0)
         damped[:, diagonal] += damping[rows, None] * np.maximum(entries, floor[:, None])
-        step = -np.linalg.solve(damped, gradient[rows][..., None])[..., 0]
+        step = -np.asarray(np.linalg.solve(damped, gradient[rows][..., None])[..., 0], dtype=np.float64)
         trial_along, trial_foot = _retract(along[rows], foot[rows], step)
         trial_cost, trial_hessian, trial_gradient = views.evaluate(rows, trial_along, trial_foot)
         better = trial_cost <= cost[rows]

@@ -50,7 +50,7 @@ def _row(gradient_u, gradient_v, u, v, du, dv, count, nu, nv, out):
     seen = 0
     for k in range(count):
         t = (k + 0.5) / count
-        j, i = int(math.floor(u + t * du)), int(math.floor(v + t * dv))
+        j, i = math.floor(u + t * du), math.floor(v + t * dv)
         if i < 0 or j < 0 or i >= height or j >= width:
             continue
         seen += 1
@@ -102,9 +102,7 @@ def _describe_all(gradient_u, gradient_v, ends, band_rows, step, out):
 
 
 # --------------------------------------------------------------------------------------------------------- Public
-def describe(
-    image: npt.NDArray[np.generic], segments: Segments, band_rows: int = 5, scale: float = 1.0
-) -> Descriptors:
+def describe(image: npt.NDArray[np.generic], segments: Segments, band_rows: int = 5, scale: float = 1.0) -> Descriptors:
     """Gradient-band descriptors of segments.
 
     Parameters

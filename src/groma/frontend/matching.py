@@ -41,7 +41,7 @@ from groma.frontend.matches import LineMatches, mutual_best
 from groma.frontend.nearby import NearbyPoints, nearby_points
 from groma.frontend.segments import Segments
 
-FEATURES = 5  # descriptor distance, points for, points against, overlap on first, on second (-1: unknown)
+FEATURES = 6  # descriptor distance; points for, against, near one only; overlap on first, on second (-1: unknown)
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,11 @@ def _crossing(a, b):
 
 @kernel
 def _points(ids_1, distance_1, low_1, high_1, ids_2, distance_2, low_2, high_2, out):
-    """Shared points on the same side (out[0], by how alike their distances are) and on opposite sides (out[1])."""
+    """Shared points on the same side, by how alike their distances are; on opposite sides; and points not shared."""
     i, j = low_1, low_2
     for_it = 0.0
     against = 0.0
+    shared = 0
     while i < high_1 and j < high_2:
         if ids_1[i] < ids_2[j]:
             i += 1
@@ -101,9 +102,11 @@ def _points(ids_1, distance_1, low_1, high_1, ids_2, distance_2, low_2, high_2, 
                 for_it += ratio
             else:
                 against += 1.0
+            shared += 1
             i += 1
             j += 1
     out[0], out[1] = for_it, against
+    out[2] = min(high_1 - low_1, high_2 - low_2) - shared
 
 
 @loop
@@ -111,12 +114,12 @@ def _candidates(
     ends_1, ends_2, descriptors_1, descriptors_2, begin_1, ids_1, distance_1, begin_2, ids_2, distance_2,
     F, has_F, min_overlap, tolerance, min_product,
 ):  # fmt: skip
-    """All pairs that pass the gates: indices (C, 2) and features (C, 5)."""
+    """All pairs that pass the gates: indices (C, 2) and features (C, 6)."""
     n1, n2, size = ends_1.shape[0], ends_2.shape[0], descriptors_1.shape[1]
     room = 16 * (n1 + 16)
     pairs, features = np.zeros((room, 2), dtype=np.int64), np.zeros((room, FEATURES))
     count = 0
-    points = np.zeros(2)
+    points = np.zeros(3)
     for i in range(n1):
         a0 = 0.0
         a1 = 0.0
@@ -126,9 +129,17 @@ def _candidates(
         b2 = 0.0
         if has_F:
             u, v = ends_1[i, 0], ends_1[i, 1]
-            a0, a1, a2 = F[0, 0] * u + F[0, 1] * v + F[0, 2], F[1, 0] * u + F[1, 1] * v + F[1, 2], F[2, 0] * u + F[2, 1] * v + F[2, 2]  # noqa: E501
+            a0, a1, a2 = (
+                F[0, 0] * u + F[0, 1] * v + F[0, 2],
+                F[1, 0] * u + F[1, 1] * v + F[1, 2],
+                F[2, 0] * u + F[2, 1] * v + F[2, 2],
+            )
             u, v = ends_1[i, 2], ends_1[i, 3]
-            b0, b1, b2 = F[0, 0] * u + F[0, 1] * v + F[0, 2], F[1, 0] * u + F[1, 1] * v + F[1, 2], F[2, 0] * u + F[2, 1] * v + F[2, 2]  # noqa: E501
+            b0, b1, b2 = (
+                F[0, 0] * u + F[0, 1] * v + F[0, 2],
+                F[1, 0] * u + F[1, 1] * v + F[1, 2],
+                F[2, 0] * u + F[2, 1] * v + F[2, 2],
+            )
             scale = 1.0 / max(math.hypot(a0, a1), 1e-300)
             a0, a1, a2 = a0 * scale, a1 * scale, a2 * scale
             scale = 1.0 / max(math.hypot(b0, b1), 1e-300)
@@ -168,8 +179,8 @@ def _candidates(
                 pairs, features, room = more_pairs, more_features, 2 * room
             pairs[count, 0], pairs[count, 1] = i, j
             features[count, 0] = math.sqrt(max(2.0 - 2.0 * product, 0.0))
-            features[count, 1], features[count, 2] = points[0], points[1]
-            features[count, 3], features[count, 4] = on_1, on_2
+            features[count, 1], features[count, 2], features[count, 3] = points[0], points[1], points[2]
+            features[count, 4], features[count, 5] = on_1, on_2
             count += 1
     return pairs[:count], features[:count]
 
@@ -237,13 +248,14 @@ def candidates(
     fundamental: FloatArray | None,
     options: WideBaselineOptions,
 ) -> tuple[IntArray, FloatArray]:
-    """Pairs (C, 2) that pass the gates and their evidence (C, 5); see :func:`match_wide_baseline`."""
+    """Pairs (C, 2) that pass the gates and their evidence (C, 6); see :func:`match_wide_baseline`."""
     one, two = _descriptors(descriptors_1, segments_1, 1), _descriptors(descriptors_2, segments_2, 2)
     if isinstance(point_matches, tuple):
         near_1, near_2 = point_matches
         for near, segments in ((near_1, segments_1), (near_2, segments_2)):
             if len(near.begin) != len(segments) + 1:
                 raise ShapeError(f"NearbyPoints must be of these {len(segments)} segments; got {len(near.begin) - 1}.")
+        near_1, near_2 = near_1.common_with(near_2), near_2.common_with(near_1)
     else:
         points = np.zeros((0, 4)) if point_matches is None else np.asarray(point_matches, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 4:
@@ -300,7 +312,7 @@ def _descriptors(descriptors: Descriptors, segments: Segments, which: int) -> np
 
 def _score(features: FloatArray) -> FloatArray:
     """Probability from the evidence: a logistic function, its weights found on surveyed and rendered scenes."""
-    distance, for_it, against, on_1, on_2 = features.T
+    distance, for_it, against, missing, on_1, on_2 = features.T
     support = np.log1p(for_it) - 1.5 * np.log1p(against)
     known = on_1 >= 0.0
     overlap = np.where(known, np.sqrt(np.maximum(on_1, 0.0) * np.maximum(on_2, 0.0)), 0.3)
@@ -308,4 +320,11 @@ def _score(features: FloatArray) -> FloatArray:
     return 1.0 / (1.0 + np.exp(-np.clip(logit, -50.0, 50.0)))
 
 
-__all__ = ["FEATURES", "LineMatches", "WideBaselineOptions", "candidates", "fundamental_from_poses", "match_wide_baseline"]
+__all__ = [
+    "FEATURES",
+    "LineMatches",
+    "WideBaselineOptions",
+    "candidates",
+    "fundamental_from_poses",
+    "match_wide_baseline",
+]

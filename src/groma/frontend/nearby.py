@@ -25,6 +25,12 @@ class NearbyPoints:
     distance: FloatArray
     """(E,) signed distance from the segment's line in pixels, positive on the right."""
 
+    def common_with(self, other: NearbyPoints) -> NearbyPoints:
+        """Without the points that are near no segment of the other image: not seen there, or far from all lines."""
+        keep = np.isin(self.point_id, other.point_id)
+        begin = np.concatenate([[0], np.cumsum(keep)])[self.begin]
+        return NearbyPoints(begin, self.point_id[keep], self.distance[keep])
+
 
 @loop
 def _near_all(ends, points, reach, beyond, fill, begin, column, distance):
@@ -67,9 +73,7 @@ def nearby_points(segments: Segments, points: FloatArray, point_ids: IntArray, r
     points = np.ascontiguousarray(points, dtype=np.float64)
     point_ids = np.asarray(point_ids, dtype=np.int64)
     if points.ndim != 2 or points.shape[1] != 2 or point_ids.shape != (len(points),):
-        raise ShapeError(
-            f"points must have shape (P, 2) and point_ids (P,); got {points.shape} and {point_ids.shape}."
-        )
+        raise ShapeError(f"points must have shape (P, 2) and point_ids (P,); got {points.shape} and {point_ids.shape}.")
     order = np.argsort(point_ids, kind="stable")
     finite = np.isfinite(points[order]).all(axis=1)
     order = order[finite]

@@ -373,7 +373,8 @@ class _TextTarget:
 
     def rows(self, array: npt.NDArray[Any]) -> None:
         columns = [
-            (array[name] if place is None else array[name][:, place]).tolist() for name, place, _ in _columns(array.dtype)
+            (array[name] if place is None else array[name][:, place]).tolist()
+            for name, place, _ in _columns(array.dtype)
         ]
         self.parts += [" ".join(map(repr, row)) for row in zip(*columns, strict=True)]
 

@@ -4,9 +4,9 @@
 Kept: rigs, sensors, frames, images, 2D points with and without a 3D point, points with colour, error and track. Images
 and frames without a pose are left out: COLMAP does not write them to files either.
 
-A COLMAP model has no place for lines, planes, directions and relations. They are written beside it, to
-``structures/groma.npz``, and put back when the model is read: rows refer to images and points by identifier, so they
-survive changes made to the model by other programs.
+A COLMAP model has no place for lines, planes, directions and relations. They are written beside it, to the folder
+``structures`` in LIMAP 2's layout (:mod:`groma.io.limap`), and put back when the model is read: rows refer to images
+and points by identifier, so they survive changes made to the model by other programs.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError
 from groma.io._atomic import atomic_output
 from groma.io._colmap_structure import check_binary_model
+from groma.io._numbering import numbered_keypoints
 from groma.io._reading import existing, reading
-from groma.io._structures import read_structures, write_structures
+from groma.io.limap import Structures, read_beside, write_beside
 from groma.scene import Cameras, Frames, Images, Keypoints, PointObservations, Points, Rigs, Scene, Sensors
 from groma.scene.camera import CAMERA, OTHER
 
@@ -88,7 +89,7 @@ def read_colmap(path: str | os.PathLike[str]) -> Scene:
         else:
             reconstruction.read_text(str(folder))
         scene = from_pycolmap(reconstruction)
-    return read_structures(scene, folder)
+    return read_beside(scene, folder)
 
 
 def from_pycolmap(reconstruction: pycolmap.Reconstruction) -> Scene:
@@ -264,9 +265,13 @@ class _quiet:  # noqa: N801 - used like a function
 
 
 def write_colmap(
-    scene: Scene, path: str | os.PathLike[str], form: Literal["binary", "text"] = "binary", force: bool = False
+    scene: Scene,
+    path: str | os.PathLike[str],
+    form: Literal["binary", "text"] = "binary",
+    force: bool = False,
+    like: Structures | None = None,
 ) -> None:
-    """Write a scene as a COLMAP model that pycolmap opens; structures go beside it.
+    """Write a scene as a COLMAP model that pycolmap opens; structures go beside it, where LIMAP opens them.
 
     Parameters
     ----------
@@ -278,6 +283,9 @@ def write_colmap(
         Form of the files.
     force : bool
         Replace an existing folder.
+    like : Structures, optional
+        The LIMAP structures that the scene came from (:func:`groma.io.limap.read_limap`), to keep what a scene cannot
+        hold: 2D lines without a 3D line, scores, weights, uncertainties, other groups.
 
     Raises
     ------
@@ -296,7 +304,7 @@ def write_colmap(
     with atomic_output(path, force) as draft:
         draft.mkdir()
         (reconstruction.write_binary if form == "binary" else reconstruction.write_text)(str(draft))
-        write_structures(scene, draft)
+        write_beside(scene, draft, form, like)
 
 
 def to_pycolmap(scene: Scene) -> pycolmap.Reconstruction:
@@ -376,22 +384,15 @@ def _add_images(pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: S
 
 
 def _numbered(scene: Scene) -> tuple[list[FloatArray], npt.NDArray[np.int64]]:
-    """Return the 2D points of every image in the order of their numbers, and the number of each observation.
-
-    Numbers run 0, 1, 2, ... in a COLMAP model; where those of the scene have gaps (after a subset) they close up.
-    """
+    """Return the 2D points of every image in the order of their numbers, and the number of each observation."""
     centre = np.zeros((scene.num_cameras, 2))
     for row, name in enumerate(scene.cameras.models):
         if name == "BAL":  # its pixels count from the image centre, COLMAP's from the corner
             centre[row] = scene.cameras.width[row] / 2, scene.cameras.height[row] / 2
     tables = (scene.point_observations, scene.keypoints)
     image_idx = np.concatenate([table.image_idx for table in tables])
-    keypoint_idx = np.concatenate([table.keypoint_idx for table in tables])
     pixel = np.concatenate([table.pixel for table in tables]) + centre[scene.images.camera_idx[image_idx]]
-    order = np.lexsort((keypoint_idx, image_idx))
-    ends = np.searchsorted(image_idx[order], np.arange(scene.num_images + 1))
-    number = np.empty(len(order), np.int64)
-    number[order] = np.arange(len(order)) - ends[image_idx[order]]
+    order, ends, number = numbered_keypoints(scene)
     pixels = [pixel[order[start:end]] for start, end in pairwise(ends.tolist())]
     return pixels, number[: len(scene.point_observations)]
 

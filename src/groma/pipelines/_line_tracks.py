@@ -469,7 +469,7 @@ class Tracks:
         if count == 0:
             return 0, 0
         reach = _images_near_lines(self.line_of, views.image_idx, neighbors, count)
-        forward = self._direction() if directed else np.zeros(count)
+        forward = self.direction() if directed else np.zeros(count)
         hits, distances = [], []
         room, value = np.empty((4096, 2), np.int64), np.empty(4096)
         for i in range(len(views.camera)):
@@ -494,7 +494,7 @@ class Tracks:
         self.line_of[segment] = merged_line[order][best]
         return len(segment), num_merged
 
-    def _direction(self) -> FloatArray:
+    def direction(self) -> FloatArray:
         """(L,) +1 or -1: whether most observations run from the first end point to the second in the image."""
         views = self.views
         rows, pointers = self._table()
@@ -519,11 +519,11 @@ class Tracks:
         images = self.num_images()
         good = (votes >= 2) & (votes >= 0.6 * images[pairs[:, 1]])
         pairs, votes = pairs[good], votes[good]
-        merged = 0
+        merged, is_target = 0, np.zeros(len(self.X), bool)
         for a, b in pairs[np.argsort(-votes, kind="stable")]:
             # Chains are left to the next round: a line is joined once, and only to one that was not joined itself.
-            if self._alias[a] == a and self._alias[b] == b and not (self._alias == b).sum() > 1:
-                self._alias[b] = a
+            if self._alias[a] == a and self._alias[b] == b and not is_target[b]:
+                self._alias[b], is_target[a] = a, True
                 merged += 1
         member = self.line_of >= 0
         self.line_of[member] = self._alias[self.line_of[member]]

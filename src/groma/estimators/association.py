@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Which features belong to a structure: a mixture of those on it and of clutter around it.
+
+A chi-square test asks whether a distance *could* be noise. That is not enough: among many features near a plane some
+pass by chance, and one whose noise is large passes always. Each structure is therefore given the share :math:`\pi` of
+what lies in a band of half thickness B around it and belongs to it; the rest is spread evenly. With the distance h
+and its standard deviation s,
+
+.. math:: P = \frac{\pi\, g(h; s)}{\pi\, g(h; s) + (1 - \pi)/B}, \qquad
+          g(h; s) = \sqrt{\tfrac{2}{\pi_0}}\,\frac1s e^{-h^2/2s^2}, \quad \pi_0 = 3.14\ldots
+
+The shares follow by expectation maximisation. A feature with :math:`s \ge B` tells nothing and never reaches a high
+probability.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.errors import ShapeError
+
+_ROUNDS = 30
+
+
+def inlier_probability(
+    distance: FloatArray, sigma: FloatArray, owner: IntArray, band: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Probability that features belong to their structures.
+
+    Parameters
+    ----------
+    distance : (N,) float64
+        Distances from the structures, zero or greater and below the band, scene units or radians.
+    sigma : (N,) float64
+        Standard deviations of the distances.
+    owner : (N,) int
+        The structure of each distance.
+    band : (K,) float64
+        Half thickness of the band of each structure, in the unit of the distances.
+
+    Returns
+    -------
+    probability : (N,) float64
+    share : (K,) float64
+        Part of the features in the band that belong to the structure; one half where there are none.
+
+    Raises
+    ------
+    ShapeError
+        If shapes do not fit.
+    """
+    distance, sigma, owner = np.asarray(distance, float), np.asarray(sigma, float), np.asarray(owner)
+    band = np.asarray(band, float)
+    if not (distance.shape == sigma.shape == owner.shape) or distance.ndim != 1 or band.ndim != 1:
+        raise ShapeError(
+            f"distance, sigma and owner must have the same shape (N,); got {distance.shape}, {sigma.shape}, "
+            f"{owner.shape}."
+        )
+    spread = np.maximum(sigma, 1e-12 * band[owner] if len(band) else 0.0)
+    noise = np.sqrt(2.0 / np.pi) / spread * np.exp(-0.5 * np.minimum((distance / spread) ** 2, 1400.0))
+    clutter = 1.0 / band[owner] if len(band) else np.zeros(0)
+    count = np.bincount(owner, minlength=len(band))
+    share = np.full(len(band), 0.5)
+    probability = np.zeros(len(distance))
+    for _ in range(_ROUNDS):
+        inner = share[owner] * noise
+        probability = inner / (inner + (1.0 - share[owner]) * clutter)
+        # One feature on and one off in advance keep small structures from extremes.
+        share = (np.bincount(owner, weights=probability, minlength=len(band)) + 1.0) / (count + 2.0)
+    return probability, share
+
+
+__all__ = ["inlier_probability"]

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Matches and segments made elsewhere, for example by a learned matcher, handed in as an ``.npz`` file.
+
+The file holds, for every image pair, arrays named by the two image names joined with ``|``::
+
+    segments|<image>            (N, 4) float  end points u1 v1 u2 v2, first pixel's centre at (0.5, 0.5); optional
+    matches|<image>|<image>     (M, 2) int    segment index in the first and in the second image
+    scores|<image>|<image>      (M,) float    0 to 1, higher is better; optional, 1 if absent
+
+Nothing is unpickled. Either order of the two images will do when asking for a pair.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from groma.errors import FileFormatError, GromaError
+from groma.frontend.edge_fit import measure_edges
+from groma.frontend.images import to_gray
+from groma.frontend.matches import LineMatches
+from groma.frontend.segments import Segments
+
+
+@dataclass(frozen=True)
+class ExternalMatches:
+    """Segments and matches by image name."""
+
+    segments: Mapping[str, npt.NDArray[np.float64]]
+    """End points (N, 4) by image name; empty where the file has matches only."""
+    matches: Mapping[tuple[str, str], LineMatches]
+    """Matches by pair of image names."""
+
+    def match(self, first: str, second: str) -> LineMatches:
+        """Matches of a pair in the order asked for; none where the file has none."""
+        if (first, second) in self.matches:
+            return self.matches[first, second]
+        if (second, first) in self.matches:
+            return self.matches[second, first].swapped()
+        return LineMatches.empty()
+
+    def segments_of(self, name: str, image: npt.NDArray[np.generic], fit: bool = False) -> Segments:
+        """Segments of an image in the file's order, directed by the grey levels, with sigma and strength measured.
+
+        With ``fit`` the end points are moved across the segment to the edge. An image the file does not name has none.
+        """
+        ends, sigma, strength = measure_edges(to_gray(image), self.segments.get(name, np.zeros((0, 4))), fit=fit)
+        return Segments(ends, sigma, strength)
+
+
+def read_matches(path: str | Path) -> ExternalMatches:
+    """Read an ``.npz`` file of matches (layout: see the module).
+
+    Raises
+    ------
+    FileFormatError
+        If the file is no such archive, or an array in it does not have the promised shape, type or range.
+    """
+    path = Path(path)
+    segments: dict[str, npt.NDArray[np.float64]] = {}
+    matches: dict[tuple[str, str], LineMatches] = {}
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+    except FileNotFoundError:
+        raise FileFormatError(f"Expected an .npz file of line matches; {path} does not exist.") from None
+    except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise FileFormatError(f"Expected an .npz file of line matches; {path} cannot be read: {error}") from error
+    for key, array in arrays.items():
+        kind, *names = key.split("|")
+        if kind == "segments" and len(names) == 1:
+            numeric = np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)
+            if array.ndim != 2 or array.shape[1] != 4 or not numeric or not np.isfinite(array).all():
+                raise FileFormatError(f"{path}: '{key}' must be finite numbers of shape (N, 4); got {array.shape}.")
+            segments[names[0]] = array.astype(np.float64)
+        elif kind == "matches" and len(names) == 2:
+            score = arrays.get("|".join(["scores", *names]), np.ones(len(array) if array.ndim else 0))
+            try:
+                matches[names[0], names[1]] = LineMatches(array, score)
+            except (GromaError, ValueError, TypeError) as error:
+                raise FileFormatError(f"{path}: '{key}': {error}") from error
+        elif kind != "scores":
+            raise FileFormatError(
+                f"{path}: array '{key}' is none of segments|IMAGE, matches|IMAGE|IMAGE, scores|IMAGE|IMAGE. Rename it."
+            )
+    for (first, second), found in matches.items():
+        limits = [len(segments[name]) if name in segments else np.iinfo(np.int64).max for name in (first, second)]
+        try:
+            found.check(limits[0], limits[1])
+        except GromaError as error:
+            raise FileFormatError(f"{path}: matches|{first}|{second}: {error}") from error
+        if not (np.isfinite(found.score).all() and ((found.score >= 0.0) & (found.score <= 1.0)).all()):
+            raise FileFormatError(f"{path}: scores|{first}|{second} must lie between 0 and 1.")
+    return ExternalMatches(segments, matches)
+
+
+def write_matches(path: str | Path, external: ExternalMatches) -> None:
+    """Write segments and matches in the layout :func:`read_matches` reads."""
+    arrays: dict[str, npt.NDArray[np.generic]] = {f"segments|{n}": np.asarray(e) for n, e in external.segments.items()}
+    for (first, second), found in external.matches.items():
+        arrays[f"matches|{first}|{second}"] = found.pairs
+        arrays[f"scores|{first}|{second}"] = found.score
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+__all__ = ["ExternalMatches", "read_matches", "write_matches"]
