@@ -45,6 +45,12 @@ BAND = 8.0
 #: Links between inliers, as a multiple of the distance to the eighth neighbour.
 LINK = 2.0
 _RANK = 8
+#: Rounds of refinement of a candidate on its growing support.
+_GROW_STEPS = 15
+#: A candidate is the same as a plane tried before if it passes its support within so many standard deviations.
+_SAME = 2.0
+#: Candidates with less than this part of the best score are not looked at.
+_LEAST_SCORE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ class PlaneOptions:
     #: Largest standard deviation of the normal, radians. 1 degree.
     max_tilt: float = 0.0175
     #: Least part of the features in the layer around a plane that lie on it.
-    min_share: float = 0.5
+    min_share: float = 0.3
     #: Expected number of planes found where there are none.
     max_false_alarms: float = 1e-4
     #: Most planes.
@@ -198,6 +204,19 @@ class _Features:
         return np.sqrt(np.einsum("i,nij,j->n", normal, self.covariances[rows], normal))
 
 
+@dataclass(frozen=True)
+class _Grown:
+    """A plane that is kept."""
+
+    fit: PlaneFit
+    share: float
+    band: float
+    log10_false_alarms: float
+    #: The features on it, and those taken out with it.
+    rows: IntArray
+    taken: IntArray
+
+
 def find_planes(
     points: FloatArray,
     covariances: FloatArray,
@@ -248,24 +267,24 @@ def find_planes(
     partner[len(points) :] = len(points) + (np.arange(2 * len(ends)) ^ 1)
     labels = np.full(len(places), -1)
     found = _extract(places, noise, partner, len(points), labels, options) if len(places) >= 4 else []
-    fits, shares, bands, alarms, rows = zip(*found, strict=True) if found else ((), (), (), (), ())
+    fits = [grown.fit for grown in found]
     end_label = labels[len(points) :].reshape(-1, 2)
     return PlaneSet(
         planes=np.array([fit.plane for fit in fits]).reshape(-1, 4),
         covariance=np.array([fit.covariance for fit in fits]).reshape(-1, 4, 4),
-        support=np.array([len(inside) for inside in rows], dtype=np.int64),
-        share=np.array(shares, dtype=np.float64),
-        band=np.array(bands, dtype=np.float64),
-        log10_false_alarms=np.array(alarms, dtype=np.float64),
+        support=np.array([len(grown.rows) for grown in found], dtype=np.int64),
+        share=np.array([grown.share for grown in found], dtype=np.float64),
+        band=np.array([grown.band for grown in found], dtype=np.float64),
+        log10_false_alarms=np.array([grown.log10_false_alarms for grown in found], dtype=np.float64),
         point_label=labels[: len(points)],
         segment_label=np.where(end_label[:, 0] == end_label[:, 1], end_label[:, 0], -1),
-        places=[places[inside] for inside in rows],
+        places=[places[grown.rows] for grown in found],
     )
 
 
 def _extract(
     places: FloatArray, noise: FloatArray, partner: IntArray, num_points: int, labels: IntArray, options: PlaneOptions
-) -> list[tuple[PlaneFit, float, float, float, IntArray]]:
+) -> list[_Grown]:
     """Take planes out one after the other; ``labels`` is filled."""
     rng = np.random.default_rng(options.seed)
     near = min(_NEIGHBOURS, len(places))
@@ -281,26 +300,25 @@ def _extract(
         scored = np.sort(rng.choice(len(places), _MAX_SCORED, replace=False))
     score = _score(features, candidates, scored, gate, extent)
     log_tried = np.log10(len(places) * _NEIGHBOURS**2 / 2.0)
-    found = []
+    found: list[_Grown] = []
     alive, total = np.ones(len(candidates), dtype=bool), score.sum(axis=1)
-    failures = 0
-    while alive.any() and len(found) < options.max_planes and failures < 60:
+    while alive.any() and len(found) < options.max_planes:
         best = int(np.argmax(np.where(alive, total, -1.0)))
-        if total[best] <= 0.0:
+        if total[best] <= _LEAST_SCORE * total.max(initial=1.0):
             break
-        outcome = _grow(features, candidates[best], labels, gate, log_tried, options)
-        if outcome is None:
-            alive[best], failures = False, failures + 1
-            continue
-        failures = 0
-        fit, share, band, alarm, inside, taken = outcome
-        labels[taken] = len(found)
-        found.append((fit, share, band, alarm, inside))
-        gone = labels[scored] == len(found) - 1
-        total -= score[:, gone].sum(axis=1)
-        score[:, gone] = 0.0
-        if not gone.any():
-            alive[best] = False
+        grown, plane, rows = _grow(features, candidates[best], labels, gate, log_tried, options)
+        alive[best] = False
+        if grown is not None:
+            labels[grown.taken] = len(found)
+            gone = labels[scored] == len(found)
+            found.append(grown)
+            total -= score[:, gone].sum(axis=1)
+            score[:, gone] = 0.0
+        if len(rows):
+            # Candidates that would end at the same plane are not tried again.
+            some = features.places[rows[:: max(1, len(rows) // 64)]]
+            height = np.abs(some @ candidates[:, :3].T + candidates[:, 3])
+            alive &= np.median(height, axis=0) > _SAME * np.median(features.spread(plane[:3], rows))
     return found
 
 
@@ -377,28 +395,28 @@ def _score(features: _Features, candidates: FloatArray, rows: IntArray, gate: fl
 
 def _grow(
     features: _Features, plane: FloatArray, labels: IntArray, gate: float, log_tried: float, options: PlaneOptions
-) -> tuple[PlaneFit, float, float, float, IntArray, IntArray] | None:
-    """Refine a candidate on its largest connected part and judge it; None unless it is kept.
-
-    Besides the plane: its share, its band, its false alarms, the features on it, and those taken out with it.
-    """
+) -> tuple[_Grown | None, FloatArray, IntArray]:
+    """Refine a candidate on its largest connected part and judge it: what is kept, where it went, and its support."""
     free = np.flatnonzero(labels < 0)
     fit, rows = None, np.zeros(0, np.int64)
-    for step in range(6):
-        height = features.places[free] @ plane[:3] + plane[3]
-        variance = features.spread(plane[:3], free) ** 2
+    for step in range(_GROW_STEPS):
+        squared = (features.places[free] @ plane[:3] + plane[3]) ** 2 / features.spread(plane[:3], free) ** 2
         # The first rounds reach farther: the candidate is not yet exact.
-        inside = free[height**2 < (4.0 if step < 2 else 1.0) * gate * variance]
-        before, rows = rows, _largest_part(features, inside)
+        inside = squared < (4.0 if step < 2 else 1.0) * gate
+        rows = _largest_part(features, free[inside])
         if len(rows) < options.min_support:
-            return None
-        fit = fit_plane(features.places[rows], features.covariances[rows])
+            return None, plane, rows
+        height = features.places[rows] @ plane[:3] + plane[3]
+        # Weights that fall with the distance lead to where the layer is densest, not to the middle of what it cuts off.
+        weight = 1.0 / (1.0 + height**2 / features.spread(plane[:3], rows) ** 2) ** 2
+        fit = fit_plane(features.places[rows], features.covariances[rows], weight)
+        moved = features.places[rows] @ fit.plane[:3] + fit.plane[3] - height * np.sign(fit.plane[:3] @ plane[:3])
         plane = fit.plane
-        if step > 2 and np.array_equal(before, rows):
+        if step > 2 and np.abs(moved).max() < 0.02 * np.median(features.spread(plane[:3], rows)):
             break
     assert fit is not None
     if tilt_sigma(fit.covariance) > options.max_tilt:
-        return None
+        return None, plane, rows
     band = BAND * float(np.median(features.spread(plane[:3], rows)))
     height = np.abs(features.places @ plane[:3] + plane[3])
     # Judged against all that is near, taken or not: what lies on another plane beside it speaks against this one.
@@ -408,12 +426,14 @@ def _grow(
         height[layer], features.spread(plane[:3], layer), np.zeros(len(layer), np.int64), np.array([band])
     )
     if share[0] < options.min_share:
-        return None
+        return None, plane, rows
     alarm = _log10_false_alarms(features, plane, rows, gate) + log_tried
     if alarm > np.log10(options.max_false_alarms):
-        return None
-    taken = layer[(labels[layer] < 0) & (height[layer] ** 2 < 9.0 * features.spread(plane[:3], layer) ** 2)]
-    return fit, float(share[0]), band, float(alarm), rows, np.union1d(rows, taken)
+        return None, plane, rows
+    # The whole layer is taken out: relief so near to a plane cannot be told from it.
+    taken = layer[labels[layer] < 0]
+    grown = _Grown(fit, float(share[0]), band, float(alarm), rows, np.union1d(rows, taken))
+    return grown, plane, rows
 
 
 def _log10_false_alarms(features: _Features, plane: FloatArray, rows: IntArray, gate: float) -> float:

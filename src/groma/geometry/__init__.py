@@ -1,1 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
+"""What the objects are and how they move: groups, points, lines, planes, their algebra and their charts."""

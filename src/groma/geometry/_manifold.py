@@ -48,11 +48,11 @@ class Manifold(ABC):
 
     @abstractmethod
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
-        """Move ``state`` (N, state_size) by the increments ``delta`` (N, dof); retract(x, 0) = x."""
+        """Move states (N, state_size) by increments (N, dof); retract(x, 0) = x."""
 
     @abstractmethod
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
-        """Increments (N, dof) that lead from ``state`` to ``other``; the inverse of :meth:`retract`."""
+        """Return the increments (N, dof) that lead from one state to another; the inverse of :meth:`retract`."""
 
     @abstractmethod
     def ambient(self, state: FloatArray) -> FloatArray:
@@ -86,20 +86,20 @@ class Euclidean(Manifold):
     def __repr__(self) -> str:
         return f"Euclidean({self.dof}, {self.kind!r})"
 
-    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:  # noqa: D102
+    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         return state + delta
 
-    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:  # noqa: D102
+    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         return other - state
 
-    def ambient(self, state: FloatArray) -> FloatArray:  # noqa: D102
+    def ambient(self, state: FloatArray) -> FloatArray:
         return state
 
-    def from_ambient(self, ambient: FloatArray) -> FloatArray:  # noqa: D102
+    def from_ambient(self, ambient: FloatArray) -> FloatArray:
         return ambient
 
-    def basis(self, state: FloatArray) -> None:  # noqa: D102
+    def basis(self, state: FloatArray) -> None:
         return None
 
-    def random(self, rng: np.random.Generator, count: int) -> FloatArray:  # noqa: D102
+    def random(self, rng: np.random.Generator, count: int) -> FloatArray:
         return rng.normal(size=(count, self.dof))

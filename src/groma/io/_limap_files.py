@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
+# ruff: noqa: RUF009 - no_rows() is dataclasses.field() with a default
 r"""The four files of LIMAP 2's ``structures`` folder, binary and text.
 
 Binary files are little-endian without padding. ``u4``, ``u8``, ``i4``, ``f8`` are the types, ``n *`` stands for a

@@ -272,10 +272,10 @@ def _members(groups: list[Group3d], kind: str, rows: _Rows) -> IntArray:
 
 def _own_ids(planes: list[Group3d], directions: list[Group3d], exact: Scene) -> list[IntArray]:
     """Return the identifiers of planes and directions: those of the groups, or as groma had them before writing."""
-    own = [dict(zip(_group_ids(exact, ())[kind], table.ids.tolist(), strict=True))
-           for kind, table in enumerate((exact.planes, exact.directions))]  # fmt: skip
+    written = _group_ids(exact, ())
     result = []
-    for groups, before in zip((planes, directions), own, strict=True):
+    for groups, numbers, table in zip((planes, directions), written, (exact.planes, exact.directions), strict=True):
+        before = dict(zip(numbers, table.ids.tolist(), strict=True))
         ids = _int_ids(np.array([group.id for group in groups], np.uint64)).tolist()
         restored = [before.get(number, number) for number in ids]
         result.append(np.array(restored if len(set(restored)) == len(ids) else ids, np.int64))
@@ -490,7 +490,7 @@ def _groups_2d(
         ):
             order = np.lexsort((numbers, image_idx))
             found, start = np.unique(image_idx[order], return_index=True)
-            for image, chunk in zip(found.tolist(), np.split(numbers[order], start[1:]), strict=bool(len(found))):
+            for image, chunk in zip(found.tolist(), np.split(numbers[order], start[1:]), strict=False):
                 table = np.ones(len(chunk), MEMBER_2D)
                 table["idx"] = chunk
                 members.setdefault(image, {})[kind] = table
