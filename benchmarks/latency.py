@@ -48,10 +48,8 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data" / "bal", help="BAL files")
     arguments = parser.parse_args()
-    problem = next(
-        problem for problem in PROBLEMS if problem.source.startswith("problem-") and problem.prepare(arguments.data)
-    )
-    groma = [sys.executable, "-m", "groma"]
+    problem = next(problem for problem in PROBLEMS if not problem.is_corridor and problem.prepare(arguments.data))
+    groma = [sys.executable, "-m", "groma.cli.main"]
     adjust = [*groma, "adjust", os.fspath(problem.file_for("groma")), "--quiet"]
 
     with tempfile.TemporaryDirectory() as cache:

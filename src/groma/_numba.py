@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The two decorators for compiled code. Nothing else in groma calls ``numba.njit``.
 
-``@kernel`` marks scalar code on one item: floats and small arrays in, results written to a passed-in array. It is always
-inlined into the loops that call it.
+``@kernel`` marks scalar code on one item: floats and small arrays in, results written to a passed-in array. It is
+always inlined into the loops that call it.
 ``@loop`` marks the walk over a batch that calls a kernel by its module-level name.
 
 Both release the GIL and are cached on disk. Division by zero gives inf or NaN, as in NumPy. Reassociation and

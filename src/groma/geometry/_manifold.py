@@ -48,7 +48,7 @@ class Manifold(ABC):
 
     @abstractmethod
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
-        """Move states (N, state_size) by increments (N, dof); retract(x, 0) = x."""
+        """Move states (N, state_size) by increments (N, dof); a zero increment changes nothing."""
 
     @abstractmethod
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
