@@ -6,6 +6,7 @@ costs next to nothing. Sub-packages are reachable the same way: ``groma.geometry
 ``groma.factors``.
 """
 
+import zlib as _zlib  # noqa: F401  (before pycolmap, whose library hides Python's own deflate and breaks it)
 from importlib import import_module
 from typing import TYPE_CHECKING
 

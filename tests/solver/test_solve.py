@@ -177,3 +177,12 @@ def test_prior_alone_is_solved():
     prior = VectorPrior(variable=Ref("x", np.arange(4)), measured=np.arange(8.0).reshape(4, 2))
     solution = solve(Problem({"x": Variables(Euclidean(2), state)}, [prior]), SolverOptions(function_tolerance=1e-14))
     np.testing.assert_allclose(solution["x"], np.arange(8.0).reshape(4, 2), atol=1e-6)
+
+
+def test_refused_steps_are_not_convergence():
+    """Far from the minimum of a bent problem the first steps are refused; the solve must go on until it is there."""
+    problem = scene_problem(num_points=40, num_lines=0, constant_landmarks=True, disturb=0.25, num_cameras=8)
+    solution = solve(problem, SolverOptions(initial_damping=1e-12, function_tolerance=1e-9, max_iterations=200))
+    assert solution.report.converged
+    close = solve(scene_problem(num_points=40, constant_landmarks=True, disturb=0.0, num_cameras=8))
+    np.testing.assert_allclose(solution.report.final_cost, close.report.final_cost, rtol=1e-5)

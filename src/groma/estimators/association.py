@@ -24,7 +24,7 @@ _ROUNDS = 30
 
 
 def inlier_probability(
-    distance: FloatArray, sigma: FloatArray, owner: IntArray, band: FloatArray
+    distance: FloatArray, sigma: FloatArray, owner: IntArray, band: FloatArray, pooled: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
     """Probability that features belong to their structures.
 
@@ -38,6 +38,9 @@ def inlier_probability(
         The structure of each distance.
     band : (K,) float64
         Half thickness of the band of each structure, in the unit of the distances.
+    pooled : float
+        How many features the share of all structures together counts in the share of each. Above zero for small
+        structures, which cannot tell their own share.
 
     Returns
     -------
@@ -61,13 +64,18 @@ def inlier_probability(
     noise = np.sqrt(2.0 / np.pi) / spread * np.exp(-0.5 * np.minimum((distance / spread) ** 2, 1400.0))
     clutter = 1.0 / band[owner] if len(band) else np.zeros(0)
     count = np.bincount(owner, minlength=len(band))
+    if pooled > 0.0 and len(distance):
+        _, shares = inlier_probability(distance / band[owner], spread / band[owner], np.zeros_like(owner), np.ones(1))
+        common = float(shares[0])
+    else:
+        common, pooled = 0.5, 2.0
     share = np.full(len(band), 0.5)
     probability = np.zeros(len(distance))
     for _ in range(_ROUNDS):
         inner = share[owner] * noise
         probability = inner / (inner + (1.0 - share[owner]) * clutter)
-        # One feature on and one off in advance keep small structures from extremes.
-        share = (np.bincount(owner, weights=probability, minlength=len(band)) + 1.0) / (count + 2.0)
+        # Some features in advance keep small structures from extremes.
+        share = (np.bincount(owner, weights=probability, minlength=len(band)) + pooled * common) / (count + pooled)
     return probability, share
 
 

@@ -370,17 +370,22 @@ class _TextTarget:
         self.parts: list[str] = []
 
     def put(self, codes: str, *values: float) -> None:
-        self.parts.append(" ".join(map(repr, values)))
+        self.parts.append(" ".join(map(_word, values)))
 
     def rows(self, array: npt.NDArray[Any]) -> None:
         columns = [
             (array[name] if place is None else array[name][:, place]).tolist()
             for name, place, _ in _columns(array.dtype)
         ]
-        self.parts += [" ".join(map(repr, row)) for row in zip(*columns, strict=True)]
+        self.parts += [" ".join(map(_word, row)) for row in zip(*columns, strict=True)]
 
     def content(self) -> bytes:
         return ("\n".join(self.parts) + "\n").encode("ascii")
+
+
+def _word(value: float) -> str:
+    """Return every digit of a number, and no more."""
+    return repr(value).removesuffix(".0")
 
 
 _Target = _BinaryTarget | _TextTarget

@@ -20,7 +20,8 @@ Quirks of the files, all survived: images without a pose have structures too; te
 2D lines; binary 2D lines may name a 3D line whose track left them out (the track counts); tracks and groups may name
 images, points and lines that were deleted; segments may have no length (left out unless groma wrote them); planes
 and directions share one sequence of identifiers. LIMAP demands a structure for every image, with its number of 2D
-points, and indices within bounds; it is written so.
+points, and indices within bounds; it is written so. In text it cannot read 2D groups that have points (its own
+neither), so beside a text model 2D groups are written without them; their 3D groups have them.
 
 Two things of a scene have no place in these files: a line's Plücker vector, where it is not exactly that of its end
 points, and identifiers of planes and directions that occur in both. Where they matter ``groma.npz`` lies beside,
@@ -143,9 +144,19 @@ def write_beside(scene: Scene, model: Path, form: Form, like: Structures | None 
         return
     folder = model / "structures"
     folder.mkdir()
-    write_files(from_scene(scene, like), folder, form)
+    structures = from_scene(scene, like)
+    write_files(_readable_text(structures) if form == "text" else structures, folder, form)
     if _needs_exact(scene):
         write_archive(Scene(lines=scene.lines, planes=scene.planes, directions=scene.directions), folder / _EXACT)
+
+
+def _readable_text(structures: Structures) -> Structures:
+    """Return the structures without the points of 2D groups, which LIMAP 2.0 cannot read in text."""
+    bare = [
+        replace(image, groups=tuple(replace(group, points=group.points[:0]) for group in image.groups))
+        for image in structures.images
+    ]
+    return replace(structures, images=tuple(bare))
 
 
 def _needs_exact(scene: Scene) -> bool:

@@ -7,6 +7,8 @@ Every variable has a damping of its own, and its step is kept only if it lowers 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from groma._simd import width
@@ -14,21 +16,40 @@ from groma._typing import FloatArray
 from groma.problem._parallel import Workers
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
-from groma.solver.schur import invert_blocks
+from groma.solver.schur import MIN_DIAGONAL, invert_blocks
+from groma.solver.steps import States, gradient, largest
 
 #: A variable whose damping exceeds this has reached its minimum to machine precision.
 MAX_DAMPING = 1e12
+MIN_DAMPING = 1e-15
+#: A gain ratio above this means the cost falls faster than the quadratic model says, and a longer step may do better.
+STRETCH_GAIN_RATIO = 1.5
+MAX_STRETCH = 8.0
+
+
+@dataclass(frozen=True)
+class BlockProgress:
+    """How far the variables have come in one step."""
+
+    #: Variables whose cost fell, or promises to fall, by more than the tolerance.
+    unfinished: int
+    #: Euclidean length of all steps that were kept.
+    length: float
+    #: Largest component of the gradient before the step.
+    gradient: float
 
 
 class IndependentBlocks:
     """Levenberg-Marquardt on every variable of a layout without kept blocks."""
 
-    def __init__(self, layout: Layout, workers: Workers, initial_damping: float) -> None:
+    def __init__(self, layout: Layout, workers: Workers, initial_damping: float, tolerance: float = 1e-6) -> None:
         self.layout = layout
+        self._tolerance = tolerance
         self.equations = NormalEquations(layout, workers)
         self._N = [np.zeros_like(V) for V in self.equations.V]
         self._h = [np.zeros_like(g) for g in self.equations.g_landmarks]
         self._initial_damping = initial_damping
+        self.num_singular = 0
         self.reset()
 
     def reset(self) -> None:
@@ -36,52 +57,62 @@ class IndependentBlocks:
         self.damping = [np.full(e.count, self._initial_damping) for e in self.layout.eliminated]
         self._growth = [np.full(e.count, 2.0) for e in self.layout.eliminated]
 
-    def costs(self, states: dict[str, FloatArray], inputs: list[tuple] | None = None) -> list[FloatArray]:
+    def costs(self, states: States, inputs: list[tuple] | None = None) -> list[FloatArray]:
         """Return the cost of each variable of each group."""
         costs = [np.zeros(e.count) for e in self.layout.eliminated]
         self.equations.cost(self.equations.prepare(states) if inputs is None else inputs, costs)
         return costs
 
-    def step(
-        self, states: dict[str, FloatArray], costs: list[FloatArray]
-    ) -> tuple[dict[str, FloatArray], list[FloatArray], list[FloatArray], float]:
-        """Try one step of every variable.
-
-        Returns the new states, their costs, the lengths of the kept steps, and the largest gradient component.
-        """
+    def step(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
+        """Try one step of every variable; return the new states, their costs, and how far the variables have come."""
         equations = self.equations
         equations.linearize(states, equations.prepare(states))
         self.num_singular = 0
-        candidate = dict(states)
-        deltas = []
+        moved, deltas, promised = dict(states), [], []
         for e, group in enumerate(self.layout.eliminated):
             V, g, N, h = equations.V[e], equations.g_landmarks[e], self._N[e], self._h[e]
             self.num_singular += invert_blocks(V, g, self.damping[e], 1, 0, group.count, N, h, width(group.dof))
             delta = h.reshape(group.count, group.dof)
+            diagonal = np.maximum(V.reshape(group.count, -1)[:, :: group.dof + 1], MIN_DIAGONAL)
+            pull = -np.einsum("ni,ni->n", g.reshape(group.count, group.dof), delta)
+            promised.append(0.5 * (pull + self.damping[e] * np.einsum("ni,ni,ni->n", delta, diagonal, delta)))
             deltas.append(delta)
             manifold = self.layout.problem.variables[group.group].manifold
-            candidate[group.group] = manifold.retract(states[group.group], delta)
-        new_costs = self.costs(candidate)
-        lengths = []
+            moved[group.group] = manifold.retract(states[group.group], delta)
+        new_costs = self.costs(moved)
+        self._stretch(states, costs, moved, new_costs, deltas, promised)
+        unfinished, squared_length = 0, 0.0
         for e, group in enumerate(self.layout.eliminated):
             better = new_costs[e] < costs[e]
-            better_rows = better[:, None]
-            candidate[group.group] = np.where(better_rows, candidate[group.group], states[group.group])
-            lengths.append(np.where(better, np.linalg.norm(deltas[e], axis=1), 0.0))
+            moved[group.group] = np.where(better[:, None], moved[group.group], states[group.group])
+            decrease = np.where(better, costs[e] - new_costs[e], promised[e])
+            open_ended = better | (self.damping[e] < MAX_DAMPING)
+            unfinished += int((open_ended & (decrease > self._tolerance * costs[e])).sum())
+            squared_length += float((np.where(better[:, None], deltas[e], 0.0) ** 2).sum())
             new_costs[e] = np.where(better, new_costs[e], costs[e])
-            self.damping[e] = np.where(
-                better, np.maximum(self.damping[e] / 5.0, 1e-15), self.damping[e] * self._growth[e]
-            )
+            raised = np.minimum(self.damping[e] * self._growth[e], MAX_DAMPING)
+            self.damping[e] = np.where(better, np.maximum(self.damping[e] / 5.0, MIN_DAMPING), raised)
             self._growth[e] = np.where(better, 2.0, np.minimum(2.0 * self._growth[e], 1e6))
-        gradient = max((float(np.abs(g).max()) for g in equations.g_landmarks if g.size), default=0.0)
-        return candidate, new_costs, lengths, gradient
+        return moved, new_costs, BlockProgress(unfinished, float(np.sqrt(squared_length)), largest(gradient(equations)))
 
-    def unfinished(self, before: list[FloatArray], after: list[FloatArray], tolerance: float) -> int:
-        """Count the variables that still moved their cost by more than ``tolerance`` or may after more damping."""
-        count = 0
-        for e in range(len(before)):
-            decrease = before[e] - after[e]
-            moving = decrease > tolerance * before[e]
-            stuck = (decrease == 0) & (self.damping[e] < 1e-2) & (before[e] > 0)
-            count += int((moving | stuck).sum())
-        return count
+    def _stretch(self, states: States, costs, moved: States, new_costs, deltas, promised) -> None:
+        """Lengthen the steps whose cost fell faster than promised; ``moved``, its costs and steps are updated.
+
+        The reason and the formula are those of the joint solve: robust losses bend the cost down.
+        """
+        factors = []
+        for e in range(len(deltas)):
+            ratio = (costs[e] - new_costs[e]) / np.maximum(promised[e], 1e-300)
+            factors.append(np.where(ratio > STRETCH_GAIN_RATIO, 1.0 / np.maximum(2.0 - ratio, 1.0 / MAX_STRETCH), 1.0))
+        if all((factor == 1.0).all() for factor in factors):
+            return
+        longer = dict(moved)
+        for e, group in enumerate(self.layout.eliminated):
+            manifold = self.layout.problem.variables[group.group].manifold
+            longer[group.group] = manifold.retract(states[group.group], factors[e][:, None] * deltas[e])
+        longer_costs = self.costs(longer)
+        for e, group in enumerate(self.layout.eliminated):
+            better = longer_costs[e] < new_costs[e]
+            moved[group.group] = np.where(better[:, None], longer[group.group], moved[group.group])
+            deltas[e] = np.where(better[:, None], factors[e][:, None] * deltas[e], deltas[e])
+            new_costs[e] = np.where(better, longer_costs[e], new_costs[e])

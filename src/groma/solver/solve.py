@@ -28,7 +28,7 @@ from groma.problem.linearization import NormalEquations, to_original_order, to_s
 from groma.problem.problem import Problem
 from groma.solver._blas import one_blas_thread
 from groma.solver.dogleg import Dogleg
-from groma.solver.independent import IndependentBlocks
+from groma.solver.independent import MAX_STRETCH, STRETCH_GAIN_RATIO, IndependentBlocks
 from groma.solver.levenberg_marquardt import LevenbergMarquardt
 from groma.solver.linear import ConjugateGradients, choose
 from groma.solver.options import SolverOptions
@@ -39,10 +39,6 @@ from groma.solver.termination import Termination
 
 #: From this many factors on, all cores are used unless the caller says otherwise.
 FACTORS_FOR_THREADS = 50_000
-
-#: A gain ratio above this means the cost falls faster than the quadratic model says, and a longer step may do better.
-STRETCH_GAIN_RATIO = 1.5
-MAX_STRETCH = 8.0
 
 #: Called after every step tried; returning False stops the solve.
 Progress = Callable[[Iteration], bool | None]
@@ -247,7 +243,7 @@ class _LandmarkRefiner:
         self._blocks.reset()
         costs = self._blocks.costs(inner)
         for _ in range(self._steps):
-            inner, costs, _, _ = self._blocks.step(inner, costs)
+            inner, costs, _ = self._blocks.step(inner, costs)
         refined = dict(trial.states)
         for group in self._outer.eliminated:
             refined[group.group] = np.ascontiguousarray(inner[group.group][group.order])
@@ -267,12 +263,13 @@ def _solve_independently(
     layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
 ) -> States:
     with watch("setup"):
-        blocks = IndependentBlocks(layout, workers, options.initial_damping)
+        blocks = IndependentBlocks(layout, workers, options.initial_damping, options.function_tolerance)
         states = to_solver_order(layout)
     report.linear_solver = "blocks"
     with watch("cost"):
         costs = blocks.costs(states)
     cost = float(sum(blocks.equations.costs))
+    outside = cost - float(sum(part.sum() for part in costs))
     _start(report, layout, blocks.equations, cost)
     if not np.isfinite(cost):
         report.termination = Termination.NOT_FINITE
@@ -281,19 +278,25 @@ def _solve_independently(
     while report.iterations < options.max_iterations:
         report.iterations += 1
         with watch("linearize"):
-            states, new_costs, lengths, gradient = blocks.step(states, costs)
-        unfinished = blocks.unfinished(costs, new_costs, options.function_tolerance)
-        new_cost = cost + float(sum((a - b).sum() for a, b in zip(new_costs, costs, strict=True)))
-        length = float(np.sqrt(sum(float(x @ x) for x in lengths)))
+            states, costs, moved = blocks.step(states, costs)
+        new_cost = float(sum(part.sum() for part in costs)) + outside
         damping = max((float(d.max()) for d in blocks.damping if d.size), default=0.0)
         record = Iteration(
-            report.iterations, new_cost, new_cost < cost, damping, 0.0, length, gradient, 0, watch.elapsed()
+            iteration=report.iterations,
+            cost=new_cost,
+            accepted=new_cost < cost,
+            damping=damping,
+            gain_ratio=0.0,
+            step_norm=moved.length,
+            gradient_max=moved.gradient,
+            linear_iterations=0,
+            seconds=watch.elapsed(),
         )
         report.history.append(record)
-        costs, cost = new_costs, new_cost
-        if gradient <= options.gradient_tolerance:
+        cost = new_cost
+        if moved.gradient <= options.gradient_tolerance:
             report.termination = Termination.GRADIENT_CONVERGED
-        elif unfinished == 0:
+        elif moved.unfinished == 0:
             report.termination = Termination.COST_CONVERGED
         if progress is not None and progress(record) is False:
             report.termination = Termination.STOPPED_BY_CALLER
@@ -301,7 +304,7 @@ def _solve_independently(
             break
     with watch("cost"):
         report.final_cost = blocks.equations.cost(blocks.equations.prepare(states))
-    _finish(report, layout, blocks.equations, getattr(blocks, "num_singular", 0))
+    _finish(report, layout, blocks.equations, blocks.num_singular)
     return states
 
 

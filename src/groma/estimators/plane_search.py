@@ -1,0 +1,440 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Several planes in uncertain points and segments, found one after the other.
+
+The search draws planes from neighbours in space (and from pairs of segments that are nearly coplanar), improves each on
+its neighbourhood, scores all of them at once on all features, and takes planes out one after the other. A plane is the
+largest part of its inliers that is connected in space: links between inliers are no longer than the distances at which
+points have their neighbours there anyway. It is kept if
+
+* it has enough support, and its normal is known to ``max_tilt``;
+* so much support would not come about by chance among all planes that were tried;
+* it stands out: of what is in the layer around it, a good share lies on it. Relief without a flat part has no plane.
+
+A segment takes part with its two end points; points on it count no more once it is there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import stats
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.errors import InputError, ShapeError
+from groma.estimators.association import inlier_probability
+from groma.estimators.plane_fit import PlaneFit, fit_plane, tilt_sigma
+from groma.geometry._algebra import dot, norm, perpendicular, unit, vectors
+
+#: Neighbours that make a candidate, and that improve it.
+_NEIGHBOURS = 32
+#: Candidates drawn; features that score them.
+_MAX_CANDIDATES, _MAX_SCORED = 1536, 6000
+#: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
+BAND = 8.0
+#: Links between inliers, as a multiple of the distance to the eighth neighbour.
+LINK = 3.0
+_RANK = 8
+#: Rounds of refinement of a candidate on its growing support.
+_GROW_STEPS = 15
+#: A candidate is the same as a plane tried before if it passes its support within so many standard deviations.
+_SAME = 2.0
+#: Candidates with less than this part of the best score are not looked at.
+_LEAST_SCORE = 1e-3
+#: Failures one after the other, of ever weaker candidates, after which the search ends.
+_PATIENCE = 80
+
+
+@dataclass(frozen=True)
+class PlaneOptions:
+    """What counts as a plane."""
+
+    #: A point lies on a plane when the chi-square test of its distance passes at this level.
+    level: float = 0.95
+    #: Least number of points; a segment counts as two.
+    min_support: int = 10
+    #: Largest standard deviation of the normal, radians. Half a degree.
+    max_tilt: float = 0.0087
+    #: Least part of the features in the layer around a plane that lie on it.
+    min_share: float = 0.4
+    #: Expected number of planes found where there are none.
+    max_false_alarms: float = 1e-4
+    #: Most planes.
+    max_planes: int = 100
+    #: Where the random choice of candidates begins.
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class PlaneSet:
+    """Planes found, in the order they were taken out."""
+
+    #: (K, 4) unit normals and offsets.
+    planes: FloatArray
+    #: (K, 4, 4) covariances of (n, w), rank 3.
+    covariance: FloatArray
+    #: (K,) number of points and segment ends that made the plane.
+    support: IntArray
+    #: (K,) part of what is in the layer around the plane that lies on it.
+    share: FloatArray
+    #: (K,) half thickness of that layer, scene units.
+    band: FloatArray
+    #: (K,) base-10 logarithm of the expected number of false alarms.
+    log10_false_alarms: FloatArray
+    #: (N,) the plane that each point was taken out with, -1 for none.
+    point_label: IntArray
+    #: (L,) the plane that each segment was taken out with, both ends; -1 for none.
+    segment_label: IntArray
+    #: For each plane the (M, 3) support points and segment ends, at which it is connected.
+    places: list[FloatArray] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.planes)
+
+
+@dataclass(frozen=True)
+class _Features:
+    """Points and segment ends."""
+
+    places: FloatArray
+    covariances: FloatArray
+    #: (N,) other end of the same segment, or the feature itself.
+    partner: IntArray
+    #: (N,) first end of the segment that a point lies on, -1 for none.
+    carrier: IntArray
+    #: (N,) distance at which a feature has its neighbours.
+    spacing: FloatArray
+    #: (N, 6) covariances as vectors whose product with :func:`_squares` of a normal is the variance along it.
+    packed: FloatArray
+
+    def spread(self, normal: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
+        """Standard deviations along a normal."""
+        return np.sqrt(np.maximum(self.packed[rows] @ _squares(normal), 1e-300))
+
+
+def _squares(normal: FloatArray) -> FloatArray:
+    """Products (..., 6) of the entries of normals (..., 3), those off the diagonal twice."""
+    x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
+    return np.stack([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z], axis=-1)
+
+
+@dataclass(frozen=True)
+class _Grown:
+    """A plane that is kept."""
+
+    fit: PlaneFit
+    share: float
+    band: float
+    log10_false_alarms: float
+    #: The features on it, and those taken out with it.
+    rows: IntArray
+    taken: IntArray
+
+
+def find_planes(
+    points: FloatArray,
+    covariances: FloatArray,
+    segments: FloatArray | None = None,
+    segment_covariances: FloatArray | None = None,
+    options: PlaneOptions | None = None,
+    carriers: IntArray | None = None,
+) -> PlaneSet:
+    """Find planes in points and segments; see the module.
+
+    Parameters
+    ----------
+    points : (N, 3) float64
+        Points, scene units.
+    covariances : (N, 3, 3) float64
+        Their covariances, positive definite.
+    segments : (L, 2, 3) float64, optional
+        End points of line segments.
+    segment_covariances : (L, 2, 3, 3) float64, optional
+        Covariances of the end points; the part along the segment hardly matters.
+    options : PlaneOptions, optional
+        What counts as a plane.
+    carriers : (N,) int, optional
+        The segment that each point lies on, -1 for none. With a segment on a plane its points are there too, and say
+        nothing more about whether there is a plane.
+
+    Returns
+    -------
+    PlaneSet
+        Each with what was taken out for it. A feature near two planes is given to one of them here.
+
+    Raises
+    ------
+    ShapeError, InputError
+        If shapes do not fit or numbers are not finite.
+    """
+    options = options or PlaneOptions()
+    points = vectors(points, 3, "points")
+    ends = np.zeros((0, 2, 3)) if segments is None else vectors(segments, 3, "segments")
+    end_noise = np.zeros((0, 2, 3, 3)) if segment_covariances is None else np.asarray(segment_covariances, float)
+    covariances = np.asarray(covariances, dtype=np.float64)
+    if covariances.shape != (len(points), 3, 3) or end_noise.shape != (len(ends), 2, 3, 3):
+        raise ShapeError(
+            f"covariances must have shapes ({len(points)}, 3, 3) and ({len(ends)}, 2, 3, 3), as points and segments; "
+            f"got {covariances.shape} and {end_noise.shape}."
+        )
+    places = np.concatenate([points, ends.reshape(-1, 3)])
+    noise = np.concatenate([covariances, end_noise.reshape(-1, 3, 3)])
+    if not (np.isfinite(places).all() and np.isfinite(noise).all()):
+        raise InputError("Points, segments and their covariances must be finite. Remove the rows that are not.")
+    carrier = np.full(len(points), -1) if carriers is None else np.asarray(carriers)
+    if carrier.shape != (len(points),) or (len(carrier) and carrier.max() >= len(ends)):
+        raise ShapeError(
+            f"carriers must have shape ({len(points)},) and refer to the {len(ends)} segments; got {carrier.shape}."
+        )
+    carrier = np.concatenate([np.where(carrier >= 0, len(points) + 2 * carrier, -1), np.full(2 * len(ends), -1)])
+    partner = np.arange(len(places))
+    partner[len(points) :] = len(points) + (np.arange(2 * len(ends)) ^ 1)
+    labels = np.full(len(places), -1)
+    found = _extract(places, noise, partner, carrier, len(points), labels, options) if len(places) >= 4 else []
+    fits = [grown.fit for grown in found]
+    end_label = labels[len(points) :].reshape(-1, 2)
+    return PlaneSet(
+        planes=np.array([fit.plane for fit in fits]).reshape(-1, 4),
+        covariance=np.array([fit.covariance for fit in fits]).reshape(-1, 4, 4),
+        support=np.array([len(grown.rows) for grown in found], dtype=np.int64),
+        share=np.array([grown.share for grown in found], dtype=np.float64),
+        band=np.array([grown.band for grown in found], dtype=np.float64),
+        log10_false_alarms=np.array([grown.log10_false_alarms for grown in found], dtype=np.float64),
+        point_label=labels[: len(points)],
+        segment_label=np.where(end_label[:, 0] == end_label[:, 1], end_label[:, 0], -1),
+        places=[places[grown.rows] for grown in found],
+    )
+
+
+def _extract(
+    places: FloatArray,
+    noise: FloatArray,
+    partner: IntArray,
+    carrier: IntArray,
+    num_points: int,
+    labels: IntArray,
+    options: PlaneOptions,
+) -> list[_Grown]:
+    """Take planes out one after the other; ``labels`` is filled."""
+    rng = np.random.default_rng(options.seed)
+    near = min(_NEIGHBOURS, len(places))
+    distance, neighbours = cKDTree(places).query(places, k=near)
+    packed = np.ascontiguousarray(noise[:, *np.triu_indices(3)])
+    features = _Features(places, noise, partner, carrier, np.maximum(distance[:, min(_RANK, near - 1)], 1e-12), packed)
+    gate = float(stats.chi2.ppf(options.level, 1))
+    extent = float(np.median(norm(places - np.median(places, axis=0)))) + 1e-300
+    first = _from_neighbours(features, neighbours, gate, rng)
+    second, num_pairs = _from_segments(features, num_points, gate)
+    candidates = np.concatenate([first, second])
+    scored = np.arange(len(places))
+    if len(scored) > _MAX_SCORED:
+        scored = np.sort(rng.choice(len(places), _MAX_SCORED, replace=False))
+    score = _score(features, candidates, scored, gate, extent)
+    log_tried = np.log10(10.0 * (len(first) + num_pairs) + 1.0)  # a refined candidate stands for about ten
+    found: list[_Grown] = []
+    alive, total = (
+        (score > 0.0).sum(axis=1) * (len(places) / len(scored)) >= 0.5 * options.min_support,
+        score.sum(axis=1),
+    )
+    failures = 0
+    while failures < _PATIENCE and alive.any() and len(found) < options.max_planes:
+        best = int(np.argmax(np.where(alive, total, -1.0)))
+        if total[best] <= _LEAST_SCORE * total.max(initial=1.0):
+            break
+        grown, plane, rows = _grow(features, candidates[best], labels, gate, log_tried, options)
+        alive[best] = False
+        failures += 1
+        if grown is not None:
+            failures = 0
+            labels[grown.taken] = len(found)
+            gone = labels[scored] == len(found)
+            found.append(grown)
+            total -= score[:, gone].sum(axis=1)
+            score[:, gone] = 0.0
+        if len(rows):
+            # Candidates that would end at the same plane are not tried again.
+            some = features.places[rows[:: max(1, len(rows) // 64)]]
+            height = np.abs(some @ candidates[:, :3].T + candidates[:, 3])
+            alive &= np.median(height, axis=0) > _SAME * np.median(features.spread(plane[:3], rows))
+    return found
+
+
+def _from_neighbours(features: _Features, neighbours: IntArray, gate: float, rng: np.random.Generator) -> FloatArray:
+    """Candidates (H, 4) from a feature and two of its neighbours, improved on the neighbourhood."""
+    count = min(_MAX_CANDIDATES, 4 * len(neighbours))
+    seed = rng.permutation(np.repeat(np.arange(len(neighbours)), -(-count // len(neighbours))))[:count]
+    patch = neighbours[seed]
+    choice = rng.integers(1, patch.shape[1], (count, 2))
+    corner = features.places[np.column_stack([seed, np.take_along_axis(patch, choice, 1)])]
+    normal = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    valid = norm(normal) > 0.5
+    normal, center, patch = normal[valid], corner[valid, 0], patch[valid]
+    around, noise = features.places[patch], features.covariances[patch]
+    for _ in range(3):
+        height = np.einsum("hki,hi->hk", around - center[:, None], normal)
+        variance = np.einsum("hi,hkij,hj->hk", normal, noise, normal)
+        weight = np.where(height**2 < 4.0 * gate * variance, 1.0, 0.0) / (variance + height**2)
+        weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
+        enough = (weight > 0).sum(axis=1) >= 4
+        middle = np.einsum("hk,hki->hi", weight, around)
+        away = around - middle[:, None]
+        _, axes = np.linalg.eigh(np.einsum("hk,hki,hkj->hij", weight, away, away))
+        normal = np.where(enough[:, None], axes[:, :, 0], normal)
+        center = np.where(enough[:, None], middle, center)
+    return np.column_stack([normal, -dot(normal, center)])
+
+
+def _from_segments(features: _Features, num_points: int, gate: float) -> tuple[FloatArray, int]:
+    """Candidates (H, 4) from pairs of near segments that are coplanar within their noise, and how many were tried."""
+    ends = features.places[num_points:].reshape(-1, 2, 3)
+    if len(ends) < 2:
+        return np.zeros((0, 4)), 0
+    middle = ends.mean(axis=1)
+    count = min(12 if len(ends) > 200 else 50, len(ends))
+    _, near = cKDTree(middle).query(middle, k=count)
+    first, second = np.repeat(np.arange(len(ends)), count - 1), near[:, 1:].ravel()
+    once = np.unique(np.column_stack([np.minimum(first, second), np.maximum(first, second)]), axis=0)
+    once = once[once[:, 0] != once[:, 1]]
+    four = ends[once].reshape(-1, 4, 3)
+    center = four.mean(axis=1)
+    away = four - center[:, None]
+    values, axes = np.linalg.eigh(np.einsum("hki,hkj->hij", away, away))
+    normal = axes[:, :, 0]
+    noise = features.covariances[num_points:].reshape(-1, 2, 3, 3)[once].reshape(-1, 4, 3, 3)
+    variance = np.einsum("hi,hkij,hj->hk", normal, noise, normal).mean(axis=1)
+    flat = values[:, 0] < 2.0 * gate * variance
+    # Two segments on one line leave the plane open.
+    flat &= values[:, 1] > 25.0 * np.maximum(values[:, 0], variance)
+    chosen = np.flatnonzero(flat)
+    if len(chosen) > _MAX_CANDIDATES:
+        chosen = chosen[np.argsort(-values[chosen, 1] / variance[chosen], kind="stable")[:_MAX_CANDIDATES]]
+    return np.column_stack([normal, -dot(normal, center)])[chosen], len(once)
+
+
+def _score(features: _Features, candidates: FloatArray, rows: IntArray, gate: float, extent: float) -> FloatArray:
+    """Information (H, N) that each feature gives to each candidate: less near the gate, less for uncertain features."""
+    normal = candidates[:, :3]
+    packed = features.packed[rows]
+    out = np.empty((len(candidates), len(rows)), dtype=np.float32)
+    places = features.places[rows]
+    for begin in range(0, len(candidates), 256):
+        part = slice(begin, begin + 256)
+        variance = _squares(normal[part]) @ packed.T
+        squared = (normal[part] @ places.T + candidates[part, 3:]) ** 2 / np.maximum(variance, 1e-300)
+        information = np.maximum(0.5 * np.log(extent**2 / (gate * np.maximum(variance, 1e-300))), 0.0)
+        out[part] = np.maximum(1.0 - squared / gate, 0.0) * information
+    return out
+
+
+def _grow(
+    features: _Features, plane: FloatArray, labels: IntArray, gate: float, log_tried: float, options: PlaneOptions
+) -> tuple[_Grown | None, FloatArray, IntArray]:
+    """Refine a candidate on its largest connected part and judge it: what is kept, where it went, and its support."""
+    free = np.flatnonzero(labels < 0)
+    fit, rows = None, np.zeros(0, np.int64)
+    for step in range(_GROW_STEPS):
+        squared = (features.places[free] @ plane[:3] + plane[3]) ** 2 / features.spread(plane[:3], free) ** 2
+        # The first rounds reach farther: the candidate is not yet exact.
+        inside = squared < (4.0 if step < 2 else 1.0) * gate
+        rows = _largest_part(features, free[inside])
+        if np.count_nonzero(_independent(features, rows)) < options.min_support:
+            return None, plane, rows
+        height = features.places[rows] @ plane[:3] + plane[3]
+        # Weights that fall with the distance lead to where the layer is densest, not to the middle of what it cuts off.
+        weight = 1.0 / (1.0 + height**2 / features.spread(plane[:3], rows) ** 2) ** 2
+        fit = fit_plane(features.places[rows], features.covariances[rows], weight)
+        moved = features.places[rows] @ fit.plane[:3] + fit.plane[3] - height * np.sign(fit.plane[:3] @ plane[:3])
+        plane = fit.plane
+        if step > 2 and np.abs(moved).max() < 0.02 * np.median(features.spread(plane[:3], rows)):
+            break
+    assert fit is not None
+    if tilt_sigma(fit.covariance) > options.max_tilt:
+        return None, plane, rows
+    band = BAND * float(np.median(features.spread(plane[:3], rows)))
+    height = np.abs(features.places @ plane[:3] + plane[3])
+    # Judged against all that is near, taken or not: what lies on another plane beside it speaks against this one.
+    layer = np.flatnonzero(height < band)
+    layer = layer[connected_to(features.places[rows], features.places[layer], features.spacing[layer], plane)]
+    _, share = inlier_probability(
+        height[layer], features.spread(plane[:3], layer), np.zeros(len(layer), np.int64), np.array([band])
+    )
+    if share[0] < options.min_share:
+        return None, plane, rows
+    alarm = _log10_false_alarms(features, plane, rows, gate) + log_tried
+    if alarm > np.log10(options.max_false_alarms):
+        return None, plane, rows
+    # The whole layer is taken out: relief so near to a plane cannot be told from it.
+    taken = layer[labels[layer] < 0]
+    grown = _Grown(fit, float(share[0]), band, float(alarm), rows, np.union1d(rows, taken))
+    return grown, plane, rows
+
+
+def _log10_false_alarms(features: _Features, plane: FloatArray, rows: IntArray, gate: float) -> float:
+    """Chance that as many features of the neighbourhood lie in the layer as do, base-10 logarithm."""
+    center = features.places[rows].mean(axis=0)
+    radius = float(np.quantile(norm(features.places[rows] - center), 0.9))
+    ball = np.flatnonzero(norm(features.places - center) < radius)
+    if len(ball) == 0:
+        return 0.0
+    inside = np.intersect1d(ball, rows, assume_unique=True)
+    inside = inside[_independent(features, inside)]
+    ball = np.union1d(inside, ball[(features.carrier[ball] < 0)])
+    chance = np.minimum(np.sqrt(gate) * features.spread(plane[:3], ball) / max(radius, 1e-300), 1.0)
+    return float(stats.poisson.logsf(len(inside) - 4, chance.sum())) / np.log(10.0)  # three fix the plane
+
+
+def _independent(features: _Features, rows: IntArray) -> BoolArray:
+    """Which of some features are not there just because the segment they lie on is."""
+    present = np.zeros(len(features.places) + 1, dtype=bool)
+    present[rows] = True
+    return ~present[features.carrier[rows]]
+
+
+def _largest_part(features: _Features, rows: IntArray) -> IntArray:
+    """Rows of the largest part of some features that is connected in space; ends of a segment always are."""
+    if len(rows) < 3:
+        return rows
+    count = min(_RANK + 1, len(rows))
+    distance, other = cKDTree(features.places[rows]).query(features.places[rows], k=count)
+    first = np.repeat(np.arange(len(rows)), count - 1)
+    second, apart = other[:, 1:].ravel(), distance[:, 1:].ravel()
+    linked = apart <= LINK * np.maximum(features.spacing[rows[first]], features.spacing[rows[second]])
+    position = np.full(len(features.places), -1)
+    position[rows] = np.arange(len(rows))
+    mate = position[features.partner[rows]]
+    has_mate = np.flatnonzero(mate >= 0)
+    edges = np.concatenate([first[linked], has_mate]), np.concatenate([second[linked], mate[has_mate]])
+    graph = coo_matrix((np.ones(len(edges[0])), edges), shape=(len(rows), len(rows)))
+    _, part = connected_components(graph, directed=False)
+    return rows[part == np.bincount(part).argmax()]
+
+
+def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:
+    """Whether tested points, projected to a plane, are near the support of the plane.
+
+    Parameters
+    ----------
+    places : (M, 3) float64
+        Support of the plane.
+    tested : (N, 3) float64
+        Points to test.
+    spacing : (N,) float64
+        Distance at which each has its neighbours.
+    plane : (4,) float64
+        Unit normal and offset.
+
+    Returns
+    -------
+    (N,) bool
+    """
+    if len(tested) == 0:
+        return np.zeros(0, dtype=bool)
+    basis = np.stack(perpendicular(plane[:3]), axis=1)
+    distance, _ = cKDTree(places @ basis).query(tested @ basis)
+    return distance <= LINK * spacing
+
+
+__all__ = ["BAND", "PlaneOptions", "PlaneSet", "connected_to", "find_planes"]
