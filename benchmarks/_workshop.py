@@ -80,8 +80,13 @@ PROBLEMS = (
 
 
 def environment(**more: str) -> dict[str, str]:
-    """Return the environment of a measured program: one thread, kernels cached among the benchmarks' own things."""
-    return {**os.environ, "NUMBA_CACHE_DIR": str(CACHE / "numba"), **ONE_THREAD, **more}
+    """Return the environment of a measured program: one thread, kernels and bytecode cached with our own things.
+
+    Bytecode is always cached, as in an installed package; without it Python would compile its sources in every run.
+    """
+    ours = {"NUMBA_CACHE_DIR": str(CACHE / "numba"), "PYTHONPYCACHEPREFIX": str(CACHE / "bytecode")}
+    inherited = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return {**inherited, **ours, **ONE_THREAD, **more}
 
 
 def forget_kernels() -> None:

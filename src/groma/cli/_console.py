@@ -48,6 +48,10 @@ class Console:
         """Return a progress line; silent when not on a terminal."""
         return Progress(enabled=not self.quiet and sys.stderr.isatty())
 
+    def stages(self) -> "Stages":
+        """Return a progress line for a pipeline of named stages; silent when not on a terminal."""
+        return Stages(enabled=not self.quiet and sys.stderr.isatty())
+
 
 class Progress:
     """One line that rewrites itself; call it with the progress events of a pipeline."""
@@ -69,6 +73,17 @@ class Progress:
     ) -> None:
         if self._enabled:
             sys.stderr.write("\r\x1b[K")
+            sys.stderr.flush()
+
+
+class Stages(Progress):
+    """One line that names the stage at work; call it with a name, what is done and what there is to do."""
+
+    def __call__(self, stage: str, done: int = 0, total: int = 0) -> None:  # type: ignore[override]
+        """Show a stage."""
+        if self._enabled:
+            count = f" {done}/{total}" if total > 1 else ""
+            sys.stderr.write(f"\r\x1b[K  {stage}{count}")
             sys.stderr.flush()
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 import groma
-from groma.cli import adjust, convert, demo, evaluate, report, selfcheck, synth
+from groma.cli import adjust, convert, demo, evaluate, map, report, selfcheck, synth
 from groma.cli._guard import guard
 
 app = typer.Typer(
@@ -19,6 +19,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("demo")(guard(demo.demo))
+app.command("map")(guard(map.map_))
 app.command("adjust")(guard(adjust.adjust))
 app.command("convert")(guard(convert.convert))
 app.command("report")(guard(report.report))
@@ -27,6 +28,8 @@ app.command("selfcheck")(guard(selfcheck.selfcheck))
 
 _evaluate = typer.Typer(help="Compare a result with a reference.", no_args_is_help=True, rich_markup_mode=None)
 _evaluate.command("poses")(guard(evaluate.poses))
+_evaluate.command("lines")(guard(evaluate.lines))
+_evaluate.command("planes")(guard(evaluate.planes))
 app.add_typer(_evaluate, name="evaluate")
 
 

@@ -37,3 +37,109 @@ def poses(
     areas = ", ".join(f"{value:.3f} at {degrees:g} deg" for degrees, value in scores.auc.items())
     console.say(f"  pose error AUC   {areas}")
     _output.write_json(json_target, scores.to_dict(), force)
+
+
+_Thresholds = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--threshold",
+        metavar="TAU",
+        help="Distance in units of REF; may be repeated. By default 1, 5 and 10 thousandths of its extent.",
+    ),
+]
+
+
+def lines(
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene or line set to judge.")],
+    reference: Annotated[
+        Path,
+        typer.Argument(
+            metavar="REF",
+            help="Scene, line set or edge graph (.npz, .npy, .txt), mesh (.ply, .obj) or points taken for true.",
+        ),
+    ],
+    threshold: _Thresholds = None,
+    align: Annotated[
+        bool, typer.Option("--align", help="First align EST to REF by the poses of images in both scenes.")
+    ] = False,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Compare 3D line segments with a reference: how much of it is covered, how much of the lines is right."""
+    from groma.cli import _output
+    from groma.cli._console import Console
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_json(json_target, force)
+
+    from groma.evaluation.lines import evaluate_lines, score_lines
+    from groma.io import read_scene
+    from groma.io.reference import read_reference
+
+    if align:
+        scores = evaluate_lines(read_scene(estimate), read_scene(reference), threshold, align=True)
+    else:
+        scores = score_lines(read_reference(estimate).segments, read_reference(reference), threshold)
+    console.say(f"{scores.num_lines} lines, {scores.length:.6g} long; reference {scores.reference_length:.6g} long")
+    if scores.num_lines == 0:
+        console.warn(f"{estimate} holds no lines.")
+    console.say("  threshold  recall of length  precision: lines  lines 90 %   length   length found")
+    for tau, recall in scores.recall_length.items():
+        shares = [recall, scores.precision_count[tau], scores.precision_strict[tau], scores.precision_length[tau]]
+        row = "  ".join(f"{100 * share:{width}.1f} %" for share, width in zip(shares, (14, 14, 8, 6), strict=True))
+        console.say(f"  {tau:9.4g}  {row}  {scores.inlier_length[tau]:13.6g}")
+    _output.write_json(json_target, scores.to_dict(), force)
+
+
+def planes(
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to judge.")],
+    reference: Annotated[
+        Path,
+        typer.Argument(metavar="REF", help="Scene with planes, or points (.ply, .obj, .npy, .npz) taken for true."),
+    ],
+    threshold: _Thresholds = None,
+    max_angle: Annotated[
+        float, typer.Option("--max-angle", metavar="DEG", help="Largest angle between planes that match.")
+    ] = 10.0,
+    max_offset: Annotated[
+        float | None,
+        typer.Option("--max-offset", metavar="D", help="Largest offset of planes that match; by default 1 % of REF."),
+    ] = None,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Compare planes with reference planes (angles and offsets of matches) or with points (share explained)."""
+    from groma.cli import _output
+    from groma.cli._console import Console
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_json(json_target, force)
+
+    from groma.evaluation.planes import evaluate_planes, score_planes_by_points
+    from groma.io import read_scene
+    from groma.io.reference import holds_scene, read_reference
+
+    scene = read_scene(estimate)
+    if scene.num_planes == 0:
+        console.warn(f"{estimate} holds no planes.")
+    if holds_scene(reference):
+        found = evaluate_planes(scene, read_scene(reference), max_angle, max_offset)
+        console.say(f"{len(found.matches)} of {found.num_planes} planes match {found.num_reference} of the reference")
+        console.say(f"  precision   {100 * found.precision:.1f} %, recall {100 * found.recall:.1f} %")
+        console.say(f"  normals     {found.normal_deg_mean:.4g} deg mean, {found.normal_deg_max:.4g} max")
+        console.say(
+            f"  offsets     {found.offset_mean:.4g} mean, {found.offset_max:.4g} max, in units of the reference"
+        )
+        _output.write_json(json_target, found.to_dict(), force)
+        return
+    shares = score_planes_by_points(scene.planes.hesse, read_reference(reference).surface_points(), threshold)
+    console.say(f"{shares.num_planes} planes, {shares.num_points} points")
+    for tau, share in shares.inlier_share.items():
+        console.say(f"  {tau:9.4g}  {100 * share:5.1f} % of the points, {shares.inlier_rmse[tau]:.4g} rms")
+    _output.write_json(json_target, shares.to_dict(), force)

@@ -24,7 +24,6 @@ The sign of a direction has no meaning.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from scipy import stats
@@ -82,34 +81,9 @@ class DirectionSet:
         return len(self.vectors)
 
 
-class _Features(Protocol):
-    """How features judge directions."""
-
-    #: Degrees of freedom of the residual.
-    freedom: int
-
-    def take(self, rows: IntArray | BoolArray) -> _Features:
-        """Return some of the features."""
-        ...
-
-    def __len__(self) -> int: ...
-
-    def squared(self, directions: FloatArray) -> FloatArray:
-        """Squared whitened residuals (H, N)."""
-        ...
-
-    def chance(self, directions: FloatArray, gate: float) -> FloatArray:
-        """Probabilities (H, N), or (1, N), to agree with a random direction within ``gate``."""
-        ...
-
-    def rows(self, direction: FloatArray) -> FloatArray:
-        """Whitened rows (N, freedom, 3): residuals are their products with the direction."""
-        ...
-
-
 @dataclass(frozen=True)
 class _Perpendicular:
-    """Normals to which the direction is perpendicular."""
+    """Normals to which the direction is perpendicular. Directions are (H, 3), results (H, N)."""
 
     normals: FloatArray
     factors: FloatArray
@@ -126,13 +100,16 @@ class _Perpendicular:
         return (directions @ self.factors[..., 0].T) ** 2 + (directions @ self.factors[..., 1].T) ** 2 + self.sigma**2
 
     def squared(self, directions: FloatArray) -> FloatArray:
+        """Squared whitened residuals."""
         return (directions @ self.normals.T) ** 2 / self._variance(directions)
 
     def chance(self, directions: FloatArray, gate: float) -> FloatArray:
+        """Probabilities to agree with a random direction within ``gate``."""
         # n.v of a random direction is uniform in -1 .. 1.
         return np.minimum(np.sqrt(gate * self._variance(directions)), 1.0)
 
     def rows(self, direction: FloatArray) -> FloatArray:
+        """Whitened rows (N, freedom, 3): residuals are their products with the direction."""
         return (self.normals / np.sqrt(self._variance(direction[None])[0])[:, None])[:, None]
 
 
@@ -177,7 +154,7 @@ def directions_from_normals(
     groups: IntArray | None = None,
     candidates: FloatArray | None = None,
 ) -> DirectionSet:
-    """Find directions perpendicular to many unit normals: vanishing directions of segments.
+    r"""Find directions perpendicular to many unit normals: vanishing directions of segments.
 
     Parameters
     ----------
@@ -319,7 +296,6 @@ def _search(
     remaining = np.arange(len(features))
     found: list[FloatArray] = []
     covariances: list[FloatArray] = []
-    supports: list[int] = []
     alarms: list[float] = []
     while len(found) < options.max_directions and len(remaining) >= max(options.min_support, 2):
         pool = features.take(remaining)
@@ -342,20 +318,27 @@ def _search(
             strong = tail < np.log10(options.max_false_alarms) and count >= options.min_support
             new = all(abs(float(direction @ other)) < np.cos(3 * options.parallel_sigma) for other in found)
             if strong and certain and new and spread >= options.min_groups:
-                accepted = direction, covariance, count, tail
+                accepted = direction, covariance, tail
                 break
         if accepted is None:
             break
-        direction, covariance, count, tail = accepted
+        direction, covariance, tail = accepted
         found.append(direction)
         covariances.append(covariance)
-        supports.append(count)
         alarms.append(tail)
         remaining = remaining[pool.squared(direction[None])[0] >= wide]
-    return _collect(features, found, covariances, supports, alarms, gate, options)
+    return _collect(features, found, covariances, alarms, gate, options)
 
 
-def _collect(features, found, covariances, supports, alarms, gate: float, options: DirectionOptions) -> DirectionSet:
+def _collect(
+    features: _Perpendicular | _Parallel,
+    found: list[FloatArray],
+    covariances: list[FloatArray],
+    alarms: list[float],
+    gate: float,
+    options: DirectionOptions,
+) -> DirectionSet:
+    """Give each feature to the direction that it fits best, and look for right angles."""
     label = np.full(len(features), -1)
     if not found:
         return DirectionSet(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64), np.zeros(0), label)
@@ -409,8 +392,6 @@ def _refine(pool: _Perpendicular | _Parallel, start: FloatArray, gate: float) ->
         move = -np.linalg.solve(information, np.einsum("n,nka,nk->a", weight, slope, residual))
         move *= min(1.0, 0.05 / max(float(norm(move)), 1e-300))
         direction = unit(direction + move @ basis)
-        if float(norm(move)) < 1e-10 and step < _REFINE_STEPS - 2:
-            continue
     return direction, scale * basis.T @ np.linalg.inv(information) @ basis
 
 

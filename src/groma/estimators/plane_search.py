@@ -18,10 +18,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 from scipy import stats
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
@@ -39,13 +40,15 @@ BAND = 8.0
 LINK = 3.0
 _RANK = 8
 #: Rounds of refinement of a candidate on its growing support.
-_GROW_STEPS = 15
+_GROW_STEPS = 10
+#: Rounds with the probability of membership as the weight.
+_POLISH_STEPS = 3
 #: A candidate is the same as a plane tried before if it passes its support within so many standard deviations.
 _SAME = 2.0
 #: Candidates with less than this part of the best score are not looked at.
 _LEAST_SCORE = 1e-3
 #: Failures one after the other, of ever weaker candidates, after which the search ends.
-_PATIENCE = 80
+_PATIENCE = 100
 
 
 @dataclass(frozen=True)
@@ -221,7 +224,7 @@ def _extract(
     """Take planes out one after the other; ``labels`` is filled."""
     rng = np.random.default_rng(options.seed)
     near = min(_NEIGHBOURS, len(places))
-    distance, neighbours = cKDTree(places).query(places, k=near)
+    distance, neighbours = KDTree(places).query(places, k=near)
     packed = np.ascontiguousarray(noise[:, *np.triu_indices(3)])
     features = _Features(places, noise, partner, carrier, np.maximum(distance[:, min(_RANK, near - 1)], 1e-12), packed)
     gate = float(stats.chi2.ppf(options.level, 1))
@@ -294,7 +297,7 @@ def _from_segments(features: _Features, num_points: int, gate: float) -> tuple[F
         return np.zeros((0, 4)), 0
     middle = ends.mean(axis=1)
     count = min(12 if len(ends) > 200 else 50, len(ends))
-    _, near = cKDTree(middle).query(middle, k=count)
+    _, near = KDTree(middle).query(middle, k=count)
     first, second = np.repeat(np.arange(len(ends)), count - 1), near[:, 1:].ravel()
     once = np.unique(np.column_stack([np.minimum(first, second), np.maximum(first, second)]), axis=0)
     once = once[once[:, 0] != once[:, 1]]
@@ -314,7 +317,9 @@ def _from_segments(features: _Features, num_points: int, gate: float) -> tuple[F
     return np.column_stack([normal, -dot(normal, center)])[chosen], len(once)
 
 
-def _score(features: _Features, candidates: FloatArray, rows: IntArray, gate: float, extent: float) -> FloatArray:
+def _score(
+    features: _Features, candidates: FloatArray, rows: IntArray, gate: float, extent: float
+) -> npt.NDArray[np.float32]:
     """Information (H, N) that each feature gives to each candidate: less near the gate, less for uncertain features."""
     normal = candidates[:, :3]
     packed = features.packed[rows]
@@ -337,6 +342,8 @@ def _grow(
     fit, rows = None, np.zeros(0, np.int64)
     for step in range(_GROW_STEPS):
         squared = (features.places[free] @ plane[:3] + plane[3]) ** 2 / features.spread(plane[:3], free) ** 2
+        if step == 1:  # what is far away stays away
+            free, squared = free[squared < 50.0 * gate], squared[squared < 50.0 * gate]
         # The first rounds reach farther: the candidate is not yet exact.
         inside = squared < (4.0 if step < 2 else 1.0) * gate
         rows = _largest_part(features, free[inside])
@@ -348,19 +355,25 @@ def _grow(
         fit = fit_plane(features.places[rows], features.covariances[rows], weight)
         moved = features.places[rows] @ fit.plane[:3] + fit.plane[3] - height * np.sign(fit.plane[:3] @ plane[:3])
         plane = fit.plane
-        if step > 2 and np.abs(moved).max() < 0.02 * np.median(features.spread(plane[:3], rows)):
+        if step > 1 and np.abs(moved).max() < 0.1 * np.median(features.spread(plane[:3], rows)):
             break
     assert fit is not None
     if tilt_sigma(fit.covariance) > options.max_tilt:
         return None, plane, rows
     band = BAND * float(np.median(features.spread(plane[:3], rows)))
-    height = np.abs(features.places @ plane[:3] + plane[3])
-    # Judged against all that is near, taken or not: what lies on another plane beside it speaks against this one.
-    layer = np.flatnonzero(height < band)
-    layer = layer[connected_to(features.places[rows], features.places[layer], features.spacing[layer], plane)]
-    _, share = inlier_probability(
-        height[layer], features.spread(plane[:3], layer), np.zeros(len(layer), np.int64), np.array([band])
-    )
+    for _ in range(_POLISH_STEPS):
+        height = np.abs(features.places @ plane[:3] + plane[3])
+        # Judged against all that is near, taken or not: what lies on a plane beside this one speaks against it.
+        layer = np.flatnonzero(height < band)
+        layer = layer[connected_to(features.places[rows], features.places[layer], features.spacing[layer], plane)]
+        spread = features.spread(plane[:3], layer)
+        probability, share = inlier_probability(height[layer], spread, np.zeros(len(layer), np.int64), np.array([band]))
+        weight = np.where(height[layer] < 3.0 * spread, probability, 0.0)
+        if np.count_nonzero(weight) < 3:
+            return None, plane, rows
+        # Membership as the weight: all of the plane where it is clean, its densest part where it is not.
+        fit = fit_plane(features.places[layer], features.covariances[layer], weight)
+        plane = fit.plane
     if share[0] < options.min_share:
         return None, plane, rows
     alarm = _log10_false_alarms(features, plane, rows, gate) + log_tried
@@ -398,7 +411,7 @@ def _largest_part(features: _Features, rows: IntArray) -> IntArray:
     if len(rows) < 3:
         return rows
     count = min(_RANK + 1, len(rows))
-    distance, other = cKDTree(features.places[rows]).query(features.places[rows], k=count)
+    distance, other = KDTree(features.places[rows]).query(features.places[rows], k=count)
     first = np.repeat(np.arange(len(rows)), count - 1)
     second, apart = other[:, 1:].ravel(), distance[:, 1:].ravel()
     linked = apart <= LINK * np.maximum(features.spacing[rows[first]], features.spacing[rows[second]])
@@ -433,7 +446,7 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
     if len(tested) == 0:
         return np.zeros(0, dtype=bool)
     basis = np.stack(perpendicular(plane[:3]), axis=1)
-    distance, _ = cKDTree(places @ basis).query(tested @ basis)
+    distance, _ = KDTree(places @ basis).query(tested @ basis)
     return distance <= LINK * spacing
 
 

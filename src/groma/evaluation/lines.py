@@ -32,10 +32,12 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
+from groma.evaluation.poses import evaluate_poses
+from groma.scene import Scene
 
 #: Places on one segment: at least, at most.
 _PLACES = (4, 1000)
@@ -101,6 +103,20 @@ class Geometry:
         every = np.concatenate([part.reshape(-1, 3) for part in (self.segments, self.triangles, self.points)])
         return float(np.linalg.norm(np.ptp(every, axis=0))) if len(every) else 0.0
 
+    def surface_points(self, count: int = 200_000, seed: int = 0) -> FloatArray:
+        """Return the points, or, where there are triangles, so many places evenly at random on them, (n, 3)."""
+        if len(self.triangles) == 0:
+            return self.points
+        rng = np.random.default_rng(seed)
+        first, second = (self.triangles[:, k] - self.triangles[:, 0] for k in (1, 2))
+        area = np.linalg.norm(np.cross(first, second), axis=1)
+        if not area.sum() > 0:
+            raise InputError("The triangles of the reference have no area.")
+        row = rng.choice(len(area), count, p=area / area.sum())
+        a, b = rng.random((2, count, 1))
+        a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
+        return self.triangles[row, 0] + a * first[row] + b * second[row]
+
 
 def score_lines(
     segments: npt.ArrayLike, reference: Geometry | npt.ArrayLike, thresholds: Sequence[float] | None = None
@@ -143,6 +159,26 @@ def score_lines(
     columns = (recall, any_part, nearly_all, precision, inlier, covered)
     by = [dict(zip(taus, np.asarray(values, float).tolist(), strict=True)) for values in columns]
     return LineScores(*by, num_lines=len(estimate), length=total, reference_length=reference_length)
+
+
+def evaluate_lines(
+    estimate: Scene, reference: Scene, thresholds: Sequence[float] | None = None, align: bool = False
+) -> LineScores:
+    """Compare the segments of two scenes.
+
+    Parameters
+    ----------
+    estimate, reference : Scene
+        The scene to judge, and the one taken for true.
+    thresholds : sequence of float, optional
+        See :func:`score_lines`.
+    align : bool
+        First bring the estimate into the reference's frame by the poses of the images that are in both.
+    """
+    segments = estimate.lines.segments
+    if align:
+        segments = evaluate_poses(estimate, reference).alignment.points(segments)
+    return score_lines(segments, Geometry(segments=reference.lines.segments), thresholds)
 
 
 def _ratio(part: FloatArray, whole: float) -> FloatArray:
@@ -221,12 +257,12 @@ class Distances:
         first = len(segments) + len(triangles)
         self.owner = np.concatenate([owner_line, owner_face + len(segments), first + np.arange(len(points))])
         self.reach = max(reach_line, reach_face)
-        self.tree = cKDTree(anchors) if len(anchors) else None
+        self.tree = KDTree(anchors)
 
     def of(self, places: FloatArray) -> FloatArray:
         """Return the distance of each place, (n, 3)."""
         result = np.full(len(places), np.inf)
-        if self.tree is None:
+        if self.tree.n == 0:
             return result
         for start in range(0, len(places), _CHUNK):
             self._fill(places[start : start + _CHUNK], result[start : start + _CHUNK])
@@ -241,7 +277,7 @@ class Distances:
             # Many neighbours of few places at a time: memory stays bounded.
             for part in np.array_split(np.arange(len(open_rows)), max(1, len(open_rows) * k // 2_000_000)):
                 rows = open_rows[part]
-                distance, found = self.tree.query(places[rows], np.arange(1, k + 1))
+                distance, found = (table.reshape(-1, k) for table in self.tree.query(places[rows], k))
                 exact = self._exact(np.repeat(places[rows], k, axis=0), self.owner[found].ravel()).reshape(-1, k)
                 result[rows] = exact.min(1)
                 beyond = distance[:, -1] - self.reach
@@ -323,4 +359,4 @@ def checked_rows(name: str, values: npt.ArrayLike, row: tuple[int, ...]) -> Floa
     return array
 
 
-__all__ = ["Geometry", "LineScores", "score_lines"]
+__all__ = ["Geometry", "LineScores", "evaluate_lines", "score_lines"]

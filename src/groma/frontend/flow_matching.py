@@ -103,7 +103,8 @@ def match_by_flow(
     score = np.sqrt(both.data)
     good = score >= options.min_score
     first, second = both.row[good].astype(np.int64), both.col[good].astype(np.int64)
-    return mutual_best(first, second, score[good], segments_1, segments_2, options.margin)
+    margin = -float(np.log1p(-options.margin))
+    return mutual_best(first, second, score[good], np.log(score[good]), segments_1, segments_2, margin)
 
 
 def _pair(image_1: npt.NDArray[np.generic], image_2: npt.NDArray[np.generic]) -> tuple[GrayImage, GrayImage]:

@@ -61,7 +61,13 @@ class LineMatches:
 
 
 def mutual_best(
-    first: IntArray, second: IntArray, score: FloatArray, segments_1: Segments, segments_2: Segments, margin: float
+    first: IntArray,
+    second: IntArray,
+    score: FloatArray,
+    evidence: FloatArray,
+    segments_1: Segments,
+    segments_2: Segments,
+    margin: float,
 ) -> LineMatches:
     """Candidates that are best for both their segments, by a margin over every rival that is another line.
 
@@ -71,26 +77,28 @@ def mutual_best(
         Candidate pairs, each at most once.
     score : (C,) float64
         Between 0 and 1.
+    evidence : (C,) float64
+        What is compared, rising with the score: a logarithm of odds or of the score, in which differences count.
     segments_1, segments_2 : Segments
         A rival collinear with the best (a piece of the same edge) does not count as a rival.
     margin : float
-        The rival's score must be at most (1 - margin) times the best's.
+        A rival's evidence must be less than the best's by at least this much.
     """
     if not len(score):
         return LineMatches.empty()
-    best_1, rival_1 = _best_and_rival(first, second, score, segments_2)
-    best_2, rival_2 = _best_and_rival(second, first, score, segments_1)
+    best_1, rival_1 = _best_and_rival(first, second, evidence, segments_2)
+    best_2, rival_2 = _best_and_rival(second, first, evidence, segments_1)
     rows = np.arange(len(score))
-    limit = (1.0 - margin) * score
+    limit = evidence - margin
     keep = (best_1[first] == rows) & (best_2[second] == rows) & (rival_1[first] <= limit) & (rival_2[second] <= limit)
     return LineMatches(np.stack([first[keep], second[keep]], axis=1), score[keep])
 
 
 def _best_and_rival(
-    owner: IntArray, other: IntArray, score: FloatArray, segments: Segments
+    owner: IntArray, other: IntArray, evidence: FloatArray, segments: Segments
 ) -> tuple[IntArray, FloatArray]:
-    """For each owner: row of its best candidate (-1 without), and the best score among other lines (0 without)."""
-    order = np.lexsort((other, -score, owner))
+    """For each owner: row of its best candidate (-1 without), and the most evidence for another line (-inf without)."""
+    order = np.lexsort((other, -evidence, owner))
     head = np.ones(len(order), dtype=bool)
     head[1:] = owner[order][1:] != owner[order][:-1]
     best = np.full(int(owner.max()) + 1, -1, dtype=np.int64)
@@ -102,8 +110,8 @@ def _best_and_rival(
         np.abs((line[:, :2] * ends[:, 2:]).sum(axis=1) + line[:, 2]),
     )
     is_rival = (other != chosen) & (distance > 2.0 + 0.02 * segments.length[other])
-    rival = np.zeros(len(best))
-    np.maximum.at(rival, owner[is_rival], score[is_rival])
+    rival = np.full(len(best), -np.inf)
+    np.maximum.at(rival, owner[is_rival], evidence[is_rival])
     return best, rival
 
 

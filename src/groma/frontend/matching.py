@@ -41,6 +41,7 @@ from groma.frontend.matches import LineMatches, mutual_best
 from groma.frontend.nearby import NearbyPoints, nearby_points
 from groma.frontend.segments import Segments
 
+BIAS = 1.5  # logarithm of odds of identical surroundings without points or overlap
 FEATURES = 6  # descriptor distance; points for, against, near one only; overlap on first, on second (-1: unknown)
 
 
@@ -58,8 +59,8 @@ class WideBaselineOptions:
     """Points within this distance of a segment support it, pixels."""
     min_score: float = 0.5
     """Smallest score of a match."""
-    margin: float = 0.1
-    """By which share of the score a match must beat any rival."""
+    margin: float = 0.7
+    """By how much a match must beat any rival, logarithm of odds: 0.7 is twice as likely."""
 
 
 # -------------------------------------------------------------------------------------------------------- Kernels
@@ -233,10 +234,11 @@ def match_wide_baseline(
     pairs, features = candidates(
         segments_1, segments_2, descriptors_1, descriptors_2, point_matches, fundamental, options
     )
-    score = _score(features)
+    evidence = _evidence(features)
+    score = 1.0 / (1.0 + np.exp(-np.clip(evidence, -50.0, 50.0)))
     good = score >= options.min_score
     first, second = pairs[good, 0], pairs[good, 1]
-    return mutual_best(first, second, score[good], segments_1, segments_2, options.margin)
+    return mutual_best(first, second, score[good], evidence[good], segments_1, segments_2, options.margin)
 
 
 def candidates(
@@ -310,14 +312,17 @@ def _descriptors(descriptors: Descriptors, segments: Segments, which: int) -> np
     return descriptors
 
 
-def _score(features: FloatArray) -> FloatArray:
-    """Probability from the evidence: a logistic function, its weights found on surveyed and rendered scenes."""
+def _evidence(features: FloatArray) -> FloatArray:
+    """Logarithm of the odds that a candidate is right.
+
+    The weights were found on surveyed scenes: they best rank, for each segment, the candidate whose triangulated line
+    is seen in two further images above all others.
+    """
     distance, for_it, against, missing, on_1, on_2 = features.T
-    support = np.log1p(for_it) - 1.5 * np.log1p(against)
     known = on_1 >= 0.0
-    overlap = np.where(known, np.sqrt(np.maximum(on_1, 0.0) * np.maximum(on_2, 0.0)), 0.3)
-    logit = 3.0 - 8.0 * distance + 1.5 * support + 2.0 * overlap
-    return 1.0 / (1.0 + np.exp(-np.clip(logit, -50.0, 50.0)))
+    overlap = np.where(known, np.sqrt(np.maximum(on_1, 0.0) * np.maximum(on_2, 0.0)), -0.25)
+    points = 2.9 * np.log1p(for_it) - 0.25 * np.log1p(against) - 0.3 * np.log1p(missing)
+    return BIAS - 6.2 * distance + points + 2.4 * overlap
 
 
 __all__ = [

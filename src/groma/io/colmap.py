@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma import cameras as camera_models
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.errors import FileFormatError, InputError
 from groma.io._atomic import atomic_output
 from groma.io._colmap_structure import check_binary_model
@@ -383,7 +383,7 @@ def _add_images(pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: S
         reconstruction.register_frame(number)
 
 
-def _numbered(scene: Scene) -> tuple[list[FloatArray], npt.NDArray[np.int64]]:
+def _numbered(scene: Scene) -> tuple[list[FloatArray], IntArray]:
     """Return the 2D points of every image in the order of their numbers, and the number of each observation."""
     centre = np.zeros((scene.num_cameras, 2))
     for row, name in enumerate(scene.cameras.models):
@@ -397,9 +397,7 @@ def _numbered(scene: Scene) -> tuple[list[FloatArray], npt.NDArray[np.int64]]:
     return pixels, number[: len(scene.point_observations)]
 
 
-def _add_points(
-    pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: Scene, keypoint_idx: npt.NDArray[np.int64]
-) -> None:
+def _add_points(pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: Scene, keypoint_idx: IntArray) -> None:
     seen, points = scene.point_observations, scene.points
     order = np.lexsort((keypoint_idx, seen.image_idx, seen.point_idx))
     ends = np.searchsorted(seen.point_idx[order], np.arange(len(points) + 1)).tolist()

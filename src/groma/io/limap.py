@@ -509,9 +509,11 @@ def _groups_2d(
             tracks[group.id].append((images[image].image_id, len(added[image])))
             added[image].append(Group2d(group.kind, group_id=group.id, **members[image]))
     edges = _wireframes_2d(scene, by_point, by_line, number, line_number)
+    before = {image.image_id: image.num_points for image in like.images}
     result = tuple(
-        replace(image, groups=tuple(found), wireframe=image.wireframe if len(image.wireframe) else edge)
+        replace(image, groups=tuple(found), wireframe=image.wireframe if same else edge)
         for image, found, edge in zip(images, added, edges, strict=True)
+        for same in [before.get(image.image_id) == image.num_points]
     )
     return result, {name: np.array(track, TRACK) for name, track in tracks.items()}
 

@@ -75,7 +75,19 @@ def read_reference(path: str | os.PathLike[str]) -> Geometry:
     if suffix not in readers:
         raise FileFormatError(f"{place} is not a known reference. Use one of {', '.join(readers)} or a COLMAP folder.")
     with reading(place, _KIND):
-        return readers[suffix](place)
+        try:
+            return readers[suffix](place)
+        except FileFormatError as error:
+            raise FileFormatError(f"{place} is not a usable {_KIND}: {error}") from error
+
+
+def holds_scene(path: str | os.PathLike[str]) -> bool:
+    """Tell whether there is a whole scene at a path (COLMAP model or groma archive), not only geometry."""
+    place = existing(path)
+    if place.is_dir() or place.suffix.lower() != ".npz":
+        return place.is_dir()
+    with reading(place, _KIND), place.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        return "format" in file.files
 
 
 def read_line3dpp(path: str | os.PathLike[str]) -> ReferenceLines:
@@ -120,7 +132,8 @@ def _read_text(place: Path) -> Geometry:
 
 
 def _read_npy(place: Path) -> Geometry:
-    return _of_array(np.load(place, allow_pickle=False))
+    with place.open("rb") as stream:
+        return _of_array(np.load(stream, allow_pickle=False))
 
 
 def _of_array(array: npt.NDArray[Any]) -> Geometry:
@@ -132,7 +145,7 @@ def _of_array(array: npt.NDArray[Any]) -> Geometry:
 
 
 def _read_npz(place: Path) -> Geometry:
-    with np.load(place, allow_pickle=False) as file:
+    with place.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         names = set(file.files)
         if "format" in names:
             return _of_scene(place)
@@ -279,4 +292,4 @@ class _PlyBytes:
         return table
 
 
-__all__ = ["ReferenceLines", "read_line3dpp", "read_reference"]
+__all__ = ["ReferenceLines", "holds_scene", "read_line3dpp", "read_reference"]

@@ -3,13 +3,15 @@ r"""Covariances of points and lines from the noise of their observations, poses 
 
 Each landmark is on its own then: the inverse of its information matrix :math:`\sum J^\top J/\sigma^2`. Lines are
 described by where their segment's two ends move across the line, four numbers :math:`(a_1, b_1, a_2, b_2)` along two
-unit vectors; a point at the share :math:`\lambda` of the segment moves by :math:`(1-\lambda)\delta_1 + \lambda\delta_2`.
+unit vectors; a point at the share :math:`\lambda` of the segment moves by
+:math:`(1-\lambda)\delta_1 + \lambda\delta_2`.
 The image of a measured end point is that of the line's point closest to its ray, and only its displacement across the
 image line is measured. Any camera model will do.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,10 +79,10 @@ def point_noise(scene: Scene, sigma_px: float | None = None) -> PointNoise:
     table = scene.point_observations
     pixels, by_world = _project(scene, table.image_idx, scene.points.xyz[table.point_idx])
     residual = pixels - table.pixel
-    good = np.isfinite(residual).all(axis=1) & np.isfinite(by_world).all(axis=(1, 2))
+    good = np.asarray(np.isfinite(residual).all(axis=1) & np.isfinite(by_world).all(axis=(1, 2)))
     residual, by_world = np.where(good[:, None], residual, 0.0), np.where(good[:, None, None], by_world, 0.0)
     count = np.bincount(table.point_idx[good], minlength=scene.num_points)
-    squares = np.bincount(table.point_idx, weights=dot(residual, residual), minlength=scene.num_points)
+    squares = _sum(dot(residual, residual)[:, None], table.point_idx, scene.num_points)[:, 0]
     sigma, misfit = _misfit(squares, 2 * count - 3, sigma_px)
     information = _sum(np.einsum("nki,nkj->nij", by_world, by_world), table.point_idx, scene.num_points) / sigma**2
     return PointNoise(_inverse(information, _extent(scene)), misfit, sigma)
@@ -107,7 +109,7 @@ def line_noise(scene: Scene, sigma_px: float | None = None) -> LineNoise:
         good = np.isfinite(residual) & np.isfinite(row).all(axis=1)
         residual, row = np.where(good, residual, 0.0), np.where(good[:, None], row, 0.0)
         information += _sum(row[:, :, None] * row[:, None, :], line, scene.num_lines)
-        squares += np.bincount(line, weights=residual**2, minlength=scene.num_lines)
+        squares += _sum(residual[:, None] ** 2, line, scene.num_lines)[:, 0]
         count += np.bincount(line[good], minlength=scene.num_lines)
     sigma, misfit = _misfit(squares, count - 4, sigma_px)
     return LineNoise(across, _inverse(information / sigma**2, _extent(scene)), misfit, sigma)
@@ -172,9 +174,11 @@ def _misfit(squares: FloatArray, freedom: IntArray, sigma_px: float | None) -> t
 
 def _sum(blocks: FloatArray, owner: IntArray, count: int) -> FloatArray:
     """Sums (count, a, b) of blocks (N, a, b) by owner."""
-    flat = blocks.reshape(len(blocks), -1)
-    sums = [np.bincount(owner, weights=column, minlength=count) for column in flat.T]
-    return np.stack(sums, axis=-1).reshape(count, *blocks.shape[1:])
+    flat = blocks.reshape(len(blocks), math.prod(blocks.shape[1:]))
+    out = np.zeros((count, flat.shape[1]))
+    for column in range(flat.shape[1]):
+        out[:, column] = np.bincount(owner, weights=flat[:, column], minlength=count)
+    return out.reshape(count, *blocks.shape[1:])
 
 
 def _extent(scene: Scene) -> float:
@@ -185,4 +189,4 @@ def _extent(scene: Scene) -> float:
 
 def _inverse(information: FloatArray, extent: float) -> FloatArray:
     """Inverses of information matrices; what is not observed is uncertain by the extent of the scene."""
-    return np.linalg.inv(information + np.eye(information.shape[-1]) / extent**2)
+    return np.asarray(np.linalg.inv(information + np.eye(information.shape[-1]) / extent**2), dtype=np.float64)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import inlier_probability
@@ -50,7 +50,7 @@ def spacings(points: FloatArray, segments: FloatArray) -> tuple[FloatArray, Floa
     places = np.concatenate([points, segments.reshape(-1, 3)])
     if len(places) < 2:
         return np.ones(len(points)), np.ones((len(segments), 2))
-    distance, _ = cKDTree(places).query(places, k=min(_NEIGHBOURS, len(places)))
+    distance, _ = KDTree(places).query(places, k=min(_NEIGHBOURS, len(places)))
     return distance[: len(points), -1], distance[len(points) :, -1].reshape(-1, 2)
 
 
@@ -96,16 +96,17 @@ def along_directions(
     own = marks.line_noise.directions(norm(marks.segments[:, 1] - marks.segments[:, 0]))[rows]
     basis = np.stack(perpendicular(unit(extent)), axis=1)
     tables, bands = [_nothing()], np.zeros(len(found))
+    gate = float(stats.chi2.ppf(level, 2))
     for k, vector in enumerate(found.vectors):
         across = basis @ vector
         noise = basis @ (own + found.covariance[k]) @ np.swapaxes(basis, 1, 2) + sigma**2 * np.eye(2)
         squared = np.einsum("na,na->n", across, np.linalg.solve(noise, across[..., None])[..., 0])
         spread = np.sqrt(np.linalg.eigvalsh(noise)[:, 1])
         angle = norm(across)
-        passing = squared < stats.chi2.ppf(level, 2)
+        passing = squared < gate
         bands[k] = max(_LEAST_CAP, BAND * float(np.median(spread[passing])) if passing.any() else 0.0)
         near = angle < bands[k]
-        tables.append(_with_plane(rows[near], k, angle[near], spread[near], squared[near], stats.chi2.ppf(level, 2)))
+        tables.append(_with_plane(rows[near], k, angle[near], spread[near], squared[near], gate))
     table = np.concatenate(tables)
     probability, _ = inlier_probability(table[:, 2], table[:, 3], table[:, 1].astype(np.int64), bands)
     passed = (table[:, 4] < table[:, 5]) & (probability > least)
@@ -159,7 +160,8 @@ def _with_plane(
 ) -> FloatArray:
     """Table of landmark, structure, distance, standard deviation, squared whitened distance, gate."""
     constant = np.ones(len(rows))
-    return np.column_stack([rows, k * constant, distance, spread, squared, gate * constant])
+    columns = rows.astype(np.float64), k * constant, distance, spread, squared, gate * constant
+    return np.column_stack(columns)
 
 
 def _point_heights(
@@ -199,7 +201,7 @@ def _near_segments(points: FloatArray, segments: FloatArray) -> IntArray:
     share = (np.arange(len(owner)) - first) / (count[owner] - 1)
     samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
     nearest = min(_NEAREST, len(samples))
-    _, index = cKDTree(samples).query(points, k=nearest)
+    _, index = KDTree(samples).query(points, k=nearest)
     pairs = np.column_stack([np.repeat(np.arange(len(points)), nearest), owner[index.reshape(len(points), -1)].ravel()])
     return np.unique(pairs, axis=0)
 

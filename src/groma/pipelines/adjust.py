@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.factors._factor import Factor
 from groma.factors.losses import Loss, Trivial
@@ -35,8 +36,11 @@ class AdjustOptions:
     #: ``none``, ``huber``, ``soft_l1``, ``cauchy``, ``tukey``, ``geman_mcclure``, ``barron`` or ``truncated``;
     #: ``auto`` is none for BAL problems, else Cauchy and then Geman-McClure, because matches contain outliers.
     loss: str = "auto"
-    #: Where the loss begins to bend, pixels; None takes 1, and 2 in the second stage of ``auto``.
+    #: Where the loss begins to bend, in standard deviations (pixels by default); None takes 1, and 2 in the second
+    #: stage of ``auto``.
     loss_scale: float | None = None
+    #: Move the cameras; False adjusts the landmarks alone.
+    refine_poses: bool = True
     #: Estimate focal lengths and distortion; None: for BAL problems only.
     refine_intrinsics: bool | None = None
     #: Estimate principal points too, if intrinsics are refined.
@@ -47,6 +51,9 @@ class AdjustOptions:
     points: bool = True
     lines: bool = True
     planes: bool = True
+    #: Standard deviation of points and of segment end points, pixels; losses are scaled in these units.
+    point_sigma_px: float = 1.0
+    line_sigma_px: float = 1.0
     #: Most steps tried.
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in a step.
@@ -190,7 +197,7 @@ def adjust(
         if solution.report.termination is Termination.STOPPED_BY_CALLER:
             break
     report = _combined(reports, assembly.problem, stages)
-    before, after = _rmse_px(assembly.problem), _rmse_px(problem)
+    before, after = (_rmse_px(p, options.line_sigma_px) for p in (assembly.problem, problem))
     outcome = AdjustReport(
         num_images=scene.num_images,
         num_points=scene.num_points if "points" in assembly.problem.variables else 0,
@@ -264,30 +271,41 @@ def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss) -> Assem
         points=options.points,
         lines=options.lines,
         planes=options.planes,
+        refine_poses=options.refine_poses,
         refine_intrinsics=refine,
         refine_principal_point=options.refine_principal_point,
         refine_rigs=options.refine_rigs,
         line_chart=options.line_chart,
         gauge=options.gauge,
+        point_sigma_px=options.point_sigma_px,
+        line_sigma_px=options.line_sigma_px,
         loss=loss,
         drop_behind=not is_bal,
     )
 
 
-def _rmse_px(problem: Problem) -> dict[str, float]:
+def _rmse_px(problem: Problem, line_sigma_px: float) -> dict[str, float]:
     """Root mean square of the reprojection residuals by kind, unweighted and without the loss, pixels."""
-    sums: dict[str, list[float]] = {}
+    return {
+        kind: float(np.sqrt(np.mean(squares))) for kind, squares in squared_residuals_px(problem, line_sigma_px).items()
+    }
+
+
+def squared_residuals_px(problem: Problem, line_sigma_px: float = 1.0) -> dict[str, FloatArray]:
+    """Return the squared norm of every reprojection residual by kind of landmark, pixels squared.
+
+    A point has one residual of two coordinates, a segment one of the distances of its two ends.
+    """
+    parts: dict[str, list[FloatArray]] = {}
     for factor in problem.factors:
         kind = "points" if factor.type_name in POINT_FACTORS else "lines" if factor.type_name in LINE_FACTORS else None
         if kind is None or len(factor) == 0:
             continue
-        plain = replace(factor, loss=Trivial())
-        ambients = tuple(problem.variables[ref.group].ambient() for _, ref in plain.references())
-        residual = np.empty((len(plain), plain.residual_size))
-        plain.residuals(plain.prepare(ambients), 0, len(plain), residual)
-        scale = np.asarray(plain.sqrt_information) if factor.type_name == "line_bearing" else np.ones(1)
-        squares = (residual**2).sum(axis=1) * scale**2
-        entry = sums.setdefault(kind, [0.0, 0])
-        entry[0] += float(squares.sum())
-        entry[1] += len(plain)
-    return {kind: float(np.sqrt(total / count)) for kind, (total, count) in sums.items()}
+        ambients = tuple(problem.variables[ref.group].ambient() for _, ref in factor.references())
+        residual = np.empty((len(factor), factor.residual_size))
+        factor.residuals(factor.prepare(ambients), 0, len(factor), residual)
+        focal = np.ones(1)
+        if factor.type_name == "line_bearing":  # sines of angles; the noise of such factors is that of pixels
+            focal = np.asarray(factor.sqrt_information) * line_sigma_px
+        parts.setdefault(kind, []).append((residual**2).sum(axis=1) * focal**2)
+    return {kind: np.concatenate(squares) for kind, squares in parts.items()}

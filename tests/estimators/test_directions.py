@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Directions shared by normals and by lines: found, refined, certain as claimed; nothing in noise; orthogonality."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from groma.errors import InputError, ShapeError
+from groma.estimators.directions import (
+    DirectionOptions,
+    directions_from_lines,
+    directions_from_normals,
+    orthogonal_pairs,
+)
+from groma.geometry.so3 import exp
+
+FRAME = exp(np.array([0.3, -0.2, 0.5]))
+EXACT = DirectionOptions(parallel_sigma=1e-5)
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def noisy_normals(rng, directions, each, clutter, sigma):
+    """Unit normals perpendicular to each direction, disturbed across by ``sigma``, and random ones."""
+    normals, factors = [], []
+    for direction in directions:
+        exact = unit(np.cross(rng.normal(size=(each, 3)), direction))
+        along = np.cross(exact, direction)
+        normals.append(
+            unit(exact + sigma * (rng.normal(size=(each, 1)) * direction + rng.normal(size=(each, 1)) * along))
+        )
+        factors.append(sigma * np.stack([np.broadcast_to(direction, along.shape), along], axis=-1))
+    wild = unit(rng.normal(size=(clutter, 3)))
+    first = unit(np.cross(wild, [0.1, 0.2, 1.0]))
+    normals.append(wild)
+    factors.append(sigma * np.stack([first, np.cross(wild, first)], axis=-1))
+    return np.concatenate(normals), np.concatenate(factors)
+
+
+def angles(found, true):
+    return np.arccos(np.clip(np.abs(found @ true.T), 0, 1))
+
+
+def test_vanishing_directions_among_clutter():
+    rng = np.random.default_rng(1)
+    normals, factors = noisy_normals(rng, FRAME, 60, 120, 2e-3)
+    found = directions_from_normals(normals, factors, EXACT)
+    assert len(found) == 3
+    # 60 normals at 2 mrad fix a direction to about 0.4 mrad; five times that.
+    assert angles(found.vectors, FRAME).min(axis=0).max() < 2e-3
+    assert found.orthogonal.tolist() == [[0, 1], [0, 2], [1, 2]]
+    owner = angles(found.vectors, FRAME).argmin(axis=1)
+    for k in range(3):
+        own = found.label[60 * owner[k] : 60 * owner[k] + 60]
+        assert (own == k).mean() > 0.85  # 95 % within the gate, some nearer to another direction by chance
+    assert (found.label[180:] >= 0).mean() < 0.1
+    assert (found.support == np.bincount(found.label[found.label >= 0])).all()
+
+
+def test_nothing_in_noise():
+    rng = np.random.default_rng(2)
+    normals, factors = noisy_normals(rng, FRAME[:0], 0, 400, 5e-3)
+    assert len(directions_from_normals(normals, factors)) == 0
+    lines = unit(rng.normal(size=(300, 3)))
+    noise = (5e-3) ** 2 * np.broadcast_to(np.eye(3), (300, 3, 3))
+    assert len(directions_from_lines(lines, noise)) == 0
+
+
+def test_covariance_is_that_of_repeated_trials():
+    """Mahalanobis distances of found directions follow chi-square with two degrees of freedom: mean 2."""
+    squared = []
+    for seed in range(60):
+        rng = np.random.default_rng([3, seed])
+        normals, factors = noisy_normals(rng, FRAME[:1], 40, 0, 3e-3)
+        found = directions_from_normals(normals, factors, replace(EXACT, level=0.999))
+        assert len(found) == 1
+        basis = np.linalg.svd(FRAME[:1])[2][1:]
+        error = basis @ found.vectors[0]
+        squared.append(error @ np.linalg.solve(basis @ found.covariance[0] @ basis.T, error))
+    # Standard deviation of the mean of 60: 2 / sqrt(60) = 0.26. Covariances are never made smaller, so low is likelier.
+    assert 1.0 < np.mean(squared) < 2.9
+
+
+def test_line_directions_with_elongated_noise():
+    rng = np.random.default_rng(4)
+    truth = np.repeat(FRAME[:2], 40, axis=0)
+    across = unit(np.cross(truth, [0.3, 0.5, 0.9]))
+    other = np.cross(truth, across)
+    lines = unit(truth + 0.03 * rng.normal(size=(80, 1)) * across + 0.002 * rng.normal(size=(80, 1)) * other)
+    lines *= rng.choice([-1, 1], (80, 1))
+    noise = 0.03**2 * across[:, :, None] * across[:, None] + 0.002**2 * other[:, :, None] * other[:, None]
+    found = directions_from_lines(lines, noise, EXACT)
+    assert len(found) == 2
+    # Forty lines at 2 mrad in the good direction; the common noise direction is worse: 30 / sqrt(40) = 5 mrad.
+    assert angles(found.vectors, FRAME[:2]).min(axis=1).max() < 0.015
+    assert (found.label >= 0).mean() > 0.9
+
+
+def test_groups_and_candidates():
+    rng = np.random.default_rng(5)
+    normals, factors = noisy_normals(rng, FRAME[:2], 40, 0, 1e-3)
+    groups = np.concatenate([np.zeros(40, int), np.arange(40) % 4])
+    options = replace(EXACT, min_groups=2)
+    found = directions_from_normals(normals, factors, options, groups, FRAME + 1e-3)
+    assert len(found) == 1
+    assert angles(found.vectors, FRAME[1:2]).max() < 2e-3
+
+
+def test_orthogonal_pairs_need_certainty():
+    directions = np.array([[1, 0, 0], [0, 1, 0], [0, np.sin(0.1), np.cos(0.1)]])
+    certain, vague = np.zeros((3, 3, 3)), np.broadcast_to(0.1**2 * np.eye(3), (3, 3, 3))
+    assert orthogonal_pairs(directions, certain).tolist() == [[0, 1], [0, 2]]
+    assert len(orthogonal_pairs(directions, vague)) == 0
+
+
+@pytest.mark.parametrize("count", [0, 1, 4])
+def test_too_few(count):
+    found = directions_from_normals(np.eye(3)[np.arange(count) % 3], np.zeros((count, 3, 2)))
+    assert len(found) == 0 and found.label.shape == (count,) and found.vectors.shape == (0, 3)
+    assert len(directions_from_lines(np.eye(3)[np.arange(count) % 3], np.zeros((count, 3, 3)))) == 0
+
+
+def test_bad_input():
+    with pytest.raises(ShapeError, match="factors"):
+        directions_from_normals(np.eye(3), np.zeros((2, 3, 2)))
+    with pytest.raises(ShapeError, match="covariance"):
+        directions_from_lines(np.eye(3), np.zeros((3, 2)))
+    with pytest.raises(InputError, match="finite"):
+        directions_from_lines(np.full((3, 3), np.nan), np.zeros((3, 3, 3)))

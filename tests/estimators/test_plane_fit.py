@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Planes: the fit and its covariance, the search among clutter, connectedness, segments, membership by mixture."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from groma.errors import InputError, ShapeError
+from groma.estimators.association import inlier_probability
+from groma.estimators.plane_fit import fit_plane, tilt_sigma
+from groma.estimators.plane_search import PlaneOptions, find_planes
+
+SIGMA = 0.01
+
+
+def wall(rng, count, normal_axis, offset, size=4.0, shift=(0.0, 0.0)):
+    """Points with noise SIGMA on a square wall across an axis."""
+    points = np.insert(rng.uniform(0, size, (count, 2)) + shift, normal_axis, offset, axis=1)
+    return points + rng.normal(0, SIGMA, points.shape)
+
+
+def noise_of(points):
+    return np.broadcast_to(SIGMA**2 * np.eye(3), (len(points), 3, 3))
+
+
+def test_fit_and_its_covariance():
+    """Errors of the fit in its three degrees of freedom, whitened by its covariance, have mean square 3."""
+    truth = np.array([2.0, -1.0, 2.0, 0.6]) / 3.0
+    basis = np.linalg.svd(truth[None, :3])[2][1:]
+    squared, chi = [], []
+    for seed in range(80):
+        rng = np.random.default_rng([1, seed])
+        exact = rng.uniform(-2, 2, (30, 2)) @ basis - truth[3] * truth[:3] + 3.0 * basis[0]
+        spread = rng.uniform(0.5, 3.0, (30, 3)) * SIGMA
+        noise = np.einsum("ni,ij->nij", spread**2, np.eye(3))
+        fit = fit_plane(exact + spread * rng.normal(size=(30, 3)), noise)
+        plane = fit.plane * np.sign(fit.plane[:3] @ truth[:3])
+        squared.append((plane - truth) @ np.linalg.pinv(fit.covariance, rcond=1e-9) @ (plane - truth))
+        chi.append(fit.reduced_chi_square)
+    # Standard deviation of the mean of 80: sqrt(6 / 80) = 0.27.
+    assert np.mean(squared) == pytest.approx(3.0, abs=0.8)
+    assert np.mean(chi) == pytest.approx(1.0, abs=0.1)
+
+
+def test_fit_of_points_on_a_line_leaves_a_tilt_open():
+    points = np.outer(np.linspace(0, 1, 20), [1.0, 2.0, 0.5])
+    assert tilt_sigma(fit_plane(points, noise_of(points)).covariance) > 1.0
+
+
+def test_walls_among_clutter():
+    rng = np.random.default_rng(2)
+    walls = [wall(rng, 300, 0, 0.0), wall(rng, 300, 1, 0.0), wall(rng, 200, 2, 0.0)]
+    clutter = rng.uniform(0.5, 4, (300, 3))
+    points = np.concatenate([*walls, clutter])
+    found = find_planes(points, noise_of(points))
+    assert len(found) == 3
+    assert sorted(np.abs(found.planes[:, :3]).argmax(axis=1)) == [0, 1, 2]
+    # The walls go through the origin: offsets within four standard deviations, which are below 0.3 noises.
+    offset_sigma = np.sqrt(found.covariance[:, 3, 3])
+    assert (np.abs(found.planes[:, 3]) < 4 * offset_sigma).all()
+    assert offset_sigma.max() < 0.3 * SIGMA
+    assert tilt_sigma(found.covariance).max() < 1e-3
+    assert found.share.min() > 0.7
+    label = found.point_label
+    assert all(np.bincount(label[300 * k : 300 * k + 200] + 1).max() > 190 for k in range(2))
+    assert (label[800:] >= 0).mean() < 0.15
+
+
+def test_no_plane_in_clutter_and_none_in_a_blob():
+    rng = np.random.default_rng(3)
+    cloud = rng.uniform(0, 4, (600, 3))
+    assert len(find_planes(cloud, noise_of(cloud))) == 0
+    blob = rng.normal(0, 10 * SIGMA, (400, 3))
+    assert len(find_planes(blob, noise_of(blob))) == 0
+
+
+def test_coplanar_walls_far_apart_are_two_planes():
+    rng = np.random.default_rng(4)
+    points = np.concatenate([wall(rng, 200, 0, 0.0), wall(rng, 200, 0, 0.0, shift=(40.0, 0.0))])
+    found = find_planes(points, noise_of(points))
+    assert len(found) == 2
+    assert sorted(found.support) == pytest.approx([190, 190], abs=12)
+
+
+def test_segments_make_planes_too():
+    rng = np.random.default_rng(5)
+    ends = rng.uniform(0, 4, (40, 2, 2))
+    segments = np.concatenate([np.insert(ends, 2, 1.0, axis=2), rng.uniform(0, 4, (30, 2, 3))])
+    segments = segments + rng.normal(0, SIGMA, segments.shape)
+    noise = np.broadcast_to(SIGMA**2 * np.eye(3), (70, 2, 3, 3))
+    found = find_planes(np.zeros((0, 3)), np.zeros((0, 3, 3)), segments, noise)
+    assert len(found) == 1
+    assert np.abs(np.abs(found.planes[0]) - [0, 0, 1, 1]).max() < 0.01
+    assert (found.segment_label[:40] == 0).mean() > 0.8
+    assert (found.segment_label[40:] == 0).mean() < 0.1
+
+
+def test_points_on_segments_are_no_evidence_of_their_own():
+    """Two crossing segments are coplanar; the points on them make it no plane."""
+    rng = np.random.default_rng(6)
+    segments = np.array([[[0, 0, 0], [2, 0, 0.0]], [[0, 0, 0], [0, 2, 0.0]]])
+    share = rng.uniform(0, 1, (40, 1))
+    owner = np.arange(40) % 2
+    points = segments[owner, 0] + share * (segments[owner, 1] - segments[owner, 0])
+    noise = np.broadcast_to(SIGMA**2 * np.eye(3), (2, 2, 3, 3))
+    assert len(find_planes(points, noise_of(points), segments, noise, carriers=owner)) == 0
+
+
+def test_mixture_separates_members_from_clutter():
+    rng = np.random.default_rng(7)
+    members, clutter = np.abs(rng.normal(0, 0.01, 200)), rng.uniform(0, 0.1, 100)
+    distance, owner = np.concatenate([members, clutter]), np.zeros(300, int)
+    probability, share = inlier_probability(distance, np.full(300, 0.01), owner, np.array([0.1]))
+    assert share[0] == pytest.approx(2 / 3, abs=0.08)
+    assert (probability[:200] > 0.7).mean() > 0.9
+    assert (probability[200:] > 0.7).mean() < 0.3
+    # A landmark as uncertain as the band is wide tells nothing: it keeps about the share of the structure.
+    vague, _ = inlier_probability(
+        np.append(distance, 0.0), np.append(np.full(300, 0.01), 0.1), np.zeros(301, int), np.array([0.1])
+    )
+    assert vague[-1] < 0.7
+
+
+def test_bad_input_and_empty():
+    assert len(find_planes(np.zeros((0, 3)), np.zeros((0, 3, 3)))) == 0
+    assert len(find_planes(np.zeros((3, 3)), np.broadcast_to(np.eye(3), (3, 3, 3)))) == 0
+    same = np.zeros((50, 3))
+    assert len(find_planes(same, noise_of(same), options=replace(PlaneOptions(), seed=1))) == 0
+    with pytest.raises(ShapeError, match="covariances"):
+        find_planes(np.zeros((5, 3)), np.zeros((4, 3, 3)))
+    with pytest.raises(InputError, match="finite"):
+        find_planes(np.full((5, 3), np.nan), np.zeros((5, 3, 3)))
+    with pytest.raises(InputError, match="at least 3"):
+        fit_plane(np.zeros((2, 3)), np.zeros((2, 3, 3)))
+    with pytest.raises(ShapeError, match="carriers"):
+        find_planes(np.zeros((5, 3)), np.zeros((5, 3, 3)), carriers=np.zeros(4, int))
