@@ -3,9 +3,9 @@
 
     python benchmarks/check.py [--update] [--require-all]
 
-A metric fails when it is worse than its baseline by more than the tolerance (a fraction of the baseline), or beyond
-its limit, which is a promise and not a habit. Times are compared as ratios to the best peer in the same run, and only
-where there was no peer as multiples of a calibration loop, so the baseline holds on other machines.
+A metric fails when it is worse than its baseline by more than the tolerance (a fraction of the baseline, where it has
+one), or beyond its limit, which is a promise and not a habit. Times are compared as ratios to the best peer in the same
+run, and only where there was no peer as multiples of a calibration loop, so the baseline holds on other machines.
 ``--update`` writes the present values as the new baseline and keeps units, directions, tolerances and limits.
 """
 
@@ -32,9 +32,10 @@ def measured() -> dict[str, float]:
 def verdict(entry: dict, value: float) -> str:
     """Return what is wrong with a value, or nothing."""
     sign = 1 if entry["direction"] == "lower" else -1
-    allowed = entry["value"] + sign * entry["tolerance"] * abs(entry["value"])
-    if sign * (value - allowed) > 0:
-        return f"worse than {allowed:.6g}"
+    if "tolerance" in entry:
+        allowed = entry["value"] + sign * entry["tolerance"] * abs(entry["value"])
+        if sign * (value - allowed) > 0:
+            return f"worse than {allowed:.6g}"
     if "limit" in entry and sign * (value - entry["limit"]) > 0:
         return f"beyond its limit {entry['limit']:.6g}"
     return ""

@@ -6,7 +6,7 @@
 Same file, same start, same rule (relative change of the cost below 1e-6, or 50 steps), one thread, every run in a
 process of its own, all contestants in turn within a round. The first round tries every linear solver of a peer; the
 others go on with those that may be its best. Reported are medians; CPU time is that of the solve alone. Writes
-``benchmarks/results/PROBLEM.json`` and ``benchmarks/results/table.md``; ``check.py`` compares them with the baseline.
+``benchmarks/results/PROBLEM.json``, and ``table.md`` of all results there; ``check.py`` compares with the baseline.
 """
 
 from __future__ import annotations
@@ -189,9 +189,10 @@ def main() -> int:
             return 1
         (RESULTS / f"{problem.name}.json").write_text(json.dumps(result, indent=1) + "\n")
         results.append(result)
-    text = table(results)
-    (RESULTS / "table.md").write_text(text)
-    print("\n" + text)
+    print("\n" + table(results))
+    paths = [RESULTS / f"{problem.name}.json" for problem in PROBLEMS]
+    everything = [json.loads(path.read_text()) for path in paths if path.is_file()]
+    (RESULTS / "table.md").write_text(table(everything))
     return 0
 
 

@@ -46,9 +46,9 @@ def _stamp() -> str:
 def _compiled(**options: Any) -> Callable[[Callable], Any]:
     def decorate(function: Callable) -> Any:
         dispatcher = njit(cache=True, **_OPTIONS, **options)(function)
-        cache = getattr(dispatcher, "_cache", None)
-        if hasattr(cache, "_cache_file"):  # absent without the compiler
-            cache._cache_file._source_stamp = _stamp()
+        cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+        if cache_file is not None:  # absent without the compiler
+            cache_file._source_stamp = _stamp()
         return dispatcher
 
     return decorate

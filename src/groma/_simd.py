@@ -14,10 +14,11 @@ With ``NUMBA_DISABLE_JIT=1`` the same names are plain NumPy.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
-import numba
+import numpy as np
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba.core import cgutils, config, types
 from numba.extending import intrinsic
 
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
@@ -44,13 +45,14 @@ class _Vectors:
             module, ir.FunctionType(_DOUBLE, [_DOUBLE, self.type]), f"llvm.vector.reduce.fadd.v{lanes}f64"
         )
 
-    def load(self, pointer):
-        value = self.builder.load(self.builder.bitcast(pointer, self.type.as_pointer()))
+    def load(self, pointer) -> Any:
+        value: Any = self.builder.load(self.builder.bitcast(pointer, self.type.as_pointer()))
         value.align = 8
         return value
 
     def store(self, value, pointer) -> None:
-        self.builder.store(value, self.builder.bitcast(pointer, self.type.as_pointer())).align = 8
+        store: Any = self.builder.store(value, self.builder.bitcast(pointer, self.type.as_pointer()))
+        store.align = 8
 
     def splat(self, scalar):
         undefined = ir.Constant(self.type, ir.Undefined)
@@ -140,7 +142,7 @@ def _blocks(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes):
     m, p, q = len(depth), len(rows), len(lanes)
     first = [A[a0 + k * a_stride : a0 + k * a_stride + p] for k in range(m)]
     second = [B[b0 + k * b_stride : b0 + k * b_stride + q] for k in range(m)]
-    product = sum(x[:, None] * y[None, :] for x, y in zip(first, second, strict=True))
+    product = np.stack(first).T @ np.stack(second)
     return C[c0 : c0 + p * q], product.reshape(-1)
 
 
@@ -159,7 +161,7 @@ def _add_matvec_plain(y, y0, A, a0, x, x0, rows, lanes):
     y[y0 : y0 + p] += A[a0 : a0 + p * q].reshape(p, q) @ x[x0 : x0 + q]
 
 
-_plain = bool(numba.config.DISABLE_JIT)
+_plain = bool(config.DISABLE_JIT)  # type: ignore[attr-defined]
 
 #: ``add_product(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)``: C += A^T B for flat float64 arrays
 #: at element offsets. A is depth x rows and B depth x lanes, with the given distances between their rows; C is

@@ -17,8 +17,6 @@ from groma.scene.synthetic import corridor, holistic
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
-pytestmark = pytest.mark.kernels
-
 
 @cache
 def measured(kind, size):
@@ -33,6 +31,7 @@ def point_errors(truth, scene):
     return scene.points.xyz - truth.points.xyz
 
 
+@pytest.mark.kernels
 def test_covariances_fit_the_errors():
     """Whitened errors of points have mean square 3, of the four line coordinates 4."""
     truth, scene = measured("corridor", "tiny")
@@ -106,6 +105,7 @@ def test_wrong_planes_are_not_invented():
         assert gap.min() < 0.02
 
 
+@pytest.mark.kernels
 def test_other_tables_stay_and_order_is_no_matter():
     _, scene = measured("corridor", "tiny")
     one, two = find_structure(scene), find_structure(find_structure(scene))

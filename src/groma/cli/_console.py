@@ -5,7 +5,7 @@ import os
 import sys
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -53,19 +53,18 @@ class Console:
         return Stages(enabled=not self.quiet and sys.stderr.isatty())
 
 
-class Progress:
-    """One line that rewrites itself; call it with the progress events of a pipeline."""
+class _Line:
+    """One line on the terminal that rewrites itself, and vanishes at the end."""
 
     def __init__(self, enabled: bool) -> None:
         self._enabled = enabled
 
-    def __call__(self, event: Any) -> None:
-        """Show one event: iteration, limit and cost."""
+    def _show(self, text: str) -> None:
         if self._enabled:
-            sys.stderr.write(f"\r\x1b[K  step {event.iteration}/{event.max_iterations}   cost {event.cost:.6g}")
+            sys.stderr.write(f"\r\x1b[K  {text}")
             sys.stderr.flush()
 
-    def __enter__(self) -> "Progress":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -76,15 +75,20 @@ class Progress:
             sys.stderr.flush()
 
 
-class Stages(Progress):
-    """One line that names the stage at work; call it with a name, what is done and what there is to do."""
+class Progress(_Line):
+    """Call it with the progress events of an adjustment."""
 
-    def __call__(self, stage: str, done: int = 0, total: int = 0) -> None:  # type: ignore[override]
+    def __call__(self, event: Any) -> None:
+        """Show one event: iteration, limit and cost."""
+        self._show(f"step {event.iteration}/{event.max_iterations}   cost {event.cost:.6g}")
+
+
+class Stages(_Line):
+    """Call it with the name of a stage, what is done and what there is to do."""
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
         """Show a stage."""
-        if self._enabled:
-            count = f" {done}/{total}" if total > 1 else ""
-            sys.stderr.write(f"\r\x1b[K  {stage}{count}")
-            sys.stderr.flush()
+        self._show(f"{stage} {done}/{total}" if total > 1 else stage)
 
 
 def _cache_is_filled() -> bool:

@@ -17,9 +17,7 @@ def map_(
     ],
     model: Annotated[
         Path | None,
-        typer.Option(
-            "--model", metavar="COLMAP", help="Poses, cameras and points of the images. Without it they are reconstructed."
-        ),
+        typer.Option("--model", metavar="COLMAP", help="Poses, cameras and points; without it they are reconstructed."),
     ] = None,
     min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 20.0,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
@@ -89,8 +87,8 @@ def map_(
         _output.write_json(str(draft / "summary.json"), numbers)
     shutil.rmtree(work, ignore_errors=True)
     console.say(
-        f"{scene.num_images} images, {scene.num_points:,} points, {scene.num_lines:,} lines, {scene.num_planes} planes, "
-        f"{scene.num_directions} directions"
+        f"{scene.num_images} images, {scene.num_points:,} points, {scene.num_lines:,} lines, "
+        f"{scene.num_planes} planes, {scene.num_directions} directions"
     )
     console.say(result.explanation)
     for kind, rmse in result.report.rmse_px.items():

@@ -224,7 +224,8 @@ def _extract(
     """Take planes out one after the other; ``labels`` is filled."""
     rng = np.random.default_rng(options.seed)
     near = min(_NEIGHBOURS, len(places))
-    distance, neighbours = KDTree(places).query(places, k=near)
+    distance, found_near = KDTree(places).query(places, k=near)
+    neighbours = np.asarray(found_near, dtype=np.int64)
     packed = np.ascontiguousarray(noise[:, *np.triu_indices(3)])
     features = _Features(places, noise, partner, carrier, np.maximum(distance[:, min(_RANK, near - 1)], 1e-12), packed)
     gate = float(stats.chi2.ppf(options.level, 1))
@@ -297,7 +298,7 @@ def _from_segments(features: _Features, num_points: int, gate: float) -> tuple[F
         return np.zeros((0, 4)), 0
     middle = ends.mean(axis=1)
     count = min(12 if len(ends) > 200 else 50, len(ends))
-    _, near = KDTree(middle).query(middle, k=count)
+    near = np.asarray(KDTree(middle).query(middle, k=count)[1], dtype=np.int64)
     first, second = np.repeat(np.arange(len(ends)), count - 1), near[:, 1:].ravel()
     once = np.unique(np.column_stack([np.minimum(first, second), np.maximum(first, second)]), axis=0)
     once = once[once[:, 0] != once[:, 1]]
@@ -411,7 +412,8 @@ def _largest_part(features: _Features, rows: IntArray) -> IntArray:
     if len(rows) < 3:
         return rows
     count = min(_RANK + 1, len(rows))
-    distance, other = KDTree(features.places[rows]).query(features.places[rows], k=count)
+    distance, nearest = KDTree(features.places[rows]).query(features.places[rows], k=count)
+    other = np.asarray(nearest, dtype=np.int64)
     first = np.repeat(np.arange(len(rows)), count - 1)
     second, apart = other[:, 1:].ravel(), distance[:, 1:].ravel()
     linked = apart <= LINK * np.maximum(features.spacing[rows[first]], features.spacing[rows[second]])

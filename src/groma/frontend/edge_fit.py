@@ -4,9 +4,9 @@ r"""Fit segments to the grey levels: direction by gradient sign, position below 
 A detector that grows regions places a line by its region. Here the edge is measured again. At every pixel of length
 the gradient across the segment is sampled a pixel apart, and its peak :math:`e_k` located as the centre of a Gaussian
 window that is also the centroid of the gradient in it: unlike a parabola through the largest samples this does not lean
-towards pixel centres (0.1 pixels on an edge parallel to an axis), and unlike a centroid without a window it does not
+towards pixel centres (0.1 pixels on a sharp edge parallel to an axis; this one 0.03), and unlike a centroid without a window it does not
 see the neighbouring edge. A robust line
-:math:`e = a + b\,s` through these peaks, :math:`s \in [-1/2, 1/2]` along the segment, moves the end points across it.
+:math:`e = a + b\,s` through these peaks, :math:`-1/2 \le s \le 1/2` along the segment, moves the end points across it.
 
 The residuals of that line also tell how well it is known. With :math:`n` samples of variance :math:`\sigma_e^2` and
 correlation :math:`\rho` from one to the next, the variance of an end point across a fitted line is
@@ -29,7 +29,7 @@ from groma.frontend.images import GrayImage
 
 REACH = 3  # samples across the segment reach this far on either side, pixels
 SAMPLES = 2 * REACH + 1
-WINDOW = 1.0  # standard deviation of the window, pixels
+WINDOW = 1.5  # standard deviation of the window, pixels
 MAX_SHIFT = 1.5  # an end point that would move further keeps its place, pixels
 SIGMA_FLOOR = 0.03  # pixels
 SIGMA_UNFITTED = 0.5  # of segments that could not be fitted, pixels
@@ -71,8 +71,8 @@ def _peak(profile):
             weight = max(profile[k + 1] - profile[k], 0.0) * math.exp(-0.5 * away * away / WINDOW**2)
             total += weight
             moment += weight * away
-        # The window pulls the centroid back by this factor when edge and window are about equally wide.
-        center += 2.0 * moment / total
+        # The window pulls the centroid back by this factor when the edge is blurred by about one pixel.
+        center += 1.5 * moment / total
         if abs(center - (at - REACH + 0.5)) > 1.0:
             return math.nan
     return center

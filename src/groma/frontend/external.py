@@ -65,7 +65,7 @@ def read_matches(path: str | Path) -> ExternalMatches:
     segments: dict[str, npt.NDArray[np.float64]] = {}
     matches: dict[tuple[str, str], LineMatches] = {}
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
     except FileNotFoundError:
         raise FileFormatError(f"Expected an .npz file of line matches; {path} does not exist.") from None

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_matrix, csr_matrix
-from scipy.spatial import cKDTree
+from scipy.sparse import coo_array, csr_array
+from scipy.spatial import KDTree
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
@@ -139,7 +139,7 @@ def _sample(flow: Flow, points: FloatArray) -> FloatArray:
     return sampled.reshape(-1, 2)[: len(rows)].astype(np.float64)
 
 
-def _votes(source: Segments, target: Segments, forward: Flow, backward: Flow, options: FlowOptions) -> csr_matrix:
+def _votes(source: Segments, target: Segments, forward: Flow, backward: Flow, options: FlowOptions) -> csr_array:
     """Share (N1, N2) of the points of each source segment that vote for each target segment."""
     points, owner = _along(source, options.step)
     total = np.bincount(owner, minlength=len(source))
@@ -159,12 +159,13 @@ def _votes(source: Segments, target: Segments, forward: Flow, backward: Flow, op
     heading = heading / np.where(norm > 0.0, norm, np.inf)
 
     ends_at, target_of = _along(target, 2.0)
-    tree = cKDTree(ends_at)
+    tree = KDTree(ends_at)
     rows = np.flatnonzero(ok)
     # The nearest few pieces: where two edges run side by side, only the one that runs the same way gets the vote.
     reach = np.hypot(options.max_distance, 1.0)
-    _, near = tree.query(arrived[rows], k=min(4, len(ends_at)), distance_upper_bound=reach)
-    near = near.reshape(len(rows), -1)
+    num_near = min(4, len(ends_at))
+    near = tree.query(arrived[rows], k=np.arange(1, num_near + 1), distance_upper_bound=reach)[1]
+    near = np.asarray(near).reshape(len(rows), num_near)
     found = near < len(ends_at)
     candidate = target_of[np.where(found, near, 0)]
     line = target.line[candidate]
@@ -174,7 +175,7 @@ def _votes(source: Segments, target: Segments, forward: Flow, backward: Flow, op
     pick = np.argmin(distance, axis=1)
     voted = np.isfinite(distance[np.arange(len(rows)), pick])
     voter, choice = owner[rows][voted], candidate[np.arange(len(rows)), pick][voted]
-    counts = coo_matrix((np.ones(len(voter)), (voter, choice)), shape=(len(source), len(target))).tocsr()
+    counts = coo_array((np.ones(len(voter)), (voter, choice)), shape=(len(source), len(target))).tocsr()
     counts.sum_duplicates()
     counts.data /= total[np.repeat(np.arange(len(source)), np.diff(counts.indptr))]
     return counts

@@ -37,11 +37,12 @@ def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
     if image.dtype == np.bool_:
         image = image.astype(np.uint8) * 255
     elif image.dtype == np.uint16:
-        image = np.round(image / 257.0).astype(np.uint8)
+        image = np.round(image.astype(np.float64) / 257.0).astype(np.uint8)
     elif np.issubdtype(image.dtype, np.floating):
-        if not np.isfinite(image).all():
+        levels = image.astype(np.float64)
+        if not np.isfinite(levels).all():
             raise InputError("image must be finite; got NaN or infinity. Replace them, e.g. with numpy.nan_to_num.")
-        image = np.clip(np.round(image * (255.0 if image.max() <= 1.0 else 1.0)), 0, 255).astype(np.uint8)
+        image = np.clip(np.round(levels * (255.0 if levels.max() <= 1.0 else 1.0)), 0, 255).astype(np.uint8)
     elif image.dtype != np.uint8:
         raise InputError(f"image must be uint8, uint16, bool or float; got {image.dtype}. Convert it with astype.")
     if image.ndim == 3:

@@ -112,7 +112,7 @@ def _points(ids_1, distance_1, low_1, high_1, ids_2, distance_2, low_2, high_2, 
 
 @loop
 def _candidates(
-    ends_1, ends_2, descriptors_1, descriptors_2, begin_1, ids_1, distance_1, begin_2, ids_2, distance_2,
+    first_row, ends_1, ends_2, products, begin_1, ids_1, distance_1, begin_2, ids_2, distance_2,
     F, has_F, min_overlap, tolerance, min_product,
 ):  # fmt: skip
     """All pairs that pass the gates: indices (C, 2) and features (C, 6)."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from groma._typing import FloatArray
 
@@ -41,7 +41,7 @@ def merge_collinear(ends: FloatArray, gap: float = 8.0, angle: float = 0.04, dis
     start, end = ends[:, :2], ends[:, 2:]
     length = np.maximum(np.linalg.norm(end - start, axis=1), 1e-9)
     along = (end - start) / length[:, None]
-    near = cKDTree(end).sparse_distance_matrix(cKDTree(start), gap, output_type="coo_matrix")
+    near = KDTree(end).sparse_distance_matrix(KDTree(start), gap, output_type="coo_matrix")
     first, second = near.row.astype(np.intp), near.col.astype(np.intp)
     # The next piece must lie ahead, parallel, and on the line of the longer of the two.
     longer = np.where((length[first] >= length[second]), first, second)
