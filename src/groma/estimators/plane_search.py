@@ -26,14 +26,15 @@ from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
+from groma.estimators._plane_candidates import Features, from_neighbours, from_segments, squares
 from groma.estimators.association import inlier_probability
 from groma.estimators.plane_fit import PlaneFit, fit_plane, tilt_sigma
-from groma.geometry._algebra import dot, norm, perpendicular, unit, vectors
+from groma.geometry._algebra import norm, perpendicular, vectors
 
 #: Neighbours that make a candidate, and that improve it.
 _NEIGHBOURS = 32
-#: Candidates drawn; features that score them.
-_MAX_CANDIDATES, _MAX_SCORED = 1536, 6000
+#: Features that score candidates.
+_MAX_SCORED = 6000
 #: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
 BAND = 8.0
 #: Links between inliers, as a multiple of the distance to the eighth neighbour.
@@ -96,32 +97,6 @@ class PlaneSet:
 
     def __len__(self) -> int:
         return len(self.planes)
-
-
-@dataclass(frozen=True)
-class _Features:
-    """Points and segment ends."""
-
-    places: FloatArray
-    covariances: FloatArray
-    #: (N,) other end of the same segment, or the feature itself.
-    partner: IntArray
-    #: (N,) first end of the segment that a point lies on, -1 for none.
-    carrier: IntArray
-    #: (N,) distance at which a feature has its neighbours.
-    spacing: FloatArray
-    #: (N, 6) covariances as vectors whose product with :func:`_squares` of a normal is the variance along it.
-    packed: FloatArray
-
-    def spread(self, normal: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
-        """Standard deviations along a normal."""
-        return np.sqrt(np.maximum(self.packed[rows] @ _squares(normal), 1e-300))
-
-
-def _squares(normal: FloatArray) -> FloatArray:
-    """Products (..., 6) of the entries of normals (..., 3), those off the diagonal twice."""
-    x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
-    return np.stack([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -227,11 +202,11 @@ def _extract(
     distance, found_near = KDTree(places).query(places, k=near)
     neighbours = np.asarray(found_near, dtype=np.int64)
     packed = np.ascontiguousarray(noise[:, *np.triu_indices(3)])
-    features = _Features(places, noise, partner, carrier, np.maximum(distance[:, min(_RANK, near - 1)], 1e-12), packed)
+    features = Features(places, noise, partner, carrier, np.maximum(distance[:, min(_RANK, near - 1)], 1e-12), packed)
     gate = float(stats.chi2.ppf(options.level, 1))
     extent = float(np.median(norm(places - np.median(places, axis=0)))) + 1e-300
-    first = _from_neighbours(features, neighbours, gate, rng)
-    second, num_pairs = _from_segments(features, num_points, gate)
+    first = from_neighbours(features, neighbours, gate, rng)
+    second, num_pairs = from_segments(features, num_points, gate)
     candidates = np.concatenate([first, second])
     scored = np.arange(len(places))
     if len(scored) > _MAX_SCORED:
@@ -266,60 +241,8 @@ def _extract(
     return found
 
 
-def _from_neighbours(features: _Features, neighbours: IntArray, gate: float, rng: np.random.Generator) -> FloatArray:
-    """Candidates (H, 4) from a feature and two of its neighbours, improved on the neighbourhood."""
-    count = min(_MAX_CANDIDATES, 4 * len(neighbours))
-    seed = rng.permutation(np.repeat(np.arange(len(neighbours)), -(-count // len(neighbours))))[:count]
-    patch = neighbours[seed]
-    choice = rng.integers(1, patch.shape[1], (count, 2))
-    corner = features.places[np.column_stack([seed, np.take_along_axis(patch, choice, 1)])]
-    normal = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
-    valid = norm(normal) > 0.5
-    normal, center, patch = normal[valid], corner[valid, 0], patch[valid]
-    around, noise = features.places[patch], features.covariances[patch]
-    for _ in range(3):
-        height = np.einsum("hki,hi->hk", around - center[:, None], normal)
-        variance = np.einsum("hi,hkij,hj->hk", normal, noise, normal)
-        weight = np.where(height**2 < 4.0 * gate * variance, 1.0, 0.0) / (variance + height**2)
-        weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
-        enough = (weight > 0).sum(axis=1) >= 4
-        middle = np.einsum("hk,hki->hi", weight, around)
-        away = around - middle[:, None]
-        _, axes = np.linalg.eigh(np.einsum("hk,hki,hkj->hij", weight, away, away))
-        normal = np.where(enough[:, None], axes[:, :, 0], normal)
-        center = np.where(enough[:, None], middle, center)
-    return np.column_stack([normal, -dot(normal, center)])
-
-
-def _from_segments(features: _Features, num_points: int, gate: float) -> tuple[FloatArray, int]:
-    """Candidates (H, 4) from pairs of near segments that are coplanar within their noise, and how many were tried."""
-    ends = features.places[num_points:].reshape(-1, 2, 3)
-    if len(ends) < 2:
-        return np.zeros((0, 4)), 0
-    middle = ends.mean(axis=1)
-    count = min(12 if len(ends) > 200 else 50, len(ends))
-    near = np.asarray(KDTree(middle).query(middle, k=count)[1], dtype=np.int64)
-    first, second = np.repeat(np.arange(len(ends)), count - 1), near[:, 1:].ravel()
-    once = np.unique(np.column_stack([np.minimum(first, second), np.maximum(first, second)]), axis=0)
-    once = once[once[:, 0] != once[:, 1]]
-    four = ends[once].reshape(-1, 4, 3)
-    center = four.mean(axis=1)
-    away = four - center[:, None]
-    values, axes = np.linalg.eigh(np.einsum("hki,hkj->hij", away, away))
-    normal = axes[:, :, 0]
-    noise = features.covariances[num_points:].reshape(-1, 2, 3, 3)[once].reshape(-1, 4, 3, 3)
-    variance = np.einsum("hi,hkij,hj->hk", normal, noise, normal).mean(axis=1)
-    flat = values[:, 0] < 2.0 * gate * variance
-    # Two segments on one line leave the plane open.
-    flat &= values[:, 1] > 25.0 * np.maximum(values[:, 0], variance)
-    chosen = np.flatnonzero(flat)
-    if len(chosen) > _MAX_CANDIDATES:
-        chosen = chosen[np.argsort(-values[chosen, 1] / variance[chosen], kind="stable")[:_MAX_CANDIDATES]]
-    return np.column_stack([normal, -dot(normal, center)])[chosen], len(once)
-
-
 def _score(
-    features: _Features, candidates: FloatArray, rows: IntArray, gate: float, extent: float
+    features: Features, candidates: FloatArray, rows: IntArray, gate: float, extent: float
 ) -> npt.NDArray[np.float32]:
     """Information (H, N) that each feature gives to each candidate: less near the gate, less for uncertain features."""
     normal = candidates[:, :3]
@@ -328,7 +251,7 @@ def _score(
     places = features.places[rows]
     for begin in range(0, len(candidates), 256):
         part = slice(begin, begin + 256)
-        variance = _squares(normal[part]) @ packed.T
+        variance = squares(normal[part]) @ packed.T
         squared = (normal[part] @ places.T + candidates[part, 3:]) ** 2 / np.maximum(variance, 1e-300)
         information = np.maximum(0.5 * np.log(extent**2 / (gate * np.maximum(variance, 1e-300))), 0.0)
         out[part] = np.maximum(1.0 - squared / gate, 0.0) * information
@@ -336,7 +259,7 @@ def _score(
 
 
 def _grow(
-    features: _Features, plane: FloatArray, labels: IntArray, gate: float, log_tried: float, options: PlaneOptions
+    features: Features, plane: FloatArray, labels: IntArray, gate: float, log_tried: float, options: PlaneOptions
 ) -> tuple[_Grown | None, FloatArray, IntArray]:
     """Refine a candidate on its largest connected part and judge it: what is kept, where it went, and its support."""
     free = np.flatnonzero(labels < 0)
@@ -362,6 +285,7 @@ def _grow(
     if tilt_sigma(fit.covariance) > options.max_tilt:
         return None, plane, rows
     band = BAND * float(np.median(features.spread(plane[:3], rows)))
+    layer, share = rows, np.zeros(1)
     for _ in range(_POLISH_STEPS):
         height = np.abs(features.places @ plane[:3] + plane[3])
         # Judged against all that is near, taken or not: what lies on a plane beside this one speaks against it.
@@ -386,7 +310,7 @@ def _grow(
     return grown, plane, rows
 
 
-def _log10_false_alarms(features: _Features, plane: FloatArray, rows: IntArray, gate: float) -> float:
+def _log10_false_alarms(features: Features, plane: FloatArray, rows: IntArray, gate: float) -> float:
     """Chance that as many features of the neighbourhood lie in the layer as do, base-10 logarithm."""
     center = features.places[rows].mean(axis=0)
     radius = float(np.quantile(norm(features.places[rows] - center), 0.9))
@@ -400,14 +324,14 @@ def _log10_false_alarms(features: _Features, plane: FloatArray, rows: IntArray, 
     return float(stats.poisson.logsf(len(inside) - 4, chance.sum())) / np.log(10.0)  # three fix the plane
 
 
-def _independent(features: _Features, rows: IntArray) -> BoolArray:
+def _independent(features: Features, rows: IntArray) -> BoolArray:
     """Which of some features are not there just because the segment they lie on is."""
     present = np.zeros(len(features.places) + 1, dtype=bool)
     present[rows] = True
     return ~present[features.carrier[rows]]
 
 
-def _largest_part(features: _Features, rows: IntArray) -> IntArray:
+def _largest_part(features: Features, rows: IntArray) -> IntArray:
     """Rows of the largest part of some features that is connected in space; ends of a segment always are."""
     if len(rows) < 3:
         return rows

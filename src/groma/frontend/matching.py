@@ -41,6 +41,7 @@ from groma.frontend.matches import LineMatches, mutual_best
 from groma.frontend.nearby import NearbyPoints, nearby_points
 from groma.frontend.segments import Segments
 
+ROWS_AT_ONCE = 512  # of the table of descriptor products held in memory
 BIAS = 1.5  # logarithm of odds of identical surroundings without points or overlap
 FEATURES = 6  # descriptor distance; points for, against, near one only; overlap on first, on second (-1: unknown)
 
@@ -115,13 +116,14 @@ def _candidates(
     first_row, ends_1, ends_2, products, begin_1, ids_1, distance_1, begin_2, ids_2, distance_2,
     F, has_F, min_overlap, tolerance, min_product,
 ):  # fmt: skip
-    """All pairs that pass the gates: indices (C, 2) and features (C, 6)."""
-    n1, n2, size = ends_1.shape[0], ends_2.shape[0], descriptors_1.shape[1]
+    """Pairs of a stretch of rows that pass the gates: indices (C, 2) and features (C, 6)."""
+    n1, n2 = products.shape
     room = 16 * (n1 + 16)
     pairs, features = np.zeros((room, 2), dtype=np.int64), np.zeros((room, FEATURES))
     count = 0
     points = np.zeros(3)
-    for i in range(n1):
+    for row in range(n1):
+        i = first_row + row
         a0 = 0.0
         a1 = 0.0
         a2 = 0.0
@@ -146,6 +148,9 @@ def _candidates(
             scale = 1.0 / max(math.hypot(b0, b1), 1e-300)
             b0, b1, b2 = b0 * scale, b1 * scale, b2 * scale
         for j in range(n2):
+            product = products[row, j]
+            if product < min_product:
+                continue
             on_1 = -1.0
             on_2 = -1.0
             if has_F:
@@ -166,11 +171,6 @@ def _candidates(
                         on_1 = _share(_crossing(pa, pb), _crossing(qa, qb))
                     if min(on_1, on_2) < min_overlap:
                         continue
-            product = np.float32(0.0)
-            for k in range(size):
-                product += descriptors_1[i, k] * descriptors_2[j, k]
-            if product < min_product:
-                continue
             _points(
                 ids_1, distance_1, begin_1[i], begin_1[i + 1], ids_2, distance_2, begin_2[j], begin_2[j + 1], points
             )
@@ -270,12 +270,17 @@ def candidates(
         raise ShapeError(f"fundamental must have shape (3, 3); got {F.shape}.")
     if fundamental is not None and not (np.isfinite(F).all() and np.abs(F).max() > 0.0):
         raise InputError("fundamental must be finite and not zero; pass None where the relative pose is not known.")
-    return _candidates(
-        segments_1.ends, segments_2.ends, one, two,
-        near_1.begin, near_1.point_id, near_1.distance, near_2.begin, near_2.point_id, near_2.distance,
-        F, fundamental is not None, options.min_overlap, options.beam_tolerance,
-        np.float32(1.0 - 0.5 * options.max_descriptor_distance**2),
-    )  # fmt: skip
+    least = np.float32(1.0 - 0.5 * options.max_descriptor_distance**2)
+    pairs, features = [np.zeros((0, 2), dtype=np.int64)], [np.zeros((0, FEATURES))]
+    for row in range(0, len(one), ROWS_AT_ONCE):
+        found = _candidates(
+            row, segments_1.ends, segments_2.ends, one[row : row + ROWS_AT_ONCE] @ two.T,
+            near_1.begin, near_1.point_id, near_1.distance, near_2.begin, near_2.point_id, near_2.distance,
+            F, fundamental is not None, options.min_overlap, options.beam_tolerance, least,
+        )  # fmt: skip
+        pairs.append(found[0])
+        features.append(found[1])
+    return np.concatenate(pairs), np.concatenate(features)
 
 
 def fundamental_from_poses(
