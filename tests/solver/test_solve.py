@@ -186,3 +186,14 @@ def test_refused_steps_are_not_convergence():
     assert solution.report.converged
     close = solve(scene_problem(num_points=40, constant_landmarks=True, disturb=0.0, num_cameras=8))
     np.testing.assert_allclose(solution.report.final_cost, close.report.final_cost, rtol=1e-5)
+
+
+def test_points_are_not_hidden_behind_the_camera():
+    """A point behind its camera is degenerate and costs nothing; the solver must not gain by moving points there."""
+    problem = scene_problem(num_points=30, num_cameras=6, noise=1.0)
+    factor = dataclasses.replace(problem.factors[0], pixels=problem.factors[0].pixels * 1.0)
+    pixels = factor.pixels.copy()
+    pixels[factor.point.index < 5] += np.random.default_rng(0).uniform(-400, 400, pixels[factor.point.index < 5].shape)
+    spoiled = Problem(problem.variables, [dataclasses.replace(factor, pixels=pixels, require_in_front=True)])
+    solution = solve(spoiled)
+    assert solution.report.num_degenerate.get("point_reprojection", 0) <= 2

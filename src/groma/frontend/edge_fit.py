@@ -5,7 +5,8 @@ A detector that grows regions places a line by its region. Here the edge is meas
 the gradient across the segment is sampled a pixel apart, and its peak :math:`e_k` located as the centre of a Gaussian
 window that is also the centroid of the gradient in it: unlike a parabola through the largest samples this does not lean
 towards pixel centres (0.1 pixels on a sharp edge parallel to an axis; this one 0.03), and unlike a centroid without a
-window it does not see the neighbouring edge. A robust line :math:`e = a + b\,s` through these peaks, :math:`-1/2 \le s \le 1/2` along the segment, moves the end points across it.
+window it does not see the neighbouring edge. A robust line :math:`e = a + b\,s` through these peaks, with
+:math:`-1/2 \le s \le 1/2` along the segment, moves the end points across it.
 
 The residuals of that line also tell how well it is known. With :math:`n` samples of variance :math:`\sigma_e^2` and
 correlation :math:`\rho` from one to the next, the variance of an end point across a fitted line is

@@ -52,7 +52,7 @@ def dense_flow(image_1: npt.NDArray[np.generic], image_2: npt.NDArray[np.generic
     one, two = _pair(image_1, image_2)
     if min(one.shape) < SMALLEST_IMAGE:
         return np.zeros((*one.shape, 2), dtype=np.float32)
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     return np.asarray(flow.calc(one, two, None), dtype=np.float32)
 
 
@@ -135,7 +135,8 @@ def _sample(flow: Flow, points: FloatArray) -> FloatArray:
     sheet = np.zeros((-(-len(rows) // width) * width, 2), dtype=np.float32)
     sheet[: len(rows)] = rows
     sheet = sheet.reshape(-1, width, 2)
-    sampled = cv2.remap(flow, sheet, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    nothing = np.zeros(0, dtype=np.float32)
+    sampled = cv2.remap(flow, sheet, nothing, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return sampled.reshape(-1, 2)[: len(rows)].astype(np.float64)
 
 
@@ -163,9 +164,8 @@ def _votes(source: Segments, target: Segments, forward: Flow, backward: Flow, op
     rows = np.flatnonzero(ok)
     # The nearest few pieces: where two edges run side by side, only the one that runs the same way gets the vote.
     reach = np.hypot(options.max_distance, 1.0)
-    num_near = min(4, len(ends_at))
-    near = tree.query(arrived[rows], k=np.arange(1, num_near + 1), distance_upper_bound=reach)[1]
-    near = np.asarray(near).reshape(len(rows), num_near)
+    num_near = max(2, min(4, len(ends_at)))  # `target` has at least two pieces
+    near = np.asarray(tree.query(arrived[rows], k=num_near, distance_upper_bound=reach)[1]).reshape(len(rows), num_near)
     found = near < len(ends_at)
     candidate = target_of[np.where(found, near, 0)]
     line = target.line[candidate]

@@ -50,7 +50,7 @@ def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
             image = image[..., 0]
         else:
             code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
-            image = cv2.cvtColor(np.ascontiguousarray(image), code)
+            image = cv2.cvtColor(np.ascontiguousarray(image, dtype=np.uint8), code)
     return np.ascontiguousarray(image, dtype=np.uint8)
 
 

@@ -35,6 +35,8 @@ from groma.pipelines._line_views import LineViews
 GATE = 11.6
 #: Hypotheses per segment that are fused and compared.
 NUM_SEEDS = 3
+#: The depth range holds for the middle of a segment; its ends may leave it by this factor.
+END_MARGIN = 2.0
 #: Bins of the angle about the baseline.
 NUM_BINS = 2048
 # Why a candidate was refused; the furthest any candidate of a segment got is reported.
@@ -76,7 +78,7 @@ def _propose(ray, across, sigma, q_low, q_high, line, ends, sigma_j, M, a, direc
         b1 = M[1, 0] * ray[k, 0] + M[1, 1] * ray[k, 1] + M[1, 2] * ray[k, 2]
         b2 = M[2, 0] * ray[k, 0] + M[2, 1] * ray[k, 1] + M[2, 2] * ray[k, 2]
         q = -(line[0] * b0 + line[1] * b1 + line[2] * b2) / gain
-        if not (q >= q_low and q <= q_high):
+        if not (q >= q_low / END_MARGIN and q <= q_high * END_MARGIN):
             return OUT_OF_BEAM
         z = q * a[2] + b2
         if z <= 0.05:
@@ -89,6 +91,9 @@ def _propose(ray, across, sigma, q_low, q_high, line, ends, sigma_j, M, a, direc
         else:
             t2, g2, h2 = t, gain / z, shift / z
     if directed and t2 <= t1:
+        return OUT_OF_BEAM
+    middle = 0.5 * (out[0] + out[1])
+    if not (middle >= q_low and middle <= q_high):
         return OUT_OF_BEAM
     low, high = min(t1, t2), max(t1, t2)
     overlap = min(high, 1.0) - max(low, 0.0)

@@ -197,7 +197,7 @@ def _solve4(H, g, damping, x):
             for k in range(n):
                 s -= L[m, k] * L[n, k]
             if m == n:
-                if not s > 1e-14 * H[m, m]:
+                if not s > 1e-12 * H[m, m]:
                     return False
                 L[m, m] = math.sqrt(s)
             else:
@@ -232,13 +232,29 @@ def _across_basis(X, U):
     U[1, 0], U[1, 1], U[1, 2] = d1 * u2 - d2 * u1, d2 * u0 - d0 * u2, d0 * u1 - d1 * u0
 
 
+@kernel
+def _largest_deviation(H, g, x):
+    """Root of the largest diagonal entry of the inverse of H; infinite where it has none."""
+    worst = 0.0
+    for a in range(4):
+        g[:] = 0.0
+        g[a] = 1.0
+        if not _solve4(H, g, 0.0, x):
+            return np.inf
+        worst = max(worst, x[a])
+    return math.sqrt(worst)
+
+
 @loop
-def _refine(camera, image, ends, sigma, pointers, rows, active, X, squared, uncertainty):
-    """Refine the lines through X (L, 2, 3) in place; squared distances over sigma of each observation (M,), and the
-    largest standard deviation of the end points across the line (L,)."""  # noqa: D205
+def _refine(camera, image, ends, sigma, pointers, rows, active, X, squared, uncertainty, unchecked):
+    """Refine the lines through X (L, 2, 3) in place.
+
+    Also the squared distances over sigma of each observation (M,), the largest standard deviation of the end points
+    across the line (L,), and the same when the image that tells most is left out.
+    """
     r, J, U = np.zeros(2), np.zeros((2, 4)), np.zeros((2, 3))
     H, g, step, inverse = np.zeros((4, 4)), np.zeros(4), np.zeros(4), np.zeros(4)
-    trial = np.zeros((2, 3))
+    trial, without = np.zeros((2, 3)), np.zeros((4, 4))
     for n in range(len(pointers) - 1):
         damping = 1e-4
         cost = np.inf
@@ -291,15 +307,22 @@ def _refine(camera, image, ends, sigma, pointers, rows, active, X, squared, unce
                 for a in range(4):
                     for b in range(a + 1):
                         H[a, b] += J[0, a] * J[0, b] + J[1, a] * J[1, b]
-        worst = 0.0
-        for a in range(4):
-            g[:] = 0.0
-            g[a] = 1.0
-            if _solve4(H, g, 0.0, inverse):
-                worst = max(worst, inverse[a])
-            else:
-                worst = np.inf
-        uncertainty[n] = math.sqrt(worst)
+        uncertainty[n] = _largest_deviation(H, g, inverse)
+        unchecked[n] = 0.0
+        for m in range(pointers[n], pointers[n + 1]):
+            if not active[m] or (m > pointers[n] and active[m - 1] and image[rows[m]] == image[rows[m - 1]]):
+                continue
+            without[:, :] = H
+            for k in range(m, pointers[n + 1]):
+                s = rows[k]
+                if image[s] != image[rows[m]]:
+                    break
+                if active[k]:
+                    _residuals(camera[image[s]], ends[s], sigma[s], X[n], U, r, J)
+                    for a in range(4):
+                        for b in range(a + 1):
+                            without[a, b] -= J[0, a] * J[0, b] + J[1, a] * J[1, b]
+            unchecked[n] = max(unchecked[n], _largest_deviation(without, g, inverse))
 
 
 # ------------------------------------------------------------------------------------------------------ Trim, recover
@@ -411,6 +434,10 @@ class Tracks:
         self.X = np.zeros((0, 2, 3))
         #: (L,) largest standard deviation of the end points across the line.
         self.uncertainty = np.zeros(0)
+        #: (L,) the same without the image that tells most: what a wrong match in one image could hide behind.
+        self.unchecked = np.zeros(0)
+        #: (S,) squared distances over sigma of each observation to its line.
+        self.squared = np.full(len(views.image_idx), np.nan)
         #: (S,) segments that were observations and failed the test.
         self.dropped = np.zeros(len(views.image_idx), bool)
 
@@ -422,7 +449,7 @@ class Tracks:
 
     def _table(self) -> tuple[IntArray, IntArray]:
         rows = np.flatnonzero(self.line_of >= 0)
-        rows = rows[np.argsort(self.line_of[rows], kind="stable")]
+        rows = rows[np.argsort(self.line_of[rows], kind="stable")]  # rows are sorted by image, and stay so per line
         return rows, np.searchsorted(self.line_of[rows], np.arange(len(self.X) + 1))
 
     def num_images(self) -> IntArray:
@@ -436,11 +463,11 @@ class Tracks:
         views = self.views
         rows, pointers = self._table()
         active, squared, front = np.ones(len(rows), bool), np.zeros(len(rows)), np.zeros(len(rows), bool)
-        self.uncertainty = np.zeros(len(self.X))
+        self.uncertainty, self.unchecked = np.zeros(len(self.X)), np.zeros(len(self.X))
         for k in range(rounds):
             _refine(
                 views.camera, views.image_idx, views.ends, views.sigma, pointers, rows, active, self.X, squared,
-                self.uncertainty,
+                self.uncertainty, self.unchecked,
             )  # fmt: skip
             _trim(views.center, views.image_idx, views.ray, pointers, rows, active, self.X, front)
             fits = (squared < GATE) & front
@@ -449,7 +476,6 @@ class Tracks:
             if (fits == active).all():
                 break
             active = fits
-        self.squared = np.full(len(self.line_of), np.nan)
         self.squared[rows] = squared
         self.dropped[rows[~active]] = True
         self.line_of[rows[~active]] = -1
@@ -460,7 +486,8 @@ class Tracks:
         member = self.line_of >= 0
         after = np.where(member, new[self.line_of], -1)
         freed = np.flatnonzero(member & (after < 0))
-        self.line_of, self.X, self.uncertainty = after, self.X[wanted], self.uncertainty[wanted]
+        self.line_of, self.X = after, self.X[wanted]
+        self.uncertainty, self.unchecked = self.uncertainty[wanted], self.unchecked[wanted]
         return freed
 
     def recover(self, neighbors: list[IntArray], free: BoolArray, directed: bool) -> tuple[int, int]:

@@ -64,7 +64,7 @@ class AdjustOptions:
     line_chart: str = "cartesian"
     #: ``auto``, ``free`` or ``first_camera``: see :class:`groma.pipelines._assemble.AssemblyOptions`.
     gauge: str = "auto"
-    #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss, else 0.
+    #: Steps of each landmark on its own after every joint step; None: 2 with lines or under a robust loss, else 0.
     landmark_steps: int | None = None
     threads: int | None = None
 
@@ -182,7 +182,7 @@ def adjust(
             max_iterations=options.max_iterations - spent,
             function_tolerance=options.function_tolerance if last else STAGE_TOLERANCE,
             linear_solver=options.linear_solver,
-            landmark_steps=_landmark_steps(options, loss),
+            landmark_steps=_landmark_steps(options, loss, problem),
             threads=options.threads,
         )
 
@@ -227,10 +227,11 @@ def _stages(scene: Scene, options: AdjustOptions) -> list[Loss]:
     return [make_loss(options.loss, 1.0 if options.loss_scale is None else options.loss_scale)]
 
 
-def _landmark_steps(options: AdjustOptions, loss: Loss) -> int:
+def _landmark_steps(options: AdjustOptions, loss: Loss, problem: Problem) -> int:
+    """Lines, and robust losses, leave a long tail of small joint steps that a few cheap steps of their own cut short."""
     if options.landmark_steps is not None:
         return options.landmark_steps
-    return 0 if isinstance(loss, Trivial) else 2
+    return 0 if isinstance(loss, Trivial) and "lines" not in problem.variables else 2
 
 
 def _with_loss(factor: Factor, loss: Loss) -> Factor:

@@ -27,7 +27,7 @@ from groma.pipelines._line_proposals import WEAK, Choice, Proposer, choose
 from groma.pipelines._line_tracks import Tracks, link
 from groma.pipelines._line_views import LineViews, build_views
 from groma.pipelines._neighbors import covisible_neighbors
-from groma.scene import LineObservations, Lines, Scene
+from groma.scene import LineObservations, Lines, Relations, Scene
 
 if TYPE_CHECKING:
     from groma.frontend.matching import LineMatches
@@ -61,7 +61,7 @@ class Fate(IntEnum):
     OUTLIER = 9
     #: Its line is seen in fewer than ``min_images`` images.
     FEW_IMAGES = 10
-    #: Its line is too uncertain for its distance.
+    #: Its line is too uncertain for its distance, or would be without one of its images.
     UNCERTAIN = 11
 
 
@@ -111,7 +111,7 @@ class MapLinesOptions:
     #: Error of poses and cameras in the image, added in quadrature to the segments' sigma; pixels.
     noise: float = 0.3
     #: The depth range of the points around a segment is widened by this factor at both sides.
-    depth_margin: float = 1.3
+    depth_margin: float = 2.0
     #: Segments are directed, for example dark on the left: the same line then runs the same way in all images.
     directed: bool = True
     #: Share of the shorter of two segments that must overlap along the line.
@@ -120,6 +120,8 @@ class MapLinesOptions:
     max_relative_sigma: float = 0.03
     #: Largest standard deviation of a line's end points over their distance from the cameras.
     max_uncertainty: float = 0.02
+    #: The same when any one image of the line is left out: beyond it, a wrong match in that image would go unnoticed.
+    max_unchecked: float = 0.03
     #: A place is ambiguous if another one has more than this share of its support.
     max_rival: float = 0.95
     #: Use lines through known points as further proposals.
@@ -171,15 +173,10 @@ class LineMap:
         for i in np.unique(self.image_idx):
             at = self.image_idx == i
             measured[at] = segments[i].ends[self.segment_idx[at]]
-        relations = scene.relations
-        if len(scene.lines):
-            empty = np.zeros((0, 2), np.int64)
-            relations = type(relations)(point_on_plane=relations.point_on_plane) if len(relations) else relations
-            del empty
         return scene.replace(
             lines=Lines.through(self.segments),
             line_observations=LineObservations(self.image_idx, self.line_idx, measured),
-            relations=relations,
+            relations=Relations(point_on_plane=scene.relations.point_on_plane),
         )
 
 
@@ -357,8 +354,11 @@ def _build_tracks(
     fate[linked & (tracks.line_of < 0)] = Fate.OUTLIER
     few = tracks.keep(tracks.num_images() >= options.min_images)
     fate[few] = Fate.FEW_IMAGES
-    uncertain = tracks.keep(tracks.uncertainty <= options.max_uncertainty * _distance(tracks))
-    fate[uncertain] = Fate.UNCERTAIN
+    distance = _distance(tracks)
+    sure = tracks.uncertainty <= options.max_uncertainty * distance
+    if options.min_images > 2:
+        sure &= tracks.unchecked <= options.max_unchecked * distance
+    fate[tracks.keep(sure)] = Fate.UNCERTAIN
     member = tracks.line_of >= 0
     fate[member] = np.where(own[member], Fate.MAPPED, Fate.RECOVERED)
     return tracks

@@ -144,6 +144,7 @@ class NormalEquations:
         self._g = [[np.zeros(c.count * c.width) for c in layout.kept] for _ in self.shares]
         self.num_degenerate = [0] * len(layout.factors)
         self.costs = [0.0] * len(layout.factors)
+        self.num_hidden = 0
 
     # ------------------------------------------------------------------------------------------------ evaluation
 
@@ -156,42 +157,44 @@ class NormalEquations:
         ]
 
     def cost(self, inputs: list[tuple], landmark_costs: list[FloatArray] | None = None) -> float:
-        """Return the total cost; also store the cost of each factor group in ``costs``.
+        """Return the total cost; also store ``costs`` by factor group, and ``num_hidden``, the degenerate factors.
 
         With ``landmark_costs`` (one array of zeros per eliminated group) the cost of each landmark is added there.
         """
 
-        def work(share: int) -> list[float]:
-            sums = [0.0] * len(self.layout.factors)
+        def work(share: int) -> tuple[list[float], int]:
+            sums, hidden = [0.0] * len(self.layout.factors), 0
             for chunk in self.shares[share]:
                 for f, begin, end in chunk.factors:
                     if begin == end:
                         continue
-                    value, rho = self._chunk_cost(share, f, inputs[f], begin, end)
+                    value, rho, degenerate = self._chunk_cost(share, f, inputs[f], begin, end)
                     sums[f] += value
+                    hidden += degenerate
                     if landmark_costs is not None and chunk.eliminated is not None:
                         landmark = self.layout.factors[f].landmark[begin:end] - chunk.begin
                         landmark_costs[chunk.eliminated][chunk.begin : chunk.end] += 0.5 * np.bincount(
                             landmark, weights=rho, minlength=chunk.end - chunk.begin
                         )
-            return sums
+            return sums, hidden
 
         parts = self.workers.map(work, len(self.shares))
-        self.costs = [0.5 * sum(part[f] for part in parts) for f in range(len(self.layout.factors))]
+        self.costs = [0.5 * sum(part[0][f] for part in parts) for f in range(len(self.layout.factors))]
+        self.num_hidden = sum(part[1] for part in parts)
         return float(sum(self.costs))
 
-    def _chunk_cost(self, share: int, f: int, inputs: tuple, begin: int, end: int) -> tuple[float, FloatArray]:
+    def _chunk_cost(self, share: int, f: int, inputs: tuple, begin: int, end: int) -> tuple[float, FloatArray, int]:
         layout, noise = self.layout.factors[f], self._noise[f]
         n, m = end - begin, layout.factor.residual_size
         flat = self._record(share, f)
         out = flat[: n * m].reshape(n, m)
         rho = flat[n * m : n * m + n]
-        layout.factor.residuals(inputs, begin, end, out)
+        degenerate = layout.factor.residuals(inputs, begin, end, out)
         if noise.matrices is not None:
             value = cost_whitened(out, begin, noise.matrices, noise.code, noise.first, noise.second, rho)
         else:
             value = cost_scaled(out, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, rho)
-        return value, rho
+        return value, rho, degenerate
 
     def _record(self, share: int, f: int) -> FloatArray:
         scratch = self._scratch[share]

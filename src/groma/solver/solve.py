@@ -121,6 +121,8 @@ def _solve_jointly(
     if not np.isfinite(cost):
         report.termination = Termination.NOT_FINITE
         return states
+    hidden = equations.num_hidden
+    share = cost / max(1, sum(len(layout_.factor) for layout_ in layout.factors))
     strategy.linearize(states, inputs)
     termination = None
     while termination is None:
@@ -134,7 +136,8 @@ def _solve_jointly(
         report.iterations += 1
         damping = strategy.damping
         trial = _try_step(layout, equations, strategy, watch, states, cost)
-        accepted = trial is not None and trial.cost < cost
+        # a factor that became degenerate counts nothing; without its share put back, steps would hide what they spoil
+        accepted = trial is not None and trial.cost + max(0, trial.hidden - hidden) * share < cost
         if trial is not None and accepted:
             if trial.gain_ratio > STRETCH_GAIN_RATIO:
                 with watch("cost"):
@@ -143,7 +146,7 @@ def _solve_jointly(
                 with watch("backsubstitute"):
                     trial = refiner.refine(equations, trial)
             decrease, old_cost = cost - trial.cost, cost
-            states, cost, inputs = trial.states, trial.cost, trial.inputs
+            states, cost, inputs, hidden = trial.states, trial.cost, trial.inputs, equations.num_hidden
             strategy.accept(trial.gain_ratio)
             if decrease <= options.function_tolerance * old_cost:
                 termination = Termination.COST_CONVERGED
@@ -185,6 +188,8 @@ class _Trial:
     #: Actual over predicted decrease of the cost.
     gain_ratio: float
     length: float
+    #: Degenerate factors at the new states.
+    hidden: int
 
 
 def _try_step(
@@ -206,7 +211,7 @@ def _try_step(
         inputs = equations.prepare(moved)
         new_cost = equations.cost(inputs)
     ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
-    return _Trial(step, moved, inputs, new_cost, float(ratio), step.norm())
+    return _Trial(step, moved, inputs, new_cost, float(ratio), step.norm(), equations.num_hidden)
 
 
 def _stretched(layout: Layout, equations: NormalEquations, states: States, trial: _Trial) -> _Trial:
