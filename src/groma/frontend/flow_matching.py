@@ -53,7 +53,8 @@ def dense_flow(image_1: npt.NDArray[np.generic], image_2: npt.NDArray[np.generic
     if min(one.shape) < SMALLEST_IMAGE:
         return np.zeros((*one.shape, 2), dtype=np.float32)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return np.asarray(flow.calc(one, two, None), dtype=np.float32)
+    found = flow.calc(one, two, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return np.asarray(found, dtype=np.float32)
 
 
 def match_by_flow(

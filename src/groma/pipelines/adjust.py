@@ -228,7 +228,7 @@ def _stages(scene: Scene, options: AdjustOptions) -> list[Loss]:
 
 
 def _landmark_steps(options: AdjustOptions, loss: Loss, problem: Problem) -> int:
-    """Lines, and robust losses, leave a long tail of small joint steps that a few cheap steps of their own cut short."""
+    """Lines and robust losses leave a long tail of small joint steps; a few cheap steps of landmarks cut it short."""
     if options.landmark_steps is not None:
         return options.landmark_steps
     return 0 if isinstance(loss, Trivial) and "lines" not in problem.variables else 2
