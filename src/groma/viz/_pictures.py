@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Photographs for pictures: found by name, read small, written as data addresses."""
+
+from __future__ import annotations
+
+import base64
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+Picture = npt.NDArray[np.uint8]
+#: A folder of images, or image files by the names that the scene gives them.
+ImageFiles = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
+
+
+def image_file(images: ImageFiles | None, name: str) -> Path | None:
+    """Return the file of an image, or None where there is none."""
+    if images is None:
+        return None
+    if isinstance(images, Mapping):
+        path = Path(images[name]) if name in images else None
+    else:
+        path = Path(images) / name
+    return path if path is not None and path.is_file() else None
+
+
+def read_picture(path: str | os.PathLike[str], max_size: int | None = None) -> Picture | None:
+    """Return an image file as red, green, blue, at most ``max_size`` pixels on its longer side; None if unreadable.
+
+    A note of the camera on how it was held is ignored: pixel coordinates count from the corner of the stored image.
+    """
+    import cv2
+
+    picture = cv2.imread(os.fspath(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None:
+        return None
+    scale = 1.0 if max_size is None else max_size / max(picture.shape[:2])
+    if scale < 1.0:
+        size = [max(1, round(scale * side)) for side in picture.shape[1::-1]]
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
+
+
+def data_address(picture: Picture, quality: int = 78) -> str:
+    """Return a picture as the address of a JPEG that is its own content."""
+    import cv2
+
+    encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
