@@ -480,6 +480,21 @@ class Tracks:
         self.dropped[rows[~active]] = True
         self.line_of[rows[~active]] = -1
 
+    def noise_scale(self) -> float:
+        """By how much the sigmas are too large or too small, from what is left of the lines' own residuals.
+
+        An observation's two squared distances over sigma have 2 - 4/n degrees of freedom where its line has n
+        observations; the median of chi-square with k degrees is close to k (1 - 2/(9k))^3.
+        """
+        rows = np.flatnonzero(self.line_of >= 0)
+        number = np.bincount(self.line_of[rows], minlength=len(self.X))[self.line_of[rows]]
+        rows, number = rows[number >= 4], number[number >= 4]
+        if len(rows) < 30:
+            return 1.0
+        freedom = 2.0 - 4.0 / number
+        expected = freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3
+        return float(np.sqrt(np.median(self.squared[rows] / expected)))
+
     def keep(self, wanted: BoolArray) -> IntArray:
         """Keep some lines; return the segments set free."""
         new = np.where(wanted, np.cumsum(wanted) - 1, -1)

@@ -92,6 +92,9 @@ class AdjustReport:
     solve: SolveReport
     #: Sentences for the user.
     warnings: tuple[str, ...]
+    #: One entry per loss that was solved with, in order: loss, initial_cost, first_step. Costs of different stages
+    #: cannot be compared.
+    stages: tuple[dict[str, Any], ...] = ()
 
     @property
     def termination(self) -> Termination:
@@ -100,8 +103,12 @@ class AdjustReport:
 
     @property
     def history(self) -> list[dict[str, Any]]:
-        """One entry per step tried: iteration, cost, accepted, damping, step_norm, seconds and more."""
-        return [asdict(record) for record in self.solve.history]
+        """One entry per step tried: iteration, stage, cost, accepted, damping, step_norm, seconds and more."""
+        firsts = [stage["first_step"] for stage in self.stages]
+        return [
+            {**asdict(record), "stage": sum(first <= record.iteration for first in firsts)}
+            for record in self.solve.history
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain numbers and words, for JSON."""
@@ -127,6 +134,7 @@ class AdjustReport:
             "threads": solve.threads,
             "seconds": dict(solve.seconds),
             "rmse_px": self.rmse_px,
+            "stages": list(self.stages),
             "num_degenerate": solve.num_degenerate,
             "num_underdetermined_landmarks": solve.num_underdetermined_landmarks,
             "history": self.history,
@@ -208,6 +216,7 @@ def adjust(
         ),
         rmse_px={kind: {"before": before[kind], "after": after[kind]} for kind in before},
         solve=report,
+        stages=_stage_entries(stages, reports),
         warnings=(*assembly.notes, *report.warnings),
     )
     return AdjustResult(disassemble(scene, problem), outcome)
@@ -236,6 +245,14 @@ def _landmark_steps(options: AdjustOptions, loss: Loss, problem: Problem) -> int
 
 def _with_loss(factor: Factor, loss: Loss) -> Factor:
     return replace(factor, loss=loss)
+
+
+def _stage_entries(stages: list[Loss], reports: list[SolveReport]) -> tuple[dict[str, Any], ...]:
+    entries, first_step = [], 1
+    for loss, report in zip(stages, reports, strict=False):
+        entries.append({"loss": loss.name, "initial_cost": report.initial_cost, "first_step": first_step})
+        first_step += report.iterations
+    return tuple(entries)
 
 
 def _combined(reports: list[SolveReport], start: Problem, stages: list[Loss]) -> SolveReport:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
@@ -110,6 +110,8 @@ class MapLinesOptions:
     min_images: int = 3
     #: Error of poses and cameras in the image, added in quadrature to the segments' sigma; pixels.
     noise: float = 0.3
+    #: The sigmas are scaled to what the first lines show, within these bounds; (1, 1) keeps them.
+    noise_scale: tuple[float, float] = (0.5, 2.0)
     #: The depth range of the points around a segment is widened by this factor at both sides.
     depth_margin: float = 2.0
     #: Segments are directed, for example dark on the left: the same line then runs the same way in all images.
@@ -346,6 +348,11 @@ def _build_tracks(
         tracks.add(members, representative, points)
         tracks.refine()
         tracks.keep(tracks.num_images() >= 2)
+        if attempt == 0:
+            scale = float(np.clip(tracks.noise_scale(), *options.noise_scale))
+            views = tracks.views = replace(views, sigma=scale * views.sigma)
+            tracks.refine()
+            tracks.keep(tracks.num_images() >= 2)
         for _ in range(2):
             tracks.recover(neighbors, views.usable, options.directed)
             tracks.refine()

@@ -89,7 +89,8 @@ def convergence(history: Sequence[Any]) -> str:
     Parameters
     ----------
     history : sequence
-        Mappings or objects with ``iteration``, ``cost``, ``accepted``.
+        Mappings or objects with ``iteration``, ``cost``, ``accepted`` and perhaps ``stage``; costs of different
+        stages belong to different losses and are not joined.
     """
     rows = [entry(row) for row in history]
     steps = [
@@ -118,8 +119,10 @@ def convergence(history: Sequence[Any]) -> str:
         body.append(_line(_LEFT, y, WIDTH - _RIGHT, y, "grid") + _text(_LEFT - 6, y + 4, _number(tick), "end"))
     stride = max(1, math.ceil((final - first) / 10))
     body += [_text(place(i, 10**low)[0], bottom + 16, str(i)) for i in range(first, final + 1, stride)]
-    taken = [place(i, cost) for i, cost, accepted in steps if accepted]
-    body.append(f'<path class="after" d="M{" L".join(f"{x:.1f} {y:.1f}" for x, y in taken)}"/>' if taken else "")
+    for stage in sorted({row.get("stage", 1) for row in rows}):
+        mine = {int(row["iteration"]) for row in rows if row.get("stage", 1) == stage}
+        taken = [place(i, cost) for i, cost, accepted in steps if accepted and i in mine]
+        body.append(f'<path class="after" d="M{" L".join(f"{x:.1f} {y:.1f}" for x, y in taken)}"/>' if taken else "")
     for iteration, cost, accepted in steps:
         x, y = place(iteration, cost)
         name = "after" if accepted else "rejected"

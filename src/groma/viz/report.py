@@ -191,7 +191,9 @@ def _footer() -> str:
 
 def _with_start(report: Report) -> list[Any]:
     """Return the history with the cost at the start as step 0."""
-    start = {"iteration": 0, "cost": report.to_dict()["initial_cost"], "accepted": True}
+    numbers = report.to_dict()
+    stages = numbers.get("stages") or [numbers]
+    start = {"iteration": 0, "cost": stages[0]["initial_cost"], "accepted": True, "stage": 1}
     return [start, *(step for step in report.history if _charts.entry(step)["iteration"] > 0)]
 
 
