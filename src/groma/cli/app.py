@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 import groma
-from groma.cli import adjust, convert, demo, evaluate, map, report, selfcheck, synth
+from groma.cli import adjust, convert, demo, evaluate, map, report, selfcheck, synth, view
 from groma.cli._guard import guard
 
 app = typer.Typer(
@@ -23,6 +23,7 @@ app.command("map")(guard(map.map_))
 app.command("adjust")(guard(adjust.adjust))
 app.command("convert")(guard(convert.convert))
 app.command("report")(guard(report.report))
+app.command("view")(guard(view.view))
 app.command("synth")(guard(synth.synth))
 app.command("selfcheck")(guard(selfcheck.selfcheck))
 

@@ -64,8 +64,8 @@ class Proposals:
 def _propose(ray, across, sigma, q_low, q_high, line, ends, sigma_j, M, a, directed, min_overlap, max_relative, out):
     """One pair of segments: fill out = q1 q2 c11 c12 c22; return how far it got."""
     gain = line[0] * a[0] + line[1] * a[1] + line[2] * a[2]
-    if gain == 0.0:
-        return WEAK
+    if not abs(gain) * (q_high - q_low) > 3.0 * sigma_j:
+        return WEAK  # the whole range of depths lies within the noise
     ux, uy = ends[2] - ends[0], ends[3] - ends[1]
     length2 = ux * ux + uy * uy
     n0 = M[0, 0] * across[0] + M[0, 1] * across[1] + M[0, 2] * across[2]
@@ -120,13 +120,13 @@ def _propose_beam(
     for i in range(len(rows_i)):
         s = rows_i[i]
         low, high = beam_i[i, 0], beam_i[i, 1]
-        bin_low, bin_high = int(math.floor(low / size)), int(math.floor(high / size))
+        bin_low, bin_high = int(np.floor(low / size)), int(np.floor(high / size))
         for k in range(bin_low, min(bin_high, bin_low + NUM_BINS - 1) + 1):
             b = k % NUM_BINS
             for e in range(bin_pointers[b], bin_pointers[b + 1]):
                 j = bin_members[e]
                 # A pair that shares several bins counts in the first of them.
-                if k != bin_low and int(math.floor(beam_j[j, 0] / size)) % NUM_BINS != b:
+                if k != bin_low and int(np.floor(beam_j[j, 0] / size)) % NUM_BINS != b:
                     continue
                 away = 0.5 * (low + high) - 0.5 * (beam_j[j, 0] + beam_j[j, 1])
                 away -= 2.0 * math.pi * math.floor(away / (2.0 * math.pi) + 0.5)
@@ -141,7 +141,9 @@ def _propose_beam(
                 if got == PROPOSED:
                     if count < len(out):
                         out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor, r
-                        out[count, :5], out[count, 5] = work, 1.0
+                        out[count, 5] = 1.0
+                        for c in range(5):
+                            out[count, c] = work[c]
                     count += 1
     return count
 
@@ -166,7 +168,9 @@ def _propose_pairs(
         if got == PROPOSED:
             if count < len(out):
                 out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor, r
-                out[count, :5], out[count, 5] = work, score[k]
+                out[count, 5] = score[k]
+                for c in range(5):
+                    out[count, c] = work[c]
             count += 1
     return count
 
@@ -232,7 +236,7 @@ def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate
             p = order[seed]
             q1, q2, c11, c12, c22 = values[p, 0], values[p, 1], values[p, 2], values[p, 3], values[p, 4]
             number, points, value = 0, 0, 0.0
-            for step in range(3):
+            for _ in range(3):  # fuse, compare again
                 nearest[:] = gate
                 chosen[:] = -1
                 for k in range(begin, end):
@@ -289,7 +293,7 @@ def _bin_beams(beams, pointers, members):
     size = 2.0 * math.pi / NUM_BINS
     fill = np.zeros(NUM_BINS, np.int64)
     for j in range(len(beams)):
-        low, high = int(math.floor(beams[j, 0] / size)), int(math.floor(beams[j, 1] / size))
+        low, high = int(np.floor(beams[j, 0] / size)), int(np.floor(beams[j, 1] / size))
         for k in range(low, min(high, low + NUM_BINS - 1) + 1):
             b = k % NUM_BINS
             if len(members):

@@ -275,7 +275,7 @@ def _refine(camera, image, ends, sigma, pointers, rows, active, X, squared, unce
                     g[a] -= weight * (J[0, a] * r[0] + J[1, a] * r[1])
                     for b in range(a + 1):
                         H[a, b] += weight * (J[0, a] * J[0, b] + J[1, a] * J[1, b])
-            done = False
+            done = better = False
             for _ in range(8):
                 better = False
                 if _solve4(H, g, damping, step):
@@ -291,7 +291,8 @@ def _refine(camera, image, ends, sigma, pointers, rows, active, X, squared, unce
                     better = fresh <= cost
                     done = fresh >= cost * (1.0 - 1e-9) - 1e-12
                 if better:
-                    X[n] = trial
+                    for c in range(3):
+                        X[n, 0, c], X[n, 1, c] = trial[0, c], trial[1, c]
                     damping = max(damping * 0.1, 1e-12)
                     break
                 damping *= 10.0
@@ -312,7 +313,9 @@ def _refine(camera, image, ends, sigma, pointers, rows, active, X, squared, unce
         for m in range(pointers[n], pointers[n + 1]):
             if not active[m] or (m > pointers[n] and active[m - 1] and image[rows[m]] == image[rows[m - 1]]):
                 continue
-            without[:, :] = H
+            for a in range(4):
+                for b in range(a + 1):
+                    without[a, b] = H[a, b]
             for k in range(m, pointers[n + 1]):
                 s = rows[k]
                 if image[s] != image[rows[m]]:
@@ -484,7 +487,8 @@ class Tracks:
         """By how much the sigmas are too large or too small, from what is left of the lines' own residuals.
 
         An observation's two squared distances over sigma have 2 - 4/n degrees of freedom where its line has n
-        observations; the median of chi-square with k degrees is close to k (1 - 2/(9k))^3.
+        observations. The upper quartile is compared, by the formula of Wilson and Hilferty: detections have heavier
+        tails than a normal law, and the gates that follow should keep them.
         """
         rows = np.flatnonzero(self.line_of >= 0)
         number = np.bincount(self.line_of[rows], minlength=len(self.X))[self.line_of[rows]]
@@ -492,15 +496,15 @@ class Tracks:
         if len(rows) < 30:
             return 1.0
         freedom = 2.0 - 4.0 / number
-        expected = freedom * (1.0 - 2.0 / (9.0 * freedom)) ** 3
-        return float(np.sqrt(np.median(self.squared[rows] / expected)))
+        spread = 2.0 / (9.0 * freedom)
+        expected = freedom * (1.0 - spread + 0.6745 * np.sqrt(spread)) ** 3
+        return float(np.sqrt(np.quantile(self.squared[rows] / expected, 0.75)))
 
     def keep(self, wanted: BoolArray) -> IntArray:
         """Keep some lines; return the segments set free."""
-        new = np.where(wanted, np.cumsum(wanted) - 1, -1)
-        member = self.line_of >= 0
-        after = np.where(member, new[self.line_of], -1)
-        freed = np.flatnonzero(member & (after < 0))
+        new = np.append(np.where(wanted, np.cumsum(wanted) - 1, -1), -1)  # the last one stands for no line
+        after = new[self.line_of]
+        freed = np.flatnonzero((self.line_of >= 0) & (after < 0))
         self.line_of, self.X = after, self.X[wanted]
         self.uncertainty, self.unchecked = self.uncertainty[wanted], self.unchecked[wanted]
         return freed
@@ -539,7 +543,7 @@ class Tracks:
     def direction(self) -> FloatArray:
         """(L,) +1 or -1: whether most observations run from the first end point to the second in the image."""
         views = self.views
-        rows, pointers = self._table()
+        rows, _ = self._table()
         P, X = views.camera[views.image_idx[rows]], self.X[self.line_of[rows]]
         x = np.einsum("mij,mkj->mki", P[:, :, :3], X) + P[:, None, :, 3]
         x = x[..., :2] / x[..., 2:]
@@ -549,7 +553,7 @@ class Tracks:
         return np.sign(votes)
 
     def _merge(self, hit: IntArray) -> int:
-        """Join line B to line A where A explains B's segments in most of B's images; the fuller line gives the start."""
+        """Join line B to line A where A explains B's segments in most of B's images; A gives the start."""
         owner = self.line_of[hit[:, 1]]
         pair = (owner >= 0) & (owner != hit[:, 0])
         triples = np.column_stack([hit[pair, 0], owner[pair], self.views.image_idx[hit[pair, 1]]])
@@ -578,7 +582,7 @@ def _images_near_lines(
     """Lines to look for in each image: those seen in it or in a neighbour."""
     num_images = len(neighbors)
     rows = np.flatnonzero(line_of >= 0)
-    seen = [np.empty(0, np.int64)] * num_images
+    seen: list[IntArray] = [np.empty(0, np.int64)] * num_images
     order = rows[np.argsort(image_idx[rows], kind="stable")]
     bounds = np.searchsorted(image_idx[order], np.arange(num_images + 1))
     for i in range(num_images):

@@ -100,8 +100,8 @@ _REMEDIES = {
 class MapLinesOptions:
     """How to map lines."""
 
-    #: Shortest segment used, pixels.
-    min_length: float = 20.0
+    #: Shortest segment used, pixels; detectors have a limit of their own.
+    min_length: float = 12.0
     #: Neighbours per image.
     num_neighbors: int = 10
     #: Fewest shared points of neighbours.
@@ -111,7 +111,7 @@ class MapLinesOptions:
     #: Error of poses and cameras in the image, added in quadrature to the segments' sigma; pixels.
     noise: float = 0.3
     #: The sigmas are scaled to what the first lines show, within these bounds; (1, 1) keeps them.
-    noise_scale: tuple[float, float] = (0.5, 2.0)
+    noise_scale: tuple[float, float] = (0.33, 2.0)
     #: The depth range of the points around a segment is widened by this factor at both sides.
     depth_margin: float = 2.0
     #: Segments are directed, for example dark on the left: the same line then runs the same way in all images.
@@ -245,8 +245,7 @@ def map_lines(
     lap("proposals")
     tracks = _build_tracks(views, neighbors, places, options, fate, report)
     lap("tracks")
-    line_map = _result(views, tracks, neighbors, fate, seconds)
-    return line_map
+    return _result(tracks, neighbors, fate, seconds)
 
 
 def _choose_places(
@@ -276,6 +275,8 @@ def _choose_places(
         if len(others) == 0:
             continue
         given = [_given(matches, i, int(j)) for j in others]
+        for j, pairs in zip(others, given, strict=True):
+            _check_pairs(pairs, i, int(j), views)
         proposals = proposer.propose(i, others, given, near_points[i])
         # A line of min_images images is this segment and min_images - 1 neighbours; two of them must agree.
         chosen = choose(proposals, rows.stop - rows.start, len(others), max(1, min(2, options.min_images - 1)))
@@ -307,6 +308,17 @@ def _given(
     if found is None:
         return np.empty((0, 2), np.int64), np.empty(0)
     return np.ascontiguousarray(found.pairs, np.int64), np.asarray(found.score, float)
+
+
+def _check_pairs(given: tuple[IntArray, FloatArray] | None, i: int, j: int, views: LineViews) -> None:
+    if given is None or len(given[0]) == 0:
+        return
+    sizes = np.array([views.pointers[i + 1] - views.pointers[i], views.pointers[j + 1] - views.pointers[j]])
+    if given[0].min() < 0 or (given[0] >= sizes).any():
+        raise InputError(
+            f"Matches of images {i} and {j} must refer to their {sizes[0]} and {sizes[1]} segments; got indices up to "
+            f"{given[0].max(0).tolist()}. Match the same segments that are mapped."
+        )
 
 
 def _points_by_image(scene: Scene, views: LineViews) -> list[tuple[FloatArray, FloatArray]]:
@@ -341,9 +353,7 @@ def _build_tracks(
         # The second attempt links what the first left over, for example the smaller part of a group of two lines.
         report("tracks", attempt, 2)
         free = views.usable & (tracks.line_of < 0)
-        members, representative = link(
-            views, places.q, places.covariance, places.score, places.supporters, free
-        )
+        members, representative = link(views, places.q, places.covariance, places.score, places.supporters, free)
         own[members] = True
         tracks.add(members, representative, points)
         tracks.refine()
@@ -380,10 +390,9 @@ def _distance(tracks: Tracks) -> FloatArray:
     return np.bincount(line, away, minlength=len(tracks.X)) / np.maximum(number, 1)
 
 
-def _result(
-    views: LineViews, tracks: Tracks, neighbors: list[IntArray], fate: IntArray, seconds: dict[str, float]
-) -> LineMap:
+def _result(tracks: Tracks, neighbors: list[IntArray], fate: IntArray, seconds: dict[str, float]) -> LineMap:
     """Collect the result; lines run like most of their segments."""
+    views = tracks.views
     rows = np.flatnonzero(tracks.line_of >= 0)
     rows = rows[np.lexsort([views.image_idx[rows], tracks.line_of[rows]])]
     line_idx, image_idx = tracks.line_of[rows], views.image_idx[rows]

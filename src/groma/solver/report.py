@@ -62,8 +62,10 @@ class SolveReport:
     threads: int = 1
     #: Wall time by stage, and ``total``.
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
-    #: Sentences for the user.
+    #: Sentences for the user about what may be wrong.
     warnings: list[str] = field(default_factory=list)
+    #: Sentences about choices that were made.
+    notes: list[str] = field(default_factory=list)
 
     @property
     def converged(self) -> bool:
@@ -83,7 +85,9 @@ class SolveReport:
             f"{self.seconds.get('total', 0.0):.3f} s ({self.linear_solver}, {self.threads} thread(s))",
             f"{self.num_factors} factors, {self.num_residuals} residuals, {self.num_unknowns} unknowns",
         ]
-        return "\n".join(rows + [f"note: {warning}" for warning in self.warnings])
+        return "\n".join(
+            rows + [f"warning: {text}" for text in self.warnings] + [f"note: {text}" for text in self.notes]
+        )
 
 
 class Stopwatch:

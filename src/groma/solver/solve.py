@@ -83,7 +83,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, progress: Prog
     watch = Stopwatch(report)
     with watch("setup"):
         layout = lay_out(problem, options.eliminate)
-    report.warnings += layout.warnings
+    report.notes += layout.warnings
     report.num_unknowns = _count_unknowns(problem)
     if not layout.factors:
         report.seconds["total"] = watch.elapsed()

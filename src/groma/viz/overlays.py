@@ -9,7 +9,7 @@ cover each other, and the white line goes on where the line is known from other 
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -169,8 +169,8 @@ def observation_crop(
     """
     full = np.array([size[0] or picture.shape[1], size[1] or picture.shape[0]], float)
     ends = segment.reshape(2, 2)
-    half = np.maximum(0.62 * np.abs(ends[1] - ends[0]).max(), 24.0) * np.array([1.0, 0.62])
-    half = np.maximum(half, 0.5 * np.abs(ends[1] - ends[0]) + 12.0)
+    across, down = 0.6 * np.abs(ends[1] - ends[0]) + 12.0
+    half = np.array([max(across, 1.6 * down), max(down, 0.4 * across)])
     scale = np.array(picture.shape[1::-1]) / full
     low = np.floor(np.clip(ends.mean(axis=0) - half, 0.0, full) * scale).astype(int)
     high = np.ceil(np.clip(ends.mean(axis=0) + half, 0.0, full) * scale).astype(int)
@@ -216,11 +216,10 @@ def _figure(
         else ""
     )
     lines = seen.line_idx[rows]
-    limits = np.array([left, upper]) - (width, height), np.array([left, upper]) + (2 * width, 2 * height)
     projected = "".join(
-        f'<path class="projected" d="{_points(place)}"/>'
-        for place in projected_segments(scene, image, lines)
-        if len(place := place[((place > limits[0]) & (place < limits[1])).all(axis=1)]) > 1
+        f'<path class="projected" d="{_points(places)}"/>'
+        for places in _near_frame(projected_segments(scene, image, lines), left, upper, width, height)
+        if len(places) > 1
     )
     residual = numbers.observation_residual_px[rows]
     observed = "".join(
@@ -251,6 +250,15 @@ def _frame(scene: Scene, image: int, rows: IntArray) -> tuple[float, float, floa
     return float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1])
 
 
+def _near_frame(
+    polylines: list[FloatArray], left: float, top: float, width: float, height: float
+) -> Iterator[FloatArray]:
+    """Drop places of bent lines that are far outside, where models of distortion are not meant to be used."""
+    low, high = np.array([left - width, top - height]), np.array([left + 2 * width, top + 2 * height])
+    for places in polylines:
+        yield places if len(places) == 2 else places[((places > low) & (places < high)).all(axis=1)]
+
+
 def _points(places: FloatArray) -> str:
     return "M" + " ".join(f"{x:.1f} {y:.1f}" for x, y in places)
 
@@ -262,10 +270,4 @@ def _path(name: str, colour: str, places: FloatArray, more: str = 'stroke-width=
     )
 
 
-__all__: Sequence[str] = [
-    "line_overlays",
-    "observation_crop",
-    "overlay_section",
-    "projected_segments",
-    "residual_top",
-]
+__all__ = ["line_overlays", "observation_crop", "overlay_section", "projected_segments", "residual_top"]

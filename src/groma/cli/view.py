@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma view``: a scene in the browser."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from groma.cli import _options
+
+
+def view(
+    source: _options.Input,
+    images: Annotated[
+        Path | None,
+        typer.Option("--images", metavar="DIR", help="Folder of the photographs, shown in the cameras."),
+    ] = None,
+    port: Annotated[
+        int, typer.Option("--port", "-p", min=0, max=65535, metavar="N", help="Port, or the next free one; 0: any.")
+    ] = 8080,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Look at a scene in the browser: cameras, points, lines, planes. Click a line for its observations.
+
+    The page is served from this machine, to this machine only, until Ctrl-C. --json writes the address and the counts
+    as soon as the page is ready.
+    """
+    from groma.cli import _output
+    from groma.cli._console import Console
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_json(json_target, force)
+
+    from groma.cli._counts import counts_of, sentence_of
+    from groma.io import read_scene
+    from groma.viz.viewer import serving, wait_for_interrupt
+
+    scene = read_scene(source)
+    console.say(sentence_of(scene))
+    with serving(scene, images, port) as shown:
+        address = f"http://localhost:{shown.server.get_port()}"
+        if images is not None and shown.num_pictures == 0:
+            console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[0]!r}.")
+        console.say(f"Open {address} in a browser. Ctrl-C ends.")
+        _output.write_json(json_target, {"address": address, **counts_of(scene)}, force)
+        if browser:
+            _open_browser(address)
+        wait_for_interrupt()
+    console.say("\nClosed.")
+
+
+def _open_browser(address: str) -> None:
+    """Open a browser with windows; never one that would take over the terminal."""
+    import os
+    import sys
+    import webbrowser
+
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return
+    webbrowser.open(address)

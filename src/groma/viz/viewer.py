@@ -1,0 +1,539 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A scene in the browser: cameras with their images, points, lines, planes, directions; a click shows a line's numbers.
+
+The page is served by viser from this machine; nothing is fetched from elsewhere. What is drawn is computed in
+:mod:`groma.viz._view_content`; here it is handed to the server, and the switches of the page are wired to it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import html
+import io
+import os
+import threading
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.errors import InputError
+from groma.viz import _colours
+from groma.viz._pictures import ImageFiles, image_file, read_picture
+from groma.viz._view_content import LINE_MODES, REACH, ViewContent, view_content
+from groma.viz.overlays import observation_crop, residual_top
+
+if TYPE_CHECKING:
+    import viser
+
+    from groma.scene import Scene
+
+#: Points drawn at first; a slider asks for more.
+FIRST_POINTS = 100_000
+#: Cameras and planes are objects of the page one by one; of more than this an even choice is drawn.
+MAX_CAMERAS = 400
+MAX_PLANES = 300
+#: Longer side of the photographs in the cameras, pixels.
+THUMBNAIL = 256
+#: A click this near to a line hits it, pixels.
+CLICK_PIXELS = 8.0
+#: Observations in the list of a clicked line, and pieces of photographs with it.
+MAX_LISTED = 40
+MAX_CROPS = 4
+
+_ORANGE = (255, 150, 30)
+_CAMERA = (60, 66, 74)
+_RAMP = "linear-gradient(90deg,#2c6fbb,#3fb6a8,#e8c53a,#d9472b)"
+_HINT = "Click a line to see where it was observed."
+
+
+class SceneView:
+    """A scene on a server: its nodes and its panel.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        Where to draw. It is not stopped here.
+    content : ViewContent
+        What to draw.
+    images : path or mapping, optional
+        Folder of the photographs, or files by image name.
+    """
+
+    def __init__(self, server: viser.ViserServer, content: ViewContent, images: ImageFiles | None = None) -> None:
+        self.server = server
+        self.content = content
+        self.images = images
+        #: The clicked line, or None.
+        self.selected: int | None = None
+        #: Number of drawn cameras that have a photograph.
+        self.num_pictures = 0
+        self._lock = threading.RLock()
+        self._nodes: dict[str, list[Any]] = {"cameras": [], "planes": [], "directions": []}
+        self._drawn_points: tuple[int, str] | None = None
+        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        server.gui.set_panel_label("groma")
+        server.scene.set_up_direction("+z")
+        server.initial_camera.fov = np.deg2rad(50.0)
+        server.initial_camera.position = content.start_position
+        server.initial_camera.look_at = content.start_target
+        with server.atomic():
+            self._add_panel()
+            self._add_cameras()
+            self._add_planes()
+            self._add_directions()
+            self.draw_points()
+            self.draw_lines()
+        server.scene.on_click()(self._clicked)
+
+    # ------------------------------------------------------------------------------------------------------- Panel
+
+    def _add_panel(self) -> None:
+        gui, content, scene = self.server.gui, self.content, self.content.scene
+        count = len(content.points)
+        gui.add_markdown(_counts(scene))
+        with gui.add_folder("Show"):
+            kinds = {
+                "cameras": scene.num_images,
+                "photographs": scene.num_images if self.images is not None else 0,
+                "points": count,
+                "lines": scene.num_lines,
+                "planes": scene.num_planes,
+                "directions": scene.num_directions,
+            }
+            self.shown = {
+                name: gui.add_checkbox(name.capitalize(), name != "directions", visible=number > 0)
+                for name, number in kinds.items()
+            }
+        with gui.add_folder("Lines", visible=scene.num_lines > 0):
+            self.line_mode = gui.add_dropdown("Colour", LINE_MODES, initial_value="length")
+            self.legend = gui.add_html("")
+            self.line_width = gui.add_slider("Width", min=1.0, max=8.0, step=0.5, initial_value=2.0)
+            most = int(content.statistics.num_images.max(initial=1))
+            self.min_images = gui.add_slider("In images", min=0, max=max(most, 1), step=1, initial_value=0)
+            self.min_images.hint = "Show lines observed in at least so many images."
+        self.selection = gui.add_html(_note(_HINT), visible=scene.num_lines > 0)
+        with gui.add_folder("Points", visible=count > 0):
+            modes = tuple(content.point_colours)
+            self.point_mode = gui.add_dropdown("Colour", modes, initial_value=modes[0])
+            self.point_size = gui.add_slider("Size", min=1.0, max=20.0, step=0.5, initial_value=_point_size(count))
+            first = min(count, FIRST_POINTS)
+            step = max(1, count // 100)
+            self.point_count = gui.add_slider("Number", min=0, max=max(count, 1), step=step, initial_value=first)
+        with gui.add_folder("Cameras", visible=scene.num_images > 0):
+            self.camera_size = gui.add_slider("Size", min=0.1, max=4.0, step=0.1, initial_value=1.0)
+            self.look_from = gui.add_dropdown("Look from", ("outside", *_unique(scene.images.names)))
+        for name, checkbox in self.shown.items():
+            checkbox.on_update(self._on_toggle(name))
+        for control in (self.line_mode, self.min_images):
+            control.on_update(lambda _: self.draw_lines())
+        self.line_width.on_update(lambda _: setattr(self.lines, "thickness", self.line_width.value))
+        for control in (self.point_mode, self.point_count):
+            control.on_update(lambda _: self.draw_points())
+        self.point_size.on_update(lambda _: setattr(self.points, "point_size", self._point_size()))
+        self.camera_size.on_update(lambda _: self._resize_cameras())
+        self.look_from.on_update(self._move_to_camera)
+
+    def _on_toggle(self, name: str) -> Callable[[Any], None]:
+        def toggle(_: Any) -> None:
+            visible = self.shown[name].value
+            if name == "points":
+                self.points.visible = visible
+            elif name == "lines":
+                self.lines.visible = visible
+                self._clear_selection()
+            elif name == "photographs":
+                with self._lock, self.server.atomic():
+                    for node, picture in zip(self._nodes["cameras"], self._pictures, strict=True):
+                        node.image = picture if visible else None
+            else:
+                for node in self._nodes[name]:
+                    node.visible = visible
+
+        return toggle
+
+    # ------------------------------------------------------------------------------------------------------- Nodes
+
+    def draw_points(self) -> None:
+        """Draw the points as the panel says."""
+        with self._lock:
+            # The slider may have moved on while an earlier call was at work.
+            wanted = int(self.point_count.value), self.point_mode.value
+            if wanted == self._drawn_points:
+                return
+            self._drawn_points = wanted
+            number, mode = wanted
+            self.points = self.server.scene.add_point_cloud(
+                "/points",
+                self.content.points[:number].astype(np.float32),
+                self.content.point_colours[mode][:number],
+                point_size=self._point_size(),
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",
+                visible=self.shown["points"].value,
+            )
+
+    def draw_lines(self) -> None:
+        """Draw the lines as the panel says."""
+        with self._lock:
+            found = self.content.line_colours(self.line_mode.value)
+            kept = self.lines_shown()
+            self.legend.content = _legend(found.low, found.high, found.meaning, int(kept.sum()), len(kept))
+            self.lines = self.server.scene.add_line_segments(
+                "/lines",
+                self.content.segments[kept].astype(np.float32),
+                _by_end(found.colours[kept]),
+                thickness=self.line_width.value,
+                thickness_units="screen",
+                visible=self.shown["lines"].value,
+            )
+
+    def lines_shown(self) -> BoolArray:
+        """(L,) which lines are drawn."""
+        enough = self.content.statistics.num_images >= self.min_images.value
+        return enough & np.isfinite(self.content.segments).all(axis=(1, 2))
+
+    def _add_cameras(self) -> None:
+        content = self.content
+        self._camera_images = _even(content.scene.num_images, MAX_CAMERAS)
+        self._pictures: list[Any] = []
+        # On average a camera is as large as a third of its distance to the next, within limits.
+        self._camera_scale = _camera_scale(content.camera_centers)
+        for image in self._camera_images:
+            name = content.scene.images.names[image]
+            path = image_file(self.images, name)
+            picture = read_picture(path, THUMBNAIL) if path is not None else None
+            self._pictures.append(picture)
+            self.num_pictures += picture is not None
+            self._nodes["cameras"].append(
+                self.server.scene.add_camera_frustum(
+                    f"/cameras/{image}",
+                    fov=float(content.camera_openings[image]),
+                    aspect=float(content.camera_aspects[image]),
+                    scale=self._camera_scale,
+                    thickness=1.5,
+                    thickness_units="screen",
+                    color=_CAMERA,
+                    image=picture,
+                    format="jpeg",
+                    jpeg_quality=80,
+                    wxyz=content.camera_wxyz[image],
+                    position=content.camera_centers[image],
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+            )
+
+    def _resize_cameras(self) -> None:
+        with self.server.atomic():
+            for node in self._nodes["cameras"]:
+                node.scale = self._camera_scale * self.camera_size.value
+
+    def _add_planes(self) -> None:
+        order = np.argsort(-self.content.patch_members, kind="stable")[:MAX_PLANES]
+        for rank, plane in enumerate(order):
+            corners = self.content.patches[plane]
+            if not np.isfinite(corners).all():
+                continue
+            colour = tuple(int(channel) for channel in _colours.PALETTE[rank % len(_colours.PALETTE)])
+            fan = np.arange(1, len(corners) - 1)
+            self._nodes["planes"] += [
+                self.server.scene.add_mesh_simple(
+                    f"/planes/{plane}/face",
+                    corners.astype(np.float32),
+                    np.column_stack([np.zeros_like(fan), fan, fan + 1]).astype(np.uint32),
+                    color=colour,
+                    opacity=0.28,
+                    side="double",
+                    flat_shading=True,
+                    cast_shadow=False,
+                    receive_shadow=False,
+                ),
+                self.server.scene.add_line_segments(
+                    f"/planes/{plane}/edge",
+                    np.stack([corners, np.roll(corners, -1, axis=0)], axis=1).astype(np.float32),
+                    colour,
+                    thickness=1.5,
+                    thickness_units="screen",
+                ),
+            ]
+
+    def _add_directions(self) -> None:
+        """A bar through the middle of the scene for each direction, the longer the more lines follow it."""
+        vectors, members = self.content.directions, self.content.direction_members
+        if not len(vectors):
+            return
+        length = REACH * (0.25 + 0.75 * np.sqrt(members / max(members.max(), 1)))
+        bars = np.stack([-vectors, vectors], axis=1) * length[:, None, None]
+        colours = _colours.of_group(np.arange(len(vectors)))
+        self._nodes["directions"].append(
+            self.server.scene.add_line_segments(
+                "/directions",
+                bars.astype(np.float32),
+                _by_end(colours),
+                thickness=5.0,
+                thickness_units="screen",
+                visible=False,
+            )
+        )
+
+    def _point_size(self) -> float:
+        return 0.0005 * REACH * self.point_size.value
+
+    # --------------------------------------------------------------------------------------------------- Selection
+
+    def _clicked(self, event: Any) -> None:
+        if not self.shown["lines"].value:
+            return
+        camera = event.client.camera
+        height = camera.image_height or 800
+        tolerance = CLICK_PIXELS * 2.0 * np.tan(0.5 * camera.fov) / height
+        hit = self.content.pick(
+            np.asarray(event.ray_origin), np.asarray(event.ray_direction), tolerance, self.lines_shown()
+        )
+        self.select(hit)
+
+    def select(self, line: int | None) -> None:
+        """Mark a line, join it to the cameras that observe it, and list its observations; None marks nothing."""
+        with self._lock:
+            self._clear_selection()
+            if line is None:
+                return
+            self.selected = line
+            content, seen = self.content, self.content.scene.line_observations
+            rows = np.flatnonzero(seen.line_idx == line)
+            segment = content.segments[line]
+            images = np.unique(seen.image_idx[rows])
+            rays = np.stack(
+                [content.camera_centers[images], np.broadcast_to(segment.mean(axis=0), (len(images), 3))], axis=1
+            )
+            with self.server.atomic():
+                for name, places, width in (("line", segment[None], self.line_width.value + 5.0), ("rays", rays, 1.0)):
+                    if len(places):
+                        self.server.scene.add_line_segments(
+                            f"/selection/{name}",
+                            places.astype(np.float32),
+                            _ORANGE,
+                            thickness=width,
+                            thickness_units="screen",
+                        )
+                self.selection.content = self._describe(line, rows)
+
+    def _clear_selection(self) -> None:
+        with self._lock:
+            if self.selected is None:
+                return
+            self.selected = None
+            self.server.scene.remove_by_name("/selection")
+            self.selection.content = _note(_HINT)
+
+    def _describe(self, line: int, rows: IntArray) -> str:
+        """Return the numbers of a line, its observations worst first, and the photographs around some of them."""
+        numbers, scene = self.content.statistics, self.content.scene
+        seen = scene.line_observations
+        order = rows[np.argsort(-np.nan_to_num(numbers.observation_residual_px[rows], nan=np.inf), kind="stable")]
+        top = residual_top(numbers)
+        planes = scene.relations.line_on_plane
+        on = ", ".join(str(scene.planes.ids[plane]) for plane in planes[planes[:, 0] == line, 1])
+        lines = [
+            f"<b>Line {scene.lines.ids[line]}</b>: length {numbers.length[line]:.4g}, "
+            f"{numbers.num_images[line]} images, {_px(numbers.residual_px[line])} rms"
+            + (f", on plane {on}" if on else "")
+        ]
+        entries = []
+        for row in order[:MAX_LISTED]:
+            first, second = np.linalg.norm(numbers.end_residuals[row], axis=1)
+            length = np.linalg.norm(seen.segment[row, 2:] - seen.segment[row, :2])
+            entries.append(
+                f"<tr><td style='overflow-wrap:anywhere'>{html.escape(scene.images.names[seen.image_idx[row]])}</td>"
+                f"<td>{first:.2f}</td><td>{second:.2f}</td><td>{length:.0f}</td></tr>"
+            )
+        for row in order[_even(len(order), MAX_CROPS)]:
+            lines.append(self._crop(int(row), _colours.css(_colours.ramp(numbers.observation_residual_px[row] / top))))
+        lines.append(
+            "<div style='max-height:16em;overflow-y:auto'><table style='width:100%;text-align:right;border-spacing:6px 1px;font-variant-numeric:tabular-nums'>"
+            "<tr style='opacity:.6'><td style='text-align:left'>image</td><td>ends, px</td><td></td><td>long, px</td>"
+            "</tr>" + "".join(entries).replace("<tr><td style='", "<tr><td style='text-align:left;") + "</table></div>"
+        )
+        if len(order) > MAX_LISTED:
+            lines.append(_note(f"and {len(order) - MAX_LISTED} more"))
+        return f"<div style='padding:0.4em 1em;font-size:0.85em'>{''.join(lines)}</div>"
+
+    def _crop(self, row: int, colour: str) -> str:
+        scene, seen = self.content.scene, self.content.scene.line_observations
+        image = int(seen.image_idx[row])
+        path = image_file(self.images, scene.images.names[image])
+        picture = read_picture(path) if path is not None else None
+        if picture is None:
+            return ""
+        camera = scene.images.camera_idx[image]
+        size = float(scene.cameras.width[camera]), float(scene.cameras.height[camera])
+        crop = observation_crop(picture, size, seen.segment[row], self.content.statistics.end_residuals[row], colour)
+        return f"<div style='margin:6px 0 2px;opacity:.75'>{html.escape(scene.images.names[image])}</div>{crop}"
+
+    def _move_to_camera(self, event: Any) -> None:
+        """Put the viewer of the page where a photograph was taken, or back."""
+        if event.client is None:
+            return
+        names = self.look_from.options
+        image = names.index(self.look_from.value) - 1
+        camera = event.client.camera
+        with event.client.atomic():
+            if image < 0:
+                camera.position, camera.look_at = self.content.start_position, self.content.start_target
+                return
+            camera.wxyz = self.content.camera_wxyz[image]
+            camera.position = self.content.camera_centers[image]
+            camera.fov = float(np.clip(self.content.camera_openings[image], 0.2, 2.0))
+
+
+# --------------------------------------------------------------------------------------------------------- Serving
+
+
+def open_viewer(scene: Scene, images: ImageFiles | None = None, port: int = 8080, host: str = "127.0.0.1") -> SceneView:
+    """Serve a scene to the browser and return at once.
+
+    Parameters
+    ----------
+    scene : Scene
+        What to show.
+    images : path or mapping, optional
+        Folder of the photographs, or files by image name.
+    port : int
+        Port to listen on, or the next free one; 0 takes any.
+    host : str
+        Address to listen on; by default only this machine can connect. "0.0.0.0" lets every machine in the network.
+
+    Returns
+    -------
+    SceneView
+        ``view.server.get_port()`` is the port; ``view.server.stop()`` ends it.
+
+    Raises
+    ------
+    InputError
+        If there is nothing to draw, or ``images`` is not a folder.
+    """
+    import viser
+
+    if not (scene.num_images or scene.num_points or scene.num_lines):
+        raise InputError("The scene has no images, points or lines: there is nothing to look at.")
+    if isinstance(images, str | os.PathLike) and not os.path.isdir(images):
+        raise InputError(f"{os.fspath(images)} is not a folder of images. Check --images.")
+    content = view_content(scene)
+    with _silence():
+        server = viser.ViserServer(host=host, port=port, label="groma", verbose=False)
+    try:
+        return SceneView(server, content, images)
+    except BaseException:
+        _stop(server)
+        raise
+
+
+@contextlib.contextmanager
+def serving(
+    scene: Scene, images: ImageFiles | None = None, port: int = 8080, host: str = "127.0.0.1"
+) -> Iterator[SceneView]:
+    """Serve a scene inside a ``with`` block; parameters are those of :func:`open_viewer`."""
+    view = open_viewer(scene, images, port, host)
+    try:
+        yield view
+    finally:
+        _stop(view.server)
+
+
+def wait_for_interrupt() -> None:
+    """Return when Ctrl-C is pressed."""
+    never = threading.Event()
+    with contextlib.suppress(KeyboardInterrupt):
+        while not never.wait(0.5):  # a wait without end cannot be interrupted on every system
+            pass
+
+
+def _silence() -> contextlib.AbstractContextManager[Any]:
+    """Keep what the server says of itself, whatever it was told about talking, off standard output."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+def _stop(server: viser.ViserServer) -> None:
+    with _silence():
+        server.stop()
+
+
+# ------------------------------------------------------------------------------------------------------------ Words
+
+
+def _counts(scene: Scene) -> str:
+    counts = [
+        (scene.num_images, "images"),
+        (scene.num_points, "points"),
+        (scene.num_lines, "lines"),
+        (scene.num_planes, "planes"),
+        (scene.num_directions, "directions"),
+    ]
+    text = ", ".join(f"{count:,} {name if count != 1 else name[:-1]}" for count, name in counts if count)
+    drawn = [
+        f"{limit} of the {count:,} {name} are drawn"
+        for count, limit, name in (
+            (scene.num_images, MAX_CAMERAS, "cameras"),
+            (scene.num_planes, MAX_PLANES, "planes"),
+        )
+        if count > limit
+    ]
+    return ". ".join([text, *drawn])
+
+
+def _legend(low: str | None, high: str | None, meaning: str, shown: int, count: int) -> str:
+    text = f"{shown:,} of {count:,} lines." if shown < count else ""
+    if low is None:
+        return _note(" ".join(part for part in (meaning, text) if part))
+    bar = f"<span style='flex:1;height:8px;border-radius:4px;background:{_RAMP}'></span>"
+    return (
+        f"<div style='padding:0 1em;font-size:0.8em'><div style='display:flex;gap:8px;align-items:center'>"
+        f"{html.escape(low)}{bar}{html.escape(high or '')}</div>{text}</div>"
+    )
+
+
+def _note(text: str) -> str:
+    return f"<div style='padding:0.2em 1em;font-size:0.8em;opacity:.7'>{html.escape(text)}</div>"
+
+
+def _px(value: float) -> str:
+    return f"{value:.2f} px" if np.isfinite(value) else "not measured"
+
+
+def _unique(names: tuple[str, ...]) -> list[str]:
+    return [f"{index + 1}: {name}" for index, name in enumerate(names)]
+
+
+def _even(count: int, limit: int) -> IntArray:
+    return np.arange(count) if count <= limit else np.linspace(0, count - 1, limit).astype(np.int64)
+
+
+def _by_end(colours: _colours.Colours) -> _colours.Colours:
+    """Return colours (L, 3) for both ends of segments, (L, 2, 3), such that the page shows them as they are meant.
+
+    The page takes the colours of the ends of segments, unlike all others, as amounts of light.
+    """
+    share = np.asarray(colours, float) / 255.0
+    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.repeat(np.round(255.0 * light).astype(np.uint8)[:, None], 2, axis=1)
+
+
+def _point_size(count: int) -> float:
+    """Return the position of the slider: small where there are many."""
+    return float(np.clip(np.round(2.0 * 4000.0 / max(count, 1) * 4) / 4 + 3.0, 3.0, 12.0))
+
+
+def _camera_scale(centers: FloatArray) -> float:
+    if len(centers) < 2:
+        return 0.08 * REACH
+    from scipy.spatial import KDTree
+
+    gap = float(np.median(KDTree(centers).query(centers, k=2)[0][:, 1]))
+    return float(np.clip(0.45 * gap, 0.02 * REACH, 0.12 * REACH))
+
+
+__all__ = ["SceneView", "open_viewer", "serving", "wait_for_interrupt"]

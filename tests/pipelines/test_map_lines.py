@@ -1,0 +1,294 @@
+"""Lines mapped from segments: wireframes with exact truth, degenerate motion, matches, distortion, empty maps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from groma import cameras as camera_models
+from groma.errors import InputError
+from groma.frontend.matches import LineMatches
+from groma.frontend.segments import Segments
+from groma.geometry import quaternion
+from groma.pipelines._line_proposals import angles_about_baseline
+from groma.pipelines._neighbors import covisible_neighbors
+from groma.pipelines.map_lines import Fate, LineMap, MapLinesOptions, explain, map_lines
+from groma.scene import Cameras, PointObservations, Points, Scene
+from groma.scene.similarity import Similarity
+
+pytestmark = pytest.mark.kernels
+
+WIDTH, HEIGHT = 800, 600
+
+
+@dataclass(frozen=True)
+class Wireframe:
+    scene: Scene
+    segments: list[Segments]
+    #: Per image, the true line of each segment; -1 for clutter.
+    truth: list[np.ndarray]
+    lines: np.ndarray  # (L, 2, 3)
+
+    def matches(self, i: int, j: int) -> LineMatches:
+        known = {n: k for k, n in enumerate(self.truth[j]) if n >= 0}
+        pairs = [(k, known[n]) for k, n in enumerate(self.truth[i]) if n in known]
+        return LineMatches(np.array(pairs, np.int64).reshape(-1, 2), np.ones(len(pairs)))
+
+
+def look_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Pose (7,) of a camera that looks at a target, world z up."""
+    z = (target - center) / np.linalg.norm(target - center)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z])
+    return np.concatenate([quaternion.from_matrix(R[None])[0], -R @ center])
+
+
+def wireframe(
+    centers: np.ndarray,
+    lines: np.ndarray,
+    rng: np.random.Generator,
+    sigma: float = 0.2,
+    num_clutter: int = 0,
+    model: str = "PINHOLE",
+    params: tuple = (700.0, 700.0, 400.0, 300.0),
+    num_points: int = 150,
+    targets: np.ndarray | None = None,
+) -> Wireframe:
+    camera = camera_models.model(model)
+    targets = np.zeros_like(centers) if targets is None else targets
+    poses = np.array([look_at(c, t) for c, t in zip(centers, targets, strict=True)])
+    xyz = rng.uniform(-1.2, 1.2, (num_points, 3))
+    segments, truth, seen = [], [], []
+    for i, pose in enumerate(poses):
+
+        def project(points, pose=pose):
+            points = quaternion.rotate(np.broadcast_to(pose[:4], (len(points), 4)), points) + pose[4:]
+            return camera.project(np.array(params), points)
+
+        # Each image sees another part of each line.
+        part = np.column_stack([rng.uniform(0.0, 0.15, len(lines)), rng.uniform(0.85, 1.0, len(lines))])
+        ends = [project(lines[:, 0] + part[:, k : k + 1] * (lines[:, 1] - lines[:, 0])) for k in (0, 1)]
+        ends = np.hstack(ends) + rng.normal(0.0, sigma, (len(lines), 4))
+        inside = np.isfinite(ends).all(1) & (ends > 0).all(1) & (ends < [WIDTH, HEIGHT] * 2).all(1)
+        inside &= np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]) > 20.0
+        angle, length = rng.uniform(0, 2 * np.pi, num_clutter), rng.uniform(20, 80, num_clutter)
+        start = rng.uniform(100, 500, (num_clutter, 2))
+        clutter = np.hstack([start, start + length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])])
+        order = rng.permutation(inside.sum() + num_clutter)
+        segments.append(Segments.from_ends(np.vstack([ends[inside], clutter])[order], max(sigma, 0.05)))
+        truth.append(np.concatenate([np.flatnonzero(inside), np.full(num_clutter, -1)])[order])
+        pixel = project(xyz)
+        good = np.flatnonzero(np.isfinite(pixel).all(1) & (pixel > 0).all(1) & (pixel < [WIDTH, HEIGHT]).all(1))
+        seen.append((np.full(len(good), i), good, pixel[good]))
+    tables = {}
+    if num_points:
+        image, point, pixel = (np.concatenate(column) for column in zip(*seen, strict=True))
+        tables["points"] = Points.at(xyz)
+        tables["point_observations"] = PointObservations(image, point, pixel, point)
+    cameras = Cameras(np.array([1]), (model,), np.array([params]), np.array([WIDTH]), np.array([HEIGHT]))
+    names = [f"{i}.png" for i in range(len(poses))]
+    return Wireframe(
+        Scene.from_images(cameras, names, np.zeros(len(poses), int), poses, **tables), segments, truth, lines
+    )
+
+
+def arc(count: int, step: float = 0.12, radius: float = 4.0, rise: float = 0.25) -> np.ndarray:
+    """Camera centres on an arc, going up and down."""
+    a = step * (np.arange(count) - 0.5 * (count - 1))
+    return np.column_stack([radius * np.sin(a), -radius * np.cos(a), rise * np.sin(2.3 * np.arange(count))])
+
+
+def random_lines(count: int, rng: np.random.Generator) -> np.ndarray:
+    middle, along = rng.uniform(-0.9, 0.9, (count, 3)), rng.normal(size=(count, 3))
+    along *= rng.uniform(0.2, 0.5, (count, 1)) / np.linalg.norm(along, axis=1, keepdims=True)
+    return np.stack([middle - along, middle + along], axis=1)
+
+
+def true_lines(world: Wireframe, line_map: LineMap) -> np.ndarray:
+    """The true line of each mapped line; -2 where its observations disagree."""
+    owners = np.array(
+        [world.truth[i][s] for i, s in zip(line_map.image_idx, line_map.segment_idx, strict=True)], np.int64
+    )
+    out = np.full(line_map.num_lines, -2)
+    for n in range(line_map.num_lines):
+        mine = np.unique(owners[line_map.line_idx == n])
+        out[n] = mine[0] if len(mine) == 1 else -2
+    return out
+
+
+def distance_to_truth(world: Wireframe, line_map: LineMap, line: int, true: int) -> float:
+    a, b = world.lines[true]
+    d = (b - a) / np.linalg.norm(b - a)
+    return np.linalg.norm(np.cross(line_map.segments[line] - a, d), axis=1).max()
+
+
+@pytest.fixture(scope="module")
+def world() -> Wireframe:
+    rng = np.random.default_rng(1)
+    return wireframe(arc(6), random_lines(25, rng), rng, num_clutter=15)
+
+
+@pytest.fixture(scope="module")
+def mapped(world: Wireframe) -> LineMap:
+    return map_lines(world.scene, world.segments)
+
+
+def test_wireframe_is_found(world, mapped):
+    owner = true_lines(world, mapped)
+    num_seen = sum(np.bincount(t[t >= 0], minlength=len(world.lines)) for t in world.truth)
+    visible = np.flatnonzero(num_seen >= 4)
+    assert len(visible) >= 20
+    assert len(np.intersect1d(owner, visible)) >= 0.9 * len(visible)
+    # Clutter agrees by chance at times: 90 random segments in six images may make a line or two.
+    assert (owner < 0).sum() <= 2
+    # One line each: nothing is found twice.
+    found = owner[owner >= 0]
+    assert len(found) <= 1.05 * len(np.unique(found))
+
+
+def test_lines_are_as_good_as_they_say(world, mapped):
+    owner = true_lines(world, mapped)
+    good = np.flatnonzero(owner >= 0)
+    error = np.array([distance_to_truth(world, mapped, n, owner[n]) for n in good])
+    # Uncertainty is the largest of four deviations; an error beyond four of them has a chance below 1e-3 each.
+    assert (error < 4.0 * mapped.uncertainty[good]).mean() >= 0.95
+    assert np.median(error) < 0.01
+    assert np.median(mapped.residual) < 0.3
+
+
+def test_result_is_consistent(world, mapped):
+    assert mapped.lines.shape == (mapped.num_lines, 6)
+    assert sum(mapped.fate_counts().values()) == sum(len(s) for s in world.segments)
+    counts = mapped.fate_counts()
+    assert counts[Fate.MAPPED] + counts[Fate.RECOVERED] == len(mapped.line_idx)
+    for i, fates in enumerate(mapped.fates):
+        on_lines = np.sort(mapped.segment_idx[mapped.image_idx == i])
+        assert np.array_equal(on_lines, np.flatnonzero(fates <= Fate.RECOVERED))
+    assert (mapped.num_images >= 3).all()
+    assert (np.diff(mapped.line_idx) >= 0).all()
+    scene = mapped.add_to(world.scene, world.segments)
+    assert scene.num_lines == mapped.num_lines
+    assert scene.num_line_observations == len(mapped.line_idx)
+    np.testing.assert_allclose(scene.lines.plucker, mapped.lines)
+    assert "lines from" in explain(mapped)
+
+
+def test_lines_run_like_their_segments(world, mapped):
+    owner = true_lines(world, mapped)
+    for n in np.flatnonzero(owner >= 0):
+        true = world.lines[owner[n], 1] - world.lines[owner[n], 0]
+        assert (mapped.segments[n, 1] - mapped.segments[n, 0]) @ true > 0
+
+
+def test_another_world_frame_changes_nothing(world, mapped):
+    turn = np.array([0.3, -0.2, 0.4, 0.0])
+    turn[3] = np.sqrt(1 - turn @ turn)
+    moved = map_lines(
+        world.scene.transformed(Similarity(7.0, quaternion.to_matrix(turn), np.array([30.0, -50.0, 4.0]))),
+        world.segments,
+    )
+    assert abs(moved.num_lines - mapped.num_lines) <= 1
+    assert abs(len(moved.line_idx) - len(mapped.line_idx)) <= 5
+
+
+@pytest.mark.parametrize("form", ["callable", "mapping", "turned"])
+def test_matches(world, form):
+    images = range(len(world.segments))
+    given = {(i, j): world.matches(i, j) for i in images for j in images if (i < j if form == "mapping" else i > j)}
+    result = map_lines(world.scene, world.segments, world.matches if form == "callable" else given)
+    owner = true_lines(world, result)
+    assert (owner >= 0).all()
+    assert len(owner) >= 20
+    # What is not matched with anything says so.
+    clutter = np.concatenate([f[t < 0] for f, t in zip(result.fates, world.truth, strict=True)])
+    assert (clutter == Fate.NO_MATCH).all()
+
+
+def test_distorted_camera():
+    rng = np.random.default_rng(3)
+    params = (700.0, 700.0, 400.0, 300.0, -0.12, 0.03, 0.001, -0.001)
+    bent = wireframe(arc(6), random_lines(20, rng), rng, model="OPENCV", params=params)
+    result = map_lines(bent.scene, bent.segments)
+    owner = true_lines(bent, result)
+    assert len(np.unique(owner)) >= 15
+    errors = [distance_to_truth(bent, result, n, owner[n]) for n in np.flatnonzero(owner >= 0)]
+    assert np.median(errors) < 0.01
+
+
+def test_scene_without_points():
+    rng = np.random.default_rng(4)
+    bare = wireframe(arc(5), random_lines(15, rng), rng, num_points=0)
+    result = map_lines(bare.scene, bare.segments, bare.matches)
+    assert len(np.unique(true_lines(bare, result))) >= 11
+
+
+def test_lines_along_the_motion_need_another_view():
+    """A camera moves along x and looks along y; lines along x lie in epipolar planes of all pairs."""
+    lines = np.array([[[-0.6, 0.1 * k, z], [0.6, 0.1 * k, z]] for k, z in enumerate((-0.6, -0.3, 0.2, 0.5))])
+    centers = np.column_stack([np.linspace(-0.9, 0.9, 5), np.full(5, -4.0), np.zeros(5)])
+    ahead = centers + np.array([0.0, 4.0, 0.0])
+    rng = np.random.default_rng(5)
+    flat = wireframe(centers, lines, rng, targets=ahead)
+    result = map_lines(flat.scene, flat.segments)
+    assert result.num_lines == 0
+    assert result.fate_counts()[Fate.DEGENERATE] >= 15
+    assert "epipolar" in explain(result)
+    assert "The map is empty" in explain(result)
+    above = np.array([[0.3, -4.0, 1.0], [-0.4, -4.0, -1.1]])
+    raised = wireframe(
+        np.vstack([centers, above]),
+        lines,
+        np.random.default_rng(5),
+        targets=np.vstack([ahead, above + np.array([0, 4.0, 0])]),
+    )
+    result = map_lines(raised.scene, raised.segments)
+    assert sorted(true_lines(raised, result)) == [0, 1, 2, 3]
+    assert (result.num_images == 7).all()
+
+
+def test_two_groups_of_images_stay_apart():
+    rng = np.random.default_rng(6)
+    world = wireframe(arc(8), random_lines(5, rng), rng)
+    neighbors = covisible_neighbors(world.scene, 3)
+    assert all(len(n) == 3 for n in neighbors)
+    assert all(i not in n for i, n in enumerate(neighbors))
+    keep = world.scene.point_observations
+    keep = keep.take(np.flatnonzero((keep.point_idx % 2 == 0) == (keep.image_idx < 4)))
+    halves = covisible_neighbors(world.scene.replace(point_observations=keep), 10)
+    assert all((n < 4).all() == (i < 4) for i, n in enumerate(halves))
+
+
+def test_angle_about_the_baseline_is_that_of_the_epipolar_plane():
+    rng = np.random.default_rng(7)
+    first, second = np.zeros(3), np.array([0.4, -0.1, 0.2])
+    X = rng.uniform(-1, 1, (50, 2, 3)) + np.array([0, 0, 4.0])
+    one = angles_about_baseline(X - first, second - first)
+    two = angles_about_baseline(X - second, second - first)
+    np.testing.assert_allclose(one, two, atol=1e-12)
+    assert (one[:, 1] >= one[:, 0]).all()
+
+
+def test_empty_maps_say_why(world):
+    none = [Segments.empty() for _ in world.segments]
+    assert "No segments" in explain(map_lines(world.scene, none))
+    assert "no images" in explain(map_lines(Scene(), []))
+    alone = map_lines(world.scene.subset([0]), world.segments[:1])
+    assert alone.fate_counts()[Fate.NO_NEIGHBOR] == len(world.segments[0])
+    assert "share too few points" in explain(alone)
+    short = map_lines(world.scene, world.segments, options=MapLinesOptions(min_length=1e4))
+    assert "min_length" in explain(short)
+
+
+def test_inputs_are_checked(world):
+    with pytest.raises(InputError, match="one set per image"):
+        map_lines(world.scene, world.segments[:-1])
+    wrong = LineMatches(np.array([[0, 10_000]]), np.ones(1))
+    with pytest.raises(InputError, match="indices up to"):
+        map_lines(world.scene, world.segments, lambda i, j: wrong)
+
+
+def test_nothing_is_changed(world):
+    before = [s.ends.copy() for s in world.segments]
+    map_lines(world.scene, world.segments)
+    assert all(np.array_equal(a, s.ends) for a, s in zip(before, world.segments, strict=True))

@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The viewer: what is drawn, what a click finds, that the page is served, and that Ctrl-C ends it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import urllib.request
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from _scene import exact_scene
+
+from groma.cli.main import run
+from groma.errors import InputError
+from groma.io import write_scene
+from groma.scene import Points, Scene, Similarity, synthetic
+from groma.viz import viewer
+from groma.viz._patches import plane_patches
+from groma.viz._view_content import LINE_MODES, REACH, ray_to_segments, view_content
+from groma.viz.viewer import open_viewer, serving
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return synthetic.holistic(10, seed=2).truth
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("images")
+    cv2.imwrite(str(folder / "first.jpg"), np.full((480, 640, 3), 90, np.uint8))
+    return folder
+
+
+@pytest.fixture
+def view(folder):
+    with serving(exact_scene(), folder, port=0) as view:
+        yield view
+
+
+# --------------------------------------------------------------------------------------------------------- Content
+
+
+def test_everything_is_moved_together(scene):
+    content = view_content(scene)
+    frame = content.view_from_world
+    np.testing.assert_allclose(content.segments, frame.points(scene.lines.segments), rtol=1e-12)
+    np.testing.assert_allclose(content.camera_centers, frame.points(scene.cam_centers_in_world), atol=1e-9)
+    # The optical axis of each camera, turned by its quaternion, leads to a point that the camera sees in its middle.
+    w, x, y, z = content.camera_wxyz.T
+    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    ahead = frame.inverse().points(content.camera_centers + axis)
+    in_cam = np.concatenate([ahead, np.ones((len(ahead), 1))], axis=1)
+    from groma.geometry import se3
+
+    in_cam = np.einsum("nij,nj->ni", se3.to_matrix(scene.cam_from_world), in_cam)
+    np.testing.assert_allclose(in_cam[:, :2], 0, atol=1e-9)
+    assert (in_cam[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+def test_size_and_place_of_the_world_do_not_matter(scene, scale):
+    there = Similarity(scale, np.eye(3), np.array([5e5, -2e6, 300.0]) * scale)
+    here, away = view_content(scene), view_content(scene.transformed(there))
+    np.testing.assert_allclose(away.segments, here.segments, atol=1e-6)
+    np.testing.assert_allclose(away.points, here.points, atol=1e-6)
+    np.testing.assert_allclose(away.statistics.length, scale * here.statistics.length, rtol=1e-6)
+    assert REACH / 2 < np.abs(here.segments).max() < 4 * REACH
+
+
+def test_openings_are_those_of_the_camera(scene):
+    content = view_content(scene)
+    np.testing.assert_allclose(content.camera_openings, 2 * np.arctan(384 / 800), rtol=1e-12)
+    np.testing.assert_allclose(content.camera_aspects, 1024 / 768, rtol=1e-12)
+
+
+@pytest.mark.parametrize("mode", LINE_MODES)
+def test_line_colours(scene, mode):
+    content = view_content(scene)
+    found = content.line_colours(mode)
+    assert found.colours.shape == (scene.num_lines, 3) and found.colours.dtype == np.uint8
+    assert len(np.unique(found.colours, axis=0)) > 1
+    assert (found.low is None) == (mode == "direction")
+
+
+def test_long_lines_are_red_and_short_ones_blue(scene):
+    content = view_content(scene)
+    colours, length = content.line_colours("length").colours, content.statistics.length
+    assert colours[length.argmax()].tolist() == [217, 71, 43]
+    assert colours[length.argmin()].tolist() == [44, 111, 187]
+
+
+def test_lines_of_one_direction_have_one_colour():
+    made = synthetic.corridor("tiny", seed=0).truth
+    along = made.relations.line_along_direction
+    assert len(along)
+    colours = view_content(made).line_colours("direction").colours
+    for direction in np.unique(along[:, 1]):
+        assert len(np.unique(colours[along[along[:, 1] == direction, 0]], axis=0)) == 1
+
+
+def test_first_points_are_an_even_sample():
+    xyz = np.zeros((20_000, 3))
+    xyz[:, 0] = np.linspace(-1, 1, len(xyz))
+    content = view_content(Scene(points=Points.at(xyz)))
+    # The mean of 500 of evenly spread numbers: standard deviation below 0.058 of their half range.
+    assert abs(content.points[:500].mean(axis=0) @ [1, 1, 1]) < 4 * 0.058 * np.abs(content.points).max()
+
+
+def test_points_that_are_no_numbers_are_not_drawn():
+    xyz = np.random.default_rng(0).normal(size=(50, 3))
+    xyz[7] = np.nan
+    content = view_content(Scene(points=Points.at(xyz)))
+    assert len(content.points) == 49 and all(len(colours) == 49 for colours in content.point_colours.values())
+
+
+# --------------------------------------------------------------------------------------------------------- Patches
+
+
+def test_patches_hold_their_members(scene):
+    polygons, members = plane_patches(scene)
+    assert len(polygons) == scene.num_planes
+    for plane, polygon in enumerate(polygons):
+        normal, offset = scene.planes.hesse[plane, :3], scene.planes.hesse[plane, 3]
+        np.testing.assert_allclose(polygon @ normal + offset, 0, atol=1e-9)
+        edges = np.roll(polygon, -1, axis=0) - polygon
+        turns = np.cross(edges, np.roll(edges, -1, axis=0)) @ normal
+        assert (turns > 0).all() or (turns < 0).all()
+        relations = scene.relations
+        lines = relations.line_on_plane[relations.line_on_plane[:, 1] == plane, 0]
+        points = relations.point_on_plane[relations.point_on_plane[:, 1] == plane, 0]
+        assert members[plane] == len(lines) + len(points)
+        places = np.concatenate([scene.points.xyz[points], scene.lines.segments[lines].reshape(-1, 3)])
+        sides = np.einsum("nei,i->ne", np.cross(edges[None], places[:, None] - polygon[None]), normal)
+        assert (np.sign(turns[0]) * sides > -1e-9).all()
+
+
+def test_one_member_far_away_does_not_stretch_a_patch():
+    scene = exact_scene()
+    xyz = scene.points.xyz.copy()
+    xyz[4, :2] = 1e4
+    polygon = plane_patches(scene.with_points(xyz))[0][0]
+    assert np.abs(polygon).max() < 10
+
+
+def test_planes_without_members_get_a_square():
+    scene = exact_scene()
+    polygons, members = plane_patches(scene.points_only().replace(planes=scene.planes))
+    assert polygons[0].shape == (4, 3) and members.tolist() == [0]
+    np.testing.assert_allclose(polygons[0][:, 2], 0.25, atol=1e-12)
+
+
+# ---------------------------------------------------------------------------------------------------------- Picking
+
+
+def test_distance_of_a_ray_from_segments_against_sampling():
+    rng = np.random.default_rng(4)
+    segments = rng.normal(size=(200, 2, 3))
+    origin, direction = np.array([0.3, -4.0, 0.2]), np.array([0.1, 1.0, 0.05])
+    distance, depth = ray_to_segments(origin, 7 * direction, segments)
+    forward = direction / np.linalg.norm(direction)
+    steps = np.linspace(0, 1, 4001)[None, :, None]
+    way = segments[:, :1] * (1 - steps) + segments[:, 1:] * steps - origin
+    ahead = way @ forward
+    tangent = np.linalg.norm(np.cross(way, forward), axis=2) / ahead
+    np.testing.assert_allclose(distance, tangent.min(axis=1), atol=1e-3)
+    assert (distance <= tangent.min(axis=1) + 1e-12).all()
+    np.testing.assert_allclose(depth, np.take_along_axis(ahead, tangent.argmin(axis=1)[:, None], 1)[:, 0], atol=5e-3)
+
+
+def test_segments_behind_or_across_the_origin():
+    segments = np.array([[[0.1, 0, -1], [0.1, 0, -2]], [[0, 1, -1], [0, 1, 3.0]], [[0, 0, 1], [0, 0, 5.0]]])
+    distance, _ = ray_to_segments(np.zeros(3), np.array([0, 0, 1.0]), segments)
+    assert np.isinf(distance[0])
+    np.testing.assert_allclose(distance[1:], [1 / 3, 0], atol=1e-12)
+
+
+def test_each_line_is_found_by_a_ray_to_its_middle(scene):
+    content = view_content(scene)
+    every = np.ones(scene.num_lines, bool)
+    for line, segment in enumerate(content.segments):
+        ray = segment.mean(axis=0) - content.start_position
+        assert content.pick(content.start_position, ray, 1e-6, every) == line
+        assert content.pick(content.start_position, -ray, 1e-6, every) is None
+        hidden = every.copy()
+        hidden[line] = False
+        assert content.pick(content.start_position, ray, 1e-6, hidden) != line
+
+
+def test_of_two_lines_behind_each_other_the_front_one_is_found(scene):
+    content = view_content(scene)
+    segments = content.segments.copy()
+    segments[0] = [[-1, 0, 2], [1, 0, 2]]
+    segments[1] = [[0, -1, 4], [0, 1, 4]]
+    from dataclasses import replace
+
+    content = replace(content, segments=segments)
+    shown = np.arange(scene.num_lines) < 2
+    assert content.pick(np.zeros(3), np.array([0, 0.001, 1]), 0.01, shown) == 0
+
+
+# ----------------------------------------------------------------------------------------------------------- Server
+
+
+def test_the_page_is_served(view):
+    address = f"http://127.0.0.1:{view.server.get_port()}"
+    with urllib.request.urlopen(address, timeout=20) as answer:
+        assert answer.status == 200
+        assert b"<html" in answer.read()[:2000].lower()
+    assert view.server.get_host() == "127.0.0.1"
+
+
+def test_every_kind_is_drawn(view):
+    names = ["/points", "/lines", "/cameras/0", "/cameras/1", "/planes/0/face", "/planes/0/edge"]
+    assert all(view.server.scene.get_handle_by_name(name) is not None for name in names)
+    assert view.num_pictures == 1
+    assert view.server.scene.get_handle_by_name("/cameras/0").image is not None
+    assert view.server.scene.get_handle_by_name("/cameras/1").image is None
+
+
+def test_switches(view):
+    for name, node in [
+        ("points", "/points"),
+        ("lines", "/lines"),
+        ("cameras", "/cameras/1"),
+        ("planes", "/planes/0/face"),
+    ]:
+        for shown in (False, True):
+            view.shown[name].value = shown
+            assert view.server.scene.get_handle_by_name(node).visible is shown
+    view.shown["photographs"].value = False
+    assert view.server.scene.get_handle_by_name("/cameras/0").image is None
+    view.shown["photographs"].value = True
+    assert view.server.scene.get_handle_by_name("/cameras/0").image is not None
+
+
+def test_fewer_points_and_lines(view):
+    view.point_count.value = 5
+    assert view.points.points.shape == (5, 3)
+    view.min_images.value = 3
+    assert view.lines.points.shape == (0, 2, 3) and "0 of 4" in view.legend.content
+    view.min_images.value = 0
+    assert view.lines.points.shape == (4, 2, 3)
+
+
+def test_colours_of_lines_change(view):
+    before = np.array(view.lines.colors)
+    view.line_mode.value = "direction"
+    assert view.lines.colors.shape == before.shape and (view.lines.colors != before).any()
+
+
+def test_a_click_lists_the_observations(view):
+    content = view.content
+    camera = SimpleNamespace(image_height=900, fov=0.9)
+    ray = content.segments[2].mean(axis=0) - content.start_position
+    event = SimpleNamespace(
+        client=SimpleNamespace(camera=camera), ray_origin=tuple(content.start_position), ray_direction=tuple(ray)
+    )
+    view._clicked(event)
+    assert view.selected == 2
+    said = view.selection.content
+    assert "<b>Line 3</b>" in said and "2 images" in said and "first.jpg" in said and "second.jpg" in said
+    assert said.count("<svg") == 1  # there is one photograph
+    assert view.server.scene.get_handle_by_name("/selection/line") is not None
+    event.ray_direction = tuple(-ray)
+    view._clicked(event)
+    assert view.selected is None and "Click a line" in view.selection.content
+    assert view.server.scene.get_handle_by_name("/selection/line") is None
+
+
+def test_names_of_images_are_text():
+    with serving(exact_scene(("<b>one</b>", "two")), port=0) as view:
+        view.select(0)
+        assert "<b>one" not in view.selection.content and "&lt;b&gt;one" in view.selection.content
+
+
+def test_much_is_thinned_out(monkeypatch, scene):
+    monkeypatch.setattr(viewer, "FIRST_POINTS", 30)
+    monkeypatch.setattr(viewer, "MAX_CAMERAS", 4)
+    monkeypatch.setattr(viewer, "MAX_PLANES", 1)
+    with serving(scene, port=0) as view:
+        assert len(view.points.points) == 30 < scene.num_points
+        assert len(view._nodes["cameras"]) == 4 and len(view._nodes["planes"]) == 2
+
+
+def test_points_alone_can_be_seen():
+    with serving(Scene(points=Points.at(np.eye(3))), port=0) as view:
+        assert len(view.points.points) == 3 and len(view.lines.points) == 0
+
+
+def test_nothing_to_see_is_said():
+    with pytest.raises(InputError, match="nothing to look at"):
+        open_viewer(Scene(), port=0)
+
+
+def test_a_folder_that_is_none_is_refused(tmp_path):
+    with pytest.raises(InputError, match="not a folder"):
+        open_viewer(exact_scene(), tmp_path / "none", port=0)
+
+
+# --------------------------------------------------------------------------------------------------------- Command
+
+
+def test_command(tmp_path, monkeypatch, capsys):
+    write_scene(exact_scene(), tmp_path / "scene.npz")
+    (tmp_path / "images").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(viewer, "wait_for_interrupt", lambda: None)
+    assert run(["view", "scene.npz", "--images", "images", "--port", "0", "--no-browser", "--json", "r.json"]) == 0
+    said = capsys.readouterr()
+    assert "Open http://localhost:" in said.out and "viser" not in said.out
+    assert "holds none of the images" in said.err
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["num_lines"] == 4 and report["address"].startswith("http://localhost:")
+    assert not any(thread.name.startswith("viser") for thread in threading.enumerate())
+
+
+def test_command_refuses_in_one_line(tmp_path, capsys):
+    write_scene(exact_scene(), tmp_path / "scene.npz")
+    assert run(["view", str(tmp_path / "scene.npz"), "--images", str(tmp_path / "no"), "--no-browser"]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
+def test_ctrl_c_ends_it(tmp_path):
+    write_scene(exact_scene(), tmp_path / "scene.npz")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "groma.cli.main", "view", "scene.npz", "--port", "0", "--no-browser"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    try:
+        lines = [process.stdout.readline(), process.stdout.readline()]
+        assert "Ctrl-C ends" in lines[1]
+        process.send_signal(signal.SIGINT)
+        rest, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    assert errors == "" and "Closed" in rest
