@@ -30,6 +30,8 @@ def view(
     The page is served from this machine, to this machine only, until Ctrl-C. --json writes the address and the counts
     as soon as the page is ready.
     """
+    import contextlib
+
     from groma.cli import _output
     from groma.cli._console import Console
 
@@ -42,7 +44,8 @@ def view(
 
     scene = read_scene(source)
     console.say(sentence_of(scene))
-    with serving(scene, images, port) as shown:
+    # Once the page is there, Ctrl-C is the way to end and no accident.
+    with serving(scene, images, port) as shown, contextlib.suppress(KeyboardInterrupt):
         address = f"http://localhost:{shown.server.get_port()}"
         if images is not None and shown.num_pictures == 0:
             console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[0]!r}.")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Where each segment may lie in space, and which places several images agree on.
+r"""Where each segment may lie in space.
 
 A 3D segment behind a segment of image i is two numbers: the inverse depths :math:`q = (q_1, q_2)` of its end points on
 their rays :math:`f_1, f_2`. A segment of image j with line :math:`l` proposes the q at which the reference segment's
@@ -11,9 +11,6 @@ linear, without an intersection to solve. Its covariance follows from the distan
 :math:`\partial \mathrm{dist}_k / \partial q_k = l^\top a / x_{k,3}`, and from the noise of both segments' end points.
 Where the line runs along the epipolar line, :math:`l^\top a \to 0`: the covariance explodes, and the proposal is left
 out of the decision; the track picks such segments up again when others have fixed the line.
-
-Proposals from different neighbours support each other by their Mahalanobis distance. The best supported ones are fused
-in information form, compared again, and the one that most images agree on is kept.
 
 References
 ----------
@@ -28,13 +25,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._typing import FloatArray, IntArray
 from groma.pipelines._line_views import LineViews
 
-#: Mahalanobis distance up to which two proposals agree: 99.7 % for two degrees of freedom.
-GATE = 11.6
-#: Hypotheses per segment that are fused and compared.
-NUM_SEEDS = 3
 #: The depth range holds for the middle of a segment; its ends may leave it by this factor.
 END_MARGIN = 2.0
 #: Bins of the angle about the baseline.
@@ -173,118 +166,6 @@ def _propose_pairs(
                     out[count, c] = work[c]
             count += 1
     return count
-
-
-@kernel
-def _distance(d1, d2, c11, c12, c22):
-    """Squared Mahalanobis distance."""
-    return (c22 * d1 * d1 - 2.0 * c12 * d1 * d2 + c11 * d2 * d2) / max(c11 * c22 - c12 * c12, 1e-300)
-
-
-@loop
-def _support(pointers, order, neighbor, values, num_neighbors, gate, total):
-    """Support of every proposal of every segment by the proposals of other neighbours: total (M,)."""
-    best = np.zeros(num_neighbors + 1)
-    for i in range(len(pointers) - 1):
-        begin, end = pointers[i], pointers[i + 1]
-        largest = 0.0
-        for k in range(begin, end):
-            largest = max(largest, values[order[k], 2])
-        for k in range(begin, end):
-            p = order[k]
-            reach = math.sqrt(gate * (values[p, 2] + largest))
-            best[:] = 0.0
-            best[neighbor[p]] = values[p, 5]
-            for side in range(-1, 2, 2):
-                m = k + side
-                while begin <= m < end:
-                    r = order[m]
-                    d1 = values[r, 0] - values[p, 0]
-                    if abs(d1) > reach:
-                        break
-                    m += side
-                    if neighbor[r] == neighbor[p]:
-                        continue
-                    d2 = values[r, 1] - values[p, 1]
-                    c11, c22 = values[r, 2] + values[p, 2], values[r, 4] + values[p, 4]
-                    if d1 * d1 > gate * c11 or d2 * d2 > gate * c22:
-                        continue
-                    distance = _distance(d1, d2, c11, values[r, 3] + values[p, 3], c22)
-                    if distance < gate:
-                        weight = values[r, 5] * (1.0 - distance / gate)
-                        if weight > best[neighbor[r]]:
-                            best[neighbor[r]] = weight
-            total[p] = best.sum()
-
-
-@loop
-def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate, min_support, q, covariance, score,
-            supporters, rival):  # fmt: skip
-    """Fuse the best supported proposals of each segment and keep the one that most neighbours agree on."""
-    chosen = np.empty(num_neighbors + 1, np.int64)
-    nearest = np.empty(num_neighbors + 1)
-    for i in range(len(pointers) - 1):
-        begin, end = pointers[i], pointers[i + 1]
-        used = np.zeros(end - begin, np.bool_)
-        for _ in range(NUM_SEEDS):
-            seed, top = -1, 0.0
-            for k in range(begin, end):
-                if not used[k - begin] and total[order[k]] > top:
-                    seed, top = k, total[order[k]]
-            if seed < 0 or top <= score[i] - 1.0:
-                break
-            p = order[seed]
-            q1, q2, c11, c12, c22 = values[p, 0], values[p, 1], values[p, 2], values[p, 3], values[p, 4]
-            number, points, value = 0, 0, 0.0
-            for _ in range(3):  # fuse, compare again
-                nearest[:] = gate
-                chosen[:] = -1
-                for k in range(begin, end):
-                    r = order[k]
-                    d1, d2 = values[r, 0] - q1, values[r, 1] - q2
-                    v11, v22 = values[r, 2] + c11, values[r, 4] + c22
-                    if d1 * d1 > gate * v11 or d2 * d2 > gate * v22:
-                        continue
-                    distance = _distance(d1, d2, v11, values[r, 3] + c12, v22)
-                    if distance < gate:
-                        used[k - begin] = True
-                    if distance < nearest[neighbor[r]]:
-                        nearest[neighbor[r]], chosen[neighbor[r]] = distance, r
-                number, points, value = 0, 0, 0.0
-                i11 = i12 = i22 = y1 = y2 = 0.0
-                for n in range(num_neighbors + 1):
-                    r = chosen[n]
-                    if r < 0:
-                        continue
-                    if n == num_neighbors:
-                        points = 1
-                    else:
-                        number += 1
-                    weight = 1.0 / (1.0 + nearest[n] / 4.0)
-                    value += values[r, 5] * (1.0 - nearest[n] / gate)
-                    determinant = values[r, 2] * values[r, 4] - values[r, 3] * values[r, 3]
-                    if not determinant > 0.0:
-                        continue
-                    w11, w12, w22 = values[r, 4] / determinant, -values[r, 3] / determinant, values[r, 2] / determinant
-                    i11, i12, i22 = i11 + weight * w11, i12 + weight * w12, i22 + weight * w22
-                    y1 += weight * (w11 * values[r, 0] + w12 * values[r, 1])
-                    y2 += weight * (w12 * values[r, 0] + w22 * values[r, 1])
-                determinant = i11 * i22 - i12 * i12
-                if not determinant > 0.0:
-                    break
-                c11, c12, c22 = i22 / determinant, -i12 / determinant, i11 / determinant
-                q1, q2 = c11 * y1 + c12 * y2, c12 * y1 + c22 * y2
-            if number < min_support or number + points < 2:
-                continue
-            if value > score[i]:
-                rival[i] = score[i]
-                score[i] = value
-                q[i, 0], q[i, 1] = q1, q2
-                covariance[i, 0], covariance[i, 1], covariance[i, 2] = c11, c12, c22
-                for n in range(num_neighbors):
-                    supporters[i, n] = other[chosen[n]] if chosen[n] >= 0 else -1
-            elif value > rival[i]:
-                rival[i] = value
 
 
 @loop
@@ -457,37 +338,3 @@ class Proposer:
         ]
         reached[usable] = np.maximum(reached[usable], local)
         return needed
-
-
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """The place chosen for each segment of an image."""
-
-    #: (n,) whether enough neighbours agree on one.
-    found: BoolArray
-    #: (n, 2) inverse depths of the end points.
-    q: FloatArray
-    #: (n, 3) their variances and covariance, c11 c12 c22.
-    covariance: FloatArray
-    #: (n,) summed support.
-    score: FloatArray
-    #: (n,) support of the best place that disagrees.
-    rival: FloatArray
-    #: (n, num_neighbors) rows of the supporting segments, -1 for none.
-    supporters: IntArray
-
-
-def choose(proposals: Proposals, num_segments: int, num_neighbors: int, min_support: int) -> Choice:
-    """Choose the place of each segment by the summed support of distinct neighbours."""
-    by_segment = np.lexsort([proposals.values[:, 0], proposals.segment])
-    pointers = np.searchsorted(proposals.segment[by_segment], np.arange(num_segments + 1))
-    total = np.zeros(len(proposals.segment))
-    _support(pointers, by_segment, proposals.neighbor, proposals.values, num_neighbors, GATE, total)
-    q, covariance = np.zeros((num_segments, 2)), np.zeros((num_segments, 3))
-    score, rival = np.zeros(num_segments), np.zeros(num_segments)
-    supporters = np.full((num_segments, num_neighbors), -1, np.int64)
-    _choose(
-        pointers, by_segment, proposals.neighbor, proposals.other, proposals.values, total, num_neighbors, GATE,
-        min_support, q, covariance, score, supporters, rival,
-    )  # fmt: skip
-    return Choice(score > 0.0, q, covariance, score, rival, supporters)

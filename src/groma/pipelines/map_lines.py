@@ -4,8 +4,8 @@
 Stages, each on all images before the next begins:
 
 1. neighbours by the points that images share (:mod:`groma.pipelines._neighbors`);
-2. for every segment, proposals of its place from every neighbour, and the one most neighbours agree on
-   (:mod:`groma.pipelines._line_proposals`), one image at a time;
+2. for every segment, proposals of its place from every neighbour (:mod:`groma.pipelines._line_proposals`), and the
+   one most neighbours agree on (:mod:`groma.pipelines._line_support`), one image at a time;
 3. tracks: link, refine, recover, merge, trim (:mod:`groma.pipelines._line_tracks`).
 
 Every segment ends with a :class:`Fate`, so that the question why a line is missing has an answer.
@@ -23,7 +23,8 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
-from groma.pipelines._line_proposals import WEAK, Choice, Proposer, choose
+from groma.pipelines._line_proposals import WEAK, Proposer
+from groma.pipelines._line_support import Choice, choose
 from groma.pipelines._line_tracks import Tracks, link
 from groma.pipelines._line_views import LineViews, build_views
 from groma.pipelines._neighbors import covisible_neighbors

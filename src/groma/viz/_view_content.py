@@ -120,9 +120,6 @@ def view_content(scene: Scene) -> ViewContent:
     shown = drawable(scene)
     frame, position, target = _frame(scene)
     order = np.random.default_rng(0).permutation(scene.num_points)
-    xyz = scene.points.xyz[order]
-    finite = np.isfinite(xyz).all(axis=1)
-    order, xyz = order[finite], xyz[finite]
     errors = shown.point_errors[order]
     known = errors[np.isfinite(errors)]
     point_colours = {}
@@ -139,7 +136,7 @@ def view_content(scene: Scene) -> ViewContent:
         scene=scene,
         statistics=line_statistics(scene, shown),
         view_from_world=frame,
-        points=frame.points(xyz),
+        points=frame.points(scene.points.xyz[order]),
         point_colours=point_colours,
         segments=frame.points(scene.lines.segments),
         patches=[frame.points(patch) for patch in patches],
@@ -225,7 +222,6 @@ def _openings(scene: Scene) -> tuple[FloatArray, FloatArray]:
 def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:
     """Return ``view_from_world``, and in the viewer the place to look from and the place to look at."""
     landmarks = np.concatenate([scene.points.xyz, scene.lines.segments.reshape(-1, 3)])
-    landmarks = landmarks[np.isfinite(landmarks).all(axis=1)]
     centers = scene.cam_centers_in_world
     places = landmarks if len(landmarks) else centers
     middle = np.median(places, axis=0) if len(places) else np.zeros(3)

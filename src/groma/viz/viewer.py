@@ -192,8 +192,7 @@ class SceneView:
 
     def lines_shown(self) -> BoolArray:
         """(L,) which lines are drawn."""
-        enough = self.content.statistics.num_images >= self.min_images.value
-        return enough & np.isfinite(self.content.segments).all(axis=(1, 2))
+        return self.content.statistics.num_images >= self.min_images.value
 
     def _add_cameras(self) -> None:
         content = self.content
@@ -235,8 +234,6 @@ class SceneView:
         order = np.argsort(-self.content.patch_members, kind="stable")[:MAX_PLANES]
         for rank, plane in enumerate(order):
             corners = self.content.patches[plane]
-            if not np.isfinite(corners).all():
-                continue
             colour = tuple(int(channel) for channel in _colours.PALETTE[rank % len(_colours.PALETTE)])
             fan = np.arange(1, len(corners) - 1)
             self._nodes["planes"] += [
@@ -342,20 +339,20 @@ class SceneView:
             f"{numbers.num_images[line]} images, {_px(numbers.residual_px[line])} rms"
             + (f", on plane {on}" if on else "")
         ]
-        entries = []
+        for row in order[_even(len(order), MAX_CROPS)]:
+            lines.append(self._crop(int(row), _colours.css(_colours.ramp(numbers.observation_residual_px[row] / top))))
+        left = "<td style='text-align:left;overflow-wrap:anywhere'>"
+        entries = [f"<tr style='opacity:.6'>{left}image</td><td colspan='2'>ends, px</td><td>long, px</td></tr>"]
         for row in order[:MAX_LISTED]:
             first, second = np.linalg.norm(numbers.end_residuals[row], axis=1)
             length = np.linalg.norm(seen.segment[row, 2:] - seen.segment[row, :2])
             entries.append(
-                f"<tr><td style='overflow-wrap:anywhere'>{html.escape(scene.images.names[seen.image_idx[row]])}</td>"
+                f"<tr>{left}{html.escape(scene.images.names[seen.image_idx[row]])}</td>"
                 f"<td>{first:.2f}</td><td>{second:.2f}</td><td>{length:.0f}</td></tr>"
             )
-        for row in order[_even(len(order), MAX_CROPS)]:
-            lines.append(self._crop(int(row), _colours.css(_colours.ramp(numbers.observation_residual_px[row] / top))))
+        style = "width:100%;text-align:right;border-spacing:6px 1px;font-variant-numeric:tabular-nums"
         lines.append(
-            "<div style='max-height:16em;overflow-y:auto'><table style='width:100%;text-align:right;border-spacing:6px 1px;font-variant-numeric:tabular-nums'>"
-            "<tr style='opacity:.6'><td style='text-align:left'>image</td><td>ends, px</td><td></td><td>long, px</td>"
-            "</tr>" + "".join(entries).replace("<tr><td style='", "<tr><td style='text-align:left;") + "</table></div>"
+            f"<div style='max-height:16em;overflow-y:auto'><table style='{style}'>{''.join(entries)}</table></div>"
         )
         if len(order) > MAX_LISTED:
             lines.append(_note(f"and {len(order) - MAX_LISTED} more"))
@@ -445,11 +442,10 @@ def serving(
 
 
 def wait_for_interrupt() -> None:
-    """Return when Ctrl-C is pressed."""
+    """Wait until Ctrl-C is pressed, which raises :class:`KeyboardInterrupt`."""
     never = threading.Event()
-    with contextlib.suppress(KeyboardInterrupt):
-        while not never.wait(0.5):  # a wait without end cannot be interrupted on every system
-            pass
+    while not never.wait(0.5):  # a wait without end cannot be interrupted on every system
+        pass
 
 
 def _silence() -> contextlib.AbstractContextManager[Any]:
