@@ -19,7 +19,7 @@ def map_(
         Path | None,
         typer.Option("--model", metavar="COLMAP", help="Poses, cameras and points; without it they are reconstructed."),
     ] = None,
-    min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 20.0,
+    min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
     refine_poses: Annotated[
         bool, typer.Option("--refine-poses/--fix-poses", help="Move the cameras too, or the landmarks alone.")

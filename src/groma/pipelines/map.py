@@ -51,7 +51,7 @@ class MapOptions:
     """Options of :func:`map_images`."""
 
     #: Shortest segment, pixels.
-    min_segment_length: float = 20.0
+    min_segment_length: float = 12.0
     lines: MapLinesOptions = field(default_factory=MapLinesOptions)
     structure: StructureOptions = field(default_factory=StructureOptions)
     #: Look for planes and common directions.
