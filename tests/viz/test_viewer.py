@@ -209,7 +209,7 @@ def test_the_page_is_served(view):
 
 
 def test_every_kind_is_drawn(view):
-    names = ["/points", "/lines", "/cameras/0", "/cameras/1", "/planes/0/face", "/planes/0/edge"]
+    names = ["/points", "/lines", "/cameras/0", "/cameras/1", "/planes/faces/0", "/planes/edges"]
     assert all(view.server.scene.get_handle_by_name(name) is not None for name in names)
     assert view.num_pictures == 1
     assert view.server.scene.get_handle_by_name("/cameras/0").image is not None
@@ -221,7 +221,7 @@ def test_switches(view):
         ("points", "/points"),
         ("lines", "/lines"),
         ("cameras", "/cameras/1"),
-        ("planes", "/planes/0/face"),
+        ("planes", "/planes/faces/0"),
     ]:
         for shown in (False, True):
             view.shown[name].value = shown
@@ -275,10 +275,17 @@ def test_names_of_images_are_text():
 def test_much_is_thinned_out(monkeypatch, scene):
     monkeypatch.setattr(viewer, "FIRST_POINTS", 30)
     monkeypatch.setattr(viewer, "MAX_CAMERAS", 4)
-    monkeypatch.setattr(viewer, "MAX_PLANES", 1)
     with serving(scene, port=0) as view:
         assert len(view.points.points) == 30 < scene.num_points
-        assert len(view._nodes["cameras"]) == 4 and len(view._nodes["planes"]) == 2
+        assert len(view._nodes["cameras"]) == 4
+
+
+def test_faces_cover_the_patches():
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
+    vertices, faces = viewer._fans([square, 2 * square + 5, square[:3]])
+    corners = vertices[faces]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    np.testing.assert_allclose([area[:2].sum(), area[2:4].sum(), area[4:].sum()], [1, 4, 0.5])
 
 
 def test_points_alone_can_be_seen():

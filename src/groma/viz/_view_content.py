@@ -224,7 +224,7 @@ def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:
     landmarks = np.concatenate([scene.points.xyz, scene.lines.segments.reshape(-1, 3)])
     centers = scene.cam_centers_in_world
     places = landmarks if len(landmarks) else centers
-    middle = np.median(places, axis=0) if len(places) else np.zeros(3)
+    middle: FloatArray = np.asarray(np.median(places, axis=0), np.float64) if len(places) else np.zeros(3)
     # The better part of the landmarks, and the cameras, decide on the size; a few points far away do not.
     reach = np.percentile(np.linalg.norm(places - middle, axis=1), 85) if len(places) else 1.0
     if len(centers):
@@ -243,8 +243,8 @@ def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:
         away = away - (away @ up) * up
     if np.linalg.norm(away) < 1e-9 * max(reach, 1e-300):
         away = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    first = away / np.linalg.norm(away)
-    rotation = np.stack([first, np.cross(up, first), up])
+    first: FloatArray = np.asarray(away / np.linalg.norm(away), np.float64)
+    rotation: FloatArray = np.stack([first, np.cross(up, first), up]).astype(np.float64)
     frame = Similarity(scale, rotation, -scale * (rotation @ middle))
     # From behind the cameras, from the side and from above.
     back = np.array([np.cos(0.45) * np.cos(0.4), np.sin(0.45) * np.cos(0.4), np.sin(0.4)])

@@ -31,9 +31,8 @@ if TYPE_CHECKING:
 
 #: Points drawn at first; a slider asks for more.
 FIRST_POINTS = 100_000
-#: Cameras and planes are objects of the page one by one; of more than this an even choice is drawn.
+#: Cameras are objects of the page one by one; of more than this an even choice is drawn.
 MAX_CAMERAS = 400
-MAX_PLANES = 300
 #: Longer side of the photographs in the cameras, pixels.
 THUMBNAIL = 256
 #: A click this near to a line hits it, pixels.
@@ -43,7 +42,10 @@ MAX_LISTED = 40
 MAX_CROPS = 4
 
 _ORANGE = (255, 150, 30)
+#: Cameras: where there are few, and where there are many.
 _CAMERA = (60, 66, 74)
+_CAMERAS = (150, 156, 164)
+_MANY_CAMERAS = 100
 _RAMP = "linear-gradient(90deg,#2c6fbb,#3fb6a8,#e8c53a,#d9472b)"
 _HINT = "Click a line to see where it was observed."
 
@@ -198,6 +200,7 @@ class SceneView:
         content = self.content
         self._camera_images = _even(content.scene.num_images, MAX_CAMERAS)
         self._pictures: list[Any] = []
+        many = len(self._camera_images) > _MANY_CAMERAS
         # On average a camera is as large as a third of its distance to the next, within limits.
         self._camera_scale = _camera_scale(content.camera_centers)
         for image in self._camera_images:
@@ -212,9 +215,9 @@ class SceneView:
                     fov=float(content.camera_openings[image]),
                     aspect=float(content.camera_aspects[image]),
                     scale=self._camera_scale,
-                    thickness=1.5,
+                    thickness=1.0 if many else 1.5,
                     thickness_units="screen",
-                    color=_CAMERA,
+                    color=_CAMERAS if many else _CAMERA,
                     image=picture,
                     format="jpeg",
                     jpeg_quality=80,
@@ -231,31 +234,40 @@ class SceneView:
                 node.scale = self._camera_scale * self.camera_size.value
 
     def _add_planes(self) -> None:
-        order = np.argsort(-self.content.patch_members, kind="stable")[:MAX_PLANES]
-        for rank, plane in enumerate(order):
-            corners = self.content.patches[plane]
-            colour = tuple(int(channel) for channel in _colours.PALETTE[rank % len(_colours.PALETTE)])
-            fan = np.arange(1, len(corners) - 1)
-            self._nodes["planes"] += [
+        """Planes of one colour are one object of the page, so that hundreds of them stay quick to draw."""
+        patches = self.content.patches
+        if not patches:
+            return
+        # Neighbours in size, which may well lie beside each other, get different colours.
+        group = np.empty(len(patches), np.int64)
+        group[np.argsort(-self.content.patch_members, kind="stable")] = np.arange(len(patches))
+        group %= len(_colours.PALETTE)
+        for colour in np.unique(group):
+            vertices, faces = _fans([patches[plane] for plane in np.flatnonzero(group == colour)])
+            red, green, blue = (int(channel) for channel in _colours.PALETTE[colour])
+            self._nodes["planes"].append(
                 self.server.scene.add_mesh_simple(
-                    f"/planes/{plane}/face",
-                    corners.astype(np.float32),
-                    np.column_stack([np.zeros_like(fan), fan, fan + 1]).astype(np.uint32),
-                    color=colour,
+                    f"/planes/faces/{colour}",
+                    vertices.astype(np.float32),
+                    faces.astype(np.uint32),
+                    color=(red, green, blue),
                     opacity=0.28,
                     side="double",
                     flat_shading=True,
                     cast_shadow=False,
                     receive_shadow=False,
-                ),
-                self.server.scene.add_line_segments(
-                    f"/planes/{plane}/edge",
-                    np.stack([corners, np.roll(corners, -1, axis=0)], axis=1).astype(np.float32),
-                    colour,
-                    thickness=1.5,
-                    thickness_units="screen",
-                ),
-            ]
+                )
+            )
+        edges = [np.stack([corners, np.roll(corners, -1, axis=0)], axis=1) for corners in patches]
+        self._nodes["planes"].append(
+            self.server.scene.add_line_segments(
+                "/planes/edges",
+                np.concatenate(edges).astype(np.float32),
+                _by_end(np.repeat(_colours.PALETTE[group], [len(edge) for edge in edges], axis=0)),
+                thickness=1.5,
+                thickness_units="screen",
+            )
+        )
 
     def _add_directions(self) -> None:
         """A bar through the middle of the scene for each direction, the longer the more lines follow it."""
@@ -470,15 +482,8 @@ def _counts(scene: Scene) -> str:
         (scene.num_directions, "directions"),
     ]
     text = ", ".join(f"{count:,} {name if count != 1 else name[:-1]}" for count, name in counts if count)
-    drawn = [
-        f"{limit} of the {count:,} {name} are drawn"
-        for count, limit, name in (
-            (scene.num_images, MAX_CAMERAS, "cameras"),
-            (scene.num_planes, MAX_PLANES, "planes"),
-        )
-        if count > limit
-    ]
-    return ". ".join([text, *drawn])
+    thinned = f". {MAX_CAMERAS} of the cameras are drawn" if scene.num_images > MAX_CAMERAS else ""
+    return text + thinned
 
 
 def _legend(low: str | None, high: str | None, meaning: str, shown: int, count: int) -> str:
@@ -516,6 +521,16 @@ def _by_end(colours: _colours.Colours) -> _colours.Colours:
     share = np.asarray(colours, float) / 255.0
     light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return np.repeat(np.round(255.0 * light).astype(np.uint8)[:, None], 2, axis=1)
+
+
+def _fans(polygons: list[FloatArray]) -> tuple[FloatArray, IntArray]:
+    """Return the corners of convex polygons, one after the other, and their triangles."""
+    begin = np.cumsum([0, *(len(corners) for corners in polygons)])
+    fans = [
+        first + np.column_stack([np.zeros(len(corners) - 2, int), *(np.arange(len(corners) - 2) + k for k in (1, 2))])
+        for first, corners in zip(begin, polygons, strict=False)
+    ]
+    return np.concatenate(polygons), np.concatenate(fans)
 
 
 def _point_size(count: int) -> float:
