@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The viewer: what is drawn, what a click finds, that the page is served, and that Ctrl-C ends it."""
 
+import contextlib
 import json
 import os
 import signal
@@ -21,8 +22,9 @@ from groma.errors import InputError
 from groma.geometry import se3
 from groma.io import write_scene
 from groma.scene import Directions, Points, Relations, Scene, Similarity, synthetic
-from groma.viz import viewer
+from groma.viz import _scene_view, viewer
 from groma.viz._patches import plane_patches
+from groma.viz._view_arrays import fans
 from groma.viz._view_content import LINE_MODES, REACH, ray_to_segments, view_content
 from groma.viz.viewer import open_viewer, serving
 
@@ -247,6 +249,20 @@ def test_colours_of_lines_change(view):
     assert view.lines.colors.shape == before.shape and (view.lines.colors != before).any()
 
 
+def test_looking_from_a_photograph(view):
+    camera = SimpleNamespace()
+    client = SimpleNamespace(camera=camera, atomic=contextlib.nullcontext)
+    view.look_from.value = "2: second.jpg"
+    view._move_to_camera(SimpleNamespace(client=client))
+    np.testing.assert_array_equal(camera.position, view.content.camera_centers[1])
+    np.testing.assert_array_equal(camera.wxyz, view.content.camera_wxyz[1])
+    assert not view.server.scene.get_handle_by_name("/cameras/1").visible
+    view.look_from.value = "outside"
+    view._move_to_camera(SimpleNamespace(client=client))
+    np.testing.assert_array_equal(camera.position, view.content.start_position)
+    assert view.server.scene.get_handle_by_name("/cameras/1").visible
+
+
 def test_a_click_lists_the_observations(view):
     content = view.content
     camera = SimpleNamespace(image_height=900, fov=0.9)
@@ -273,8 +289,8 @@ def test_names_of_images_are_text():
 
 
 def test_much_is_thinned_out(monkeypatch, scene):
-    monkeypatch.setattr(viewer, "FIRST_POINTS", 30)
-    monkeypatch.setattr(viewer, "MAX_CAMERAS", 4)
+    monkeypatch.setattr(_scene_view, "FIRST_POINTS", 30)
+    monkeypatch.setattr(_scene_view, "MAX_CAMERAS", 4)
     with serving(scene, port=0) as view:
         assert len(view.points.points) == 30 < scene.num_points
         assert len(view._nodes["cameras"]) == 4
@@ -282,7 +298,7 @@ def test_much_is_thinned_out(monkeypatch, scene):
 
 def test_faces_cover_the_patches():
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
-    vertices, faces = viewer._fans([square, 2 * square + 5, square[:3]])
+    vertices, faces = fans([square, 2 * square + 5, square[:3]])
     corners = vertices[faces]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     np.testing.assert_allclose([area[:2].sum(), area[2:4].sum(), area[4:].sum()], [1, 4, 0.5])

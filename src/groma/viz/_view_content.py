@@ -234,7 +234,7 @@ def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:
     up = -axes[:, 1].sum(axis=0) if len(axes) else np.zeros(3)
     if np.linalg.norm(up) < 0.3 * max(len(axes), 1):
         up = np.array([0.0, 0.0, 1.0])  # cameras all around: no common up
-    up = up / np.linalg.norm(up)
+    up = up / float(np.linalg.norm(up))
     away = centers.mean(axis=0) - middle if len(axes) else np.array([1.0, 1.0, 0.0])
     away = away - (away @ up) * up
     if np.linalg.norm(away) < 0.15 * reach:
@@ -245,7 +245,8 @@ def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:
         away = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first: FloatArray = np.asarray(away / np.linalg.norm(away), np.float64)
     rotation: FloatArray = np.stack([first, np.cross(up, first), up]).astype(np.float64)
-    frame = Similarity(scale, rotation, -scale * (rotation @ middle))
+    shift: FloatArray = -scale * (rotation @ middle)
+    frame = Similarity(scale, rotation, shift)
     # From behind the cameras, from the side and from above.
     back = np.array([np.cos(0.45) * np.cos(0.4), np.sin(0.45) * np.cos(0.4), np.sin(0.4)])
     return frame, 2.4 * REACH * back, np.zeros(3)
