@@ -83,7 +83,9 @@ def map_(
         write_scene(scene, draft, format="colmap")
         write_scene(scene, draft / "scene.npz")
         write_scene(scene, draft / "lines.obj")
-        write_report(draft / "report.html", result.before, scene, result.report, title=f"Map of {images.name}")
+        pictures = {name: images / name for name in scene.images.names}
+        title = f"Map of {images.absolute().name}"
+        write_report(draft / "report.html", result.before, scene, result.report, pictures, title)
         _output.write_json(str(draft / "summary.json"), numbers)
     shutil.rmtree(work, ignore_errors=True)
     console.say(

@@ -226,7 +226,7 @@ def _image_files(folder: Path) -> list[Path]:
 
 
 def _read_gray(path: Path) -> np.ndarray:
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise InputError(f"{path} cannot be read as an image. Replace it, or leave it out of the model.")
     return image

@@ -25,6 +25,7 @@ from groma._typing import FloatArray
 from groma.errors import InputError, OutputError
 from groma.viz import _charts
 from groma.viz._drawable import Drawable, drawable
+from groma.viz.overlays import overlay_section
 
 if TYPE_CHECKING:
     from groma.scene import Scene
@@ -107,6 +108,7 @@ def write_report(
         "CHARTS": _chart_cards(before, after, report),
         "NUMBERS": _numbers(before, after),
         "TABLES": _tables(after, numbers),
+        "OVERLAYS": overlay_section(scene_after, images) if images else "",
         "FOOTER": _footer(),
         "DATA": _json(_data(states, images or {})),
     }
