@@ -11,17 +11,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._typing import BoolArray, IntArray
 from groma.cameras import model as camera_model
 from groma.errors import InputError
 from groma.factors._factor import Factor, Ref
 from groma.factors.line_bearing import LineBearing
-from groma.factors.line_direction import LineDirection
-from groma.factors.line_on_plane import SegmentOnPlane
 from groma.factors.line_reprojection import LineReprojection
 from groma.factors.losses import Loss, Trivial
-from groma.factors.point_on_line import PointOnLine
-from groma.factors.point_on_plane import PointOnPlane
 from groma.factors.point_reprojection import PointReprojection
 from groma.geometry import quaternion, se3
 from groma.geometry._manifold import Euclidean
@@ -29,6 +25,7 @@ from groma.geometry.line_charts import LINE_CHARTS
 from groma.geometry.plane_charts import PLANE_CHARTS
 from groma.geometry.pose_charts import POSE_CHARTS
 from groma.geometry.unit3 import DIRECTION_CHARTS
+from groma.pipelines._structure_factors import structure_factors
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene
@@ -97,7 +94,7 @@ def assemble(scene: Scene, options: AssemblyOptions) -> Assembly:
     if options.planes and scene.num_directions:
         chart = next(iter(DIRECTION_CHARTS.values()))
         variables["directions"] = Variables(chart, chart.from_ambient(scene.directions.vectors))
-    factors += _structure_factors(scene, options, variables)
+    factors += structure_factors(scene, options.structure_sigma_px, options.loss, variables)
     used = {ref.group for factor in factors for _, ref in factor.references()}
     return Assembly(Problem({k: v for k, v in variables.items() if k in used}, factors), tuple(notes))
 
@@ -264,85 +261,4 @@ def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> l
                 **_camera_refs(scene, table.image_idx[kept]),
             )
         )
-    return factors
-
-
-# ------------------------------------------------------------------------------------------------------- structure
-
-
-def _lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
-    """For each landmark the length that a pixel of its images spans at its distance, scene units; the median image."""
-    if kind == "point":
-        image_idx, index, places = (
-            scene.point_observations.image_idx, scene.point_observations.point_idx, scene.points.xyz,
-        )  # fmt: skip
-    else:
-        image_idx, index, places = (
-            scene.line_observations.image_idx, scene.line_observations.line_idx, scene.lines.segments.mean(axis=1),
-        )  # fmt: skip
-    focal_of = np.array(
-        [
-            scene.cameras.params_of(c)[list(camera_model(name).focal_indices)].mean()
-            for c, name in enumerate(scene.cameras.models)
-        ]
-    )
-    distance = np.linalg.norm(scene.cam_centers_in_world[image_idx] - places[index], axis=1)
-    length = distance / focal_of[scene.images.camera_idx[image_idx]]
-    count = np.bincount(index, minlength=len(places))
-    mean = np.bincount(index, weights=length, minlength=len(places)) / np.maximum(count, 1)
-    fallback = float(np.median(length)) if len(length) else 1.0
-    return np.where(count > 0, mean, fallback)
-
-
-def _structure_factors(scene: Scene, options: AssemblyOptions, variables: dict[str, Variables]) -> list[Factor]:
-    relations = scene.relations
-    factors: list[Factor] = []
-    have = {name: name in variables for name in ("points", "lines", "planes", "directions")}
-    if have["points"] and (have["planes"] or have["lines"]):
-        per_point = 1.0 / (options.structure_sigma_px * _lengths_per_pixel(scene, "point"))
-        if have["planes"] and len(relations.point_on_plane):
-            point, plane = relations.point_on_plane.T
-            factors.append(
-                PointOnPlane(
-                    point=Ref("points", point),
-                    plane=Ref("planes", plane),
-                    sqrt_information=per_point[point],
-                    loss=options.loss,
-                )
-            )
-        if have["lines"] and len(relations.point_on_line):
-            point, line = relations.point_on_line.T
-            factors.append(
-                PointOnLine(
-                    point=Ref("points", point),
-                    line=Ref("lines", line),
-                    sqrt_information=per_point[point],
-                    loss=options.loss,
-                )
-            )
-    if have["lines"] and (have["planes"] or have["directions"]):
-        per_line = 1.0 / (options.structure_sigma_px * _lengths_per_pixel(scene, "line"))
-        ends = scene.lines.segments
-        if have["planes"] and len(relations.line_on_plane):
-            line, plane = relations.line_on_plane.T
-            factors.append(
-                SegmentOnPlane(
-                    line=Ref("lines", line),
-                    plane=Ref("planes", plane),
-                    ends=ends[line],
-                    sqrt_information=per_line[line],
-                    loss=options.loss,
-                )
-            )
-        if have["directions"] and len(relations.line_along_direction):
-            line, direction = relations.line_along_direction.T
-            length = np.linalg.norm(ends[line, 1] - ends[line, 0], axis=1)
-            factors.append(
-                LineDirection(
-                    line=Ref("lines", line),
-                    direction=Ref("directions", direction),
-                    sqrt_information=per_line[line] * np.maximum(0.5 * length, 1e-12),
-                    loss=options.loss,
-                )
-            )
     return factors

@@ -15,30 +15,25 @@ Stages, each saved when it is finished, so that an interrupted run goes on where
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 import os
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 
 from groma.errors import InputError
 from groma.frontend.lsd import LsdDetector
 from groma.frontend.segments import Segments
-from groma.io import read_archive, write_archive
 from groma.io.colmap_sfm import reconstruct_points
 from groma.pipelines._assemble import AssemblyOptions, assemble
+from groma.pipelines._photographs import check_images, image_files, read_gray
+from groma.pipelines._stages import Stages, fingerprint
 from groma.pipelines.adjust import AdjustOptions, AdjustReport, adjust, squared_residuals_px
 from groma.pipelines.find_structure import StructureOptions, find_structure
 from groma.pipelines.map_lines import LineMap, MapLinesOptions, explain, map_lines
 from groma.scene import Scene
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 #: Residuals smaller than this are not believed when noise is estimated, pixels.
 MIN_SIGMA_PX = 0.1
 
@@ -122,12 +117,12 @@ def map_images(
     options = options or MapOptions()
     say = progress or (lambda stage, done, total: None)
     folder = Path(images)
-    files = _image_files(folder)
-    store = _Stages(Path(work), _fingerprint(files, model, options))
+    files = image_files(folder)
+    store = Stages(Path(work), fingerprint(files, model, options))
     warnings: list[str] = []
 
     start = store.scene("model", lambda: _point_model(folder, files, model, store, options, say))
-    _check_images(folder, start)
+    check_images(folder, start)
     robust = AdjustOptions(refine_intrinsics=options.refine_intrinsics, threads=options.threads)
     points = store.scene("points", lambda: _adjusted(start, robust, options, say, "adjusting points").scene)
     segments = store.segments(lambda: _detect(folder, points, options, say))
@@ -161,7 +156,7 @@ def map_images(
 # ---------------------------------------------------------------------------------------------------------- stages
 
 
-def _point_model(folder, files, model: Scene | None, store: _Stages, options: MapOptions, say: StageProgress) -> Scene:
+def _point_model(folder, files, model: Scene | None, store: Stages, options: MapOptions, say: StageProgress) -> Scene:
     if model is not None:
         names = {path.relative_to(folder).as_posix() for path in files}
         missing = [name for name in model.images.names if name not in names]
@@ -188,7 +183,7 @@ def _detect(folder: Path, scene: Scene, options: MapOptions, say: StageProgress)
     found = []
     for i, name in enumerate(scene.images.names):
         say("finding segments", i, scene.num_images)
-        found.append(detector.detect(_read_gray(folder / name)))
+        found.append(detector.detect(read_gray(folder / name)))
     return found
 
 
@@ -211,96 +206,3 @@ def _sigma(scene: Scene, kind: str) -> float:
     unknowns = 3 * scene.num_points if kind == "points" else 4 * scene.num_lines
     share = 1.0 - min(unknowns / (2 * len(squares)), 0.8)
     return max(float(np.sqrt(np.median(squares) / 1.386 / share)), MIN_SIGMA_PX)
-
-
-# ---------------------------------------------------------------------------------------------------------- images
-
-
-def _image_files(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder of images. Check the path.")
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
-    if not files:
-        raise InputError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)}). Check the path.")
-    return files
-
-
-def _read_gray(path: Path) -> np.ndarray:
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise InputError(f"{path} cannot be read as an image. Replace it, or leave it out of the model.")
-    return image
-
-
-def _check_images(folder: Path, scene: Scene) -> None:
-    """Check that every image can be read and has the size of its camera."""
-    for i, name in enumerate(scene.images.names):
-        camera = scene.images.camera_idx[i]
-        size = (int(scene.cameras.width[camera]), int(scene.cameras.height[camera]))
-        image = _read_gray(folder / name)
-        if size != (0, 0) and (image.shape[1], image.shape[0]) != size:
-            raise InputError(
-                f"{folder / name} has {image.shape[1]}x{image.shape[0]} pixels, its camera {size[0]}x{size[1]}. "
-                "Pass the images the model was made from."
-            )
-
-
-# ------------------------------------------------------------------------------------------------------- resuming
-
-
-def _fingerprint(files: list[Path], model: Scene | None, options: MapOptions) -> str:
-    digest = hashlib.sha256(repr(options).encode())
-    for path in files:
-        stat = path.stat()
-        digest.update(f"{path.name} {stat.st_size} {stat.st_mtime_ns}".encode())
-    if model is not None:
-        for array in (
-            model.frames.rig_from_world,
-            model.points.xyz,
-            model.point_observations.pixel,
-            model.cameras.params,
-        ):
-            digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
-class _Stages:
-    """Finished stages in a folder, valid for one fingerprint of input and options."""
-
-    def __init__(self, folder: Path, fingerprint: str) -> None:
-        self.folder = folder
-        mark = folder / "fingerprint.json"
-        if folder.is_dir():
-            try:
-                same = json.loads(mark.read_text())["fingerprint"] == fingerprint
-            except (OSError, ValueError, KeyError):
-                same = False
-            if not same:
-                shutil.rmtree(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        mark.write_text(json.dumps({"fingerprint": fingerprint}))
-
-    def scene(self, name: str, make: Callable[[], Scene]) -> Scene:
-        """Return the saved scene of a stage, or make and save it."""
-        path = self.folder / f"{name}.npz"
-        if path.exists():
-            return read_archive(path)
-        scene = make()
-        write_archive(scene, path, force=True)
-        return scene
-
-    def segments(self, make: Callable[[], list[Segments]]) -> list[Segments]:
-        """Return the saved segments, or make and save them."""
-        path = self.folder / "segments.npz"
-        if not path.exists():
-            found = make()
-            draft = path.with_suffix(".tmp.npz")
-            arrays: dict[str, Any] = {
-                name: np.concatenate([getattr(s, name) for s in found]) for name in ("ends", "sigma", "strength")
-            }
-            np.savez(draft, counts=np.array([len(s) for s in found]), **arrays)
-            os.replace(draft, path)
-        with np.load(path, allow_pickle=False) as saved:
-            cuts = np.cumsum(saved["counts"])[:-1]
-            parts = (np.split(saved[name], cuts) for name in ("ends", "sigma", "strength"))
-            return [Segments(ends, sigma, strength) for ends, sigma, strength in zip(*parts, strict=True)]
