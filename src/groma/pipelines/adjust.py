@@ -15,6 +15,7 @@ from groma.factors._factor import Factor
 from groma.factors.losses import Loss, Trivial
 from groma.factors.losses import loss as make_loss
 from groma.pipelines._assemble import LINE_FACTORS, POINT_FACTORS, AssemblyOptions, assemble, disassemble
+from groma.pipelines._line_restart import restart_lines
 from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.solver.options import SolverOptions
@@ -27,6 +28,8 @@ from groma.solver.termination import Termination
 ROBUST_STAGES = (("cauchy", 1.0), ("geman_mcclure", 2.0))
 #: Relative decrease of the cost at which a stage that is not the last ends.
 STAGE_TOLERANCE = 1e-4
+#: The same for the first stage of plain least squares with lines, after which lines may be restarted.
+RESTART_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
@@ -188,7 +191,7 @@ def adjust(
         spent = sum(report.iterations for report in reports)
         solver_options = SolverOptions(
             max_iterations=options.max_iterations - spent,
-            function_tolerance=options.function_tolerance if last else STAGE_TOLERANCE,
+            function_tolerance=options.function_tolerance if last else _stage_tolerance(loss),
             linear_solver=options.linear_solver,
             landmark_steps=_landmark_steps(options, loss, problem),
             threads=options.threads,
@@ -204,6 +207,8 @@ def adjust(
         reports.append(solution.report)
         if solution.report.termination is Termination.STOPPED_BY_CALLER:
             break
+        if not last:
+            problem = restart_lines(disassemble(scene, problem), problem, LINE_FACTORS) or problem
     report = _combined(reports, assembly.problem, stages)
     before, after = (_rmse_px(p, options.line_sigma_px) for p in (assembly.problem, problem))
     outcome = AdjustReport(
@@ -229,11 +234,16 @@ def _is_bal(scene: Scene) -> bool:
 def _stages(scene: Scene, options: AdjustOptions) -> list[Loss]:
     """Return the losses to solve with, one after the other."""
     if options.loss == "none" or (options.loss == "auto" and _is_bal(scene)):
-        return [Trivial()]
+        with_lines = options.lines and scene.num_line_observations > 0
+        return [Trivial(), Trivial()] if with_lines else [Trivial()]
     if options.loss == "auto":
         scale = 1.0 if options.loss_scale is None else options.loss_scale
         return [make_loss(name, scale * factor) for name, factor in ROBUST_STAGES]
     return [make_loss(options.loss, 1.0 if options.loss_scale is None else options.loss_scale)]
+
+
+def _stage_tolerance(loss: Loss) -> float:
+    return RESTART_TOLERANCE if isinstance(loss, Trivial) else STAGE_TOLERANCE
 
 
 def _landmark_steps(options: AdjustOptions, loss: Loss, problem: Problem) -> int:

@@ -2,12 +2,12 @@
 """Three ways to solve the reduced system S x = b.
 
 ``dense``
-    Cholesky (LAPACK). Best below about 1 500 unknowns, or when S is nearly full.
+    Cholesky (LAPACK). Best for small systems.
 ``sparse``
     Direct factorisation with a fill-reducing symmetric ordering (SuperLU). Best when cameras see few others.
 ``pcg``
     Conjugate gradients, preconditioned with the inverses of the diagonal blocks, stopped early: a Newton step needs few
-    digits. Best for thousands of cameras.
+    digits. Best for large systems.
 
 Each solver is made once per layout and called once per step. It returns None when S is not positive definite; the
 caller then raises the damping.
@@ -29,11 +29,13 @@ from groma.problem.layout import Layout
 
 Blocks = dict[tuple[int, int], FloatArray]
 
-#: Up to this many unknowns a dense factorisation is taken without looking at the structure.
-DENSE_UNKNOWNS = 1500
-#: A denser reduced system than this share of blocks is factorised densely up to ``DENSE_LIMIT`` unknowns.
-DENSE_SHARE = 0.3
-DENSE_LIMIT = 12000
+#: Rates that choose between dense and pcg, measured on one core: flops of a dense factorisation, bytes of a product.
+DENSE_FLOPS_PER_SECOND = 2.5e10
+BYTES_PER_SECOND = 6e9
+#: Iterations of conjugate gradients in a step of a problem of unknown difficulty.
+TYPICAL_ITERATIONS = 60
+#: Up to this many unknowns a dense factorisation costs next to nothing, and is exact.
+DENSE_UNKNOWNS = 1000
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 
@@ -75,18 +77,15 @@ class LinearSolver(Protocol):
 
 
 def choose(layout: Layout, name: str) -> LinearSolver:
-    """Return the solver called ``name``; ``auto`` looks at size and structure."""
+    """Return the solver called ``name``; ``auto`` takes what should be faster for this size and fill."""
     if name == "auto":
         unknowns = layout.num_kept_unknowns
-        filled = 0.0
-        for (a, b), (rows, _) in layout.blocks.items():
-            size = layout.kept[a].width * layout.kept[b].width * len(rows)
-            filled += size if a == b else 2 * size
-        share = 2 * filled / max(unknowns, 1) ** 2
-        if unknowns <= DENSE_UNKNOWNS or (share > DENSE_SHARE and unknowns <= DENSE_LIMIT):
-            name = "dense"
-        else:
-            name = "pcg"
+        stored = sum(
+            layout.kept[a].width * layout.kept[b].width * len(rows) for (a, b), (rows, _) in layout.blocks.items()
+        )
+        dense_seconds = unknowns**3 / 3 / DENSE_FLOPS_PER_SECOND
+        pcg_seconds = TYPICAL_ITERATIONS * 8 * stored / BYTES_PER_SECOND
+        name = "dense" if unknowns <= DENSE_UNKNOWNS or dense_seconds < pcg_seconds else "pcg"
     return {"dense": Dense, "sparse": Sparse, "pcg": ConjugateGradients}[name](layout)
 
 

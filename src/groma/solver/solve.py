@@ -138,13 +138,20 @@ def _solve_jointly(
         trial = _try_step(layout, equations, strategy, watch, states, cost)
         # a factor that became degenerate counts nothing; without its share put back, steps would hide what they spoil
         accepted = trial is not None and trial.cost + max(0, trial.hidden - hidden) * share < cost
-        if trial is not None and accepted:
+        if trial is not None and not accepted and refiner is not None:
+            with watch("backsubstitute"):
+                rescued = refiner.refine(equations, trial, instead=states)
+            accepted = rescued.cost + max(0, rescued.hidden - hidden) * share < cost
+            if accepted:
+                trial = replace(rescued, gain_ratio=min((cost - rescued.cost) / trial.promised, 1.0))
+        elif trial is not None and accepted:
             if trial.gain_ratio > STRETCH_GAIN_RATIO:
                 with watch("cost"):
                     trial = _stretched(layout, equations, states, trial)
             if refiner is not None:
                 with watch("backsubstitute"):
                     trial = refiner.refine(equations, trial)
+        if trial is not None and accepted:
             decrease, old_cost = cost - trial.cost, cost
             states, cost, inputs, hidden = trial.states, trial.cost, trial.inputs, equations.num_hidden
             strategy.accept(trial.gain_ratio)
@@ -190,6 +197,8 @@ class _Trial:
     length: float
     #: Degenerate factors at the new states.
     hidden: int
+    #: The decrease of the quadratic model.
+    promised: float
 
 
 def _try_step(
@@ -211,7 +220,7 @@ def _try_step(
         inputs = equations.prepare(moved)
         new_cost = equations.cost(inputs)
     ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
-    return _Trial(step, moved, inputs, new_cost, float(ratio), step.norm(), equations.num_hidden)
+    return _Trial(step, moved, inputs, new_cost, float(ratio), step.norm(), equations.num_hidden, predicted)
 
 
 def _stretched(layout: Layout, equations: NormalEquations, states: States, trial: _Trial) -> _Trial:
@@ -231,7 +240,11 @@ def _stretched(layout: Layout, equations: NormalEquations, states: States, trial
 
 
 class _LandmarkRefiner:
-    """A few steps of each landmark on its own, cameras held; a step that does not lower its cost is undone."""
+    """A few steps of each landmark on its own, cameras held; a step that does not lower its cost is undone.
+
+    It follows every accepted step. It also rescues steps that would be refused: a few landmarks with a strongly bent
+    cost, such as lines over a short baseline, would otherwise hold back all cameras.
+    """
 
     def __init__(self, layout: Layout, workers: Workers, groups: list[str], steps: int) -> None:
         held = {
@@ -242,11 +255,22 @@ class _LandmarkRefiner:
         self._outer, self._steps = layout, steps
         self._blocks = IndependentBlocks(lay_out(Problem(held, factors), tuple(groups)), workers, 1e-6)
 
-    def refine(self, equations: NormalEquations, trial: _Trial) -> _Trial:
-        """Return the trial with better landmarks."""
+    def refine(self, equations: NormalEquations, trial: _Trial, instead: States | None = None) -> _Trial:
+        """Return the trial with better landmarks.
+
+        Landmarks start from the trial, or from the states ``instead`` where those cost less with the new cameras.
+        """
         inner = to_original_order(self._outer, trial.states)
         self._blocks.reset()
         costs = self._blocks.costs(inner)
+        if instead is not None:
+            before = to_original_order(self._outer, instead)
+            groups = [e.group for e in self._blocks.layout.eliminated]
+            unmoved = {**inner, **{group: before[group] for group in groups}}
+            for e, (group, kept_costs) in enumerate(zip(groups, self._blocks.costs(unmoved), strict=True)):
+                better = kept_costs < costs[e]
+                inner[group] = np.where(better[:, None], before[group], inner[group])
+                costs[e] = np.where(better, kept_costs, costs[e])
         for _ in range(self._steps):
             inner, costs, _ = self._blocks.step(inner, costs)
         refined = dict(trial.states)
@@ -254,7 +278,9 @@ class _LandmarkRefiner:
             refined[group.group] = np.ascontiguousarray(inner[group.group][group.order])
         inputs = equations.prepare(refined)
         cost = equations.cost(inputs)
-        return replace(trial, states=refined, inputs=inputs, cost=cost) if cost < trial.cost else trial
+        if cost >= trial.cost:
+            return trial
+        return replace(trial, states=refined, inputs=inputs, cost=cost, hidden=equations.num_hidden)
 
 
 def _landmark_refiner(layout: Layout, workers: Workers, options: SolverOptions) -> _LandmarkRefiner | None:
