@@ -12,6 +12,7 @@ from groma.factors.line_direction import LineDirection
 from groma.factors.line_normal import LineNormal
 from groma.factors.line_on_plane import LineOnPlane, SegmentOnPlane
 from groma.factors.line_reprojection import LineReprojection
+from groma.factors.line_to_pixel import LineToPixel
 from groma.factors.losses import (
     LOSSES,
     Barron,
@@ -25,6 +26,7 @@ from groma.factors.losses import (
     Tukey,
     loss,
 )
+from groma.factors.on_plane_pixels import PointOnPlanePixels, SegmentOnPlanePixels
 from groma.factors.orthogonal import (
     LineParallelToPlane,
     LinePerpendicularToDirection,
@@ -46,6 +48,7 @@ from groma.factors.point_depth import PointDepth
 from groma.factors.point_on_line import PointOnLine
 from groma.factors.point_on_plane import PointOnPlane
 from groma.factors.point_reprojection import PointReprojection
+from groma.factors.point_to_image_line import PointToImageLine
 from groma.factors.pose_between import PoseBetween
 from groma.factors.pose_prior import PosePrior
 from groma.factors.position_prior import PositionPrior
@@ -71,6 +74,7 @@ __all__ = [
     "LinePerpendicularToDirection",
     "LinePerpendicularToPlane",
     "LineReprojection",
+    "LineToPixel",
     "Loss",
     "OrthogonalDirections",
     "OrthogonalLines",
@@ -85,12 +89,15 @@ __all__ = [
     "PointDepth",
     "PointOnLine",
     "PointOnPlane",
+    "PointOnPlanePixels",
     "PointReprojection",
+    "PointToImageLine",
     "PoseBetween",
     "PosePrior",
     "PositionPrior",
     "Ref",
     "SegmentOnPlane",
+    "SegmentOnPlanePixels",
     "SelfCheckReport",
     "SelfCheckRow",
     "Slot",
