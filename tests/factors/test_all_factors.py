@@ -25,6 +25,7 @@ TIED_TO_THE_WORLD = {
     "pose_prior": "a prior fixes the world",
     "position_prior": "a prior fixes the world",
     "segment_on_plane": "ends are world points",
+    "segment_on_plane_pixels": "ends are world points",
     "vector_prior": "a prior fixes the world",
 }
 
