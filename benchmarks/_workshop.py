@@ -24,7 +24,7 @@ CONTESTANTS = HERE / "contestants"
 CACHE = ROOT / ".cache" / "benchmarks"
 PACKAGED = ROOT / "src" / "groma" / "data"
 
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 #: Longest that one run may take, seconds.
 TIMEOUT = 600
 
@@ -37,29 +37,45 @@ class BenchmarkProblem:
     title: str
     #: ``points``: BAL model, calibration estimated; ``points_lines``: pinhole images, calibration held.
     kind: str
-    #: A BAL file looked for in the folder of data, or the size of a corridor.
+    #: A BAL file looked for in the folder of data, a COLMAP model (a path, looked for beside it), or the size of a
+    #: corridor.
     source: str
     quick: bool = False
+    #: Runs only if it is named.
+    large: bool = False
 
     @property
     def is_corridor(self) -> bool:
         """Whether the problem is generated."""
-        return not self.source.startswith("problem-")
+        return not self.source.startswith("problem-") and not self.is_model
+
+    @property
+    def is_model(self) -> bool:
+        """Whether the problem is made from a COLMAP model."""
+        return "/" in self.source
 
     def file_for(self, contestant: str) -> Path:
         """Return the prepared file."""
-        stem = f"corridor_{self.source}_{self.kind}" if self.is_corridor else self.source
-        return CACHE / f"{stem}{'.npz' if self.kind == 'points_lines' and contestant == 'groma' else '.txt'}"
+        stem = f"corridor_{self.source}_{self.kind}" if self.is_corridor else self.source.replace("/", "_")
+        if self.kind == "points":
+            return CACHE / f"{stem}.txt"
+        return CACHE / {"groma": f"{stem}.npz", "limap": stem}.get(contestant, f"{stem}.txt")
 
     def prepare(self, data: Path) -> bool:
         """Unpack or generate the file; return False where its data is not at hand."""
         CACHE.mkdir(parents=True, exist_ok=True)
-        if all(self.file_for(name).is_file() for name in ("groma", "ceres")):
+        if all(self.file_for(name).exists() for name in ("groma", "ceres", "limap")):
             return True
         if self.is_corridor:
             script = CONTESTANTS / "make_corridor.py"
             subprocess.run([sys.executable, script, self.kind, self.source, CACHE], check=True, env=environment())
             return True
+        if self.is_model:
+            model, script = data.parent / self.source, CONTESTANTS / "make_from_colmap.py"
+            if model.is_dir():
+                command = [sys.executable, script, model, self.file_for("ceres")]
+                subprocess.run(command, check=True, env=environment())
+            return model.is_dir()
         for packed in (data / f"{self.source}.txt.bz2", PACKAGED / f"{self.source}.txt.bz2"):
             if packed.is_file():
                 draft = CACHE / f"{self.source}.draft"
@@ -68,29 +84,40 @@ class BenchmarkProblem:
                 return True
         return False
 
+    def missing(self, data: Path) -> str:
+        """Say what data is not at hand."""
+        return f"there is no {data.parent / self.source if self.is_model else data / f'{self.source}.txt.bz2'}."
+
 
 PROBLEMS = (
     BenchmarkProblem("ladybug-49", "Ladybug-49", "points", "problem-49-7776-pre", quick=True),
     BenchmarkProblem("trafalgar-21", "Trafalgar-21", "points", "problem-21-11315-pre", quick=True),
     BenchmarkProblem("dubrovnik-16", "Dubrovnik-16", "points", "problem-16-22106-pre", quick=True),
+    BenchmarkProblem("castle-30", "Castle-P30, a COLMAP model", "points", "strecha_castle_p30/sparse_inc"),
+    BenchmarkProblem("south-building-26", "South Building, a COLMAP model", "points", "south_building/sparse_inc"),
     BenchmarkProblem("corridor-300", "Corridor, 300 cameras, 50 000 points", "points", "medium"),
+    BenchmarkProblem("corridor-1500", "Corridor, 1 500 cameras, 400 000 points", "points", "large", large=True),
     BenchmarkProblem("lines-50", "Corridor, 50 cameras, points and 2 000 lines", "points_lines", "small", quick=True),
     BenchmarkProblem("lines-300", "Corridor, 300 cameras, points and 20 000 lines", "points_lines", "medium"),
+    BenchmarkProblem(
+        "lines-1000", "Corridor, 1 000 cameras, points and 40 000 lines", "points_lines", "1000", large=True
+    ),
 )
 
 
-def environment(**more: str) -> dict[str, str]:
-    """Return the environment of a measured program: one thread, kernels and bytecode cached with our own things.
+def environment(threads: int | None = 1, **more: str) -> dict[str, str]:
+    """Return the environment of a measured program: so many threads, kernels and bytecode cached with our own things.
 
     Bytecode is always cached, as in an installed package; without it Python would compile its sources in every run.
     """
+    limits = {} if threads is None else dict.fromkeys(THREAD_VARIABLES, str(threads))
     ours = {"NUMBA_CACHE_DIR": str(CACHE / "numba"), "PYTHONPYCACHEPREFIX": str(CACHE / "bytecode")}
     inherited = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    return {**inherited, **ours, **ONE_THREAD, **more}
+    return {**inherited, **ours, **limits, **more}
 
 
 def forget_kernels() -> None:
-    """Drop the cached kernels: Numba does not notice when a kernel in another file has changed."""
+    """Drop the kernels compiled by earlier runs, so that a first use is measured as one."""
     shutil.rmtree(CACHE / "numba", ignore_errors=True)
 
 
@@ -109,11 +136,11 @@ def build_ceres() -> Path | None:
     return folder
 
 
-def run_program(command: list) -> dict | None:
+def run_program(command: list, threads: int = 1) -> dict | None:
     """Run a program that prints a line of JSON at its end; return it, or None (and say why) if it failed."""
     words = [str(word) for word in command]
     try:
-        done = subprocess.run(words, capture_output=True, text=True, timeout=TIMEOUT, env=environment())
+        done = subprocess.run(words, capture_output=True, text=True, timeout=TIMEOUT, env=environment(threads))
     except subprocess.TimeoutExpired:
         print(f"  gave up after {TIMEOUT} s: {' '.join(words)}")
         return None

@@ -5,9 +5,11 @@
 
 - *motion only*: one image, 500 points and 100 lines held, the pose estimated; warm, with and without making the
   problem. What a tracker calls for every frame.
+- *landmarks only*: 5 000 points and 2 000 lines, cameras held; warm.
 - ``import groma`` and ``groma --help``, whole process.
 - ``groma adjust`` on Ladybug-49 (or the problem in the package), whole process: the first run with an empty cache,
   which compiles the kernels, and the next one.
+- ``groma warmup``, whole process: with an empty cache, and again.
 
 Medians; writes ``benchmarks/results/latency.json``.
 """
@@ -25,12 +27,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from _workshop import CONTESTANTS, ONE_THREAD, PROBLEMS, RESULTS, ROOT, calibrate, environment, machine, run_program
+from _workshop import CONTESTANTS, PROBLEMS, RESULTS, ROOT, calibrate, environment, machine, run_program
 
 
 def whole_process(command: list[str], cache: str) -> dict[str, float]:
     """Run a command with as many threads as it likes and return its wall and CPU time."""
-    free = {name: value for name, value in environment(NUMBA_CACHE_DIR=cache).items() if name not in ONE_THREAD}
+    free = environment(None, NUMBA_CACHE_DIR=cache)
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=free)
     wall, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -55,15 +57,18 @@ def main() -> int:
         whole_process([*groma, "adjust", "--help"], cache)  # bytecode, which an installation brings along
         whole_process([sys.executable, "-c", "import groma.io, groma.pipelines.adjust"], cache)
         first = whole_process(adjust, cache)  # compiles the kernels: once
-        units, following, importing, helping, frames = [], [], [], [], []
+        units, following, importing, helping, frames, landmarks = [], [], [], [], [], []
         for _ in range(arguments.rounds):
             units.append(calibrate())
             following.append(whole_process(adjust, cache))
             importing.append(whole_process([sys.executable, "-c", "import groma"], cache))
             helping.append(whole_process([*groma, "--help"], cache))
             frames.append(run_program([sys.executable, CONTESTANTS / "motion_only.py"]))
-    if None in frames:
+            landmarks.append(run_program([sys.executable, CONTESTANTS / "landmarks_only.py"]))
+    if None in frames or None in landmarks:
         return 1
+    with tempfile.TemporaryDirectory() as cache:
+        warming = [whole_process([*groma, "warmup", "--quiet"], cache) for _ in range(2)]
     unit = statistics.median(units)
     result = {
         "problem": "latency",
@@ -76,7 +81,12 @@ def main() -> int:
         "help": medians(helping),
         "motion_only_ms": medians([{k: v for k, v in f.items() if k.endswith("_ms")} for f in frames]),
     }
+    result["landmarks_only_ms"] = statistics.median(run["solve_ms"] for run in landmarks)
+    result["first_warmup"], result["next_warmup"] = warming
     result["metrics"] = {
+        "landmarks_only_in_calibrations": result["landmarks_only_ms"] / 1e3 / unit,
+        "first_warmup_in_calibrations": result["first_warmup"]["cpu_s"] / unit,
+        "next_warmup_in_calibrations": result["next_warmup"]["cpu_s"] / unit,
         "motion_only_in_calibrations": result["motion_only_ms"]["solve_ms"] / 1e3 / unit,
         "first_adjust_in_calibrations": result["first_adjust"]["cpu_s"] / unit,
         "next_adjust_in_calibrations": result["next_adjust"]["cpu_s"] / unit,
@@ -89,10 +99,13 @@ def main() -> int:
     rows = [
         ("motion only, 500 points and 100 lines: solve", None, frame["solve_ms"] / 1e3),
         ("the same with making the problem", None, frame["total_ms"] / 1e3),
+        ("landmarks only, 5 000 points and 2 000 lines", None, result["landmarks_only_ms"] / 1e3),
         ("`import groma`", *result["import"].values()),
         ("`groma --help`", *result["help"].values()),
         (f"{adjusting}, first ever", *first.values()),
         (f"{adjusting}, next", *result["next_adjust"].values()),
+        ("`groma warmup`, empty cache", *warming[0].values()),
+        ("`groma warmup`, again", *warming[1].values()),
     ]
     print("| what | wall s | CPU s |\n|---|--:|--:|")
     for what, wall, cpu in rows:

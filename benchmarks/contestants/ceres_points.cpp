@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Ceres on a BAL file, nine parameters a camera, as in its own example: ceres_points FILE SOLVER
+// Ceres on a BAL file, nine parameters a camera, as in its own example: ceres_points FILE SOLVER THREADS
 #include <ceres/rotation.h>
 
 #include "common.h"
@@ -23,7 +23,7 @@ struct Reprojection {
 };
 
 int main(int argc, char** argv) {
-  FILE* f = argc == 3 ? fopen(argv[1], "r") : nullptr;
+  FILE* f = argc == 4 ? fopen(argv[1], "r") : nullptr;
   int num_cameras, num_points, num_observations;
   if (!f || fscanf(f, "%d %d %d", &num_cameras, &num_points, &num_observations) != 3) return 2;
   std::vector<int> camera_of(num_observations), point_of(num_observations);
@@ -40,7 +40,7 @@ int main(int argc, char** argv) {
     problem.AddResidualBlock(new ceres::AutoDiffCostFunction<Reprojection, 2, 9, 3>(
                                  new Reprojection{pixel[2 * k], pixel[2 * k + 1]}),
                              nullptr, &camera[9 * camera_of[k]], &point[3 * point_of[k]]);
-  ceres::Solver::Options options = OptionsFor(argv[2]);
+  ceres::Solver::Options options = OptionsFor(argv[2], atoi(argv[3]));
   auto* order = new ceres::ParameterBlockOrdering;
   for (int i = 0; i < num_points; i++)
     if (problem.HasParameterBlock(&point[3 * i])) order->AddElementToGroup(&point[3 * i], 0);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Ceres on pinhole images of points and lines, calibration held: ceres_points_lines FILE SOLVER
+// Ceres on pinhole images of points and lines, calibration held: ceres_points_lines FILE SOLVER THREADS
 //
 // The state of the art as a careful user would write it: analytic derivatives, the tangent Jacobian of every block
 // written directly (the manifolds' own Jacobians are identities), lines as Pluecker vectors in the orthonormal chart.
@@ -153,7 +153,7 @@ struct LineCost : ceres::SizedCostFunction<2, 12, 6> {
 };
 
 int main(int argc, char** argv) {
-  FILE* f = argc == 3 ? fopen(argv[1], "r") : nullptr;
+  FILE* f = argc == 4 ? fopen(argv[1], "r") : nullptr;
   int nc, np, nl, mp, ml;
   if (!f || fscanf(f, "%d %d %d %d %d %lf %lf %lf", &nc, &np, &nl, &mp, &ml, &focal, &center_x, &center_y) != 8) return 2;
   std::vector<double> camera(6 * nc), point(3 * np), ends(6 * nl), pixel(2 * mp), segment(4 * ml);
@@ -194,7 +194,7 @@ int main(int argc, char** argv) {
                              &point[3 * point_of[k]]);
   for (int k = 0; k < ml; k++)
     problem.AddResidualBlock(new LineCost(&segment[4 * k]), nullptr, &pose[12 * line_camera[k]], &line[6 * line_of[k]]);
-  ceres::Solver::Options options = OptionsFor(argv[2]);
+  ceres::Solver::Options options = OptionsFor(argv[2], atoi(argv[3]));
   auto* order = new ceres::ParameterBlockOrdering;
   for (int i = 0; i < np; i++) order->AddElementToGroup(&point[3 * i], 0);
   for (int i = 0; i < nl; i++) order->AddElementToGroup(&line[6 * i], 0);

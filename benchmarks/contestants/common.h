@@ -4,7 +4,9 @@
 #include <ceres/ceres.h>
 #include <sys/resource.h>
 
+#include <algorithm>
 #include <chrono>
+#include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
@@ -39,8 +41,8 @@ inline double PeakMemoryMib() {
   return u.ru_maxrss / 1024.0;
 }
 
-// One thread; stop at a relative change of the cost of 1e-6 or after 50 steps, and for no other reason.
-inline ceres::Solver::Options OptionsFor(const std::string& solver) {
+// Stop at a relative change of the cost of 1e-6 or after 50 steps, and for no other reason.
+inline ceres::Solver::Options OptionsFor(const std::string& solver, int threads) {
   ceres::Solver::Options o;
   o.preconditioner_type = ceres::SCHUR_JACOBI;
   if (solver == "dense_schur") {
@@ -54,7 +56,7 @@ inline ceres::Solver::Options OptionsFor(const std::string& solver) {
     fprintf(stderr, "no such solver: %s\n", solver.c_str());
     exit(2);
   }
-  o.num_threads = 1;
+  o.num_threads = threads;
   o.max_num_iterations = 50;
   o.function_tolerance = 1e-6;
   o.gradient_tolerance = 0;
@@ -63,15 +65,32 @@ inline ceres::Solver::Options OptionsFor(const std::string& solver) {
   return o;
 }
 
+// Notes CPU time, wall time and the best cost so far after every step.
+struct Curve : ceres::IterationCallback {
+  double cpu = Clock::Cpu(), wall = Clock::Wall(), best = HUGE_VAL;
+  std::string text;
+  ceres::CallbackReturnType operator()(const ceres::IterationSummary& step) override {
+    if (step.step_is_successful || step.iteration == 0) best = std::min(best, step.cost);
+    char entry[96];
+    snprintf(entry, sizeof entry, "%s[%.6f, %.6f, %.12g]", text.empty() ? "" : ", ", Clock::Cpu() - cpu,
+             Clock::Wall() - wall, best);
+    text += entry;
+    return ceres::SOLVER_CONTINUE;
+  }
+};
+
 inline int SolveAndReport(const std::string& solver, ceres::Solver::Options& o, ceres::Problem& problem) {
   ceres::Solver::Summary s;
-  const double wall = Clock::Wall(), cpu = Clock::Cpu();
+  Curve curve;
+  o.callbacks.push_back(&curve);
   ceres::Solve(o, &problem, &s);
-  const double cpu_s = Clock::Cpu() - cpu, wall_s = Clock::Wall() - wall;
+  const double cpu_s = Clock::Cpu() - curve.cpu, wall_s = Clock::Wall() - curve.wall;
   printf(
-      "{\"contestant\": \"ceres\", \"version\": \"%s\", \"solver\": \"%s\", \"cpu_s\": %.6f, \"wall_s\": %.6f, "
-      "\"iterations\": %d, \"initial_cost\": %.12g, \"final_cost\": %.12g, \"peak_memory_mib\": %.1f}\n",
-      CERES_VERSION_STRING, solver.c_str(), cpu_s, wall_s, s.num_successful_steps + s.num_unsuccessful_steps - 1,
-      s.initial_cost, s.final_cost, PeakMemoryMib());
+      "{\"contestant\": \"ceres\", \"version\": \"%s\", \"solver\": \"%s\", \"threads\": %d, \"cpu_s\": %.6f, "
+      "\"wall_s\": %.6f, \"iterations\": %d, \"initial_cost\": %.12g, \"final_cost\": %.12g, \"curve\": [%s], "
+      "\"peak_memory_mib\": %.1f}\n",
+      CERES_VERSION_STRING, solver.c_str(), o.num_threads, cpu_s, wall_s,
+      s.num_successful_steps + s.num_unsuccessful_steps - 1, s.initial_cost, s.final_cost, curve.text.c_str(),
+      PeakMemoryMib());
   return s.IsSolutionUsable() ? 0 : 1;
 }

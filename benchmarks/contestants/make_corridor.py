@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Write a corridor scene for the contestants: ``make_corridor.py points|points_lines SIZE FOLDER``.
 
-``points``: a BAL file, focal lengths 1 % too long. ``points_lines``: an archive for groma and the same as text for
-the Ceres program, whose head describes it.
+``points``: a BAL file, focal lengths 1 % too long. ``points_lines``: an archive for groma, the same as text for the
+Ceres program, whose head describes it, and as a COLMAP model with lines beside it for LIMAP. SIZE is a name or a number
+of images.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from groma.geometry import quaternion
-from groma.io import write_archive, write_bal
+from groma.io import write_archive, write_bal, write_scene
 from groma.scene import Scene, synthetic
 
 
@@ -37,7 +38,7 @@ def write_text(scene: Scene, path: Path) -> None:
 
 def main() -> None:
     kind, size, folder = sys.argv[1:]
-    start = synthetic.corridor(size).start
+    start = synthetic.corridor(int(size) if size.isdigit() else size).start
     name = Path(folder) / f"corridor_{size}_{kind}"
     draft = name.with_suffix(".draft.npz")
     if kind == "points":
@@ -47,6 +48,7 @@ def main() -> None:
         os.replace(draft, name.with_suffix(".txt"))
         return
     write_text(start, name.with_suffix(".txt"))
+    write_scene(start, name, format="colmap", force=True)
     write_archive(start, draft, force=True)
     os.replace(draft, name.with_suffix(".npz"))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""pycolmap's bundle adjuster on a BAL file: ``pycolmap_solve.py FILE SOLVER``.
+"""pycolmap's bundle adjuster on a BAL file: ``pycolmap_solve.py FILE SOLVER THREADS``.
 
 A BAL camera is COLMAP's RADIAL with its principal point at the origin, which the adjuster holds there; the costs are
 the same. Needs numpy and pycolmap, not groma.
@@ -11,24 +11,8 @@ import sys
 
 import numpy as np
 import pycolmap
-from _common import Clock, report
+from _common import MAX_STEPS, TOLERANCE, Clock, read_bal, report
 from pycolmap._core import pyceres
-
-
-def read(path: str) -> tuple[np.ndarray, ...]:
-    """Return (camera_of, point_of, pixels, cameras, points) of a BAL file, pixels and cameras with y down."""
-    with open(path) as file:
-        num_cameras, num_points, num_observations = map(int, file.readline().split())
-        numbers = np.array(file.read().split(), dtype=float)
-    observations, cameras, points = np.split(numbers, [4 * num_observations, 4 * num_observations + 9 * num_cameras])
-    observations, cameras = observations.reshape(-1, 4), cameras.reshape(-1, 9)
-    return (
-        observations[:, 0].astype(int),
-        observations[:, 1].astype(int),
-        observations[:, 2:] * [1, -1],
-        cameras,
-        points.reshape(num_points, 3),
-    )
 
 
 def rotation_of(vector: np.ndarray) -> np.ndarray:
@@ -41,7 +25,8 @@ def rotation_of(vector: np.ndarray) -> np.ndarray:
 
 def build(path: str) -> pycolmap.Reconstruction:
     """Make the reconstruction: every camera an image of its own in a trivial rig."""
-    camera_of, point_of, pixels, cameras, points = read(path)
+    camera_of, point_of, pixels, cameras, points = read_bal(path)
+    pixels = pixels * [1, -1]  # y down
     model = pycolmap.Reconstruction()
     position = np.empty(len(camera_of), dtype=int)
     for index, camera in enumerate(cameras):
@@ -64,33 +49,33 @@ def build(path: str) -> pycolmap.Reconstruction:
     return model
 
 
-def options_for(solver: str) -> pycolmap.BundleAdjustmentOptions:
-    """Return the same rule as for all contestants: one thread, 1e-6 or 50 steps, squared residuals."""
+def options_for(solver: str, threads: int) -> pycolmap.BundleAdjustmentOptions:
+    """Return the rule of all contestants, with squared residuals."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = options.refine_extra_params = True
     options.refine_principal_point = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.TRIVIAL
     options.ceres.auto_select_solver_type = False
-    options.ceres.min_num_residuals_for_cpu_multi_threading = 2**31 - 1
+    options.ceres.min_num_residuals_for_cpu_multi_threading = 0  # as many threads as asked for
     ceres = options.ceres.solver_options
     ceres.linear_solver_type = getattr(pyceres.LinearSolverType, solver.removesuffix("_explicit").upper())
     ceres.use_explicit_schur_complement = solver.endswith("_explicit")
     ceres.preconditioner_type = pyceres.PreconditionerType.SCHUR_JACOBI
-    ceres.num_threads = 1
-    ceres.max_num_iterations = 50
-    ceres.function_tolerance = 1e-6
+    ceres.num_threads = threads
+    ceres.max_num_iterations = MAX_STEPS
+    ceres.function_tolerance = TOLERANCE
     ceres.gradient_tolerance = ceres.parameter_tolerance = 0.0
     return options
 
 
 def main() -> None:
-    path, solver = sys.argv[1:]
+    path, solver, threads = sys.argv[1:]
     model = build(path)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.images:
         config.add_image(image_id)
-    adjuster = pycolmap.create_default_bundle_adjuster(options_for(solver), config, model)
+    adjuster = pycolmap.create_default_bundle_adjuster(options_for(solver, int(threads)), config, model)
     clock = Clock()
     summary = adjuster.solve()
     times = clock.read()
@@ -99,6 +84,7 @@ def main() -> None:
         contestant="pycolmap",
         version=pycolmap.__version__,
         solver=solver,
+        threads=int(threads),
         **times,
         iterations=summary.num_successful_steps + summary.num_unsuccessful_steps - 1,
         initial_cost=summary.initial_cost,

@@ -5,51 +5,29 @@
 always inlined into the loops that call it.
 ``@loop`` marks the walk over a batch that calls a kernel by its module-level name.
 
-Both release the GIL and are cached on disk. Division by zero gives inf or NaN, as in NumPy. Reassociation and
-fused multiply-add are allowed; NaN and infinity keep their meaning.
-
-Numba's cache compares the file of a function with the one it was compiled from, but not the files of the kernels it
-calls. Here every cached function is stamped with all files that hold compiled code, so that a change in one of them,
-by an edit or by an upgrade, never brings back old numbers.
+Both release the GIL and are cached on disk by :mod:`groma._numba_cache`. Division by zero gives inf or NaN, as in
+NumPy. Reassociation and fused multiply-add are allowed; NaN and infinity keep their meaning.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 from numba import njit
+
+from groma._numba_cache import keep_on_disk
 
 _OPTIONS = {
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
 }
-#: A file that contains one of these holds compiled code, or chooses it.
-_MARKS = (b"_numba import", b"numba.extending", b"llvmlite")
-
-
-@lru_cache(maxsize=1)
-def _stamp() -> str:
-    """Return a digest of all files of the package that hold compiled code."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        content = path.read_bytes()
-        if any(mark in content for mark in _MARKS):
-            digest.update(path.name.encode() + b"\0" + content)
-    return digest.hexdigest()
 
 
 def _compiled(**options: Any) -> Callable[[Callable], Any]:
     def decorate(function: Callable) -> Any:
-        dispatcher = njit(cache=True, **_OPTIONS, **options)(function)
-        cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-        if cache_file is not None:  # absent without the compiler
-            cache_file._source_stamp = _stamp()
-        return dispatcher
+        return keep_on_disk(njit(**_OPTIONS, **options)(function))
 
     return decorate
 

@@ -46,3 +46,43 @@ def test_ctrl_c_in_mid_solve(tmp_path):
     assert finished.returncode == 130
     assert finished.stderr == "groma: interrupted; nothing was written.\n"
     assert os.listdir(tmp_path) == ["in"]
+
+
+def test_a_signal_that_a_library_swallows_is_not_forgotten():
+    from groma.cli._interrupt import interruptible
+
+    calls = []
+    before = signal.getsignal(signal.SIGTERM)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        with pytest.raises(KeyboardInterrupt), interruptible() as interruption:
+            progress = interruption.checking(lambda *event: calls.append(event))
+            progress("a", 0, 1)
+            with pytest.raises(KeyboardInterrupt):  # swallowed, as in a callback of a compiler
+                os.kill(os.getpid(), number)
+            progress("b", 0, 1)
+        with pytest.raises(KeyboardInterrupt), interruptible():
+            try:
+                os.kill(os.getpid(), number)
+            except KeyboardInterrupt:
+                raise RuntimeError("no compiled object yet") from None
+    with pytest.raises(RuntimeError, match="a real one"), interruptible():
+        raise RuntimeError("a real one")
+    assert calls == [("a", 0, 1), ("a", 0, 1)]
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_ctrl_c_while_mapping_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    from groma.cli.main import run
+    from groma.pipelines import map as mapping
+
+    (tmp_path / "photos").mkdir()
+
+    def interrupted(images, work, model, options, progress, matches):
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(mapping, "map_images", interrupted)
+    assert run(["map", str(tmp_path / "photos"), "-o", str(tmp_path / "out")]) == 130
+    said = capsys.readouterr().err
+    assert said.startswith("groma: interrupted; finished stages are kept in") and said.count("\n") == 1
+    assert "the same command goes on from there" in said
+    assert os.listdir(tmp_path) == ["photos"]

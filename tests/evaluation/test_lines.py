@@ -51,6 +51,15 @@ def test_the_two_published_recalls_differ_for_repeated_lines():
     assert scores.recall_length[1e-3] == pytest.approx(0.5, abs=2e-3)
 
 
+def test_recall_by_count_weighs_short_segments_as_long_ones():
+    reference = np.array([[[0, 0, 0], [9.0, 0, 0]], [[0, 5, 0], [1.0, 5, 0]], [[0, 7, 0], [1.0, 7, 0]]])
+    # The long one is covered by four ninths, the second by six tenths, the third not at all.
+    estimate = [[[0, 0, 0], [4, 0, 0]], [[0, 5, 0], [0.6, 5, 0]]]
+    scores = score_lines(estimate, reference, [1e-3])
+    assert scores.recall_count[1e-3] == pytest.approx(1 / 3)
+    assert scores.recall_length[1e-3] == pytest.approx(4.6 / 11, abs=2e-3)
+
+
 def test_meshes_and_points_have_no_length_to_recall():
     square = Geometry(triangles=np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1.0, 0]]]))
     scores = score_lines([[[0.5, 0.5, -0.1], [0.5, 0.5, 0.1]]], square, [0.05])

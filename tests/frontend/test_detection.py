@@ -66,6 +66,29 @@ def test_sigma_agrees_with_the_errors_made():
         assert 0.25 < ratio < 1.3, f"error / sigma = {ratio:.2f} at noise {noise}"
 
 
+def test_the_chord_of_an_arc_is_uncertain():
+    """A segment on a circle is as uncertain as its ends are off the fitted line; one on a straight edge is not."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 721)[:-1]
+    disc = 60.0 + 130.0 * coverage(100.0 + 90.0 * np.column_stack([np.cos(angle), np.sin(angle)]), 200, 200, 4)
+    half = 15.0
+    sagitta = 90.0 - np.sqrt(90.0**2 - half**2)
+    chord = np.array([[190.0 - sagitta / 2, 100.0 - half, 190.0 - sagitta / 2, 100.0 + half]])
+    straight = 60.0 + 130.0 * coverage([[20, 20], [190, 20], [190, 180], [20, 180]], 200, 200, 4)
+    bent = measure_edges(to_uint8(disc), chord)[1]
+    level = measure_edges(to_uint8(straight), np.array([[190.0, 85.0, 190.0, 115.0]]))[1]
+    assert 0.5 * sagitta * 2 / 3 < bent[0] < 1.5 * sagitta * 2 / 3
+    assert level[0] < 0.3 * bent[0]
+
+
+def test_two_edges_at_an_obtuse_corner_stay_two():
+    corners = np.array([[10.0, 60], [150, 20], [290, 50], [290, 190], [10, 190]])
+    image = to_uint8(30.0 + 90.0 * coverage(corners, 300, 200, 4), np.random.default_rng(3), 2.0)
+    found = LsdDetector(min_length=30).detect(image)
+    distance = np.abs(distance_to_edges(found.ends, corners)[0]).max(axis=1)
+    assert len(found) >= 5
+    assert distance.max() < 0.5
+
+
 def test_sigma_grows_with_noise():
     quiet = _signed_errors(LsdDetector(), seed=3, count=6, noise=2.0)[2]
     loud = _signed_errors(LsdDetector(), seed=3, count=6, noise=20.0)[2]

@@ -297,19 +297,6 @@ def test_writers_refuse_to_overwrite(tmp_path):
         write_scene(Scene(), tmp_path / name, force=True)
 
 
-def test_ply_and_obj(tmp_path):
-    scene = rig_scene()
-    write_scene(scene, tmp_path / "scene.ply")
-    header, _, body = (tmp_path / "scene.ply").read_bytes().partition(b"end_header\n")
-    assert b"element vertex 7\n" in header and b"element edge 2\n" in header
-    vertices = np.frombuffer(body[: 7 * 27], [("xyz", "<f8", 3), ("color", "u1", 3)])
-    np.testing.assert_array_equal(vertices["xyz"][:3], scene.points.xyz)
-    np.testing.assert_array_equal(vertices["xyz"][3:], scene.lines.segments.reshape(-1, 3))
-    assert np.frombuffer(body[7 * 27 :], "<i4").tolist() == [3, 4, 5, 6]
-    write_scene(scene, tmp_path / "scene.obj")
-    assert (tmp_path / "scene.obj").read_text().splitlines()[-2:] == ["l 4 5", "l 6 7"]
-
-
 def test_tum_round_trip(tmp_path):
     poses = rig_scene().frames.rig_from_world
     write_tum(Trajectory([0.5, 1.25, 1e9 + 0.125], poses), tmp_path / "t.txt")

@@ -21,15 +21,17 @@ from _models import rig_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from groma.cli.main import run
 from groma.errors import FileFormatError, GromaError, InputError, OutputError
-from groma.io import read_scene, write_colmap
-from groma.io._limap_files import MEMBER_3D, NONE, TRACK
-from groma.io.limap import Group3d, Lines3d, Structures, from_scene, read_limap, with_structures, write_limap
+from groma.io import read_scene, structures_of, write_colmap
+from groma.io._limap_files import LINE_2D, MEMBER_2D, MEMBER_3D, NONE, TRACK
+from groma.io.limap import Group2d, Group3d, Lines3d, Structures, from_scene, read_limap, with_structures, write_limap
 from groma.scene import Directions, LineObservations, Lines, Planes, Relations, Scene
 from groma.scene.compare import equal, near
 from groma.scene.synthetic import holistic
 
 DATA = Path(__file__).parents[1] / "data" / "limap"
+LIMAP_PYTHON = os.environ.get("GROMA_LIMAP_PYTHON") or (sys.executable if importlib.util.find_spec("limap") else "")
 FILES = ("structures2d", "lines3D", "groups3D", "wireframe3D")
 
 
@@ -327,9 +329,93 @@ def test_damaged_files_give_a_scene_or_an_error(tmp_path, form):
     run()
 
 
+# Through the commands
+
+
+def _as_from_limap(folder: Path, form: str) -> Structures:
+    """Write a model to adjust beside structures with everything that a scene does not hold; return these."""
+    pair = holistic(8, seed=4)
+    write_colmap(pair.start, folder, form)
+    (folder / "structures" / "groma.npz").unlink(missing_ok=True)
+    made = read_limap(folder)
+    rng = np.random.default_rng(5)
+    images = []
+    for image in made.images:
+        # 2D lines come in another order, with scores, and more of them than there are in 3D.
+        more = np.zeros(3, LINE_2D)
+        more["ends"], more["line_id"] = rng.uniform(0, 500, (3, 4)).round(3), NONE
+        lines = np.concatenate([more, image.lines])
+        lines["score"] = rng.uniform(1, 9, len(lines)).round(2)
+        groups = tuple(replace(group, lines=_shifted(group.lines, "idx", 3)) for group in image.groups)
+        other = Group2d(2, group_id=NONE, lines=np.array([(0, 0.5), (1, 1.5)], MEMBER_2D))
+        images.append(
+            replace(image, lines=lines, groups=(*groups, other), wireframe=_shifted(image.wireframe, "line", 3))
+        )
+    lines = replace(
+        made.lines,
+        uncertainty=rng.uniform(0.1, 2, len(made.lines.ids)).round(3),
+        track=_shifted(made.lines.track, "idx", 3),
+    )
+    wireframe = made.wireframe.copy()
+    wireframe["weight"] = rng.uniform(1, 2, len(wireframe)).round(3)
+    groups = (*made.groups, Group3d(900, 2, np.array([1.0, 2.0, 3.0, 0.5])))
+    result = Structures(tuple(images), lines, groups, wireframe)
+    write_limap(result, folder / "structures", form, force=True)
+    return read_limap(folder)
+
+
+def _shifted(table: np.ndarray, name: str, by: int) -> np.ndarray:
+    moved = table.copy()
+    moved[name] += by
+    return moved
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_adjust_keeps_what_it_does_not_model(tmp_path, form):
+    """`groma adjust` on LIMAP's output: landmarks move, all else of the structures stays."""
+    before = _as_from_limap(tmp_path / "limap", form)
+    done = ["adjust", str(tmp_path / "limap"), "-o", str(tmp_path / "out"), "--max-iterations", "2", "-q"]
+    assert run(done) == 0
+    after = read_limap(tmp_path / "out")
+    for old, new in zip(before.images, after.images, strict=True):
+        assert new.lines.tobytes() == old.lines.tobytes()
+        assert new.wireframe.tobytes() == old.wireframe.tobytes()
+        for one, two in zip(old.groups, new.groups, strict=True):
+            assert (one.kind, one.group_id) == (two.kind, two.group_id)
+            assert one.lines.tobytes() == two.lines.tobytes() and one.points.tobytes() == two.points.tobytes()
+    assert after.lines.ids.tolist() == before.lines.ids.tolist()
+    assert after.lines.uncertainty.tolist() == before.lines.uncertainty.tolist()
+    assert after.lines.track.tobytes() == before.lines.track.tobytes()
+    assert not np.array_equal(after.lines.segments, before.lines.segments)
+    assert sorted(after.wireframe.tolist()) == sorted(before.wireframe.tolist()) and len(after.wireframe)
+    assert [group.id for group in after.groups] == [group.id for group in before.groups]
+    for old, new in zip(before.groups, after.groups, strict=True):
+        assert new.track.tobytes() == old.track.tobytes() and new.points.tobytes() == old.points.tobytes()
+        assert np.array_equal(new.params, old.params) == (old.kind == 2)
+    if LIMAP_PYTHON:
+        told = _through_limap(tmp_path / "out", tmp_path / "again_binary")
+        assert told["valid"] and len(told["groups"]) == len(before.groups)
+        assert [tuple(edge) for edge in told["edges"]] == sorted(before.wireframe.tolist())
+
+
+def test_convert_keeps_what_it_does_not_model(tmp_path):
+    before = _as_from_limap(tmp_path / "limap", "binary")
+    assert run(["convert", str(tmp_path / "limap"), str(tmp_path / "copy"), "-q"]) == 0
+    after = read_limap(tmp_path / "copy")
+    assert [image.lines.tobytes() for image in after.images] == [image.lines.tobytes() for image in before.images]
+    np.testing.assert_array_equal(after.lines.segments, before.lines.segments)
+
+
+def test_structures_of_what_has_none(tmp_path):
+    write_colmap(rig_scene().points_only(), tmp_path / "model")
+    (tmp_path / "scene.npz").write_bytes(b"")
+    assert structures_of(tmp_path / "model") is None and structures_of(tmp_path / "scene.npz") is None
+    assert structures_of(DATA / "binary") is not None
+
+
 # Against LIMAP itself
 
-LIMAP_PYTHON = os.environ.get("GROMA_LIMAP_PYTHON") or (sys.executable if importlib.util.find_spec("limap") else "")
 needs_limap = pytest.mark.skipif(not LIMAP_PYTHON, reason="needs pylimap 2.0 (or GROMA_LIMAP_PYTHON)")
 
 BRIDGE = """

@@ -2,17 +2,30 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import pytest
 
 from groma import cameras as camera_models
 from groma.errors import InputError
+from groma.frontend import ExternalMatches, LsdDetector
 from groma.frontend.matches import LineMatches
 from groma.frontend.segments import Segments
 from groma.geometry import quaternion
-from groma.pipelines._line_proposals import angles_about_baseline
+from groma.pipelines._line_directions import depth_ratios
+from groma.pipelines._line_proposals import Proposer, angles_about_baseline
+from groma.pipelines._line_views import build_views
 from groma.pipelines._neighbors import covisible_neighbors
-from groma.pipelines.map_lines import Fate, LineMap, MapLinesOptions, explain, map_lines
+from groma.pipelines.map_lines import (
+    Fate,
+    LineMap,
+    MapLinesOptions,
+    explain,
+    external_matches,
+    flow_matches,
+    map_lines,
+    wide_baseline_matches,
+)
 from groma.scene import Cameras, PointObservations, Points, Scene
 from groma.scene.similarity import Similarity
 
@@ -160,6 +173,7 @@ def test_lines_are_as_good_as_they_say(world, mapped):
 def test_result_is_consistent(world, mapped):
     assert mapped.lines.shape == (mapped.num_lines, 6)
     assert sum(mapped.fate_counts().values()) == sum(len(s) for s in world.segments)
+    assert all((fates >= 0).all() for fates in mapped.fates)
     counts = mapped.fate_counts()
     assert counts[Fate.MAPPED] + counts[Fate.RECOVERED] == len(mapped.line_idx)
     for i, fates in enumerate(mapped.fates):
@@ -203,6 +217,98 @@ def test_matches(world, form):
     # What is not matched with anything says so.
     clutter = np.concatenate([f[t < 0] for f, t in zip(result.fates, world.truth, strict=True)])
     assert (clutter == Fate.NO_MATCH).all()
+
+
+def test_matches_of_a_file(world, mapped):
+    names = world.scene.images.names
+    images = range(len(names))
+    pairs = {(names[i], names[j]): world.matches(i, j) for i in images for j in images if i < j}
+    result = map_lines(
+        world.scene, world.segments, external_matches(world.scene, world.segments, ExternalMatches({}, pairs))
+    )
+    owner = true_lines(world, result)
+    assert (owner >= 0).all()
+    assert len(owner) >= 20
+    wrong = ExternalMatches({}, {(names[0], names[1]): LineMatches(np.array([[0, 10_000]]), np.ones(1))})
+    with pytest.raises(InputError, match=r"Matches of 0\.png and 1\.png"):
+        external_matches(world.scene, world.segments, wrong)
+
+
+@pytest.mark.parametrize("provider", [wide_baseline_matches, flow_matches])
+def test_matches_from_images(provider):
+    """A tiled floor seen from a camera that moves sideways: the providers' matches are the same edges."""
+    rng = np.random.default_rng(9)
+    image = np.full((300, 420), 110.0, np.float32)
+    for _ in range(14):
+        x, y, w, h = *rng.integers(20, 260, 2), *rng.integers(30, 90, 2)
+        image[y : y + h, x : x + w] = rng.uniform(20, 240)
+    image = cv2.GaussianBlur(image, (0, 0), 0.7)
+    images = [np.ascontiguousarray(image[:, 12 * k : 12 * k + 360]).astype(np.uint8) for k in range(4)]
+    # Depth 4 and focal length 400: 12 pixels are 0.12 units.
+    centers = np.column_stack([0.12 * np.arange(4), np.zeros(4), np.zeros(4)])
+    poses = np.column_stack([np.zeros((4, 3)), np.ones(4), -centers])
+    cameras = Cameras(np.array([1]), ("PINHOLE",), np.array([[400.0, 400, 180, 150]]), np.array([360]), np.array([300]))
+    scene = Scene.from_images(cameras, [f"{k}.png" for k in range(4)], np.zeros(4, int), poses)
+    detector = LsdDetector(min_length=20)
+    segments = [detector.detect(picture) for picture in images]
+    found = provider(scene, segments, lambda k: images[k])(0, 2)
+    assert len(found) >= 0.5 * min(len(segments[0]), len(segments[2]))
+    shift = segments[0].midpoint[found.pairs[:, 0]] - segments[2].midpoint[found.pairs[:, 1]]
+    along = segments[0].direction[found.pairs[:, 0]]
+    across = np.abs((shift[:, 0] - 24.0) * along[:, 1] - shift[:, 1] * along[:, 0])
+    assert (across < 1.0).mean() >= 0.95
+    with pytest.raises(InputError, match="one set per image"):
+        provider(scene, segments[:2], lambda k: images[k])
+
+
+def test_lines_that_only_short_segments_show(world):
+    short = map_lines(world.scene, world.segments, options=MapLinesOptions(min_longest=1e4))
+    assert short.num_lines == 0
+    assert short.fate_counts()[Fate.SHORT_LINE] > 0
+    assert "min_longest" in explain(short)
+
+
+def test_vanishing_points_tell_how_depth_changes():
+    rng = np.random.default_rng(10)
+    middle, along = rng.uniform(-1.0, 1.0, (24, 3)), np.array([0.5, 0.3, 0.0])
+    parallel = wireframe(arc(4), np.stack([middle - along, middle + along], 1), rng, sigma=0.05)
+    views = build_views(parallel.scene, parallel.segments, 12.0, 0.1, 2.0)
+    ratios = depth_ratios(parallel.scene, parallel.segments, views)
+    known = ratios[:, 0] > 0
+    assert known.mean() >= 0.8
+    # The true ratio, from where the rays of the ends meet the true line.
+    truth = np.concatenate(parallel.truth)
+    depth = np.zeros((len(truth), 2))
+    for s, (n, i) in enumerate(zip(truth, views.image_idx, strict=True)):
+        for k in range(2):
+            table = np.column_stack([views.ray[s, k], parallel.lines[n, 0] - parallel.lines[n, 1]])
+            depth[s, k] = np.linalg.lstsq(table, parallel.lines[n, 0] - views.center[i], rcond=None)[0][0]
+    error = np.abs(ratios[:, 0] - depth[:, 0] / depth[:, 1])[known]
+    assert np.median(error) < 2e-3
+    assert (error < 4.0 * ratios[known, 1] + 2e-3).mean() >= 0.95
+
+
+def test_directions_place_what_two_views_cannot():
+    """All neighbours lie in the epipolar planes of lines along x; a direction and a point place them from one image."""
+    rng = np.random.default_rng(11)
+    lines = np.array([[[-0.6, 0.1 * k, z], [0.6, 0.1 * k, z]] for k, z in enumerate(np.linspace(-0.8, 0.8, 12))])
+    flat = wireframe(arc(5), lines, rng)
+    xyz = lines.mean(1)
+    views = build_views(flat.scene, flat.segments, 12.0, 0.1, 2.0)
+    ratios = depth_ratios(flat.scene, flat.segments, views)
+    P = views.camera[0]
+    x = xyz @ P[:, :3].T + P[:, 3]
+    proposer = Proposer(views, ratios, True, 0.3, 0.03)
+    found = proposer.propose(
+        0, np.array([1]), [(np.empty((0, 2), np.int64), np.empty(0))], (x[:, :2] / x[:, 2:], 1 / x[:, 2])
+    )
+    assert (found.neighbor == 2).all()  # slot of a point with a direction: no other proposal is possible
+    assert len(np.unique(found.segment)) >= 8
+    for s, q in zip(found.segment, found.values[:, :2], strict=True):
+        ends = views.center[0] + views.ray[s] / q[:, None]
+        a, b = lines[flat.truth[0][s]]
+        d = (b - a) / np.linalg.norm(b - a)
+        assert np.linalg.norm(np.cross(ends - a, d), axis=1).max() < 0.05
 
 
 def test_distorted_camera():

@@ -57,3 +57,30 @@ def test_bars_show_the_worst_first_and_escape_names():
 
 def test_bars_of_nothing():
     _tree(_charts.bars([], None, np.zeros(0)))
+
+
+def test_stages_begin_where_they_begin():
+    """Each stage starts at its own cost; curves of different losses are not joined."""
+    steps = [Step(1, 50.0, True), Step(2, 40.0, True), Step(3, 8.0, True)]
+    rows = [{**vars(step), "stage": 1 + (step.iteration > 2)} for step in steps]
+    stages = [
+        {"loss": "cauchy", "initial_cost": 100.0, "first_step": 1},
+        {"loss": "geman_mcclure", "initial_cost": 9.0, "first_step": 3},
+    ]
+    tree = _tree(_charts.convergence(rows, stages))
+    assert len(list(tree.iter("circle"))) == 5
+    assert [path.get("d").count("L") for path in tree.iter("path")] == [2, 1]
+    assert {"cauchy", "geman mcclure"} <= {text.text for text in tree.iter("text")}
+
+
+@pytest.mark.parametrize("values", [[], [2], [2, 3, 3], [5] * 10, list(range(2, 200))])
+def test_tracks(values):
+    tree = _tree(_charts.tracks({"points": np.array(values, int), "lines": np.array([3, 4])}))
+    heights = [sum(float(bar.get("height")) for bar in group) for group in tree.iter("g")]
+    assert len(heights) == 2 and heights[1] > 0 and (heights[0] > 0) == (len(values) > 0)
+
+
+def test_shares_leave_out_what_there_is_none_of():
+    text = _charts.shares([("<a>", 300, "red"), ("b", 1, "blue"), ("c", 0, "green")])
+    assert "&lt;a&gt;" in text and "under 1 %" in text and "green" not in text
+    assert _charts.shares([]) == '<div class="shares"></div><div class="keys"></div>'

@@ -67,18 +67,19 @@ def test_camera_axes_and_centres():
 
 def test_planes_are_drawn_around_what_lies_on_them():
     scene = exact_scene()
-    quad = drawable(scene).quads[0]
-    np.testing.assert_allclose(quad[:, 2], 0.25, atol=1e-12)
-    assert np.abs(quad[:, :2]).max() <= 1.0
+    patch = drawable(scene).patches[0]
+    np.testing.assert_allclose(patch[:, 2], 0.25, atol=1e-12)
+    assert np.abs(patch[:, :2]).max() <= 1.0
+    assert drawable(scene).patch_members.tolist() == [6]
 
 
 def test_planes_without_members_are_drawn_in_the_middle():
     scene = exact_scene()
-    quad = drawable(scene.points_only().replace(planes=scene.planes)).quads[0]
-    np.testing.assert_allclose(quad[:, 2], 0.25, atol=1e-12)
+    patch = drawable(scene.points_only().replace(planes=scene.planes)).patches[0]
+    np.testing.assert_allclose(patch[:, 2], 0.25, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["points", "segments", "quads", "residuals", "cam_from_world"])
+@pytest.mark.parametrize("name", ["points", "segments", "patches", "residuals", "cam_from_world"])
 def test_an_empty_scene_is_drawable(name):
     assert len(getattr(drawable(Scene()), name)) == 0
 

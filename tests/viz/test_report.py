@@ -11,9 +11,14 @@ import numpy as np
 import pytest
 from _scene import exact_scene
 
+from groma.cli.main import run
 from groma.errors import InputError, OutputError
-from groma.scene import Scene
-from groma.viz import report as report_module
+from groma.io import write_scene
+from groma.scene import Directions, Relations, Scene
+from groma.scene.synthetic import holistic
+from groma.viz import _page_data, _page_images
+from groma.viz._pictures import jpeg_address
+from groma.viz._saved_report import saved_report
 from groma.viz.report import write_report
 
 REPORT = SimpleNamespace(
@@ -35,7 +40,7 @@ REPORT = SimpleNamespace(
 class Balance(HTMLParser):
     """Checks that elements are closed in the order in which they were opened."""
 
-    VOID = frozenset({"meta", "input", "br", "link", "line", "rect", "circle", "path"})
+    VOID = frozenset({"meta", "image", "input", "br", "link", "line", "rect", "circle", "path"})
 
     def __init__(self) -> None:
         super().__init__()
@@ -97,10 +102,12 @@ def test_data_of_both_states(tmp_path):
     np.testing.assert_allclose(steps - steps[0], 0, atol=1e-6)  # one offset for all
     assert not np.allclose(_floats(before["points"]), _floats(after["points"]))
     assert len(_floats(after["lines"])) == 4 * 6
-    assert len(_floats(after["planes"])) == 12
+    assert len(_floats(after["planes"])) == 3 * sum(data["corners"]) >= 9
     assert len(_floats(after["cameras"])) == 2 * 12
-    assert len(_floats(data["residuals"])) == 40 * 6
-    assert [entry["count"] for entry in data["images"]] == [20, 20]
+    assert len(_floats(after["line_errors"])) == len(_floats(data["line_views"])) == 4
+    assert _floats(data["line_views"]).tolist() == [2] * 4
+    assert len(_floats(data["rows"])) == 24 * 6
+    assert [entry["points_seen"] for entry in data["images"]] == [12, 12]
 
 
 def test_numbers_and_warnings_are_shown(tmp_path):
@@ -141,7 +148,7 @@ def test_an_empty_scene(tmp_path):
 
 
 def test_large_scenes_are_thinned(tmp_path, monkeypatch):
-    monkeypatch.setattr(report_module, "MAX_POINTS", 5)
+    monkeypatch.setattr(_page_data, "MAX_POINTS", 5)
     data = _data(_write(tmp_path, None, exact_scene()))
     assert len(_floats(data["states"][0]["points"])) == 5 * 3
     assert len(_floats(data["states"][0]["errors"])) == 5
@@ -159,8 +166,102 @@ def test_images_are_embedded(tmp_path):
     cv2.imwrite(str(tmp_path / "first.png"), np.full((480, 640, 3), 128, np.uint8))
     images = {"first.jpg": tmp_path / "first.png", "second.jpg": tmp_path / "missing.png"}
     entries = _data(_write(tmp_path, None, exact_scene(), images=images))["images"]
-    assert entries[0]["picture"].startswith("data:image/jpeg;base64,")
-    assert entries[1]["picture"] == ""
+    assert entries[0]["photo"].startswith("data:image/jpeg;base64,")
+    assert entries[1]["photo"] == ""
+
+
+def test_segments_in_the_images(tmp_path):
+    """What is drawn in a photograph: measured ends, ways to the image of the line, images of the 3D segments."""
+    scene = exact_scene()
+    data = _data(_write(tmp_path, None, scene))
+    seen = scene.line_observations
+    rows = _floats(data["segments"]).reshape(-1, 8)
+    np.testing.assert_allclose(rows[:, :4], seen.segment, rtol=1e-6)
+    np.testing.assert_allclose(rows[:, 4:], 0, atol=1e-6)
+    projected = _floats(data["projected"]).reshape(len(rows), data["samples"], 2)
+    assert data["samples"] > 2  # one of the cameras bends lines
+    np.testing.assert_allclose(projected[:, [0, -1]].reshape(-1, 4), seen.segment, rtol=1e-5)
+    assert data["owners"] == scene.lines.ids[seen.line_idx].tolist()
+    first, second = data["images"]
+    assert (first["segments"], second["segments"]) == ([0, 4], [4, 8])
+    assert first["lines_seen"] == second["lines_seen"] == 4
+
+
+def test_bent_ends_of_polylines_are_kept_when_thinned(tmp_path, monkeypatch):
+    monkeypatch.setattr(_page_images, "MAX_SEGMENT_ROWS", 4)
+    data = _data(_write(tmp_path, None, exact_scene()))
+    assert len(data["owners"]) == 8  # forty per image are always kept
+    assert [entry["lines_seen"] for entry in data["images"]] == [4, 4]
+
+
+def test_planes_before_lie_on_the_planes_before(tmp_path):
+    scene = exact_scene()
+    tilt = np.array([[0.0, 0.6, 0.8, -0.1]])
+    data = _data(_write(tmp_path, scene.replace(planes=scene.planes.replace(hesse=tilt)), scene))
+    before, after = (_floats(state["planes"]).reshape(-1, 3).astype(float) for state in data["states"])
+    assert np.ptp(before @ tilt[0, :3]) < 1e-6 and np.ptp(after[:, 2]) < 1e-6
+    assert before.shape == after.shape
+
+
+def test_tables_of_planes_and_directions(tmp_path):
+    text = _write(tmp_path, None, holistic(10, seed=2).truth)
+    assert "<h2>Planes</h2>" in text and "<h2>Directions</h2>" not in text
+    scene = exact_scene()
+    along = scene.replace(
+        directions=Directions([7, 9], [[1.0, 0, 0], [0.6, 0.8, 0]]),
+        relations=Relations(line_along_direction=[[0, 0], [1, 0], [2, 1]]),
+    )
+    text = _write(tmp_path, None, along)
+    assert "<h2>Directions</h2>" in text and "53.1°" in text and ">to 7<" in text
+
+
+def test_what_became_of_the_segments(tmp_path):
+    fates = {"mapped": 60, "few_images": 40, "of_a_kind_to_come": 1, "outlier": 0}
+    text = _write(tmp_path, None, exact_scene(), fates=fates, explanation="4 lines from <60> segments.")
+    assert "4 lines from &lt;60&gt; segments." in text
+    for words in ("observes a line", "line in too few images", "of a kind to come", "59 %"):
+        assert words in text
+    assert "outlier of its line" not in text
+    assert "What became" not in _write(tmp_path, None, exact_scene())
+
+
+def test_photographs_keep_to_their_budget(tmp_path):
+    import cv2
+
+    noise = np.random.default_rng(0).integers(0, 255, (900, 1200, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "first.jpg"), noise)
+    cv2.imwrite(str(tmp_path / "second.jpg"), noise)
+    photos = _page_images._photographs(["first.jpg", "missing.jpg", "second.jpg"], tmp_path)
+    assert photos[1] == "" and all(photo.startswith("data:image/jpeg;base64,") for photo in photos[::2])
+    assert all(len(jpeg_address(noise, budget)) <= 1.1 * budget for budget in (30_000, 100_000, 10_000_000))
+
+
+def test_the_summary_of_a_map_stands_in_the_page(tmp_path):
+    """A folder with a summary: `groma report` tells of the run; with photographs, they are embedded."""
+    import cv2
+
+    write_scene(exact_scene(), tmp_path / "map")
+    (tmp_path / "photos").mkdir()
+    cv2.imwrite(str(tmp_path / "photos" / "first.jpg"), np.full((480, 640, 3), 128, np.uint8))
+    numbers = {
+        **REPORT.to_dict(),
+        "history": [{"iteration": 1, "cost": 1.0, "accepted": True, "stage": 1}],
+        "termination_sentence": "It went well.",
+        "warnings": ["Mind the gap."],
+        "segments": {"mapped": 3},
+        "explanation": "Three of three.",
+    }
+    (tmp_path / "map" / "summary.json").write_text(json.dumps(numbers))
+    page = tmp_path / "page.html"
+    assert run(["report", str(tmp_path / "map"), "-o", str(page), "--images", str(tmp_path / "photos")]) == 0
+    text = page.read_text(encoding="utf-8")
+    for words in ("It went well.", "Mind the gap.", "Three of three.", "Convergence"):
+        assert words in text
+    assert [bool(entry["photo"]) for entry in _data(text)["images"]] == [True, False]
+    assert run(["report", str(tmp_path / "map"), "-o", str(page), "-f", "--images", str(tmp_path / "none")]) != 0
+    for content in ("no json", "[]", '{"history": []}'):
+        (tmp_path / "map" / "summary.json").write_text(content)
+        assert saved_report(tmp_path / "map") is None
 
 
 def test_a_place_that_cannot_be_written(tmp_path):

@@ -22,9 +22,8 @@ from groma.errors import InputError
 from groma.geometry import se3
 from groma.io import write_scene
 from groma.scene import Directions, Points, Relations, Scene, Similarity, synthetic
+from groma.scene.patches import plane_patches
 from groma.viz import _scene_view, viewer
-from groma.viz._patches import plane_patches
-from groma.viz._view_arrays import fans
 from groma.viz._view_content import LINE_MODES, REACH, ray_to_segments, view_content
 from groma.viz.viewer import open_viewer, serving
 
@@ -294,14 +293,6 @@ def test_much_is_thinned_out(monkeypatch, scene):
     with serving(scene, port=0) as view:
         assert len(view.points.points) == 30 < scene.num_points
         assert len(view._nodes["cameras"]) == 4
-
-
-def test_faces_cover_the_patches():
-    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
-    vertices, faces = fans([square, 2 * square + 5, square[:3]])
-    corners = vertices[faces]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    np.testing.assert_allclose([area[:2].sum(), area[2:4].sum(), area[4:].sum()], [1, 4, 0.5])
 
 
 def test_points_alone_can_be_seen():

@@ -3,6 +3,8 @@
 
 import os
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -49,8 +51,11 @@ class Console:
         return Progress(enabled=not self.quiet and sys.stderr.isatty())
 
     def stages(self) -> "Stages":
-        """Return a progress line for a pipeline of named stages; silent when not on a terminal."""
-        return Stages(enabled=not self.quiet and sys.stderr.isatty())
+        """Return a progress line for a pipeline of named stages; silent when not on a terminal.
+
+        With --verbose every stage leaves a line with its time, on a terminal or not.
+        """
+        return Stages(enabled=not self.quiet and sys.stderr.isatty(), finished=self.detail if self.verbose else None)
 
 
 class _Line:
@@ -70,6 +75,9 @@ class _Line:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._wipe()
+
+    def _wipe(self) -> None:
         if self._enabled:
             sys.stderr.write("\r\x1b[K")
             sys.stderr.flush()
@@ -86,9 +94,25 @@ class Progress(_Line):
 class Stages(_Line):
     """Call it with the name of a stage, what is done and what there is to do."""
 
+    def __init__(self, enabled: bool, finished: Callable[[str], None] | None = None) -> None:
+        super().__init__(enabled)
+        self._finished = finished
+        self._stage = ""
+        self._since = time.perf_counter()
+
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Show a stage."""
+        if stage != self._stage:
+            self._leave()
+            self._stage = stage
         self._show(f"{stage} {done}/{total}" if total > 1 else stage)
+
+    def _leave(self) -> None:
+        now = time.perf_counter()
+        if self._stage and self._finished is not None:
+            self._wipe()
+            self._finished(f"  {self._stage}: {now - self._since:.1f} s")
+        self._since = now
 
 
 def _cache_is_filled() -> bool:

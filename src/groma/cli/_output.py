@@ -11,7 +11,7 @@ from groma.errors import OutputError
 
 #: A folder that holds anything else is not a result of groma, and ``--force`` does not replace it.
 _RESULT_NAMES = {"structures", "report.html", "report.json", "adjusted.npz", "rigs", "sparse", "truth", "start"}
-_RESULT_SUFFIXES = {".bin", ".txt", ".npz", ".json", ".html", ".npy"}
+_RESULT_SUFFIXES = {".bin", ".txt", ".npz", ".json", ".html", ".npy", ".obj", ".ply"}
 
 
 def check_output(path: Path, force: bool) -> None:
@@ -39,12 +39,15 @@ def check_output(path: Path, force: bool) -> None:
 
 
 @contextmanager
-def atomic_output(path: Path, force: bool) -> Iterator[Path]:
-    """Yield a place to write a file or folder to; it becomes ``path`` when the block ends well, else it vanishes."""
+def atomic_output(path: Path, force: bool, workshop_in: Path | None = None) -> Iterator[Path]:
+    """Yield a place to write a file or folder to; it becomes ``path`` when the block ends well, else it vanishes.
+
+    It is built in ``workshop_in`` (default: beside ``path``).
+    """
     from groma.io._atomic import atomic_output as complete_or_not_at_all
 
     check_output(path, force)
-    with complete_or_not_at_all(path, force) as draft:
+    with complete_or_not_at_all(path, force, workshop_in) as draft:
         yield draft
 
 

@@ -73,7 +73,8 @@ def adjust(
     """Adjust cameras, points, lines and planes together (bundle adjustment).
 
     Reads a scene, minimises the robust reprojection error over everything in it and writes the scene back. The input
-    is never changed. Chance plays no part here: --seed is accepted so that scripts can pass it everywhere.
+    is never changed. LIMAP's structures beside a COLMAP model are read and written too, with what they hold besides.
+    Chance plays no part here: --seed is accepted so that scripts can pass it everywhere.
     """
     from groma.cli import _output
     from groma.cli._console import Console
@@ -85,7 +86,7 @@ def adjust(
     _output.check_json(json_target, force)
 
     from groma.cli._numbers import describe
-    from groma.io import read_scene, write_scene
+    from groma.io import read_scene, structures_of, write_scene
     from groma.pipelines.adjust import AdjustOptions
     from groma.pipelines.adjust import adjust as run_adjust
 
@@ -114,7 +115,7 @@ def adjust(
     numbers = result.report.to_dict()
 
     if output is not None:
-        write_scene(result.scene, output, force=force)
+        write_scene(result.scene, output, force=force, like=structures_of(source))
     if page is not None:
         from groma.viz.report import write_report
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 import groma
-from groma.cli import adjust, convert, demo, evaluate, map, report, selfcheck, synth, view
+from groma.cli import adjust, convert, demo, evaluate, map, report, selfcheck, synth, track, view, warmup
 from groma.cli._guard import guard
 
 app = typer.Typer(
@@ -20,17 +20,20 @@ app = typer.Typer(
 )
 app.command("demo")(guard(demo.demo))
 app.command("map")(guard(map.map_))
+app.command("track")(guard(track.track))
 app.command("adjust")(guard(adjust.adjust))
 app.command("convert")(guard(convert.convert))
 app.command("report")(guard(report.report))
 app.command("view")(guard(view.view))
 app.command("synth")(guard(synth.synth))
 app.command("selfcheck")(guard(selfcheck.selfcheck))
+app.command("warmup")(guard(warmup.warmup))
 
 _evaluate = typer.Typer(help="Compare a result with a reference.", no_args_is_help=True, rich_markup_mode=None)
 _evaluate.command("poses")(guard(evaluate.poses))
 _evaluate.command("lines")(guard(evaluate.lines))
 _evaluate.command("planes")(guard(evaluate.planes))
+_evaluate.command("trajectory")(guard(evaluate.trajectory))
 app.add_typer(_evaluate, name="evaluate")
 
 

@@ -16,7 +16,7 @@ def convert(
         typer.Argument(
             metavar="OUTPUT",
             help="Its name says the format: a folder for a COLMAP model, .npz for a groma archive, .txt, .bz2 or .gz "
-            "for BAL, .ply or .obj for geometry only.",
+            "for BAL, .ply or .obj for geometry only: points, lines and pieces of planes.",
         ),
     ],
     force: _options.Force = False,
@@ -34,9 +34,9 @@ def convert(
     _output.check_json(json_target, force)
 
     from groma.cli._counts import counts_of, sentence_of
-    from groma.io import read_scene, write_scene
+    from groma.io import read_scene, structures_of, write_scene
 
     scene = read_scene(source)
-    write_scene(scene, target, force=force)
+    write_scene(scene, target, force=force, like=structures_of(source))
     console.say(f"Wrote {target}: {sentence_of(scene)}")
     _output.write_json(json_target, {"input": str(source), "output": str(target), **counts_of(scene)}, force)

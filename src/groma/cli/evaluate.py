@@ -143,3 +143,69 @@ def planes(
     for tau, share in shares.inlier_share.items():
         console.say(f"  {tau:9.4g}  {100 * share:5.1f} % of the points, {shares.inlier_rmse[tau]:.4g} rms")
     _output.write_json(json_target, shares.to_dict(), force)
+
+
+def trajectory(
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory to judge.")],
+    reference: Annotated[Path, typer.Argument(metavar="REF", help="Trajectory taken for true.")],
+    format: Annotated[
+        str, typer.Option("--format", metavar="auto|tum|kitti|euroc", help="Format of both files; .gz is unpacked.")
+    ] = "auto",
+    align: Annotated[
+        str, typer.Option("--align", metavar="se3|sim3|none", help="Alignment of EST to REF; sim3 for monocular.")
+    ] = "se3",
+    max_time_difference: Annotated[
+        float, typer.Option("--max-time-difference", metavar="S", help="Largest difference of associated times, s.")
+    ] = 0.01,
+    rpe_delta: Annotated[float, typer.Option("--rpe-delta", metavar="D", help="Step of the relative errors.")] = 1.0,
+    rpe_unit: Annotated[
+        str, typer.Option("--rpe-unit", metavar="frames|metres|seconds", help="Unit of the step.")
+    ] = "frames",
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Compare a trajectory with a reference: absolute and relative errors, and drift; poses are matched by time."""
+    from groma.cli import _output
+    from groma.cli._console import Console
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_json(json_target, force)
+
+    from groma.evaluation.trajectory import Spread, score_trajectory
+    from groma.io import read_trajectory
+
+    def row(name: str, spread: Spread, unit: str) -> None:
+        console.say(
+            f"  {name:20s} {spread.rmse:10.6g} rms {spread.mean:10.6g} mean {spread.median:10.6g} median "
+            f"{spread.max:10.6g} max  {unit}"
+        )
+
+    scores = score_trajectory(
+        read_trajectory(estimate, format),  # type: ignore[arg-type]  # unknown words are refused there
+        read_trajectory(reference, format),  # type: ignore[arg-type]
+        align,  # type: ignore[arg-type]
+        max_time_difference,
+        rpe_delta,
+        rpe_unit,  # type: ignore[arg-type]
+    )
+    applied = {"se3": "rotation and translation", "sim3": f"similarity of scale {scores.similarity.scale:.6g}"}
+    console.say(
+        f"{scores.num_poses} poses associated of {scores.num_estimate} and {scores.num_reference}, path of "
+        f"{scores.path_length:.6g} m; alignment: {applied.get(align, 'none')}"
+    )
+    row("absolute, position", scores.ate, "m")
+    row("absolute, rotation", scores.rotation_deg, "deg")
+    if scores.rpe_translation is None or scores.rpe_rotation_deg is None:
+        console.warn(f"No two associated poses are {rpe_delta:g} {rpe_unit} apart; there are no relative errors.")
+    else:
+        row("relative, position", scores.rpe_translation, f"m per {rpe_delta:g} {rpe_unit}")
+        row("relative, rotation", scores.rpe_rotation_deg, f"deg per {rpe_delta:g} {rpe_unit}")
+    if scores.drift_percent is not None:
+        console.say(
+            f"  drift                {scores.drift_percent:10.6g} %   {scores.drift_deg_per_metre:10.6g} deg/m, "
+            f"mean over segments of {scores.segment_lengths[0]:.4g} to {scores.segment_lengths[-1]:.4g} m"
+        )
+    _output.write_json(json_target, scores.to_dict(), force)

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from groma.cli import _options
+from groma.errors import InputError
 
 
 def map_(
@@ -19,6 +20,19 @@ def map_(
         Path | None,
         typer.Option("--model", metavar="COLMAP", help="Poses, cameras and points; without it they are reconstructed."),
     ] = None,
+    camera_model: Annotated[
+        str, typer.Option(metavar="NAME", help="Without --model: lens model to estimate, by COLMAP's name.")
+    ] = "SIMPLE_RADIAL",
+    camera_params: Annotated[
+        str | None,
+        typer.Option(metavar="F,CX,CY,...", help="Without --model: the calibration, if it is known; it is then kept."),
+    ] = None,
+    line_matches: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="NPZ", help="Segments and their matches from elsewhere; see groma.frontend.external for the layout."
+        ),
+    ] = None,
     min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
     refine_poses: Annotated[
@@ -26,6 +40,9 @@ def map_(
     ] = True,
     refine_intrinsics: Annotated[
         bool, typer.Option("--refine-intrinsics/--fix-intrinsics", help="Estimate the calibration too.")
+    ] = False,
+    refine_points: Annotated[
+        bool, typer.Option("--refine-points/--keep-points", help="Measure the points of the model again in the images.")
     ] = False,
     force: _options.Force = False,
     threads: _options.Threads = None,
@@ -36,8 +53,9 @@ def map_(
 ) -> None:
     """Map photographs: points, lines and planes, adjusted together.
 
-    OUT then holds a COLMAP model with the lines and planes beside it (structures/), scene.npz, lines.obj, summary.json
-    and report.html. Finished stages are kept in OUT.work until the end: an interrupted run goes on from there.
+    OUT then holds a COLMAP model with the lines and planes beside it (structures/), scene.npz, lines and planes as PLY
+    and OBJ, summary.json and report.html. Finished stages are kept in OUT.work until the end: after an interruption the
+    same command goes on from there.
     """
     from groma.cli import _output
     from groma.cli._console import Console
@@ -46,57 +64,44 @@ def map_(
     _output.check_output(output, force)
     _output.check_json(json_target, force)
 
-    import shutil
+    if model is not None and (camera_params is not None or camera_model != "SIMPLE_RADIAL"):
+        raise InputError("--camera-model and --camera-params are for images without a model. Leave them out.")
 
-    from groma.io import read_scene, write_scene
-    from groma.pipelines.map import MapOptions, map_images
-    from groma.viz.report import write_report
+    from groma.cli._mapping import map_and_write
+    from groma.frontend.external import read_matches
+    from groma.io import read_scene
+    from groma.pipelines.map import MapOptions
 
     options = MapOptions(
         min_segment_length=min_length,
         find_planes=planes,
+        refine_points=refine_points,
         refine_poses=refine_poses,
         refine_intrinsics=refine_intrinsics,
+        camera_model=camera_model,
+        camera_params=_parameters(camera_params),
         threads=threads,
         seed=seed,
     )
-    given = read_scene(model) if model is not None else None
-    fresh = console.announce_compilation()
-    work = output.with_name(output.name + ".work")
-    with console.stages() as stages:
-        result = map_images(images, work, given, options, stages)
-    scene = result.scene
-    solve = result.report.to_dict()
-    numbers = {
-        **solve,
-        "num_images": scene.num_images,
-        "num_points": scene.num_points,
-        "num_lines": scene.num_lines,
-        "num_planes": scene.num_planes,
-        "num_directions": scene.num_directions,
-        "sigma_px": result.sigma_px,
-        "segments": result.fates,
-        "explanation": result.explanation,
-        "warnings": list(result.warnings),
-    }
-    with _output.atomic_output(output, force) as draft:
-        write_scene(scene, draft, format="colmap")
-        write_scene(scene, draft / "scene.npz")
-        write_scene(scene, draft / "lines.obj")
-        pictures = {name: images / name for name in scene.images.names}
-        title = f"Map of {images.absolute().name}"
-        write_report(draft / "report.html", result.before, scene, result.report, pictures, title)
-        _output.write_json(str(draft / "summary.json"), numbers)
-    shutil.rmtree(work, ignore_errors=True)
-    console.say(
-        f"{scene.num_images} images, {scene.num_points:,} points, {scene.num_lines:,} lines, "
-        f"{scene.num_planes} planes, {scene.num_directions} directions"
+    numbers = map_and_write(
+        console,
+        images,
+        output,
+        read_scene(model) if model is not None else None,
+        options,
+        force,
+        f"Map of {images.absolute().name}",
+        line_matches=read_matches(line_matches) if line_matches is not None else None,
     )
-    console.say(result.explanation)
-    for kind, rmse in result.report.rmse_px.items():
-        console.say(f"  {kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms, outliers included)")
-    for sentence in result.warnings:
-        console.warn(sentence)
-    console.detail(f"with compilation: {fresh}")
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
+
+
+def _parameters(text: str | None) -> tuple[float, ...] | None:
+    """Camera parameters from numbers with commas between them."""
+    if text is None:
+        return None
+    try:
+        return tuple(float(number) for number in text.split(","))
+    except ValueError:
+        raise InputError(f"--camera-params must be numbers with commas between them; got {text!r}.") from None

@@ -14,6 +14,10 @@ def report(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The HTML file.")] = Path(
         "report.html"
     ),
+    images: Annotated[
+        Path | None,
+        typer.Option("--images", metavar="DIR", help="Folder of the photographs, with what was measured in them."),
+    ] = None,
     before: Annotated[
         Path | None, typer.Option(metavar="SCENE", help="The same scene before adjustment, to compare with.")
     ] = None,
@@ -23,7 +27,10 @@ def report(
     quiet: _options.Quiet = False,
     verbose: _options.Verbose = False,
 ) -> None:
-    """Write a self-contained HTML page of a scene: 3D view, residuals, numbers. It needs no network."""
+    """Write a self-contained HTML page of a scene: 3D view, photographs, residuals, numbers. It needs no network.
+
+    For the folder of a finished map the page also says how the adjustment went and what became of the segments.
+    """
     from groma.cli import _output
     from groma.cli._console import Console
 
@@ -32,12 +39,29 @@ def report(
     _output.check_json(json_target, force)
 
     from groma.cli._counts import counts_of
+    from groma.errors import InputError
     from groma.io import read_scene
+    from groma.viz._pictures import image_file
+    from groma.viz._saved_report import saved_report
     from groma.viz.report import write_report
 
+    if images is not None and not images.is_dir():
+        raise InputError(f"{images} is not a folder of images. Check --images.")
     scene = read_scene(source)
     earlier = read_scene(before) if before is not None else None
+    if images is not None and not any(image_file(images, name) for name in scene.images.names):
+        console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[:1]}.")
+    saved = saved_report(source) if source.is_dir() else None
     with _output.atomic_output(output, force) as draft:
-        write_report(draft, earlier, scene, title=source.name)
+        write_report(
+            draft,
+            earlier,
+            scene,
+            saved,
+            images,
+            title=source.absolute().name,
+            fates=saved.fates if saved is not None else None,
+            explanation=saved.explanation if saved is not None else "",
+        )
     console.say(f"Wrote {output}")
     _output.write_json(json_target, {"output": str(output), **counts_of(scene)}, force)

@@ -15,9 +15,13 @@ Two families of scores are published under nearly the same names. Both are given
 ``precision_count``       share of estimated lines of which any part lies within tau: "precision P_tau" of LIMAP
 ``precision_strict``      share of estimated lines of which at least 90 % lie within tau
 ``precision_length``      share of the estimate's length that lies within tau
+``recall_count``          share of the reference's segments of which at least half lies within tau of the estimate
 ========================  =========================================================================================
 
-A mesh or a set of points has no length of lines: ``recall_length`` and ``covered_length`` are then NaN. Precisions of
+Places at equal steps weigh by length: ``recall_length`` and ``precision_length`` are recall and precision of sampled
+edges, as curve drawings and wireframes are judged; those by count are the ones of line maps.
+
+A mesh or a set of points has no length of lines: both recalls and ``covered_length`` are then NaN. Precisions of
 an estimate without lines are NaN, its recall is zero.
 
 References
@@ -45,6 +49,7 @@ _PLACES = (4, 1000)
 _MAX_ANCHORS = 200_000
 _CHUNK = 100_000
 _STRICT_SHARE = 0.9
+_FOUND_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,8 @@ class LineScores:
     inlier_length: dict[float, float]
     #: Length of the reference near the estimate.
     covered_length: dict[float, float]
+    #: Share of the reference's segments that are covered by half.
+    recall_count: dict[float, float]
     #: Number of estimated lines.
     num_lines: int
     #: Length of the estimate.
@@ -149,14 +156,14 @@ def score_lines(
     if len(truth) == len(target):  # segments only
         back, true_length = _near(truth, step, taus, Distances(Geometry(segments=estimate), min(taus), *needed))
         reference_length = float(true_length.sum())
-        covered = (back * true_length[:, None]).sum(0)
+        covered, halves = (back * true_length[:, None]).sum(0), (back >= _FOUND_SHARE).mean(0)
     else:
-        reference_length, covered = np.nan, np.full(len(taus), np.nan)
+        reference_length, covered, halves = np.nan, np.full(len(taus), np.nan), np.full(len(taus), np.nan)
     inlier = (forth * length[:, None]).sum(0)
     shares = [forth > 0, forth >= _STRICT_SHARE]
     any_part, nearly_all = (s.mean(0) if len(estimate) else np.full(len(taus), np.nan) for s in shares)
     recall, precision = _ratio(covered, reference_length), _ratio(inlier, total)
-    columns = (recall, any_part, nearly_all, precision, inlier, covered)
+    columns = (recall, any_part, nearly_all, precision, inlier, covered, halves)
     by = [dict(zip(taus, np.asarray(values, float).tolist(), strict=True)) for values in columns]
     return LineScores(*by, num_lines=len(estimate), length=total, reference_length=reference_length)
 

@@ -7,7 +7,9 @@ lies on it, where that is known, else the point of it closest to the middle of t
 .. math:: \alpha = \angle(\pm n, n_r), \qquad o = | n \cdot x_r + w |
 
 A pair may match when angle and offset are within their limits. Every plane is in one pair at most; the pairs are
-those with the smallest sum of :math:`\alpha / \alpha_{max} + o / o_{max}` among those with the most matches.
+those with the smallest sum of :math:`\alpha / \alpha_{max} + o / o_{max}` among those with the most matches. A
+surface that is found twice therefore counts once for the recall and against the precision; where in the plane the
+estimate was seen plays no part, so pieces of one wall in one plane should be one reference plane.
 """
 
 from __future__ import annotations
@@ -159,7 +161,9 @@ def evaluate_planes(
     max_angle_deg : float
         Largest angle of a match.
     max_offset : float, optional
-        Largest offset of a match, scene units; by default a hundredth of the reference's extent.
+        Largest offset of a match, scene units; by default a hundredth of the reference's extent, the diagonal of the
+        box that holds its points and lines except, on every side, the outermost two in a hundred: single points far
+        away, as reconstructions have them, would make every offset a match.
 
     Raises
     ------
@@ -170,7 +174,8 @@ def evaluate_planes(
         raise InputError("The reference has no planes. Pass a scene with planes, or points to compare with.")
     if max_offset is None:
         every = np.concatenate([reference.points.xyz, reference.lines.segments.reshape(-1, 3)])
-        max_offset = 0.01 * float(np.linalg.norm(np.ptp(every, axis=0))) if len(every) else 0.0
+        sides = np.diff(np.percentile(every, (2, 98), axis=0), axis=0) if len(every) else np.zeros(3)
+        max_offset = 0.01 * float(np.linalg.norm(sides))
         if not max_offset > 0:
             raise InputError("The reference has no extent; pass max_offset in scene units.")
     return score_planes(

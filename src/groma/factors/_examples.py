@@ -11,9 +11,10 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import ProblemError
 from groma.factors._factor import Example, Factor
 from groma.geometry import se3
-from groma.geometry._manifold import Euclidean, Manifold
+from groma.geometry._manifold import Manifold
 from groma.geometry.line_charts import LINE_CHARTS
 from groma.geometry.plane_charts import PLANE_CHARTS
+from groma.geometry.point3 import POINT_CHARTS
 from groma.geometry.pose_charts import POSE_CHARTS
 from groma.geometry.unit3 import DIRECTION_CHARTS
 
@@ -23,9 +24,13 @@ COUNT = 6
 
 def charts(kind: str) -> tuple[Manifold, ...]:
     """Return every chart known for ``kind``, the default first; none for kinds of any size."""
-    if kind == "point":
-        return (Euclidean(3, "point"),)
-    tables = {"pose": POSE_CHARTS, "line": LINE_CHARTS, "plane": PLANE_CHARTS, "direction": DIRECTION_CHARTS}
+    tables = {
+        "point": POINT_CHARTS,
+        "pose": POSE_CHARTS,
+        "line": LINE_CHARTS,
+        "plane": PLANE_CHARTS,
+        "direction": DIRECTION_CHARTS,
+    }
     return tuple(tables[kind].values()) if kind in tables else ()
 
 

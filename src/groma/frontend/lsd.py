@@ -66,7 +66,7 @@ class LsdDetector:
         gray = to_gray(image)
         if min(gray.shape) < SMALLEST_IMAGE or gray.min() == gray.max():
             return Segments.empty()
-        detected = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE, self.scale).detect(gray)[0]
+        detected = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD, self.scale).detect(gray)[0]
         if detected is None or np.size(detected) == 0:
             return Segments.empty()
         ends = np.asarray(detected, dtype=np.float64).reshape(-1, 4) + 0.5 / self.scale

@@ -105,9 +105,9 @@ def random_planes(rng: np.random.Generator, count: int) -> FloatArray:
 
 
 class Chart(Manifold):
-    """A chart of lines or planes: the sizes of its kind, and checks of shapes."""
+    """A chart of points, lines or planes: the sizes of its kind, and checks of shapes."""
 
-    _SIZES: ClassVar[dict[str, tuple[int, int]]] = {"line": (6, 4), "plane": (4, 3)}
+    _SIZES: ClassVar[dict[str, tuple[int, int]]] = {"point": (3, 3), "line": (6, 4), "plane": (4, 3)}
 
     def __init__(self) -> None:
         self.ambient_size, self.dof = self._SIZES[self.kind]

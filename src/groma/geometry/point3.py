@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Points: three numbers (x, y, z), moved by addition, and their homogeneous form [X, Y, Z, W].
+r"""Points: three numbers (x, y, z), their charts, and their homogeneous form [X, Y, Z, W].
 
 .. math:: (x, y, z) = (X, Y, Z) / W, \qquad X_b = R\,X_a + t .
 
@@ -13,9 +13,13 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import ShapeError
 from groma.geometry._manifold import Euclidean, Manifold
+from groma.geometry.point_inverse_depth import InverseDepthPoint
 
-#: Charts of points by name.
-POINT_CHARTS: dict[str, Manifold] = {Euclidean.name: Euclidean(3, "point")}
+#: Charts of points by name: moved by addition, or linear in the inverse of the distance from an anchor.
+POINT_CHARTS: dict[str, Manifold] = {
+    Euclidean.name: Euclidean(3, "point"),
+    InverseDepthPoint.name: InverseDepthPoint(),
+}
 
 
 def to_homogeneous(point: FloatArray) -> FloatArray:

@@ -15,8 +15,9 @@ from groma.io._reading import existing, reading
 from groma.io.archive import is_archive_name, looks_like_archive, read_archive, write_archive
 from groma.io.bal import looks_like_bal, read_bal, write_bal
 from groma.io.colmap import from_pycolmap, read_colmap, to_pycolmap, write_colmap
-from groma.io.ply import write_obj, write_ply
-from groma.io.tum import Trajectory, read_tum, write_tum
+from groma.io.limap import Structures, structures_of
+from groma.io.ply import write_geometry, write_obj, write_ply
+from groma.io.trajectories import Trajectory, read_trajectory, read_tum, write_trajectory, write_tum
 from groma.scene import Scene
 
 Format = Literal["auto", "colmap", "colmap_text", "archive", "bal", "ply", "obj"]
@@ -56,7 +57,13 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     )
 
 
-def write_scene(scene: Scene, path: str | os.PathLike[str], format: Format = "auto", force: bool = False) -> None:
+def write_scene(
+    scene: Scene,
+    path: str | os.PathLike[str],
+    format: Format = "auto",
+    force: bool = False,
+    like: Structures | None = None,
+) -> None:
     """Write a scene, whole or not at all.
 
     Parameters
@@ -65,11 +72,14 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], format: Format = "au
         What to write.
     path : path
         Where. With ``format="auto"`` the name says the format: ``.npz`` archive, ``.txt``, ``.bz2`` or ``.gz`` BAL,
-        ``.ply`` and ``.obj`` geometry only, no suffix a COLMAP model in a new folder.
+        ``.ply`` and ``.obj`` geometry only (points, lines, pieces of planes), no suffix a COLMAP model in a new folder.
     format : str
         ``colmap``, ``colmap_text``, ``archive``, ``bal``, ``ply`` or ``obj``, to override the name.
     force : bool
         Replace what is there.
+    like : Structures, optional
+        For COLMAP models: the LIMAP structures that the scene came from (:func:`groma.io.limap.structures_of`), to
+        keep what a scene cannot hold.
 
     Raises
     ------
@@ -94,9 +104,9 @@ def write_scene(scene: Scene, path: str | os.PathLike[str], format: Format = "au
     elif chosen == "bal":
         write_bal(scene, path, force)
     elif chosen == "colmap":
-        write_colmap(scene, path, "binary", force)
+        write_colmap(scene, path, "binary", force, like)
     elif chosen == "colmap_text":
-        write_colmap(scene, path, "text", force)
+        write_colmap(scene, path, "text", force, like)
     elif chosen == "ply":
         write_ply(scene, path, force)
     elif chosen == "obj":
@@ -122,6 +132,7 @@ def _unpacked_head(path: Path, head: bytes) -> bytes:
 
 
 __all__ = [
+    "Structures",
     "Trajectory",
     "atomic_output",
     "from_pycolmap",
@@ -129,13 +140,17 @@ __all__ = [
     "read_bal",
     "read_colmap",
     "read_scene",
+    "read_trajectory",
     "read_tum",
+    "structures_of",
     "to_pycolmap",
     "write_archive",
     "write_bal",
     "write_colmap",
+    "write_geometry",
     "write_obj",
     "write_ply",
     "write_scene",
+    "write_trajectory",
     "write_tum",
 ]

@@ -16,7 +16,9 @@ from groma.errors import OutputError
 
 
 @contextmanager
-def atomic_output(path: str | os.PathLike[str], force: bool = False) -> Iterator[Path]:
+def atomic_output(
+    path: str | os.PathLike[str], force: bool = False, workshop_in: str | os.PathLike[str] | None = None
+) -> Iterator[Path]:
     """Yield a path to write a file or folder to; it becomes ``path`` when the block ends well, else it vanishes.
 
     Parameters
@@ -25,6 +27,9 @@ def atomic_output(path: str | os.PathLike[str], force: bool = False) -> Iterator
         Where the result goes. Its folder must exist.
     force : bool
         Replace what is there. Without it an existing file or folder is refused.
+    workshop_in : path, optional
+        Folder, on the same disk, where the draft is built: what a killed process leaves is then found there, and not
+        beside ``path``.
 
     Raises
     ------
@@ -35,7 +40,7 @@ def atomic_output(path: str | os.PathLike[str], force: bool = False) -> Iterator
     if not force and (target.exists() or target.is_symlink()):
         raise OutputError(f"{path} exists already. Pass force=True (--force) to replace it, or choose another name.")
     try:
-        workshop = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+        workshop = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=workshop_in or target.parent))
     except OSError as error:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}. Choose another place.") from error
     try:

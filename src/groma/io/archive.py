@@ -42,6 +42,9 @@ def write_archive(scene: Scene, path: str | os.PathLike[str], force: bool = Fals
         for table in fields(scene):
             for item in fields(getattr(scene, table.name)):
                 value = getattr(getattr(scene, table.name), item.name)
+                if (fill := item.metadata.get("fill")) is not None and not isinstance(value, tuple):
+                    if (value == fill).all():
+                        continue  # as if left out; readers that do not know the column can read the file
                 array = np.array(value, dtype="<U1" if not value else None) if isinstance(value, tuple) else value
                 _write_array(file, f"{table.name}.{item.name}", array)
 
@@ -77,6 +80,8 @@ def read_archive(path: str | os.PathLike[str]) -> Scene:
 
 def _read_column(file: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], name: str, item: Field[Any]) -> Any:
     info = members.get(f"{name}.npy")
+    if info is None and item.metadata.get("fill") is not None:
+        return np.zeros((0, *item.metadata["row"]), item.metadata["dtype"])
     if info is None:
         raise FileFormatError(f"Array {name} is missing. The file is incomplete or of another program.")
     dtype = item.metadata["dtype"]

@@ -90,6 +90,22 @@ def read_limap(path: str | os.PathLike[str]) -> Structures:
         return read_files(folder, form)
 
 
+def structures_of(source: str | os.PathLike[str]) -> Structures | None:
+    """Return the LIMAP structures beside the COLMAP model that a scene is read from; None where there are none.
+
+    Parameters
+    ----------
+    source : path
+        What :func:`groma.io.read_scene` read: the folder of a model, or the folder it lies in.
+    """
+    from groma.io.colmap import find_model
+
+    if not Path(source).is_dir():
+        return None
+    folder = find_model(source)[0] / "structures"
+    return read_limap(folder) if folder.is_dir() and _form(folder) is not None else None
+
+
 def write_limap(
     structures: Structures, path: str | os.PathLike[str], form: Form = "binary", force: bool = False
 ) -> None:
@@ -291,6 +307,7 @@ __all__ = [
     "Structures",
     "from_scene",
     "read_limap",
+    "structures_of",
     "with_structures",
     "write_limap",
 ]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from groma._typing import BoolArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.cameras import model as camera_model
 from groma.errors import InputError
 from groma.factors._factor import Factor, Ref
@@ -23,15 +23,19 @@ from groma.geometry import quaternion, se3
 from groma.geometry._manifold import Euclidean
 from groma.geometry.line_charts import LINE_CHARTS
 from groma.geometry.plane_charts import PLANE_CHARTS
+from groma.geometry.point_inverse_depth import InverseDepthPoint
 from groma.geometry.pose_charts import POSE_CHARTS
 from groma.geometry.unit3 import DIRECTION_CHARTS
-from groma.pipelines._structure_factors import structure_factors
+from groma.pipelines._structure_factors import MAX_COUPLED_LINES, SURFACE_SIGMA_PX, structure_factors
+from groma.pipelines._structure_pixels import structure_pixel_factors, wireframe_factors
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene
 
 POINT_FACTORS = ("point_reprojection",)
 LINE_FACTORS = ("line_reprojection", "line_bearing")
+#: A point this many times farther away than its cameras from each other moves linearly in its inverse depth.
+FAR_FROM_CAMERAS = 2.0
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,10 @@ class AssemblyOptions:
     point_sigma_px: float = 1.0
     line_sigma_px: float = 1.0
     #: How well points and lines keep to their planes and lines, as a length in the images, pixels.
-    structure_sigma_px: float = 0.1
+    structure_sigma_px: float = SURFACE_SIGMA_PX
+    #: Relations between landmarks as distances (``metric``, weighted by ``structure_sigma_px``) or as differences of
+    #: pixels (``pixels``, weighted by the noise of the images).
+    structure_form: str = "metric"
     #: Loss of what comes from matching, and of the relations between landmarks.
     loss: Loss = field(default_factory=Trivial)
     #: Leave out points that start behind their camera.
@@ -71,32 +78,48 @@ class Assembly:
     problem: Problem
     #: Sentences about observations that were left out.
     notes: tuple[str, ...]
+    #: What a residual of 1 is in the image, pixels, by number of the factor group: 1 unless it is listed here.
+    pixels_of_residual: dict[int, FloatArray] = field(default_factory=dict)
 
 
 def assemble(scene: Scene, options: AssemblyOptions) -> Assembly:
     """Turn a scene into a problem."""
     notes: list[str] = []
     if options.gauge == "auto":
-        metric = options.planes and len(scene.relations) > 0
+        wireframe = options.points and options.lines and len(scene.relations.point_on_line) > 0
+        metric = (wireframe or (options.planes and len(scene.relations) > 0)) and options.structure_form == "metric"
         options = replace(options, gauge="first_camera" if metric else "free")
     variables = _camera_variables(scene, options)
     factors: list[Factor] = []
+    pixels_of_residual: dict[int, FloatArray] = {}
     if options.points and scene.num_point_observations:
-        variables["points"] = Variables(Euclidean(3, "point"), scene.points.xyz)
+        variables["points"] = _point_variables(scene)
         factors += _point_factors(scene, options, notes)
     if options.lines and scene.num_line_observations:
         chart = _chart(LINE_CHARTS, options.line_chart, "line_chart")
         variables["lines"] = Variables(chart, chart.from_ambient(scene.lines.plucker))
-        factors += _line_factors(scene, options, notes)
+        for factor, focal in _line_factors(scene, options, notes):
+            if focal is not None:
+                pixels_of_residual[len(factors)] = focal
+            factors.append(factor)
     if options.planes and scene.num_planes:
         chart = _chart(PLANE_CHARTS, options.plane_chart, "plane_chart")
         variables["planes"] = Variables(chart, chart.from_ambient(scene.planes.hesse))
     if options.planes and scene.num_directions:
         chart = next(iter(DIRECTION_CHARTS.values()))
         variables["directions"] = Variables(chart, chart.from_ambient(scene.directions.vectors))
-    factors += structure_factors(scene, options.structure_sigma_px, options.loss, variables)
+    sigma_px = (options.point_sigma_px, options.line_sigma_px)
+    if options.structure_form == "pixels":
+        factors += structure_pixel_factors(scene, sigma_px, options.loss, variables, _camera_refs, _by_model)
+    elif options.structure_form == "metric":
+        factors += structure_factors(scene, options.structure_sigma_px, options.loss, variables)
+        if {"points", "lines"} <= set(variables) and scene.num_lines > MAX_COUPLED_LINES:
+            factors += wireframe_factors(scene, sigma_px, options.loss, _camera_refs, _by_model)
+    else:
+        raise InputError(f"structure_form must be 'metric' or 'pixels'; got {options.structure_form!r}.")
     used = {ref.group for factor in factors for _, ref in factor.references()}
-    return Assembly(Problem({k: v for k, v in variables.items() if k in used}, factors), tuple(notes))
+    problem = Problem({k: v for k, v in variables.items() if k in used}, factors)
+    return Assembly(problem, tuple(notes), pixels_of_residual)
 
 
 def disassemble(scene: Scene, problem: Problem) -> Scene:
@@ -111,7 +134,7 @@ def disassemble(scene: Scene, problem: Problem) -> Scene:
             params[members, : states[group].shape[1]] = states[group]
     scene = scene.with_params(params)
     if "points" in states:
-        scene = scene.with_points(states["points"])
+        scene = scene.with_points(problem.variables["points"].ambient())
     if "lines" in states:
         scene = scene.with_lines(problem.variables["lines"].ambient())
     if "planes" in states:
@@ -194,6 +217,22 @@ def _by_model(scene: Scene, image_idx: IntArray):
 # ------------------------------------------------------------------------------------------------------- landmarks
 
 
+def _point_variables(scene: Scene) -> Variables:
+    """Points; those far from their cameras move linearly in the inverse of their distance from the cameras' mean."""
+    table = scene.point_observations
+    count = np.maximum(np.bincount(table.point_idx, minlength=scene.num_points), 1)
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.bincount(table.point_idx, weights=values, minlength=scene.num_points) / count
+
+    centers = scene.cam_centers_in_world[table.image_idx]
+    anchor = np.stack([mean(column) for column in centers.T], axis=1)
+    spread = np.sqrt(mean(((centers - anchor[table.point_idx]) ** 2).sum(axis=1)))
+    far = np.linalg.norm(scene.points.xyz - anchor, axis=1) > FAR_FROM_CAMERAS * spread
+    chart = InverseDepthPoint()
+    return Variables(chart, chart.anchored(scene.points.xyz, anchor, far.astype(np.float64)))
+
+
 def _point_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> list[Factor]:
     table = scene.point_observations
     keep = np.ones(len(table), dtype=bool)
@@ -213,7 +252,7 @@ def _point_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> 
                 intrinsics=Ref(f"intrinsics/{name}", camera),
                 pixels=table.pixel[rows],
                 require_in_front=False,
-                sqrt_information=1.0 / options.point_sigma_px,
+                sqrt_information=1.0 / (options.point_sigma_px * table.sigma[rows]),
                 loss=options.loss,
                 **_camera_refs(scene, table.image_idx[rows]),
             )
@@ -221,25 +260,24 @@ def _point_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> 
     return factors
 
 
-def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> list[Factor]:
+def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]):
+    """Yield factors of lines, and the pixels of a residual of 1 where it is not measured in pixels."""
     table = scene.line_observations
-    factors: list[Factor] = []
     for name, rows, camera in _by_model(scene, table.image_idx):
         model = camera_model(name)
         line = Ref("lines", table.line_idx[rows])
         poses = _camera_refs(scene, table.image_idx[rows])
         if model.has_pinhole_parameters:
-            factors.append(
-                LineReprojection(
-                    camera_model=name,
-                    line=line,
-                    intrinsics=Ref(f"intrinsics/{name}", camera),
-                    segments=table.segment[rows],
-                    sqrt_information=1.0 / options.line_sigma_px,
-                    loss=options.loss,
-                    **poses,
-                )
+            in_pixels = LineReprojection(
+                camera_model=name,
+                line=line,
+                intrinsics=Ref(f"intrinsics/{name}", camera),
+                segments=table.segment[rows],
+                sqrt_information=1.0 / (options.line_sigma_px * table.sigma[rows]),
+                loss=options.loss,
+                **poses,
             )
+            yield in_pixels, None
             continue
         params = scene.cameras.params[scene.images.camera_idx[table.image_idx[rows]], : model.num_parameters]
         first = model.unproject(params, table.segment[rows, :2])
@@ -251,14 +289,12 @@ def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> l
             )
         focal = params[:, list(model.focal_indices)].mean(axis=1)
         kept = rows[good]
-        factors.append(
-            LineBearing(
-                line=Ref("lines", table.line_idx[kept]),
-                start_bearings=first[good],
-                end_bearings=second[good],
-                sqrt_information=focal[good] / options.line_sigma_px,
-                loss=options.loss,
-                **_camera_refs(scene, table.image_idx[kept]),
-            )
+        in_radians = LineBearing(
+            line=Ref("lines", table.line_idx[kept]),
+            start_bearings=first[good],
+            end_bearings=second[good],
+            sqrt_information=focal[good] / (options.line_sigma_px * table.sigma[kept]),
+            loss=options.loss,
+            **_camera_refs(scene, table.image_idx[kept]),
         )
-    return factors
+        yield in_radians, focal[good]

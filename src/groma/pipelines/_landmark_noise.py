@@ -12,7 +12,7 @@ image line is measured. Any camera model will do.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from groma.geometry._algebra import apply, dot, norm, perpendicular, ratio, unit
 from groma.scene import Scene
 
 #: Least standard deviation of a measured coordinate, pixels: synthetic scenes may have none.
-_LEAST_SIGMA = 0.05
+_LEAST_SIGMA = 0.02
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,12 @@ class PointNoise:
     covariance: FloatArray
     #: (P,) root mean square reprojection error over the degrees of freedom, in standard deviations.
     misfit: FloatArray
-    #: Standard deviation of a measured coordinate, pixels.
+    #: Standard deviation of the usual measured coordinate, pixels; the observations' own are relative to it.
     sigma_px: float
+
+    def widened(self, length: FloatArray) -> PointNoise:
+        """Return the noise with a standard deviation (P,) in every direction added, scene units."""
+        return replace(self, covariance=self.covariance + length[:, None, None] ** 2 * np.eye(3))
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,10 @@ class LineNoise:
     #: (L,) as for points.
     misfit: FloatArray
     sigma_px: float
+
+    def widened(self, length: FloatArray) -> LineNoise:
+        """Return the noise with a standard deviation (L,) of both ends across the line added, scene units."""
+        return replace(self, covariance=self.covariance + length[:, None, None] ** 2 * np.eye(4))
 
     def at(self, first_share: FloatArray, second_share: FloatArray, rows: IntArray) -> FloatArray:
         """Cross-covariance (N, 2, 2), along ``across``, of the points at two shares of the segments ``rows``."""
@@ -77,10 +85,12 @@ class LineNoise:
 def point_noise(scene: Scene, sigma_px: float | None = None) -> PointNoise:
     """Return the covariances of the points; ``sigma_px`` None estimates it from the residuals."""
     table = scene.point_observations
-    pixels, by_world = _project(scene, table.image_idx, scene.points.xyz[table.point_idx])
+    pixels, by_world = project_points(scene, table.image_idx, scene.points.xyz[table.point_idx])
     residual = pixels - table.pixel
     good = np.asarray(np.isfinite(residual).all(axis=1) & np.isfinite(by_world).all(axis=(1, 2)))
-    residual, by_world = np.where(good[:, None], residual, 0.0), np.where(good[:, None, None], by_world, 0.0)
+    weight = good / table.sigma
+    residual = np.where(good[:, None], residual, 0.0) * weight[:, None]
+    by_world = np.where(good[:, None, None], by_world, 0.0) * weight[:, None, None]
     count = np.bincount(table.point_idx[good], minlength=scene.num_points)
     squares = _sum(dot(residual, residual)[:, None], table.point_idx, scene.num_points)[:, 0]
     sigma, misfit = _misfit(squares, 2 * count - 3, sigma_px)
@@ -100,14 +110,15 @@ def line_noise(scene: Scene, sigma_px: float | None = None) -> LineNoise:
         measured = np.ascontiguousarray(table.segment[:, columns])
         share = _share_on_line(scene, table.image_idx, measured, ends[line])
         place = ends[line, 0] + share[:, None] * (ends[line, 1] - ends[line, 0])
-        pixels, by_world = _project(scene, table.image_idx, place)
+        pixels, by_world = project_points(scene, table.image_idx, place)
         tangent = unit(apply(by_world, direction[line]))
         normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
         residual = dot(normal, pixels - measured)
         row = np.einsum("nk,nki,nai->na", normal, by_world, across[line])
         row = np.hstack([(1.0 - share)[:, None] * row, share[:, None] * row])
         good = np.isfinite(residual) & np.isfinite(row).all(axis=1)
-        residual, row = np.where(good, residual, 0.0), np.where(good[:, None], row, 0.0)
+        weight = good / table.sigma
+        residual, row = np.where(good, residual, 0.0) * weight, np.where(good[:, None], row, 0.0) * weight[:, None]
         information += _sum(row[:, :, None] * row[:, None, :], line, scene.num_lines)
         squares += _sum(residual[:, None] ** 2, line, scene.num_lines)[:, 0]
         count += np.bincount(line[good], minlength=scene.num_lines)
@@ -115,7 +126,7 @@ def line_noise(scene: Scene, sigma_px: float | None = None) -> LineNoise:
     return LineNoise(across, _inverse(information / sigma**2, _extent(scene)), misfit, sigma)
 
 
-def _project(scene: Scene, image_idx: IntArray, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+def project_points(scene: Scene, image_idx: IntArray, places: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pixels (N, 2) of points in the world and their derivatives (N, 2, 3) by them; NaN behind the camera."""
     poses = scene.cam_from_world[image_idx]
     in_cam = quaternion.rotate(poses[:, :4], places) + poses[:, 4:]

@@ -10,7 +10,11 @@ plane meets the plane of :math:`l`. With the epipole :math:`a = P_j [c_i; 1]` an
 linear, without an intersection to solve. Its covariance follows from the distance of the projected end point to l,
 :math:`\partial \mathrm{dist}_k / \partial q_k = l^\top a / x_{k,3}`, and from the noise of both segments' end points.
 Where the line runs along the epipolar line, :math:`l^\top a \to 0`: the covariance explodes, and the proposal is left
-out of the decision; the track picks such segments up again when others have fixed the line.
+out of the decision; the track picks such segments up again when others have fixed the line. Where only the change of
+depth along the segment is uncertain, because the other image sees a small part of it, its vanishing point supplies it.
+
+The image itself proposes, too: the line through known points that lie on the segment, and the line through one of them
+in the direction of the segment's vanishing point (:mod:`groma.pipelines._line_directions`).
 
 References
 ----------
@@ -42,7 +46,7 @@ class Proposals:
 
     #: (M,) segment within the image.
     segment: IntArray
-    #: (M,) which neighbour, 0 to n - 1; n stands for the known points near the segment.
+    #: (M,) which neighbour, 0 to n - 1; n stands for known points on the segment, n + 1 for one and a direction.
     neighbor: IntArray
     #: (M,) row of the other segment in the table of all images; -1 for points.
     other: IntArray
@@ -54,7 +58,23 @@ class Proposals:
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
-def _propose(ray, across, sigma, q_low, q_high, line, ends, sigma_j, M, a, directed, min_overlap, max_relative, out):
+def _use_direction(ratio, out):
+    """Fuse out = q1 q2 c11 c12 c22 with q2 = r q1, r of mean and deviation ratio; False where they disagree."""
+    r = ratio[0]
+    away = out[1] - r * out[0]
+    variance = out[4] - 2.0 * r * out[3] + r * r * out[2] + (ratio[1] * out[0]) ** 2
+    if not away * away < 9.0 * variance:
+        return False
+    k1, k2 = (out[3] - r * out[2]) / variance, (out[4] - r * out[3]) / variance
+    out[0], out[1] = out[0] - k1 * away, out[1] - k2 * away
+    out[2], out[3], out[4] = out[2] - k1 * k1 * variance, out[3] - k1 * k2 * variance, out[4] - k2 * k2 * variance
+    return True
+
+
+@kernel
+def _propose(
+    ray, across, sigma, q_low, q_high, ratio, line, ends, sigma_j, M, a, directed, min_overlap, max_relative, out
+):
     """One pair of segments: fill out = q1 q2 c11 c12 c22; return how far it got."""
     gain = line[0] * a[0] + line[1] * a[1] + line[2] * a[2]
     if not abs(gain) * (q_high - q_low) > 3.0 * sigma_j:
@@ -96,14 +116,17 @@ def _propose(ray, across, sigma, q_low, q_high, line, ends, sigma_j, M, a, direc
     out[2] = (s2 * ((1.0 - t1) * (1.0 - t1) + t1 * t1) + r2 * h1 * h1) / (g1 * g1)
     out[3] = s2 * ((1.0 - t1) * (1.0 - t2) + t1 * t2) / (g1 * g2)
     out[4] = (s2 * ((1.0 - t2) * (1.0 - t2) + t2 * t2) + r2 * h2 * h2) / (g2 * g2)
-    if out[2] > (max_relative * out[0]) ** 2 or out[4] > (max_relative * out[1]) ** 2:
-        return WEAK
-    return PROPOSED
+    for attempt in range(2):
+        if out[2] <= (max_relative * out[0]) ** 2 and out[4] <= (max_relative * out[1]) ** 2:
+            return PROPOSED
+        if attempt == 1 or ratio[0] <= 0.0 or not _use_direction(ratio, out):
+            return WEAK
+    return WEAK
 
 
 @loop
 def _propose_beam(
-    rows_i, rows_j, ray, across, sigma, search, line, ends, beam_i, beam_j, bin_pointers, bin_members, M, a,
+    rows_i, rows_j, ray, across, sigma, search, ratio, line, ends, beam_i, beam_j, bin_pointers, bin_members, M, a,
     directed, min_overlap, max_relative, first, neighbor, out_index, out, reached,
 ):  # fmt: skip
     """All pairs whose angles about the baseline overlap; return the number written, or needed if out is too short."""
@@ -127,7 +150,7 @@ def _propose_beam(
                     continue
                 r = rows_j[j]
                 got = _propose(
-                    ray[s], across[s], sigma[s], search[s, 0], search[s, 1], line[r], ends[r], sigma[r], M, a,
+                    ray[s], across[s], sigma[s], search[s, 0], search[s, 1], ratio[s], line[r], ends[r], sigma[r], M, a,
                     directed, min_overlap, max_relative, work,
                 )  # fmt: skip
                 reached[i] = max(reached[i], got)
@@ -143,8 +166,8 @@ def _propose_beam(
 
 @loop
 def _propose_pairs(
-    pairs, score, start_i, start_j, ray, across, sigma, search, line, ends, usable, M, a, min_overlap, max_relative,
-    first, neighbor, out_index, out, reached,
+    pairs, score, start_i, start_j, ray, across, sigma, search, ratio, line, ends, usable, M, a, min_overlap,
+    max_relative, first, neighbor, out_index, out, reached,
 ):  # fmt: skip
     """Given pairs of segments; return the number written, or needed if out is too short."""
     count = first
@@ -154,7 +177,7 @@ def _propose_pairs(
         if not (usable[s] and usable[r]):
             continue
         got = _propose(
-            ray[s], across[s], sigma[s], search[0], search[1], line[r], ends[r], sigma[r], M, a,
+            ray[s], across[s], sigma[s], search[0], search[1], ratio[s], line[r], ends[r], sigma[r], M, a,
             False, min_overlap, max_relative, work,
         )  # fmt: skip
         reached[i] = max(reached[i], got)
@@ -186,8 +209,11 @@ def _bin_beams(beams, pointers, members):
 
 
 @loop
-def _point_lines(ends, line, sigma, near, search, pixel, inverse, tolerance, neighbor, out_index, out):
-    """Lines through known points that lie on a segment in the image: inverse depth affine along the segment."""
+def _point_lines(ends, line, near, search, ratio, pixel, inverse, tolerance, neighbor, out_index, out):
+    """Lines through known points that lie on a segment in the image: inverse depth affine along the segment.
+
+    Through several, with slot ``neighbor``; through one, in the segment's own direction, with slot ``neighbor + 1``.
+    """
     count = 0
     t, q = np.empty(16), np.empty(16)
     for i in range(len(ends)):
@@ -204,6 +230,25 @@ def _point_lines(ends, line, sigma, near, search, pixel, inverse, tolerance, nei
             if -reach <= at <= 1.0 + reach and number < 16:
                 t[number], q[number] = at, inverse[p]
                 number += 1
+        if ratio[i, 0] > 0.0 and number > 0:
+            # Scale q1 by the point that most others agree with.
+            change, most, middle = ratio[i, 0] - 1.0, 0, 0.0
+            for m in range(number):
+                scale = q[m] / (1.0 + change * t[m])
+                agree = 0
+                for p in range(number):
+                    if abs(scale * (1.0 + change * t[p]) - q[p]) < tolerance * q[p]:
+                        agree += 1
+                if agree > most:
+                    most, middle = agree, scale
+            q1, q2 = middle, ratio[i, 0] * middle
+            if min(q1, q2) >= search[i, 0] and max(q1, q2) <= search[i, 1]:
+                variance = (0.5 * tolerance * q1) ** 2
+                out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor + 1, -1
+                out[count, 0], out[count, 1], out[count, 5] = q1, q2, 0.5
+                out[count, 2], out[count, 3] = variance, ratio[i, 0] * variance
+                out[count, 4] = ratio[i, 0] ** 2 * variance + (ratio[i, 1] * q1) ** 2 + 0.01 * variance
+                count += 1
         best, first, second = 2, -1, -1
         for m in range(number):
             for n in range(m):
@@ -260,8 +305,10 @@ def angles_about_baseline(ray: FloatArray, baseline: FloatArray) -> FloatArray:
 class Proposer:
     """Makes the proposals of one image at a time; keeps the room for them between images."""
 
-    def __init__(self, views: LineViews, directed: bool, min_overlap: float, max_relative_sigma: float) -> None:
-        self.views, self.directed = views, directed
+    def __init__(
+        self, views: LineViews, ratios: FloatArray, directed: bool, min_overlap: float, max_relative_sigma: float
+    ) -> None:
+        self.views, self.ratios, self.directed = views, ratios, directed
         self.min_overlap, self.max_relative = min_overlap, max_relative_sigma
         self._index, self._values = np.empty((1 << 14, 3), np.int64), np.empty((1 << 14, 6))
 
@@ -284,9 +331,9 @@ class Proposer:
         reached = np.zeros(rows.stop - rows.start, np.int64)
         count = 0
         if near_points is not None and len(near_points[0]):
-            self._reserve(0, reached.size)
+            self._reserve(0, 2 * reached.size)
             count = _point_lines(
-                views.ends[rows], views.line[rows], views.sigma[rows], views.usable[rows], views.range[rows],
+                views.ends[rows], views.line[rows], views.usable[rows], views.range[rows], self.ratios[rows],
                 *near_points, 0.01, len(neighbors), self._index, self._values,
             )  # fmt: skip
         for n, (j, given) in enumerate(zip(neighbors, matches, strict=True)):
@@ -298,8 +345,8 @@ class Proposer:
                     search = views.inverse_depth[image]
                     needed = _propose_pairs(
                         given[0], given[1], rows.start, views.rows(j).start, views.ray, views.across, views.sigma,
-                        search, views.line, views.ends, views.usable, M, a, self.min_overlap, self.max_relative,
-                        count, n, self._index, self._values, reached,
+                        search, self.ratios, views.line, views.ends, views.usable, M, a, self.min_overlap,
+                        self.max_relative, count, n, self._index, self._values, reached,
                     )  # fmt: skip
                 if needed <= len(self._values):
                     break
@@ -329,9 +376,9 @@ class Proposer:
             _bin_beams(beam_j, pointers, members)
         local = np.zeros(len(rows_i), np.int64)
         needed = _propose_beam(
-            rows_i, rows_j, views.ray, views.across, views.sigma, views.range, views.line, views.ends, beam_i, beam_j,
-            pointers, members, M, a, self.directed, self.min_overlap, self.max_relative, count, n, self._index,
-            self._values, local,
+            rows_i, rows_j, views.ray, views.across, views.sigma, views.range, self.ratios, views.line, views.ends,
+            beam_i, beam_j, pointers, members, M, a, self.directed, self.min_overlap, self.max_relative, count, n,
+            self._index, self._values, local,
         )  # fmt: skip
         self._index[count : min(needed, len(self._index)), 0] = usable[
             self._index[count : min(needed, len(self._index)), 0]

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.cameras import model as camera_model
 from groma.estimators.line_triangulation import triangulate_planes
 from groma.factors._factor import Factor
@@ -46,7 +46,7 @@ def restart_lines(scene: Scene, problem: Problem, line_factors: tuple[str, ...])
     if variables is None or variables.is_constant or not factors:
         return None
     cost, count = _line_costs(problem, factors)
-    enough = count >= 3
+    enough: BoolArray = np.asarray(count >= 3)
     if not enough.any():
         return None
     per_view = cost / np.maximum(count, 1)
@@ -98,7 +98,7 @@ def _line_costs(problem: Problem, factors: list[Factor]) -> tuple[FloatArray, In
     return total, count
 
 
-def _triangulated(scene: Scene, lines: IntArray) -> tuple[FloatArray, FloatArray]:
+def _triangulated(scene: Scene, lines: IntArray) -> tuple[FloatArray, BoolArray]:
     """Return Plücker lines (n, 6) where the planes of their views meet best, and which of them are finite."""
     table = scene.line_observations
     rows = np.flatnonzero(np.isin(table.line_idx, lines))
@@ -117,8 +117,9 @@ def _triangulated(scene: Scene, lines: IntArray) -> tuple[FloatArray, FloatArray
     normal = quaternion.rotate(world_from_cam, np.cross(bearings[:, 0], bearings[:, 1]))
     center = -quaternion.rotate(world_from_cam, poses[:, 4:])
     planes = np.concatenate([normal, -np.einsum("ni,ni->n", normal, center)[:, None]], axis=1)
-    usable = np.isfinite(planes).all(axis=1)
+    usable: BoolArray = np.asarray(np.isfinite(planes).all(axis=1))
     weight = np.where(usable, np.linalg.norm(np.where(usable[:, None], normal, 0.0), axis=1), 0.0)
     pointers = np.concatenate([[0], np.cumsum(np.bincount(table.line_idx[rows], minlength=scene.num_lines)[lines])])
     result = triangulate_planes(planes, pointers, center, weight)
-    return result.line, line3.is_finite(result.line) & (np.abs(result.line) > 0).any(axis=1)
+    found: BoolArray = np.asarray(line3.is_finite(result.line) & (np.abs(result.line) > 0).any(axis=1))
+    return result.line, found

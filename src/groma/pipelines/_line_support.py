@@ -6,7 +6,8 @@ Proposals q, q' of different neighbours with covariances support each other by
 
 .. math:: \Sigma_f^{-1} = \sum w_j \Sigma_j^{-1}, \qquad \Sigma_f^{-1} q_f = \sum w_j \Sigma_j^{-1} q_j,
 
-one proposal per neighbour, compared again, and the place that most neighbours agree on is kept.
+one proposal per neighbour, compared again, and the place that most neighbours agree on is kept. What the image itself
+proposes, from points or a vanishing direction, takes part like a neighbour, but cannot make up for one.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def _distance(d1, d2, c11, c12, c22):
 @loop
 def _support(pointers, order, neighbor, values, num_neighbors, gate, total):
     """Support of every proposal of every segment by the proposals of other neighbours: total (M,)."""
-    best = np.zeros(num_neighbors + 1)
+    best = np.zeros(num_neighbors + 2)
     for i in range(len(pointers) - 1):
         begin, end = pointers[i], pointers[i + 1]
         largest = 0.0
@@ -71,10 +72,10 @@ def _support(pointers, order, neighbor, values, num_neighbors, gate, total):
 
 @loop
 def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate, min_support, q, covariance, score,
-            supporters, rival):  # fmt: skip
+            supporters, rival, assisted):  # fmt: skip
     """Fuse the best supported proposals of each segment and keep the one that most neighbours agree on."""
-    chosen = np.empty(num_neighbors + 1, np.int64)
-    nearest = np.empty(num_neighbors + 1)
+    chosen = np.empty(num_neighbors + 2, np.int64)
+    nearest = np.empty(num_neighbors + 2)
     for i in range(len(pointers) - 1):
         begin, end = pointers[i], pointers[i + 1]
         used = np.zeros(end - begin, np.bool_)
@@ -104,11 +105,11 @@ def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate
                         nearest[neighbor[r]], chosen[neighbor[r]] = distance, r
                 number, points, value = 0, 0, 0.0
                 i11 = i12 = i22 = y1 = y2 = 0.0
-                for n in range(num_neighbors + 1):
+                for n in range(num_neighbors + 2):
                     r = chosen[n]
                     if r < 0:
                         continue
-                    if n == num_neighbors:
+                    if n >= num_neighbors:
                         points = 1
                     else:
                         number += 1
@@ -133,6 +134,7 @@ def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate
                 score[i] = value
                 q[i, 0], q[i, 1] = q1, q2
                 covariance[i, 0], covariance[i, 1], covariance[i, 2] = c11, c12, c22
+                assisted[i, 0], assisted[i, 1] = chosen[num_neighbors] >= 0, chosen[num_neighbors + 1] >= 0
                 for n in range(num_neighbors):
                     supporters[i, n] = other[chosen[n]] if chosen[n] >= 0 else -1
             elif value > rival[i]:
@@ -156,6 +158,8 @@ class Choice:
     rival: FloatArray
     #: (n, num_neighbors) rows of the supporting segments, -1 for none.
     supporters: IntArray
+    #: (n, 2) whether known points, and a point with a vanishing direction, have a part in it.
+    assisted: BoolArray
 
 
 def choose(proposals: Proposals, num_segments: int, num_neighbors: int, min_support: int) -> Choice:
@@ -167,8 +171,9 @@ def choose(proposals: Proposals, num_segments: int, num_neighbors: int, min_supp
     q, covariance = np.zeros((num_segments, 2)), np.zeros((num_segments, 3))
     score, rival = np.zeros(num_segments), np.zeros(num_segments)
     supporters = np.full((num_segments, num_neighbors), -1, np.int64)
+    assisted = np.zeros((num_segments, 2), bool)
     _choose(
         pointers, by_segment, proposals.neighbor, proposals.other, proposals.values, total, num_neighbors, GATE,
-        min_support, q, covariance, score, supporters, rival,
+        min_support, q, covariance, score, supporters, rival, assisted,
     )  # fmt: skip
-    return Choice(score > 0.0, q, covariance, score, rival, supporters)
+    return Choice(score > 0.0, q, covariance, score, rival, supporters, assisted)

@@ -16,8 +16,21 @@ from groma.factors.point_on_plane import PointOnPlane
 from groma.problem.variables import Variables
 from groma.scene import Scene
 
+#: How well landmarks keep to what they lie on, as a length in the images, pixels: walls are not flat.
+SURFACE_SIGMA_PX = 0.2
+#: Types of the factors of relations, and the relation of the scene each stands for.
+RELATION_FACTORS = {
+    "point_on_plane": "point_on_plane",
+    "segment_on_plane": "line_on_plane",
+    "line_direction": "line_along_direction",
+    "point_on_line": "point_on_line",
+}
+#: Points on lines tie points to lines, and only one of the two can be eliminated. With more lines than this they are
+#: measured in pixels instead, which leaves points and lines uncoupled.
+MAX_COUPLED_LINES = 1000
 
-def _lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
+
+def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
     """For each landmark the length that a pixel of its images spans at its distance, scene units; the median image."""
     if kind == "point":
         image_idx, index, places = (
@@ -50,7 +63,7 @@ def structure_factors(scene: Scene, sigma_px: float, loss: Loss, variables: dict
     factors: list[Factor] = []
     have = {name: name in variables for name in ("points", "lines", "planes", "directions")}
     if have["points"] and (have["planes"] or have["lines"]):
-        per_point = 1.0 / (sigma_px * _lengths_per_pixel(scene, "point"))
+        per_point = 1.0 / (sigma_px * lengths_per_pixel(scene, "point"))
         if have["planes"] and len(relations.point_on_plane):
             point, plane = relations.point_on_plane.T
             factors.append(
@@ -61,7 +74,7 @@ def structure_factors(scene: Scene, sigma_px: float, loss: Loss, variables: dict
                     loss=loss,
                 )
             )
-        if have["lines"] and len(relations.point_on_line):
+        if have["lines"] and len(relations.point_on_line) and scene.num_lines <= MAX_COUPLED_LINES:
             point, line = relations.point_on_line.T
             factors.append(
                 PointOnLine(
@@ -72,7 +85,7 @@ def structure_factors(scene: Scene, sigma_px: float, loss: Loss, variables: dict
                 )
             )
     if have["lines"] and (have["planes"] or have["directions"]):
-        per_line = 1.0 / (sigma_px * _lengths_per_pixel(scene, "line"))
+        per_line = 1.0 / (sigma_px * lengths_per_pixel(scene, "line"))
         ends = scene.lines.segments
         if have["planes"] and len(relations.line_on_plane):
             line, plane = relations.line_on_plane.T

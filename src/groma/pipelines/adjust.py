@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,12 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.factors._factor import Factor
-from groma.factors.losses import Loss, Trivial
+from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
-from groma.pipelines._assemble import LINE_FACTORS, POINT_FACTORS, AssemblyOptions, assemble, disassemble
+from groma.pipelines._assemble import LINE_FACTORS, POINT_FACTORS, Assembly, AssemblyOptions, assemble, disassemble
 from groma.pipelines._line_restart import restart_lines
+from groma.pipelines._relation_outcome import drop_failed_relations
+from groma.pipelines._structure_factors import RELATION_FACTORS, SURFACE_SIGMA_PX
 from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.solver.options import SolverOptions
@@ -26,6 +28,11 @@ from groma.solver.termination import Termination
 #: The default for what comes from matching: first a loss that pulls from afar, then one that ignores what stayed far.
 #: Losses by name and scale in pixels; see the page *How to choose* for the measurements behind them.
 ROBUST_STAGES = (("cauchy", 1.0), ("geman_mcclure", 2.0))
+#: Scales of the same losses for relations between landmarks, in standard deviations of those.
+RELATION_SCALES = {"cauchy": 2.0, "geman_mcclure": 4.0}
+#: The last scale is at least this many standard deviations of the residuals that the stage before left: a narrower
+#: loss would doubt good measurements.
+LAST_SCALE_SIGMAS = 12.0
 #: Relative decrease of the cost at which a stage that is not the last ends.
 STAGE_TOLERANCE = 1e-4
 #: The same for the first stage of plain least squares with lines, after which lines may be restarted.
@@ -54,9 +61,14 @@ class AdjustOptions:
     points: bool = True
     lines: bool = True
     planes: bool = True
-    #: Standard deviation of points and of segment end points, pixels; losses are scaled in these units.
+    #: Standard deviation of the usual point observation and segment end point, pixels; those of single observations in
+    #: the scene are relative to it. Losses are scaled in these units.
     point_sigma_px: float = 1.0
     line_sigma_px: float = 1.0
+    #: How relations between landmarks are measured: ``metric`` or ``pixels``, and how well they hold if metric: see
+    #: :class:`groma.pipelines._assemble.AssemblyOptions`.
+    structure_form: str = "metric"
+    structure_sigma_px: float = SURFACE_SIGMA_PX
     #: Most steps tried.
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in a step.
@@ -98,6 +110,8 @@ class AdjustReport:
     #: One entry per loss that was solved with, in order: loss, initial_cost, first_step. Costs of different stages
     #: cannot be compared.
     stages: tuple[dict[str, Any], ...] = ()
+    #: Relations between landmarks by kind: how many held, and how many the loss gave up, which the scene then drops.
+    relations: dict[str, dict[str, int]] = field(default_factory=dict)
 
     @property
     def termination(self) -> Termination:
@@ -137,6 +151,7 @@ class AdjustReport:
             "threads": solve.threads,
             "seconds": dict(solve.seconds),
             "rmse_px": self.rmse_px,
+            "relations": self.relations,
             "stages": list(self.stages),
             "num_degenerate": solve.num_degenerate,
             "num_underdetermined_landmarks": solve.num_underdetermined_landmarks,
@@ -150,6 +165,8 @@ class AdjustResult:
 
     scene: Scene
     report: AdjustReport
+    #: The problem at its solution, for covariances and diagnosis; None in a result read from a file.
+    problem: Problem | None = None
 
 
 def adjust(
@@ -194,6 +211,7 @@ def adjust(
             function_tolerance=options.function_tolerance if last else _stage_tolerance(loss),
             linear_solver=options.linear_solver,
             landmark_steps=_landmark_steps(options, loss, problem),
+            landmark_groups=("lines",) if isinstance(loss, Trivial) else None,
             threads=options.threads,
         )
 
@@ -201,6 +219,8 @@ def adjust(
             event = Progress(spent + record.iteration, options.max_iterations, record.cost)
             return None if progress is None else progress(event)
 
+        if last and number:
+            loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
         staged = Problem(problem.variables, [_with_loss(factor, loss) for factor in problem.factors])
         solution = solve(staged, solver_options, tell)
         problem = solution.problem
@@ -210,7 +230,8 @@ def adjust(
         if not last:
             problem = restart_lines(disassemble(scene, problem), problem, LINE_FACTORS) or problem
     report = _combined(reports, assembly.problem, stages)
-    before, after = (_rmse_px(p, options.line_sigma_px) for p in (assembly.problem, problem))
+    adjusted, relations = drop_failed_relations(disassemble(scene, problem), problem)
+    before, after = (_rmse_px(replace(assembly, problem=p)) for p in (assembly.problem, problem))
     outcome = AdjustReport(
         num_images=scene.num_images,
         num_points=scene.num_points if "points" in assembly.problem.variables else 0,
@@ -221,10 +242,11 @@ def adjust(
         ),
         rmse_px={kind: {"before": before[kind], "after": after[kind]} for kind in before},
         solve=report,
+        relations=relations,
         stages=_stage_entries(stages, reports),
         warnings=(*assembly.notes, *report.warnings),
     )
-    return AdjustResult(disassemble(scene, problem), outcome)
+    return AdjustResult(adjusted, outcome, problem)
 
 
 def _is_bal(scene: Scene) -> bool:
@@ -242,6 +264,16 @@ def _stages(scene: Scene, options: AdjustOptions) -> list[Loss]:
     return [make_loss(options.loss, 1.0 if options.loss_scale is None else options.loss_scale)]
 
 
+def _wide_enough(loss: Loss, assembly: Assembly) -> Loss:
+    """Return the loss, widened if the residuals are noisier than its scale suggests."""
+    squares = squared_residuals_px(assembly, weighted=True)
+    if not squares or not isinstance(loss, GemanMcClure):
+        return loss
+    # the median of the squared norm of two Gaussian coordinates is 1.386 variances
+    sigma = float(np.sqrt(np.median(np.concatenate(list(squares.values()))) / 1.386))
+    return replace(loss, scale=max(loss.scale, LAST_SCALE_SIGMAS * sigma))
+
+
 def _stage_tolerance(loss: Loss) -> float:
     return RESTART_TOLERANCE if isinstance(loss, Trivial) else STAGE_TOLERANCE
 
@@ -254,6 +286,9 @@ def _landmark_steps(options: AdjustOptions, loss: Loss, problem: Problem) -> int
 
 
 def _with_loss(factor: Factor, loss: Loss) -> Factor:
+    """Return the factors under a loss; relations between landmarks have a noise of their own, and the plain scale."""
+    if factor.type_name in RELATION_FACTORS and loss.name in RELATION_SCALES:
+        return replace(factor, loss=make_loss(loss.name, RELATION_SCALES[loss.name]))
     return replace(factor, loss=loss)
 
 
@@ -307,33 +342,44 @@ def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss) -> Assem
         gauge=options.gauge,
         point_sigma_px=options.point_sigma_px,
         line_sigma_px=options.line_sigma_px,
+        structure_form=options.structure_form,
+        structure_sigma_px=options.structure_sigma_px,
         loss=loss,
         drop_behind=not is_bal,
     )
 
 
-def _rmse_px(problem: Problem, line_sigma_px: float) -> dict[str, float]:
+def _rmse_px(assembly: Assembly) -> dict[str, float]:
     """Root mean square of the reprojection residuals by kind, unweighted and without the loss, pixels."""
-    return {
-        kind: float(np.sqrt(np.mean(squares))) for kind, squares in squared_residuals_px(problem, line_sigma_px).items()
-    }
+    return {kind: float(np.sqrt(np.mean(squares))) for kind, squares in squared_residuals_px(assembly).items()}
 
 
-def squared_residuals_px(problem: Problem, line_sigma_px: float = 1.0) -> dict[str, FloatArray]:
-    """Return the squared norm of every reprojection residual by kind of landmark, pixels squared.
+def squared_residuals_px(assembly: Assembly, weighted: bool = False) -> dict[str, FloatArray]:
+    """Return the squared norm of every reprojection residual by kind of landmark.
 
     A point has one residual of two coordinates, a segment one of the distances of its two ends.
+
+    Parameters
+    ----------
+    assembly : Assembly
+        A problem made from a scene, at any state.
+    weighted : bool
+        In standard deviations instead of pixels.
+
+    Returns
+    -------
+    dict
+        For ``points`` and ``lines``, if there are: (N,) float64, pixels squared, or variances.
     """
     parts: dict[str, list[FloatArray]] = {}
-    for factor in problem.factors:
+    problem = assembly.problem
+    for number, factor in enumerate(problem.factors):
         kind = "points" if factor.type_name in POINT_FACTORS else "lines" if factor.type_name in LINE_FACTORS else None
         if kind is None or len(factor) == 0:
             continue
         ambients = tuple(problem.variables[ref.group].ambient() for _, ref in factor.references())
         residual = np.empty((len(factor), factor.residual_size))
         factor.residuals(factor.prepare(ambients), 0, len(factor), residual)
-        focal = np.ones(1)
-        if factor.type_name == "line_bearing":  # sines of angles; the noise of such factors is that of pixels
-            focal = np.asarray(factor.sqrt_information) * line_sigma_px
-        parts.setdefault(kind, []).append((residual**2).sum(axis=1) * focal**2)
+        unit = factor.sqrt_information if weighted else assembly.pixels_of_residual.get(number, 1.0)
+        parts.setdefault(kind, []).append((residual**2).sum(axis=1) * np.asarray(unit) ** 2)
     return {kind: np.concatenate(squares) for kind, squares in parts.items()}

@@ -25,6 +25,7 @@ from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
 from groma.geometry._algebra import norm
 from groma.pipelines import _relations
 from groma.pipelines._landmark_noise import line_noise, point_noise
+from groma.pipelines._structure_factors import SURFACE_SIGMA_PX, lengths_per_pixel
 from groma.scene import Directions, Planes, Relations, Scene
 
 
@@ -46,6 +47,10 @@ class StructureOptions:
     min_views: int = 3
     #: Landmarks whose reprojection error is so many times the usual one take no part.
     max_misfit: float = 3.0
+    #: How well points and lines keep to what they lie on, as a length in the images, pixels: walls are not flat, and
+    #: what was measured very well would show it. Added to the noise of points and lines; an adjustment gives relations
+    #: the same slack.
+    surface_sigma_px: float = SURFACE_SIGMA_PX
     #: Standard deviations of points and of segment end points, pixels; None: from the residuals.
     point_sigma_px: float | None = None
     line_sigma_px: float | None = None
@@ -185,7 +190,12 @@ def detect_structure(
 
 def _landmarks(scene: Scene, options: StructureOptions) -> _relations.Landmarks:
     """Points and lines with their noise, and which of them may take part."""
-    points, lines = point_noise(scene, options.point_sigma_px), line_noise(scene, options.line_sigma_px)
+    points = point_noise(scene, options.point_sigma_px).widened(
+        options.surface_sigma_px * lengths_per_pixel(scene, "point")
+    )
+    lines = line_noise(scene, options.line_sigma_px).widened(
+        options.surface_sigma_px * lengths_per_pixel(scene, "line")
+    )
     seen = _views(scene.point_observations.image_idx, scene.point_observations.point_idx, scene.num_points)
     lines_seen = _views(scene.line_observations.image_idx, scene.line_observations.line_idx, scene.num_lines)
     point_usable = (seen >= options.min_views) & (points.misfit < options.max_misfit)

@@ -3,7 +3,8 @@
 
 Stages, each saved when it is finished, so that an interrupted run goes on where it was:
 
-1. ``model``      points and poses: read, or reconstructed from the images; adjusted with robust losses;
+1. ``model``      points and poses: read, or reconstructed from the images; adjusted with robust losses (``points``);
+                  the points' observations placed anew by their grey levels, and adjusted again (``measured``);
 2. ``segments``   line segments in every image, one image at a time;
 3. ``lines``      3D lines from the segments;
 4. ``joint``      poses, points and lines adjusted together, each weighted by its own noise; then the lines are mapped
@@ -20,22 +21,26 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
+from groma import __version__
 from groma.errors import InputError
+from groma.frontend.external import ExternalMatches
 from groma.frontend.lsd import LsdDetector
+from groma.frontend.matches import LineMatches
 from groma.frontend.segments import Segments
-from groma.io.colmap_sfm import reconstruct_points
-from groma.pipelines._assemble import AssemblyOptions, assemble
-from groma.pipelines._photographs import check_images, image_files, read_gray
-from groma.pipelines._stages import Stages, fingerprint
-from groma.pipelines.adjust import AdjustOptions, AdjustReport, adjust, squared_residuals_px
+from groma.io.colmap_sfm import PointModelOptions, reconstruct_points
+from groma.pipelines._image_segments import detect_segments, given_segments
+from groma.pipelines._noise import noise_px
+from groma.pipelines._photographs import check_images, check_names, image_files, read_gray
+from groma.pipelines._stages import Stages, digest, digest_files
+from groma.pipelines.adjust import AdjustOptions, AdjustReport, adjust
 from groma.pipelines.find_structure import StructureOptions, find_structure
-from groma.pipelines.map_lines import LineMap, MapLinesOptions, explain, map_lines
+from groma.pipelines.map_lines import MapLinesOptions, explain, map_lines
+from groma.pipelines.refine_points import PointRefinementOptions, refine_points
 from groma.scene import Scene
 
-#: Residuals smaller than this are not believed when noise is estimated, pixels.
-MIN_SIGMA_PX = 0.1
+#: Scale of the first loss in standard deviations of the estimated noise. Matches of SIFT have a narrow core and heavy
+#: tails that are still right.
+LOSS_SIGMAS = 6.0
 
 #: Called with the name of a stage, what is done and what there is to do.
 StageProgress = Callable[[str, int, int], None]
@@ -47,6 +52,9 @@ class MapOptions:
 
     #: Shortest segment, pixels.
     min_segment_length: float = 12.0
+    #: Place the observations of points anew by the grey levels around them: three times less noise, which pays where
+    #: the calibration is as good.
+    refine_points: bool = False
     lines: MapLinesOptions = field(default_factory=MapLinesOptions)
     structure: StructureOptions = field(default_factory=StructureOptions)
     #: Look for planes and common directions.
@@ -56,7 +64,9 @@ class MapOptions:
     #: Estimate focal lengths and distortion too.
     refine_intrinsics: bool = False
     threads: int | None = None
-    #: Seed of the point reconstruction, where there is no model.
+    #: How points are reconstructed where there is no model: camera model, its parameters if they are known, seed.
+    camera_model: str = "SIMPLE_RADIAL"
+    camera_params: tuple[float, ...] | None = None
     seed: int = 0
 
 
@@ -88,6 +98,7 @@ def map_images(
     model: Scene | None = None,
     options: MapOptions | None = None,
     progress: StageProgress | None = None,
+    line_matches: ExternalMatches | None = None,
 ) -> MapResult:
     """Map a folder of photographs: points, lines and planes, adjusted together.
 
@@ -103,6 +114,8 @@ def map_images(
         Lengths, gates and what is estimated.
     progress : callable, optional
         Called with the name of a stage, what is done and what there is to do.
+    line_matches : ExternalMatches, optional
+        Segments and their matches from elsewhere, by image name; nothing is detected then.
 
     Returns
     -------
@@ -113,32 +126,79 @@ def map_images(
     ------
     InputError
         If images are missing, unreadable, of another size than their camera, or do not overlap.
+    OutputError
+        If another run works in ``work``, or it cannot be written.
     """
     options = options or MapOptions()
     say = progress or (lambda stage, done, total: None)
     folder = Path(images)
     files = image_files(folder)
-    store = Stages(Path(work), fingerprint(files, model, options))
-    warnings: list[str] = []
-
-    start = store.scene("model", lambda: _point_model(folder, files, model, store, options, say))
-    check_images(folder, start)
-    robust = AdjustOptions(refine_intrinsics=options.refine_intrinsics, threads=options.threads)
-    points = store.scene("points", lambda: _adjusted(start, robust, options, say, "adjusting points").scene)
-    segments = store.segments(lambda: _detect(folder, points, options, say))
-    lined, line_map = _with_lines(points, segments, options, say)
-    sigma = {"points": _sigma(lined, "points"), "lines": _sigma(lined, "lines")}
-    weighted = dataclasses.replace(robust, point_sigma_px=sigma["points"], line_sigma_px=sigma["lines"])
-    if options.refine_poses and lined.num_lines:
-        joint = store.scene(
-            "joint", lambda: _adjusted(lined, weighted, options, say, "adjusting points and lines").scene
+    names = [path.relative_to(folder).as_posix() for path in files]
+    found = PointModelOptions(options.camera_model, options.camera_params, options.seed, options.threads)
+    _check_number(folder, names, model, options.lines.min_images)
+    check_images(folder, names, model, say)
+    key = digest(__version__, digest_files(folder, files), model)
+    with Stages(Path(work), key) as store:
+        start = store.scene(
+            "model",
+            lambda: reconstruct_points(folder, store.place("sfm"), names, found, say) if model is None else model,
+            dataclasses.replace(found, threads=None),
         )
-        lined, line_map = _with_lines(joint, segments, options, say)
+        return _mapped(folder, names, start, store, options, say, line_matches)
+
+
+def _mapped(
+    folder: Path,
+    names: list[str],
+    start: Scene,
+    store: Stages,
+    options: MapOptions,
+    say: StageProgress,
+    line_matches: ExternalMatches | None,
+) -> MapResult:
+    robust = AdjustOptions(refine_intrinsics=options.refine_intrinsics, threads=options.threads)
+    points = store.scene(
+        "points",
+        lambda: _adjusted(start, robust, options, say, "adjusting points").scene,
+        options.refine_poses,
+        options.refine_intrinsics,
+    )
+    if options.refine_points:
+        raw = points
+        points = store.scene("measured", lambda: _measured(folder, raw, robust, options, say), options.refine_points)
+    matches = _by_index(line_matches, start)
+    given = None if line_matches is None else digest(line_matches)
+    # From here on every stage depends on all options.
+    segments = store.segments(
+        "segments",
+        lambda: _segments(folder, points, options, say, line_matches),
+        dataclasses.replace(options, threads=None),
+        given,
+    )
+    line_map = store.line_map("lines", lambda: map_lines(points, segments, matches, options.lines, say))
+    lined = line_map.add_to(points, segments)
+    sigma = {"points": noise_px(lined, "points"), "lines": noise_px(lined, "lines")}
+    weighted = dataclasses.replace(
+        robust, point_sigma_px=sigma["points"], line_sigma_px=sigma["lines"], loss_scale=LOSS_SIGMAS
+    )
+    if options.refine_poses and lined.num_lines:
+        first = lined
+        joint = store.scene(
+            "joint", lambda: _adjusted(first, weighted, options, say, "adjusting points and lines").scene
+        )
+        # The lines as mapped are good starts, and only the adjusted ones tell the noise of the segments.
+        sigma = {"points": noise_px(joint, "points"), "lines": noise_px(joint, "lines")}
+        line_map = store.line_map("final-lines", lambda: map_lines(joint, segments, matches, options.lines, say))
+        lined = line_map.add_to(joint, segments)
+        weighted = dataclasses.replace(weighted, point_sigma_px=sigma["points"], line_sigma_px=sigma["lines"])
     if options.find_planes:
         say("finding planes and directions", 0, 1)
-        lined = find_structure(lined, options.structure)
-    result = _adjusted(lined, weighted, options, say, "adjusting everything")
+        flat = lined
+        weighted = dataclasses.replace(weighted, structure_sigma_px=options.structure.surface_sigma_px)
+        lined = store.scene("structure", lambda: find_structure(flat, options.structure))
+    result = store.adjusted("adjusted", lambda: _adjusted(lined, weighted, options, say, "adjusting everything"))
     say("done", 1, 1)
+    warnings = [*_not_in_model(names, start)]
     if lined.num_lines == 0:
         warnings.append("No line was mapped. " + explain(line_map))
     return MapResult(
@@ -156,53 +216,59 @@ def map_images(
 # ---------------------------------------------------------------------------------------------------------- stages
 
 
-def _point_model(folder, files, model: Scene | None, store: Stages, options: MapOptions, say: StageProgress) -> Scene:
-    if model is not None:
-        names = {path.relative_to(folder).as_posix() for path in files}
-        missing = [name for name in model.images.names if name not in names]
-        if missing:
+def _check_number(folder: Path, names: list[str], model: Scene | None, fewest: int) -> None:
+    if model is None:
+        if len(names) < 3:
             raise InputError(
-                f"{len(missing)} of the {model.num_images} images of the model are not in {folder}, for example "
-                f"{missing[0]!r}. Pass the folder the model was made from; names must match."
+                f"{folder} holds {len(names)} {'image' if len(names) == 1 else 'images'}; a map needs at least 3 that "
+                "overlap. Take more."
             )
-        if model.num_images < 2:
-            raise InputError(f"The model has {model.num_images} image(s); lines need at least 2, better 3.")
-        return model
-    if len(files) < 3:
-        raise InputError(f"{folder} holds {len(files)} image(s); a map needs at least 3 that overlap.")
-    return reconstruct_points(folder, store.folder / "sfm", lambda sentence: say(sentence, 0, 1), options.seed)
+        return
+    if model.num_images < max(2, fewest):
+        raise InputError(
+            f"The model has {model.num_images} {'image' if model.num_images == 1 else 'images'} with a pose; a map "
+            f"needs at least {max(2, fewest)} that overlap. Pass a model with more, or none to have it made."
+        )
+    check_names(folder, names, model)
+
+
+def _not_in_model(names: list[str], start: Scene) -> list[str]:
+    left = sorted(set(names) - set(start.images.names))
+    if not left:
+        return []
+    more = "" if len(left) <= 3 else f" and {len(left) - 3} more"
+    return [
+        f"{len(left)} of {len(names)} images have no pose in the model and were not used: {', '.join(left[:3])}{more}."
+    ]
+
+
+def _by_index(line_matches: ExternalMatches | None, scene: Scene) -> Callable[[int, int], LineMatches] | None:
+    if line_matches is None:
+        return None
+    return lambda i, j: line_matches.match(scene.images.names[i], scene.images.names[j])
+
+
+def _segments(
+    folder: Path, scene: Scene, options: MapOptions, say: StageProgress, line_matches: ExternalMatches | None
+) -> list[Segments]:
+    if line_matches is not None:
+        return given_segments(folder, scene, line_matches, say)
+    return detect_segments(folder, scene, LsdDetector(min_length=options.min_segment_length), say)
+
+
+def _measured(folder: Path, points: Scene, robust: AdjustOptions, options: MapOptions, say: StageProgress) -> Scene:
+    """Points measured again in the photographs, and adjusted with the noise they have then."""
+    found = refine_points(
+        points,
+        lambda image: read_gray(folder / points.images.names[image]),
+        noise_px(points, "points"),
+        PointRefinementOptions(threads=options.threads),
+        lambda done, total: say("measuring points", done, total),
+    )
+    weighted = dataclasses.replace(robust, point_sigma_px=found.sigma_px)
+    return _adjusted(found.scene, weighted, options, say, "adjusting points again").scene
 
 
 def _adjusted(scene: Scene, adjust_options: AdjustOptions, options: MapOptions, say: StageProgress, stage: str):
     held = dataclasses.replace(adjust_options, refine_poses=options.refine_poses)
     return adjust(scene, held, lambda event: say(stage, event.iteration, event.max_iterations))
-
-
-def _detect(folder: Path, scene: Scene, options: MapOptions, say: StageProgress) -> list[Segments]:
-    detector = LsdDetector(min_length=options.min_segment_length)
-    found = []
-    for i, name in enumerate(scene.images.names):
-        say("finding segments", i, scene.num_images)
-        found.append(detector.detect(read_gray(folder / name)))
-    return found
-
-
-def _with_lines(
-    scene: Scene, segments: list[Segments], options: MapOptions, say: StageProgress
-) -> tuple[Scene, LineMap]:
-    line_map = map_lines(scene, segments, options=options.lines, progress=say)
-    return line_map.add_to(scene, segments), line_map
-
-
-def _sigma(scene: Scene, kind: str) -> float:
-    """Robust standard deviation of the residuals of one kind of landmark, pixels.
-
-    The median of the squared norm of two Gaussian coordinates is 1.386 variances; fitted landmarks take their share.
-    """
-    problem = assemble(scene, AssemblyOptions(planes=False)).problem
-    squares = squared_residuals_px(problem).get(kind)
-    if squares is None or len(squares) < 10:
-        return 1.0
-    unknowns = 3 * scene.num_points if kind == "points" else 4 * scene.num_lines
-    share = 1.0 - min(unknowns / (2 * len(squares)), 0.8)
-    return max(float(np.sqrt(np.median(squares) / 1.386 / share)), MIN_SIGMA_PX)

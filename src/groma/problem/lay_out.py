@@ -342,7 +342,9 @@ def _incidences(problem, group, e, order, layouts: list[FactorLayout], kept, tab
         for b in incidences:
             if a < b:
                 first, second = incidences[a], incidences[b]
-                cross[a, b] = tables[a, b].add_cross(first.pointer, first.block, second.pointer, second.block)
+                slots, pointer = tables[a, b].add_cross(first.pointer, first.block, second.pointer, second.block)
+                if len(slots):  # no landmark may touch both classes; the pair then has no blocks
+                    cross[a, b] = slots, pointer
     return Eliminated(group, problem.variables[group].manifold.dof, count, order, incidences, cross)
 
 

@@ -15,14 +15,20 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import numpy.typing as npt
 
-from groma._typing import IntArray
+from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 
 
-def column(dtype: type, *row: int | None) -> Any:
-    """Declare a column of arrays: dtype and the shape of one row (None: any, but the same in all rows)."""
+def column(dtype: type, *row: int | None, fill: float | None = None) -> Any:
+    """Declare a column of arrays: dtype and the shape of one row (None: any, but the same in all rows).
+
+    A column with a ``fill`` may be left out: its rows then hold that number.
+    """
     empty = tuple(0 if size is None else size for size in row)
-    return field(default_factory=lambda: np.zeros((0, *empty), dtype), metadata={"dtype": np.dtype(dtype), "row": row})
+    return field(
+        default_factory=lambda: np.zeros((0, *empty), dtype),
+        metadata={"dtype": np.dtype(dtype), "row": row, "fill": fill},
+    )
 
 
 def text_column() -> Any:
@@ -44,6 +50,9 @@ class Table:
             object.__setattr__(self, item.name, value)
             if not first:
                 length, first = len(value), item.name
+            elif len(value) == 0 and item.metadata.get("fill") is not None:
+                value = np.full((length, *value.shape[1:]), item.metadata["fill"], value.dtype)
+                object.__setattr__(self, item.name, value)
             elif len(value) != length:
                 raise ShapeError(
                     f"All columns of {type(self).__name__} must be equally long; {first} has {length} rows, "
@@ -116,6 +125,13 @@ def _convert_text(name: str, value: Any) -> tuple[str, ...]:
         if any(character in entry for character in "\0\n\r"):
             raise InputError(f"{name}[{index}] must not hold line breaks or NUL; got {entry!r}. Rename it.")
     return names
+
+
+def check_sigma(name: str, sigma: FloatArray) -> None:
+    """Raise when a standard deviation is not positive."""
+    if len(sigma) and not sigma.min() > 0.0:
+        row = int(np.argmin(sigma))
+        raise InputError(f"{name} must be positive; row {row} is {sigma[row]}. Leave out what is not known at all.")
 
 
 def check_unique(name: str, ids: IntArray) -> None:

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.scene._table import Table, column, convert
+from groma.scene._table import Table, check_sigma, column, convert
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +26,11 @@ class PointObservations(Table):
     pixel: FloatArray = column(np.float64, 2)
     #: (N,) number of the 2D point within its image (COLMAP's ``point2D_idx``).
     keypoint_idx: IntArray = column(np.int64)
+    #: (N,) standard deviation of a coordinate, relative to the usual one; 1 if left out.
+    sigma: FloatArray = column(np.float64, fill=1.0)
+
+    def _check(self) -> None:
+        check_sigma("PointObservations.sigma", self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +57,11 @@ class LineObservations(Table):
     line_idx: IntArray = column(np.int64)
     #: (N, 4) end points u1 v1 u2 v2 of the detected segment, pixels; no correspondence with the 3D end points.
     segment: FloatArray = column(np.float64, 4)
+    #: (N,) standard deviation of an end point across the segment, relative to the usual one; 1 if left out.
+    sigma: FloatArray = column(np.float64, fill=1.0)
+
+    def _check(self) -> None:
+        check_sigma("LineObservations.sigma", self.sigma)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,197 +1,600 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Marginal covariances of the variables of a solved problem.
+r"""Marginal and joint covariances of the variables of a solved problem.
 
 With the reduced system S of the undamped normal equations (see :mod:`groma.solver.schur`) the covariance of the kept
-blocks is :math:`\Sigma_c = S^{-1}`, and that of a landmark, with :math:`B = V^{-1} W`,
+blocks is :math:`\Sigma_c = S^{-1}`, and that of a landmark, with :math:`B = -V^{-1} W`,
 
 .. math:: \Sigma_l = V^{-1} + B\,\Sigma_c\,B^\top .
+
+The second term needs :math:`\Sigma_c` only between blocks that see the landmark, which is where S has its own blocks;
+:mod:`groma.solver._fronts` finds these and no others, so the inverse is never formed. Covariances between variables
+that share nothing are found by solving with the factorisation.
 
 Every covariance refers to the increments of the chart the variable is stored in, and to unit weight: the square root
 information of the factors must be that of the noise. Weights of robust losses count as they are at the solution.
 
-Gauge. When the scene is free to move, S is singular. Either hold variables constant, or take ``gauge="inner"``: the
-covariance of least trace among all choices of frame and scale, :math:`\Sigma_c = (S + G G^\top)^{-1} - G G^\top` with
-G an orthonormal basis of the free world motions, restricted to the kept blocks.
+Gauge. When the scene is free to move, S is singular. Either hold variables constant, or take ``gauge="inner"``: of all
+frames and scales the one in which the coordinates named by ``datum`` vary least together; see
+:mod:`groma.solver._datum`. A free motion of the scene does not count as uncertainty then.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
 import numpy as np
-import scipy.linalg
+import numpy.typing as npt
 
 from groma._numba import loop
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ProblemError
+from groma.geometry._manifold import Manifold
+from groma.geometry.conversions import conversion_jacobian
 from groma.problem._parallel import Workers
-from groma.problem.gauge import gauge_directions
 from groma.problem.lay_out import lay_out
-from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.problem import Problem
-from groma.solver.linear import Dense
+from groma.solver._blas import one_blas_thread
+from groma.solver._datum import FreeMotions, constrained, free_motions, held_coordinates
+from groma.solver._fronts import Fronts
+from groma.solver._modes import MODES, divided, scaled, smallest
+from groma.solver.linear import Blocks
 from groma.solver.schur import ReducedSystem
 
-#: A world motion counts as free when the cost it causes is below this fraction of what its size would suggest.
-FREE_TOLERANCE = 1e-9
+#: A scaled variance above this means a direction that the data do not determine.
+LARGEST_VARIANCE = 1e11
+#: A landmark whose scaled normal matrix has a smaller eigenvalue than this has an undetermined direction.
+LANDMARK_TOLERANCE = 1e-12
+#: A variable that moves by more than this in a scaled mode of zero cost is loose; so many may be, of all unknowns.
+LOOSE, MAX_LOOSE = 1e-6, 0.2
+#: Relative step of the central differences of functions of variables.
+STEP = 1e-6
+
+#: A variable: the name of its group, and its index.
+Variable = tuple[str, int]
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 
 
 @loop
-def _add_landmark_covariances(
-    landmarks, N, dl, pointer_a, block_a, W_a, start_a, da, pointer_b, block_b, W_b, start_b, db, sigma, out
-):
-    """Out += (N W_a) Sigma_ab (N W_b)^T for the listed landmarks."""
-    left, right = np.zeros((dl, da)), np.zeros((dl, db))
-    for i in range(landmarks.shape[0]):
-        p = landmarks[i]
-        for k in range(pointer_a[p], pointer_a[p + 1]):
+def _multiply_incidences(pointer, N, W, dl, dc, out):
+    """Out = N W for every incidence, with N = -V^-1."""
+    for p in range(pointer.shape[0] - 1):
+        for k in range(pointer[p], pointer[p + 1]):
             for r in range(dl):
-                for c in range(da):
+                for c in range(dc):
                     total = 0.0
                     for m in range(dl):
-                        total += N[(p * dl + r) * dl + m] * W_a[(k * dl + m) * da + c]
-                    left[r, c] = total
-            row = start_a + block_a[k] * da
-            for q in range(pointer_b[p], pointer_b[p + 1]):
-                for r in range(dl):
-                    for c in range(db):
-                        total = 0.0
-                        for m in range(dl):
-                            total += N[(p * dl + r) * dl + m] * W_b[(q * dl + m) * db + c]
-                        right[r, c] = total
-                column = start_b + block_b[q] * db
-                for r in range(dl):
-                    for s in range(dl):
-                        total = 0.0
-                        for c in range(da):
-                            for e in range(db):
-                                total += left[r, c] * sigma[row + c, column + e] * right[s, e]
-                        out[i, r, s] += total
+                        total += N[(p * dl + r) * dl + m] * W[(k * dl + m) * dc + c]
+                    out[k, r, c] = total
+
+
+@loop
+def _add_outer(B_k, sigma, B_m, twice, half, out):
+    """Out += B_k sigma B_m^T, and its transpose if ``twice``."""
+    dl, da = B_k.shape
+    db = B_m.shape[1]
+    for r in range(dl):
+        for e in range(db):
+            total = 0.0
+            for c in range(da):
+                total += B_k[r, c] * sigma[c, e]
+            half[r, e] = total
+    for r in range(dl):
+        for s in range(dl):
+            total = 0.0
+            for e in range(db):
+                total += half[r, e] * B_m[s, e]
+            out[r, s] += total
+            if twice:
+                out[s, r] += total
+
+
+@loop
+def _add_within(landmarks, pointer, pair_slots, pair_pointer, B, sigma, out):
+    """Add B Sigma B^T over the pairs of incidences of one class; ``sigma`` holds the blocks by slot."""
+    half = np.zeros((out.shape[1], sigma.shape[2]))
+    for i in range(landmarks.shape[0]):
+        p = landmarks[i]
+        s = pair_pointer[p]
+        for k in range(pointer[p], pointer[p + 1]):
+            for m in range(k, pointer[p + 1]):
+                _add_outer(B[k], sigma[pair_slots[s]], B[m], m > k, half, out[i])
+                s += 1
+
+
+@loop
+def _add_between(landmarks, pointer_a, pointer_b, pair_slots, pair_pointer, B_a, B_b, sigma, out):
+    """Add B_a Sigma_ab B_b^T and its transpose over the pairs of incidences of two classes."""
+    half = np.zeros((out.shape[1], sigma.shape[2]))
+    for i in range(landmarks.shape[0]):
+        p = landmarks[i]
+        s = pair_pointer[p]
+        for k in range(pointer_b[p], pointer_b[p + 1]):
+            for m in range(pointer_a[p], pointer_a[p + 1]):
+                _add_outer(B_a[m], sigma[pair_slots[s]], B_b[k], True, half, out[i])
+                s += 1
 
 
 # ----------------------------------------------------------------------------------------------------------- Public
 
 
+@dataclass(frozen=True)
+class Derived:
+    """A quantity computed from variables, with its covariance to first order."""
+
+    #: (n,) value.
+    value: FloatArray
+    #: (n, n) covariance.
+    covariance: FloatArray
+
+    @property
+    def sigma(self) -> FloatArray:
+        """(n,) standard deviations."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+
 class Covariances:
-    """Marginal covariances at the states of a problem.
+    """Covariances at the states of a problem.
 
     Parameters
     ----------
     problem
         A problem at its solution.
     gauge
-        ``"held"``: the variables held constant fix the frame; ``"inner"``: inner constraints on the kept blocks.
+        ``"held"``: the variables held constant fix the frame; ``"inner"``: inner constraints (a free network).
     eliminate
-        As for :func:`groma.solver.levenberg_marquardt.solve`.
+        As for :func:`groma.solver.solve.solve`.
+    datum
+        For ``gauge="inner"``: weights of the coordinates whose variances are to be least, by group, each of a shape
+        that broadcasts to (count, dof). By default all kept variables (poses, planes, directions, intrinsics) count
+        alike. ``{"poses": [1, 1, 1, 0, 0, 0]}`` refers covariances to the camera centres, in the left chart of poses,
+        and ``{"points": 1}`` to the points.
 
     Raises
     ------
     ProblemError
         If the normal equations are rank deficient in the chosen gauge.
+    InputError
+        If the gauge or the datum is not one.
+
+    Notes
+    -----
+    Variables held constant have covariance zero. Where the data leave a few variables open (a point seen once, a plane
+    with two points), these have no covariance: theirs are NaN, see :meth:`undetermined`; all others are not affected.
     """
 
-    def __init__(self, problem: Problem, gauge: str = "held", eliminate: str | tuple[str, ...] = "auto") -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        gauge: str = "held",
+        eliminate: str | tuple[str, ...] = "auto",
+        datum: Mapping[str, npt.ArrayLike] | None = None,
+    ) -> None:
         if gauge not in ("held", "inner"):
             raise InputError(f"gauge must be 'held' or 'inner'; got {gauge!r}.")
         self.problem = problem
         self._layout = layout = lay_out(problem, eliminate)
         states = to_solver_order(layout)
-        self._equations = NormalEquations(layout, Workers(1))
-        self._system = ReducedSystem(self._equations)
-        self._equations.linearize(states, self._equations.prepare(states))
+        self._equations = equations = NormalEquations(layout, Workers(1))
+        self._system = ReducedSystem(equations)
+        equations.linearize(states, equations.prepare(states))
         self._system.eliminate(0.0)
         self._position = {e.group: np.argsort(e.order) for e in layout.eliminated}
-        self._sigma = self._kept_covariance(gauge) if layout.kept else np.zeros((0, 0))
+        self._held, self._held_landmarks = held_coordinates(layout)
+        self._open = [self._open_landmarks(e) for e in range(len(layout.eliminated))]
+        self._B: dict[tuple[int, int], FloatArray] = {}
+        self._datum: _Datum | None = None
+        if layout.kept:
+            self._system.assemble(0.0)
+            self._unseen = [
+                (self._system.diagonal(c).reshape(-1) == 0.0) & ~self._held[c] for c in range(len(layout.kept))
+            ]
+            with one_blas_thread():
+                self._invert(gauge, datum)
 
-    def _kept_covariance(self, gauge: str) -> FloatArray:
+    def _open_landmarks(self, e: int) -> BoolArray:
+        """Return which landmarks have a direction that their own observations leave open."""
+        dof = self._layout.eliminated[e].dof
+        V = self._equations.V[e].reshape(-1, dof, dof).copy()
+        steps = np.arange(dof)
+        V[:, steps, steps] += self._held_landmarks[e].reshape(-1, dof)
+        size = np.sqrt(V[:, steps, steps])
+        empty = (size == 0.0).any(axis=1)
+        size[size == 0.0] = 1.0
+        return empty | (np.linalg.eigvalsh(V / size[:, :, None] / size[:, None, :])[:, 0] < LANDMARK_TOLERANCE)
+
+    # Inversion
+
+    def _invert(self, gauge: str, datum: Mapping[str, npt.ArrayLike] | None) -> None:
         layout = self._layout
-        self._system.assemble(0.0)
-        S = np.zeros((layout.num_kept_unknowns,) * 2)
-        Dense(layout).fill(self._system.S, S)
-        S = np.triu(S) + np.triu(S, 1).T
-        held = np.concatenate([self._system.diagonal(c).reshape(-1) == 0.0 for c in range(len(layout.kept))])
-        scale = np.sqrt(np.maximum(np.diag(S), 1e-300))
-        G = free_motions(layout, self._system, S)
+        self._fronts = Fronts(layout)
+        S, self._size = scaled(layout, self._system.S)
+        motions, G = None, np.zeros((layout.num_kept_unknowns, 0))
         if gauge == "inner":
-            S = S + (scale**2).mean() * G @ G.T
-        scaled = S / scale[:, None] / scale[None, :]
-        values, vectors = scipy.linalg.eigh(scaled)
-        tolerance = len(S) * 1e-14 * max(values.max(initial=0.0), 1e-300)
-        deficiency = int((values < max(tolerance, 1e-12)).sum())
-        if deficiency:
-            free = G.shape[1] if gauge == "held" else 0
-            what = f"; {free} of them are motions of the whole scene" if free else ""
-            raise ProblemError(
-                f"The normal equations are rank deficient by {deficiency}{what}. Hold variables constant, pass "
-                "gauge='inner', or add priors."
+            motions = free_motions(layout, self._equations, self._system)
+            G = np.concatenate(motions.kept)
+            G[np.concatenate(self._held) | np.concatenate(self._unseen)] = 0.0
+            S = constrained(layout, S, G * self._size[:, None])
+        inverse = self._inverse(S)
+        if inverse is None:
+            S = self._without_loose_ends(S, gauge)
+            inverse = self._inverse(S)
+            if inverse is None:
+                raise self._deficient(S, gauge)
+        self._sigma = divided(layout, inverse, self._size)
+        if motions is not None and motions.count:
+            self._datum = self._transformation(motions, G, datum)
+
+    def _inverse(self, S: Blocks) -> Blocks | None:
+        """Return the inverse of a scaled system on its pattern, None where it has no rank."""
+        if not self._fronts.factorize(S):
+            return None
+        inverse = self._fronts.inverse_on_pattern()
+        variances = [np.einsum("nii->ni", inverse[c, c][: k.count]) for c, k in enumerate(self._layout.kept)]
+        return inverse if all((part < LARGEST_VARIANCE).all() for part in variances) else None
+
+    def _without_loose_ends(self, S: Blocks, gauge: str) -> Blocks:
+        """Hold the few variables that the data leave open, and note them and the landmarks they move."""
+        modes = smallest(self._layout, self._fronts, S)
+        null = modes.vectors[:, : modes.num_null]
+        loose = (np.abs(null) > LOOSE).any(axis=1)
+        free = gauge == "held" and free_motions(self._layout, self._equations, self._system).count
+        if free or not 0 < modes.num_null < MODES or loose.mean() > MAX_LOOSE:
+            raise self._deficient(S, gauge, modes.num_null)
+        for c, kept in enumerate(self._layout.kept):
+            self._unseen[c] |= np.asarray(loose)[kept.start : kept.start + kept.count * kept.width]
+        for e, eliminated in enumerate(self._layout.eliminated):
+            moved = self._seen_from_kept(e, null / self._size[:, None])
+            V = self._equations.V[e].reshape(-1, eliminated.dof, eliminated.dof)
+            size = np.sqrt(np.einsum("nii->ni", V))
+            self._open[e] |= (np.abs(moved) * size[:, :, None] > LOOSE).any(axis=(1, 2))
+        return constrained(self._layout, S, null)
+
+    def _deficient(self, S: Blocks, gauge: str, count: int | None = None) -> ProblemError:
+        count = smallest(self._layout, self._fronts, S).num_null if count is None else count
+        number = f"at least {count}" if count == MODES else str(max(count, 1))
+        free = free_motions(self._layout, self._equations, self._system).count if gauge == "held" else 0
+        what = f"; {free} of them are motions of the whole scene" if free else ""
+        remedy = "Hold variables constant, pass gauge='inner', or add priors."
+        if not free:
+            remedy = "groma.solver.diagnosis.diagnose(problem) names what is not determined; drop it, or add priors."
+        return ProblemError(f"The normal equations are rank deficient by {number}{what}. {remedy}")
+
+    def _transformation(self, motions: FreeMotions, G: FloatArray, datum: Mapping[str, npt.ArrayLike] | None) -> _Datum:
+        """Set up the S-transformation to the frame that the datum names."""
+        layout = self._layout
+        D_kept, D_landmarks = self._weights(datum)
+        G_landmarks = [
+            np.where(held[:, None], 0.0, part)
+            for part, held in zip(motions.landmarks, self._held_landmarks, strict=True)
+        ]
+        target = D_kept[:, None] * G
+        local = []
+        for e, eliminated in enumerate(layout.eliminated):
+            weighted = (D_landmarks[e][:, None] * G_landmarks[e]).reshape(eliminated.count, eliminated.dof, -1)
+            local.append(-(self._inverses(e) @ weighted))
+            if D_landmarks[e].any():
+                for c, incidences in eliminated.incidences.items():
+                    landmark = np.repeat(np.arange(eliminated.count), np.diff(incidences.pointer))
+                    parts = np.swapaxes(self._incidence(e, c), 1, 2) @ weighted[landmark]
+                    kept = layout.kept[c]
+                    view = target[kept.start : kept.start + kept.count * kept.width]
+                    np.add.at(view.reshape(kept.count, kept.width, -1), incidences.block, parts)
+        Y = self._solve(target)
+        Y_landmarks = [part + self._seen_from_kept(e, Y) for e, part in enumerate(local)]
+        weight = G.T @ (D_kept[:, None] * G)
+        inner = G.T @ (D_kept[:, None] * Y)
+        for e, part in enumerate(G_landmarks):
+            weight += part.T @ (D_landmarks[e][:, None] * part)
+            inner += part.T @ (D_landmarks[e][:, None] * Y_landmarks[e].reshape(part.shape))
+        values = np.linalg.eigvalsh(weight / np.sqrt(np.outer(np.diag(weight), np.diag(weight))))
+        if not (np.diag(weight) > 0).all() or not values[0] > 1e-14:
+            raise InputError(
+                "The datum does not fix the frame: some motion of the whole scene moves none of its coordinates. Name "
+                "more variables, for example all poses or all points."
             )
-        sigma = (vectors / values) @ vectors.T / scale[:, None] / scale[None, :]
-        if gauge == "inner":
-            sigma = sigma - (G @ G.T) / (scale**2).mean()
-        sigma[held] = 0.0
-        sigma[:, held] = 0.0
-        return sigma
+        Q = np.linalg.inv(weight).astype(np.float64)
+        K = Q @ inner @ Q
+        A_landmarks = [y.reshape(g.shape) @ Q for y, g in zip(Y_landmarks, G_landmarks, strict=True)]
+        return _Datum(G, Y @ Q, G_landmarks, A_landmarks, K, D_kept, D_landmarks, Q)
+
+    def _weights(self, datum: Mapping[str, npt.ArrayLike] | None) -> tuple[FloatArray, list[FloatArray]]:
+        """Weights of all unknowns, flat: of the kept ones, and of the landmarks by eliminated group."""
+        layout = self._layout
+        kept = np.zeros(layout.num_kept_unknowns)
+        landmarks = [np.zeros(e.count * e.dof) for e in layout.eliminated]
+        known = [m.group for c in layout.kept for m in c.members] + [e.group for e in layout.eliminated]
+        for name in datum or {}:
+            if name not in known:
+                raise InputError(f"The datum names {name!r}; the groups with free variables are {sorted(known)}.")
+        for c in layout.kept:
+            blocks = kept[c.start : c.start + c.count * c.width].reshape(c.count, c.width)
+            for member in c.members:
+                weight = self._weight(member.group, 1.0 if datum is None else datum.get(member.group, 0.0))
+                rows = member.blocks(np.arange(len(weight)))
+                blocks[rows, member.offset : member.offset + member.dof] = weight
+        for e, eliminated in enumerate(layout.eliminated):
+            weight = self._weight(eliminated.group, 0.0 if datum is None else datum.get(eliminated.group, 0.0))
+            landmarks[e] = np.where(self._open[e][:, None], 0.0, weight[eliminated.order]).reshape(-1)
+        return kept, landmarks
+
+    def _weight(self, group: str, value: npt.ArrayLike) -> FloatArray:
+        variables = self.problem.variables[group]
+        shape = (len(variables), variables.manifold.dof)
+        try:
+            weight = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)
+        except ValueError:
+            raise InputError(f"The datum of {group!r} must broadcast to {shape}; got {np.shape(value)}.") from None
+        if not (weight >= 0).all():
+            raise InputError(f"The weights of the datum must not be negative; those of {group!r} are.")
+        return weight
+
+    # Products
+
+    def _inverses(self, e: int) -> FloatArray:
+        """-V^-1 of every landmark, (count, dof, dof)."""
+        dof = self._layout.eliminated[e].dof
+        return self._system.N[e].reshape(-1, dof, dof)
+
+    def _incidence(self, e: int, c: int) -> FloatArray:
+        """Return B = -V^-1 W of every incidence, (incidences, dof, width)."""
+        if (e, c) not in self._B:
+            eliminated, width = self._layout.eliminated[e], self._layout.kept[c].width
+            incidences = eliminated.incidences[c]
+            B = np.empty((len(incidences.block), eliminated.dof, width))
+            _multiply_incidences(
+                incidences.pointer, self._system.N[e], self._equations.W[e][c], eliminated.dof, width, B
+            )
+            self._B[e, c] = B
+        return self._B[e, c]
+
+    def _solve(self, rhs: FloatArray) -> FloatArray:
+        """Return S^-1 times the columns of ``rhs``, S with the constraints of the gauge."""
+        with one_blas_thread():
+            return self._fronts.solve(rhs / self._size[:, None]) / self._size[:, None]
+
+    def _seen_from_kept(self, e: int, X: FloatArray) -> FloatArray:
+        """Return B X for the landmarks of a group, (count, dof, columns of X)."""
+        eliminated = self._layout.eliminated[e]
+        out = np.zeros((eliminated.count, eliminated.dof, X.shape[1]))
+        for c, incidences in eliminated.incidences.items():
+            kept = self._layout.kept[c]
+            blocks = X[kept.start : kept.start + kept.count * kept.width].reshape(kept.count, kept.width, -1)
+            landmark = np.repeat(np.arange(eliminated.count), np.diff(incidences.pointer))
+            np.add.at(out, landmark, self._incidence(e, c) @ blocks[incidences.block])
+        return out
+
+    # What is asked for
 
     def of(self, group: str, index: IntArray | int | None = None) -> FloatArray:
         """Return the covariances (len(index), dof, dof) of variables of a group; all of them by default.
 
-        Variables held constant have covariance zero.
+        Variables held constant have covariance zero, variables that are not determined NaN.
         """
-        if group not in self.problem.variables:
-            raise InputError(f"There is no group {group!r}; the problem has {sorted(self.problem.variables)}.")
-        variables = self.problem.variables[group]
-        index = np.arange(len(variables)) if index is None else np.atleast_1d(np.asarray(index))
-        if len(index) and (index.min() < 0 or index.max() >= len(variables)):
-            raise InputError(
-                f"Group {group!r} has variables 0 to {len(variables) - 1}; asked for {index.tolist()[:5]}."
-            )
-        dof = variables.manifold.dof
-        for c in self._layout.kept:
-            for member in c.members:
+        index = self._checked(group, index)
+        dof = self.problem.variables[group].manifold.dof
+        for c, kept in enumerate(self._layout.kept):
+            for member in kept.members:
                 if member.group == group:
-                    start = c.start + member.blocks(index) * c.width + member.offset
-                    rows = start[:, None] + np.arange(dof)
-                    return self._sigma[rows[:, :, None], rows[:, None, :]]
+                    return self._of_kept(c, member.blocks(index), slice(member.offset, member.offset + dof))
         for e, eliminated in enumerate(self._layout.eliminated):
             if eliminated.group == group:
                 return self._of_landmarks(e, self._position[group][index])
         return np.zeros((len(index), dof, dof))
 
+    def _checked(self, group: str, index: npt.ArrayLike | None) -> IntArray:
+        if group not in self.problem.variables:
+            raise InputError(f"There is no group {group!r}; the problem has {sorted(self.problem.variables)}.")
+        variables = self.problem.variables[group]
+        rows = np.arange(len(variables)) if index is None else np.atleast_1d(np.asarray(index))
+        if len(rows) and (rows.min() < 0 or rows.max() >= len(variables)):
+            raise InputError(f"Group {group!r} has variables 0 to {len(variables) - 1}; asked for {rows.tolist()[:5]}.")
+        return rows
+
+    def _of_kept(self, c: int, blocks: IntArray, part: slice) -> FloatArray:
+        kept = self._layout.kept[c]
+        sigma = self._sigma[c, c][blocks].copy()
+        if self._datum is not None:
+            rows = kept.start + blocks[:, None] * kept.width + np.arange(kept.width)
+            sigma += self._datum.correction(self._datum.G[rows], self._datum.A[rows])
+        held = self._held[c].reshape(kept.count, kept.width)[blocks]
+        unseen = self._unseen[c].reshape(kept.count, kept.width)[blocks]
+        sigma = np.where(held[:, :, None] | held[:, None, :], 0.0, sigma)[:, part, part]
+        return np.where(unseen[:, part].any(axis=1)[:, None, None], np.nan, sigma)
+
     def _of_landmarks(self, e: int, landmarks: IntArray) -> FloatArray:
-        layout, equations = self._layout, self._equations
-        eliminated = layout.eliminated[e]
-        dl, N = eliminated.dof, self._system.N[e]
-        out = -N.reshape(-1, dl, dl)[landmarks]
-        for a, first in eliminated.incidences.items():
-            for b, second in eliminated.incidences.items():
-                A, B = layout.kept[a], layout.kept[b]
-                _add_landmark_covariances(
-                    landmarks, N, dl, first.pointer, first.block, equations.W[e][a], A.start, A.width,
-                    second.pointer, second.block, equations.W[e][b], B.start, B.width, self._sigma, out,
-                )  # fmt: skip
-        return out
+        eliminated = self._layout.eliminated[e]
+        dof = eliminated.dof
+        out = -self._inverses(e)[landmarks]
+        for c, incidences in eliminated.incidences.items():
+            _add_within(
+                landmarks, incidences.pointer, incidences.pair_slots, incidences.pair_pointer,
+                self._incidence(e, c), self._sigma[c, c], out,
+            )  # fmt: skip
+        for (a, b), (slots, pointer) in eliminated.cross.items():
+            _add_between(
+                landmarks, eliminated.incidences[a].pointer, eliminated.incidences[b].pointer, slots, pointer,
+                self._incidence(e, a), self._incidence(e, b), self._sigma[a, b], out,
+            )  # fmt: skip
+        if self._datum is not None:
+            rows = landmarks[:, None] * dof + np.arange(dof)
+            out += self._datum.correction(self._datum.G_landmarks[e][rows], self._datum.A_landmarks[e][rows])
+        held = self._held_landmarks[e].reshape(-1, dof)[landmarks]
+        out = np.where(held[:, :, None] | held[:, None, :], 0.0, out)
+        return np.where(self._open[e][landmarks][:, None, None], np.nan, out)
+
+    def undetermined(self, group: str) -> IntArray:
+        """Return the indices of the variables of a group that the data leave open; their covariances are NaN."""
+        self._checked(group, None)
+        for e, eliminated in enumerate(self._layout.eliminated):
+            if eliminated.group == group:
+                return np.sort(eliminated.order[self._open[e]]).astype(np.int64)
+        for c, kept in enumerate(self._layout.kept):
+            for member in kept.members:
+                if member.group == group:
+                    blocks = member.blocks(np.arange(len(self.problem.variables[group])))
+                    part = self._unseen[c].reshape(kept.count, kept.width)[blocks]
+                    return np.flatnonzero(part[:, member.offset : member.offset + member.dof].any(axis=1))
+        return np.zeros(0, np.int64)
+
+    def in_datum(self, increments: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Free increments (count, dof) of all groups from their common motion: the errors that :meth:`of` describes.
+
+        For ``gauge="inner"``, an error is known only up to a motion of the whole scene; this is P of the datum.
+        """
+        moved = {name: np.array(part, dtype=np.float64) for name, part in increments.items()}
+        if self._datum is None:
+            return moved
+        layout, datum = self._layout, self._datum
+        views = []  # (group, rows of G, rows of D)
+        for c in layout.kept:
+            at = slice(c.start, c.start + c.count * c.width)
+            G, D = datum.G[at].reshape(c.count, c.width, -1), datum.D[at].reshape(c.count, c.width)
+            for member in c.members:
+                rows = member.blocks(np.arange(len(self.problem.variables[member.group])))
+                part = slice(member.offset, member.offset + member.dof)
+                views.append((member.group, G[rows, part], D[rows, part]))
+        for e, eliminated in enumerate(layout.eliminated):
+            rows = self._position[eliminated.group]
+            shape = (eliminated.count, eliminated.dof)
+            G, D = datum.G_landmarks[e].reshape(*shape, -1)[rows], datum.D_landmarks[e].reshape(shape)[rows]
+            views.append((eliminated.group, G, D))
+        common = sum(np.einsum("nik,ni,ni->k", G, D, moved[name]) for name, G, D in views)
+        for name, G, _ in views:
+            moved[name] -= G @ (datum.Q @ common)
+        return moved
+
+    def in_chart(self, group: str, chart: Manifold, index: IntArray | int | None = None) -> FloatArray:
+        """Return covariances (n, dof, dof) of lines or planes for the increments of another chart."""
+        rows = self._checked(group, index)
+        variables = self.problem.variables[group]
+        J = conversion_jacobian(variables.state[rows], variables.manifold, chart)
+        return J @ self.of(group, rows) @ np.swapaxes(J, 1, 2)
+
+    def of_coordinates(self, group: str, index: IntArray | int | None = None) -> FloatArray:
+        r"""Return covariances (n, m, m) of the factor coordinates, :math:`B \Sigma B^\top`.
+
+        (m, d) of lines, (n, w) of planes, the left twist of poses; singular where these have redundant numbers.
+        """
+        rows = self._checked(group, index)
+        variables = self.problem.variables[group]
+        basis, sigma = variables.manifold.basis(variables.state[rows]), self.of(group, rows)
+        return sigma if basis is None else basis @ sigma @ np.swapaxes(basis, 1, 2)
+
+    def joint(self, variables: Sequence[Variable]) -> FloatArray:
+        """Return the joint covariance of some variables, increments one after the other.
+
+        Each costs one solve with the factorised system per degree of freedom; the variables need not share anything.
+        """
+        layout = self._layout
+        sizes = [self.problem.variables[group].manifold.dof for group, _ in variables]
+        starts = np.concatenate([[0], np.cumsum(sizes)])
+        R = np.zeros((layout.num_kept_unknowns, starts[-1]))
+        out = np.zeros((starts[-1], starts[-1]))
+        rows_G: list[tuple[slice, FloatArray, FloatArray]] = []
+        broken = np.zeros(starts[-1], bool)
+        seen: dict[Variable, slice] = {}
+        for (group, i), start, size in zip(variables, starts, sizes, strict=False):
+            i = int(self._checked(group, i)[0])
+            at = slice(int(start), int(start) + size)
+            broken[at] = i in self.undetermined(group)
+            for kept in layout.kept:
+                for member in kept.members:
+                    if member.group == group:
+                        first = kept.start + int(member.blocks(np.array([i]))[0]) * kept.width + member.offset
+                        R[first : first + size, at] = np.eye(size)
+                        R[:, at] *= ~np.concatenate(self._held)[:, None]
+                        if self._datum is not None:
+                            rows = slice(first, first + size)
+                            rows_G.append((at, self._datum.G[rows], self._datum.A[rows]))
+            for e, eliminated in enumerate(layout.eliminated):
+                if eliminated.group != group:
+                    continue
+                p = int(self._position[group][i])
+                for c, incidences in eliminated.incidences.items():
+                    kept, B = layout.kept[c], self._incidence(e, c)
+                    for k in range(incidences.pointer[p], incidences.pointer[p + 1]):
+                        first = kept.start + int(incidences.block[k]) * kept.width
+                        R[first : first + kept.width, at] += B[k].T
+                local = -self._inverses(e)[p]
+                out[at, at] += local
+                for other, place in seen.items():  # the same landmark asked for twice
+                    if other == (group, i):
+                        out[at, place] += local
+                        out[place, at] += local
+                if self._datum is not None:
+                    rows = slice(p * size, (p + 1) * size)
+                    rows_G.append((at, self._datum.G_landmarks[e][rows], self._datum.A_landmarks[e][rows]))
+            seen.setdefault((group, i), at)
+        if layout.kept:
+            out += R.T @ self._solve(R)
+        if self._datum is not None:
+            G, A = (np.zeros((starts[-1], self._datum.G.shape[1])) for _ in range(2))
+            for at, g, a in rows_G:
+                G[at], A[at] = g, a
+            out += self._datum.correction(G[None], A[None])[0]
+        out[broken] = np.nan
+        out[:, broken] = np.nan
+        return 0.5 * (out + out.T)
+
+    def derived(self, function: Callable[..., npt.ArrayLike], variables: Sequence[Variable]) -> Derived:
+        """Return the value and covariance of a function of some variables.
+
+        Parameters
+        ----------
+        function
+            Takes the ambient numbers of each variable, (12,), (3,), (6,) or (4,), and returns a number or (n,) numbers.
+            Its value must not depend on the scale of (m, d) and (n, w). :mod:`groma.solver.quantities` has some.
+        variables
+            (group, index) of each argument.
+
+        Returns
+        -------
+        Derived
+            To first order; derivatives by the increments of the charts are central differences.
+        """
+        groups = [self.problem.variables[group] for group, _ in variables]
+        states = [group.state[i : i + 1] for group, (_, i) in zip(groups, variables, strict=True)]
+
+        def value(moved: list[FloatArray]) -> FloatArray:
+            ambients = [group.manifold.ambient(state)[0] for group, state in zip(groups, moved, strict=True)]
+            return np.atleast_1d(np.asarray(function(*ambients), dtype=np.float64))
+
+        center, columns = value(states), []
+        for v, group in enumerate(groups):
+            step = STEP * max(1.0, float(np.abs(states[v]).max())) if group.manifold.kind == "point" else STEP
+            for k in range(group.manifold.dof):
+                delta = np.zeros((1, group.manifold.dof))
+                delta[0, k] = step
+                ends = [
+                    value([*states[:v], group.manifold.retract(states[v], sign * delta), *states[v + 1 :]])
+                    for sign in (1.0, -1.0)
+                ]
+                columns.append((ends[0] - ends[1]) / (2 * step))
+        J = np.stack(columns, axis=1)
+        return Derived(center, J @ self.joint(variables) @ J.T)
 
 
-def free_motions(layout: Layout, system: ReducedSystem, S: FloatArray) -> FloatArray:
-    """Orthonormal basis (unknowns, k) of the world motions that the reduced system does not see, k at most 7."""
-    directions = np.zeros((7, layout.num_kept_unknowns))
-    for kept in layout.kept:
-        blocks = np.zeros((7, kept.count, kept.width))
-        for member in kept.members:
-            group = layout.problem.variables[member.group]
-            part = gauge_directions(group.manifold, group.state)
-            target = np.arange(kept.count) if member.block_of is None else member.block_of
-            blocks[:, target[: part.shape[1]], member.offset : member.offset + member.dof] = part
-        directions[:, kept.start : kept.start + kept.count * kept.width] = blocks.reshape(7, -1)
-    held = np.concatenate([system.diagonal(c).reshape(-1) == 0.0 for c in range(len(layout.kept))])
-    if held.any():  # only combinations that leave the held coordinates alone are free
-        _, values, combinations = np.linalg.svd(directions[:, held].T, full_matrices=True)
-        rank = int((values > 1e-9 * max(values.max(initial=0.0), 1e-300)).sum())
-        directions = combinations[rank:] @ directions
-    U, values, _ = np.linalg.svd(directions.T, full_matrices=False)
-    Q = U[:, values > 1e-9 * max(values.max(initial=0.0), 1e-300)]
-    inner = Q.T @ S @ Q
-    values, vectors = np.linalg.eigh(inner)
-    expected = np.einsum("ni,n,ni->i", Q @ vectors, np.diag(S), Q @ vectors)
-    return Q @ vectors[:, values < FREE_TOLERANCE * np.maximum(expected, 1e-300)]
+@dataclass(frozen=True)
+class _Datum:
+    """The S-transformation: rows of G and of A = Y Q of all unknowns, and K; see :mod:`groma.solver._datum`."""
+
+    G: FloatArray
+    A: FloatArray
+    G_landmarks: list[FloatArray]
+    A_landmarks: list[FloatArray]
+    K: FloatArray
+    #: Weights D, and (G^T D G)^-1.
+    D: FloatArray
+    D_landmarks: list[FloatArray]
+    Q: FloatArray
+
+    def correction(self, G: FloatArray, A: FloatArray) -> FloatArray:
+        """What P M P^T differs from M, for rows (n, dof, k) of G and A."""
+        cross = A @ np.swapaxes(G, 1, 2)
+        return G @ self.K @ np.swapaxes(G, 1, 2) - cross - np.swapaxes(cross, 1, 2)
+
+
+__all__ = ["Covariances", "Derived"]

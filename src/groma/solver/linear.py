@@ -187,6 +187,9 @@ class ConjugateGradients:
     name = "pcg"
     #: Stop when one more iteration improves the quadratic model by less than this share of its mean improvement.
     model_tolerance = 0.05
+    #: ... and, where other blocks than cameras are kept, when the residual has fallen to this share. Planes converge in
+    #: two phases, and the model seems to stand still between them.
+    mixed_tolerance = 0.03
     max_iterations = 500
 
     def __init__(self, layout: Layout) -> None:
@@ -211,8 +214,9 @@ class ConjugateGradients:
         r = [b.copy() for b in rhs]
         z = precondition(r)
         p = [v.copy() for v in z]
-        rz = _dot(r, z)
+        rz = rz_begin = _dot(r, z)
         model = 0.0
+        mixed = len(x) > 1
         for k in range(1, self.max_iterations + 1):
             if rz <= 0.0:
                 break
@@ -230,11 +234,14 @@ class ConjugateGradients:
             # truncated-Newton method", 1990
             value = -0.5 * (_dot(x, rhs) + _dot(x, r))
             self.num_iterations = k
-            if k * (value - model) / value < self.model_tolerance:
+            slow = k * (value - model) / value < self.model_tolerance
+            if slow and not mixed:
                 break
             model = value
             z = precondition(r)
             rz_next = _dot(r, z)
+            if slow and rz_next < self.mixed_tolerance**2 * rz_begin:
+                break
             p = [a + (rz_next / rz) * b for a, b in zip(z, p, strict=True)]
             rz = rz_next
         self.residual = r

@@ -22,12 +22,14 @@ class SolverOptions:
     step_tolerance: float = 1e-10
     #: ``levenberg_marquardt`` or ``dogleg``.
     strategy: str = "levenberg_marquardt"
-    #: First damping, relative to the diagonal of the normal equations.
-    initial_damping: float = 1e-4
+    #: First damping, relative to the diagonal of the normal equations; None: 1e-4 where lines move, else 1e-5.
+    initial_damping: float | None = None
     #: ``auto``, ``dense``, ``sparse`` or ``pcg``: how the reduced system is solved.
     linear_solver: str = "auto"
     #: Steps of every landmark on its own after each accepted joint step; a step that does not help is undone.
     landmark_steps: int = 0
+    #: The groups of landmarks that take them; None: all that are eliminated.
+    landmark_groups: tuple[str, ...] | None = None
     #: Groups of variables that are eliminated, or ``auto``.
     eliminate: str | tuple[str, ...] = "auto"
     #: Threads; None takes one for small problems and all cores for large ones.
@@ -45,7 +47,7 @@ class SolverOptions:
             if getattr(self, name) < 0:
                 raise InputError(f"{name} must not be negative; got {getattr(self, name)}.")
         for name in ("function_tolerance", "gradient_tolerance", "step_tolerance", "initial_damping"):
-            if not getattr(self, name) >= 0:
+            if getattr(self, name) is not None and not getattr(self, name) >= 0:
                 raise InputError(f"{name} must be a number that is not negative; got {getattr(self, name)}.")
         if self.threads is not None and self.threads < 1:
             raise InputError(f"threads must be at least 1, or None; got {self.threads}.")

@@ -112,7 +112,7 @@ def _solve_jointly(
         states = to_solver_order(layout)
     report.linear_solver = linear.name
     strategy = {"levenberg_marquardt": LevenbergMarquardt, "dogleg": Dogleg}[options.strategy](
-        equations, system, linear, watch, options.initial_damping
+        equations, system, linear, watch, _initial_damping(layout, options)
     )
     with watch("cost"):
         inputs = equations.prepare(states)
@@ -275,7 +275,8 @@ class _LandmarkRefiner:
             inner, costs, _ = self._blocks.step(inner, costs)
         refined = dict(trial.states)
         for group in self._outer.eliminated:
-            refined[group.group] = np.ascontiguousarray(inner[group.group][group.order])
+            if group.group in inner:
+                refined[group.group] = np.ascontiguousarray(inner[group.group][group.order])
         inputs = equations.prepare(refined)
         cost = equations.cost(inputs)
         if cost >= trial.cost:
@@ -284,17 +285,28 @@ class _LandmarkRefiner:
 
 
 def _landmark_refiner(layout: Layout, workers: Workers, options: SolverOptions) -> _LandmarkRefiner | None:
-    groups = [e.group for e in layout.eliminated]
+    groups = [
+        e.group for e in layout.eliminated if options.landmark_groups is None or e.group in options.landmark_groups
+    ]
     if options.landmark_steps == 0 or not groups:
         return None
     return _LandmarkRefiner(layout, workers, groups, options.landmark_steps)
+
+
+def _initial_damping(layout: Layout, options: SolverOptions) -> float:
+    """Lines are more bent than points, and long first steps throw some into minima of their own."""
+    if options.initial_damping is not None:
+        return options.initial_damping
+    variables = layout.problem.variables.values()
+    moving_lines = any(group.manifold.kind == "line" and not group.is_constant for group in variables)
+    return 1e-4 if moving_lines else 1e-5
 
 
 def _solve_independently(
     layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
 ) -> States:
     with watch("setup"):
-        blocks = IndependentBlocks(layout, workers, options.initial_damping, options.function_tolerance)
+        blocks = IndependentBlocks(layout, workers, _initial_damping(layout, options), options.function_tolerance)
         states = to_solver_order(layout)
     report.linear_solver = "blocks"
     with watch("cost"):

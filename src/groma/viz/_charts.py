@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 
 WIDTH, HEIGHT = 560, 250
 #: Images shown in the bar chart.
@@ -33,8 +33,10 @@ def _line(x1: float, y1: float, x2: float, y2: float, name: str) -> str:
 def _number(value: float) -> str:
     if value == 0:
         return "0"
-    if 1e-3 <= abs(value) < 1e5:
+    if 1e-3 <= abs(value) < 1e6:
         return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    if 1e6 <= abs(value) < 1e9:
+        return f"{value / 1e6:.4g} M"
     mantissa, exponent = f"{value:.0e}".split("e")
     return f"{mantissa}e{int(exponent)}"
 
@@ -83,7 +85,7 @@ def entry(step: Any) -> Mapping[str, Any]:
     return step if isinstance(step, Mapping) else vars(step)
 
 
-def convergence(history: Sequence[Any]) -> str:
+def convergence(history: Sequence[Any], stages: Sequence[Mapping[str, Any]] = ()) -> str:
     """Return the cost after each accepted step, on a logarithmic axis; rejected steps are hollow.
 
     Parameters
@@ -91,22 +93,25 @@ def convergence(history: Sequence[Any]) -> str:
     history : sequence
         Mappings or objects with ``iteration``, ``cost``, ``accepted`` and perhaps ``stage``; costs of different
         stages belong to different losses and are not joined.
+    stages : sequence of mappings, optional
+        ``loss``, ``initial_cost`` and ``first_step`` of each stage: where its curve begins, and its name.
     """
     rows = [entry(row) for row in history]
-    steps = [
-        (int(row["iteration"]), float(row["cost"]), bool(row["accepted"]))
-        for row in rows
-        if math.isfinite(row["cost"]) and row["cost"] > 0
+    rows += [
+        {"iteration": stage["first_step"] - 1, "cost": stage["initial_cost"], "accepted": True, "stage": number}
+        for number, stage in enumerate(stages, 1)
     ]
-    if not steps:
+    rows.sort(key=lambda row: (row.get("stage", 1), row["iteration"]))
+    rows = [row for row in rows if math.isfinite(row["cost"]) and row["cost"] > 0]
+    if not rows:
         return _svg([_text(WIDTH / 2, HEIGHT / 2, "no steps were taken")])
-    costs = [cost for _, cost, _ in steps]
-    low, high = math.log10(min(costs)), math.log10(max(costs))
+    steps = [int(row["iteration"]) for row in rows]
+    low, high = (math.log10(pick(float(row["cost"]) for row in rows)) for pick in (min, max))
     if high - low < 0.05:
         low, high = low - 0.05, high + 0.05
     margin = 0.06 * (high - low)
-    low, high = low - margin, high + margin
-    first, final = steps[0][0], max(steps[-1][0], steps[0][0] + 1)
+    low, high = low - margin, high + (2 if len(stages) > 1 else 1) * margin
+    first, final = min(steps), max(*steps, min(steps) + 1)
     bottom = HEIGHT - _BOTTOM
 
     def place(iteration: int, cost: float) -> tuple[float, float]:
@@ -119,16 +124,21 @@ def convergence(history: Sequence[Any]) -> str:
         body.append(_line(_LEFT, y, WIDTH - _RIGHT, y, "grid") + _text(_LEFT - 6, y + 4, _number(tick), "end"))
     stride = max(1, math.ceil((final - first) / 10))
     body += [_text(place(i, 10**low)[0], bottom + 16, str(i)) for i in range(first, final + 1, stride)]
+    if len(stages) > 1:
+        for stage in stages:
+            x = place(max(first, stage["first_step"] - 1), 10**low)[0]
+            body.append(_line(x, _TOP, x, bottom, "grid"))
+            body.append(_text(x + 5, _TOP + 10, str(stage["loss"]).replace("_", " "), "start"))
     for stage in sorted({row.get("stage", 1) for row in rows}):
-        mine = {int(row["iteration"]) for row in rows if row.get("stage", 1) == stage}
-        taken = [place(i, cost) for i, cost, accepted in steps if accepted and i in mine]
+        mine = [row for row in rows if row.get("stage", 1) == stage]
+        taken = [place(int(row["iteration"]), float(row["cost"])) for row in mine if row["accepted"]]
         body.append(f'<path class="after" d="M{" L".join(f"{x:.1f} {y:.1f}" for x, y in taken)}"/>' if taken else "")
-    for iteration, cost, accepted in steps:
-        x, y = place(iteration, cost)
-        name = "after" if accepted else "rejected"
+    for row in rows:
+        x, y = place(int(row["iteration"]), float(row["cost"]))
+        name = "after" if row["accepted"] else "rejected"
         body.append(
-            f'<circle class="{name}" cx="{x:.1f}" cy="{y:.1f}" r="4"><title>step {iteration}: cost {cost:.6g}'
-            f"{'' if accepted else ', rejected'}</title></circle>"
+            f'<circle class="{name}" cx="{x:.1f}" cy="{y:.1f}" r="4"><title>step {row["iteration"]}: cost '
+            f"{row['cost']:.6g}{'' if row['accepted'] else ', rejected'}</title></circle>"
         )
     body.append(_line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
     body.append(_text((_LEFT + WIDTH) / 2, HEIGHT - 5, "step"))
@@ -142,7 +152,15 @@ def _log_ticks(low: float, high: float) -> list[float]:
         ticks = [tick for tick in ticks if low <= math.log10(tick) <= high]
         if len(ticks) >= 3:
             return ticks[:: max(1, len(ticks) // 6)]
-    return [10 ** (low + (high - low) * share) for share in (0.1, 0.5, 0.9)]
+    # A narrow range: round numbers at even steps.
+    first, final = 10.0**low, 10.0**high
+    power = 10.0 ** math.floor(math.log10(final - first))
+    step = next(f * power for f in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0) if (final - first) / (f * power) <= 6)
+    return [step * place for place in range(math.ceil(first / step), math.floor(final / step) + 1)]
+
+
+def _percent(share: float) -> str:
+    return "under 1 %" if 0 < share < 0.005 else f"{100 * share:.0f} %"
 
 
 def bars(names: Sequence[str], before: FloatArray | None, after: FloatArray) -> str:
@@ -170,5 +188,68 @@ def bars(names: Sequence[str], before: FloatArray | None, after: FloatArray) -> 
                 body.append(
                     f'<rect class="{kind}" x="{left}" y="{y + offset}" width="{length:.1f}" height="8" rx="2"/>'
                 )
-        body.append(_text(min(left + longest + 6, WIDTH - right + 2), y + 12, words, "start"))
+        body.append(_text(min(left + longest, WIDTH - right) + 6, y + 12, words, "start"))
     return _svg(body, height)
+
+
+def tracks(lengths: Mapping[str, IntArray]) -> str:
+    """Return how many images observe each landmark, as shares by kind; long tracks stand together in the last bar.
+
+    Parameters
+    ----------
+    lengths : mapping of str to (n,) int
+        Number of images of each landmark, by a kind that is also a class of the style sheet.
+    """
+    every = np.concatenate(list(lengths.values()))
+    last = int(min(max(np.percentile(every, 98), 6), MAX_BARS)) if len(every) else 6
+    first = int(min(every.min(initial=2), 2))
+    shares = {
+        kind: np.bincount(np.minimum(values, last) - first, minlength=last - first + 1) / max(len(values), 1)
+        for kind, values in lengths.items()
+    }
+    top = max(float(share.max()) for share in shares.values()) or 1.0
+    bottom, step = HEIGHT - _BOTTOM, (WIDTH - _LEFT - _RIGHT) / (last - first + 1)
+    width = (step - 3) / len(shares)
+    body = []
+    for number, (kind, share) in enumerate(shares.items()):
+        bars = "".join(
+            f'<rect x="{_LEFT + place * step + 1.5 + number * width:.1f}" y="{bottom - height:.1f}" '
+            f'width="{width:.1f}" height="{height:.1f}"><title>{100 * value:.2g} % of the {kind} in {first + place}'
+            f"{' or more' if first + place == last else ''} images</title></rect>"
+            for place, value in enumerate(share)
+            if (height := value / top * (bottom - _TOP)) > 0
+        )
+        body.append(f'<g class="{kind}">{bars}</g>')
+    stride = max(1, math.ceil((last - first + 1) / 16))
+    for place in range(0, last - first + 1, stride):
+        if place > last - first - stride and place != last - first:
+            continue
+        more = "+" if place == last - first and bool((every > last).any()) else ""
+        body.append(_text(_LEFT + (place + 0.5) * step, bottom + 16, f"{first + place}{more}"))
+    body.append(_line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
+    body.append(_text((_LEFT + WIDTH) / 2, HEIGHT - 5, "images that observe it"))
+    body.append(_text(_LEFT - 8, _TOP + 10, f"{100 * top:.2g} %", "end") + _text(_LEFT - 8, bottom, "0", "end"))
+    return _svg(body)
+
+
+def shares(parts: Sequence[tuple[str, int, str]]) -> str:
+    """Return one bar cut into shares, with a legend under it that holds names, numbers and percentages.
+
+    Parameters
+    ----------
+    parts : sequence of (words, count, colour)
+        The pieces from left to right; colours of the style sheet or of CSS.
+    """
+    total = max(sum(count for _, count, _ in parts), 1)
+    pieces = "".join(
+        f'<i style="flex:{count};background:{colour}" title="{html.escape(words)}: {count:,}"></i>'
+        for words, count, colour in parts
+        if count
+    )
+    legend = "".join(
+        f'<span class="key" style="--c:{colour}"><span>{html.escape(words)}</span><b>{count:,}</b>'
+        f"<span>{_percent(count / total)}</span></span>"
+        for words, count, colour in parts
+        if count
+    )
+    return f'<div class="shares">{pieces}</div><div class="keys">{legend}</div>'

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
+from groma.scene.patches import PALETTE
 
 Colours = npt.NDArray[np.uint8]
 
@@ -14,20 +15,6 @@ Colours = npt.NDArray[np.uint8]
 RAMP = np.array([[44, 111, 187], [63, 182, 168], [232, 197, 58], [217, 71, 43]], float)
 #: For what has no number.
 GREY = np.array([150, 152, 156], np.uint8)
-#: Colours that are told apart by most eyes, the first ones best.
-PALETTE = np.array(
-    [
-        [214, 75, 54],
-        [44, 122, 196],
-        [58, 158, 92],
-        [226, 160, 40],
-        [138, 99, 201],
-        [38, 170, 178],
-        [205, 92, 154],
-        [130, 104, 66],
-    ],
-    np.uint8,
-)
 
 
 def ramp(share: npt.ArrayLike) -> Colours:

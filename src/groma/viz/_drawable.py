@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A scene as plain arrays to draw: places, camera axes, planes as quadrangles, and the residual of every observation.
+"""A scene as plain arrays to draw: places, camera axes, pieces of planes, and the residual of every observation.
 
 Residuals are computed here from scene and camera model alone, so that a picture shows what is in the file and not
 what a solver said about it. The residual of a line end is the way from the measured end to the image of the line. It is
@@ -20,6 +20,7 @@ import numpy.typing as npt
 from groma import cameras
 from groma._typing import FloatArray, IntArray
 from groma.geometry import se3
+from groma.scene.patches import plane_patches
 
 if TYPE_CHECKING:
     from groma.cameras import CameraModel
@@ -38,8 +39,9 @@ class Drawable:
     colours: npt.NDArray[np.uint8] | None
     #: (L, 2, 3) end points of the lines.
     segments: FloatArray
-    #: (K, 4, 3) corners of a piece of each plane.
-    quads: FloatArray
+    #: K convex polygons (n, 3), a piece of each plane, and (K,) how many landmarks lie on each.
+    patches: list[FloatArray]
+    patch_members: IntArray
     #: (N, 7) poses of the images.
     cam_from_world: FloatArray
     image_names: list[str]
@@ -86,12 +88,14 @@ def drawable(scene: Scene) -> Drawable:
     line_residuals, line_places = _line_residuals(scene, poses)
     kinds = [("points", len(points)), ("line ends", 2 * len(lines))]
     color = scene.points.color
+    patches, members = plane_patches(scene)
     camera_idx = scene.images.camera_idx
     return Drawable(
         points=scene.points.xyz,
         colours=np.ascontiguousarray(color) if color.any() else None,
         segments=scene.lines.segments,
-        quads=_quads(scene),
+        patches=patches,
+        patch_members=members,
         cam_from_world=scene.cam_from_world,
         image_names=list(scene.images.names),
         image_sizes=np.stack([scene.cameras.width, scene.cameras.height], axis=1)[camera_idx],
@@ -173,36 +177,3 @@ def _line_residuals(scene: Scene, poses: FloatArray) -> tuple[FloatArray, FloatA
 
 def _transform(poses: FloatArray, points: FloatArray) -> FloatArray:
     return np.einsum("nij,nj->ni", poses[:, :, :3], points) + poses[:, :, 3]
-
-
-# --------------------------------------------------------------------------------------------------------- Planes
-
-
-def _quads(scene: Scene) -> FloatArray:
-    """Return a rectangle (K, 4, 3) in each plane around what lies on it, or around the middle of the scene."""
-    everything = np.concatenate([scene.points.xyz, scene.lines.segments.reshape(-1, 3)])
-    middle = np.median(everything, axis=0) if len(everything) else np.zeros(3)
-    reach = float(np.median(np.linalg.norm(everything - middle, axis=1))) if len(everything) else 1.0
-    quads = np.empty((len(scene.planes), 4, 3))
-    for index, plane in enumerate(scene.planes.hesse):
-        members = np.concatenate(
-            [
-                scene.points.xyz[_partners(scene.relations.point_on_plane, index)],
-                scene.lines.segments[_partners(scene.relations.line_on_plane, index)].reshape(-1, 3),
-            ]
-        )
-        normal, offset = plane[:3], plane[3]
-        origin = middle - (normal @ middle + offset) * normal
-        first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-        first /= np.linalg.norm(first)
-        axes = np.stack([first, np.cross(normal, first)])
-        low, high = np.full(2, -reach / 2), np.full(2, reach / 2)
-        if len(members) >= 3:
-            low, high = np.percentile((members - origin) @ axes.T, (2, 98), axis=0)
-        corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
-        quads[index] = origin + corners @ axes
-    return quads
-
-
-def _partners(pairs: IntArray, plane_idx: int) -> IntArray:
-    return pairs[pairs[:, 1] == plane_idx, 0]

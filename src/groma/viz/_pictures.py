@@ -50,3 +50,19 @@ def data_address(picture: Picture, quality: int = 78) -> str:
 
     encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
+
+
+def jpeg_address(picture: Picture, budget: int) -> str:
+    """Return a picture as a data address of at most about ``budget`` characters, made smaller until it fits."""
+    import cv2
+
+    address = data_address(picture)
+    for _ in range(4):
+        if len(address) <= budget:
+            break
+        # A smaller picture has more detail in each pixel, so the bytes fall slower than the area.
+        scale = max(0.9 * (budget / len(address)) ** 0.55, 0.2)
+        size = [max(1, round(scale * side)) for side in picture.shape[1::-1]]
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+        address = data_address(picture)
+    return address

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from groma._typing import BoolArray
+from groma.scene.patches import patch_groups, triangle_fans
 from groma.viz import _colours, _view_arrays, _view_words
 from groma.viz._pictures import ImageFiles, image_file, read_picture
 from groma.viz._view_content import LINE_MODES, REACH, ViewContent
@@ -224,12 +225,9 @@ class SceneView:
         patches = self.content.patches
         if not patches:
             return
-        # Neighbours in size, which may well lie beside each other, get different colours.
-        group = np.empty(len(patches), np.int64)
-        group[np.argsort(-self.content.patch_members, kind="stable")] = np.arange(len(patches))
-        group %= len(_colours.PALETTE)
+        group = patch_groups(self.content.patch_members)
         for colour in np.unique(group):
-            vertices, faces = _view_arrays.fans([patches[plane] for plane in np.flatnonzero(group == colour)])
+            vertices, faces = triangle_fans([patches[plane] for plane in np.flatnonzero(group == colour)])
             red, green, blue = (int(channel) for channel in _colours.PALETTE[colour])
             self._nodes["planes"].append(
                 self.server.scene.add_mesh_simple(

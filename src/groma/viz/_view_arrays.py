@@ -25,16 +25,6 @@ def by_end(colours: Colours) -> Colours:
     return np.repeat(np.round(255.0 * light).astype(np.uint8)[:, None], 2, axis=1)
 
 
-def fans(polygons: list[FloatArray]) -> tuple[FloatArray, IntArray]:
-    """Return the corners of convex polygons, one after the other, and their triangles."""
-    begin = np.cumsum([0, *(len(corners) for corners in polygons)])
-    triangles = [
-        first + np.column_stack([np.zeros(len(corners) - 2, int), *(np.arange(len(corners) - 2) + k for k in (1, 2))])
-        for first, corners in zip(begin, polygons, strict=False)
-    ]
-    return np.concatenate(polygons), np.concatenate(triangles)
-
-
 def point_size(count: int) -> float:
     """Return the position of the slider: small where there are many."""
     return float(np.clip(np.round(2.0 * (4.0 + 2e4 / max(count, 1))) / 2.0, 4.0, 12.0))

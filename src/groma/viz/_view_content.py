@@ -20,7 +20,6 @@ from groma.scene.similarity import Similarity
 from groma.viz import _colours
 from groma.viz._colours import Colours
 from groma.viz._drawable import drawable
-from groma.viz._patches import plane_patches
 from groma.viz._statistics import LineStatistics, line_statistics
 
 if TYPE_CHECKING:
@@ -128,7 +127,6 @@ def view_content(scene: Scene) -> ViewContent:
     if len(known):
         point_colours["reprojection error"] = _colours.ramp(errors / max(float(np.percentile(known, 90)), 1e-12))
     point_colours["plain"] = np.tile(np.array([[96, 104, 116]], np.uint8), (len(order), 1))
-    patches, members = plane_patches(scene)
     pose = frame.poses(scene.cam_from_world)
     world_from_cam = quaternion.conjugate(pose[:, :4])
     opening, aspect = _openings(scene)
@@ -139,8 +137,8 @@ def view_content(scene: Scene) -> ViewContent:
         points=frame.points(scene.points.xyz[order]),
         point_colours=point_colours,
         segments=frame.points(scene.lines.segments),
-        patches=[frame.points(patch) for patch in patches],
-        patch_members=members,
+        patches=[frame.points(patch) for patch in shown.patches],
+        patch_members=shown.patch_members,
         directions=frame.directions(scene.directions.vectors),
         direction_members=np.bincount(
             scene.relations.line_along_direction[:, 1], minlength=scene.num_directions

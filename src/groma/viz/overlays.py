@@ -118,6 +118,11 @@ def residual_top(numbers: LineStatistics) -> float:
     return max(float(np.percentile(known, 95)), 0.1) if len(known) else 1.0
 
 
+def is_straight(model: str) -> bool:
+    """Tell whether the images of straight lines are straight under a camera model."""
+    return model in _STRAIGHT
+
+
 def projected_segments(scene: Scene, image_idx: int, line_idx: IntArray) -> list[FloatArray]:
     """Return the images of 3D segments as polylines (n, 2) in pixels; empty ones for segments behind the camera.
 
@@ -140,7 +145,7 @@ def projected_segments(scene: Scene, image_idx: int, line_idx: IntArray) -> list
     # Where a segment passes through the camera's plane only the part before it is seen.
     share = np.clip((near[:, None] - depth) / np.where(depth == depth[:, ::-1], 1.0, depth[:, ::-1] - depth), 0.0, 1.0)
     ends = np.where((depth < near[:, None])[..., None], ends + share[..., None] * (ends[:, ::-1] - ends), ends)
-    steps = np.linspace(0.0, 1.0, 2 if model.name in _STRAIGHT else _SAMPLES)[None, :, None]
+    steps = np.linspace(0.0, 1.0, 2 if is_straight(model.name) else _SAMPLES)[None, :, None]
     places = ends[:, :1] * (1.0 - steps) + ends[:, 1:] * steps
     pixels = model.project(params, np.ascontiguousarray(places.reshape(-1, 3))).reshape(*places.shape[:2], 2)
     good = np.isfinite(pixels).all(axis=2) & (depth.max(axis=1) > near)[:, None]

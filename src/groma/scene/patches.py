@@ -1,19 +1,29 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The part of each plane that is worth drawing: the convex hull of what lies on it."""
+"""The part of each plane that is worth showing: the convex hull of what lies on it, and a colour to tell it by."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-
-if TYPE_CHECKING:
-    from groma.scene import Scene
+from groma.scene.scene import Scene
 
 #: Members farther from their middle than this multiple of what holds four fifths of them are left out.
 _FAR = 3.0
+#: Colours that are told apart by most eyes, the first ones best.
+PALETTE = np.array(
+    [
+        [214, 75, 54],
+        [44, 122, 196],
+        [58, 158, 92],
+        [226, 160, 40],
+        [138, 99, 201],
+        [38, 170, 178],
+        [205, 92, 154],
+        [130, 104, 66],
+    ],
+    np.uint8,
+)
 
 
 def plane_patches(scene: Scene) -> tuple[list[FloatArray], IntArray]:
@@ -54,6 +64,31 @@ def plane_patches(scene: Scene) -> tuple[list[FloatArray], IntArray]:
     return polygons, np.asarray(members, np.int64)
 
 
+def patch_area(polygon: FloatArray) -> float:
+    """Area of a flat polygon (n, 3), squared scene units."""
+    arms = polygon[1:] - polygon[0]
+    return 0.5 * float(np.linalg.norm(np.cross(arms[:-1], arms[1:]).sum(axis=0)))
+
+
+def patch_groups(members: IntArray) -> IntArray:
+    """Return the colour of each plane as a row of ``PALETTE``: neighbours in size, which may well touch, differ."""
+    group = np.empty(len(members), np.int64)
+    group[np.argsort(-members, kind="stable")] = np.arange(len(members))
+    return group % len(PALETTE)
+
+
+def triangle_fans(polygons: list[FloatArray]) -> tuple[FloatArray, IntArray]:
+    """Return the corners of convex polygons, one after the other (n, 3), and their triangles (t, 3)."""
+    begin = np.cumsum([0, *(len(corners) for corners in polygons)])
+    triangles = [
+        first + np.column_stack([np.zeros(len(corners) - 2, int), *(np.arange(len(corners) - 2) + k for k in (1, 2))])
+        for first, corners in zip(begin, polygons, strict=False)
+    ]
+    if not polygons:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    return np.concatenate(polygons), np.concatenate(triangles).astype(np.int64)
+
+
 def _without_far(places: FloatArray) -> FloatArray:
     if len(places) < 5:
         return places
@@ -71,3 +106,6 @@ def _hull(places: FloatArray) -> FloatArray | None:
     from scipy.spatial import ConvexHull
 
     return places[ConvexHull(places).vertices]
+
+
+__all__ = ["PALETTE", "patch_area", "patch_groups", "plane_patches", "triangle_fans"]

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Posed images whose lines are mapped by the benchmark of lines: photographs, and renderings whose edges are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from _renderings import BoxSettings, render_boxes
+from _workshop import CACHE
+
+from groma.frontend import LsdDetector, Segments
+from groma.io import read_scene
+from groma.io.colmap import from_pycolmap
+from groma.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class LineScene:
+    """Images, poses, points, and the truth where there is one."""
+
+    name: str
+    scene: Scene
+    images: list[np.ndarray]
+    #: (E, 2, 3) true edges, or None.
+    edges: np.ndarray | None = None
+    #: Distances at which lines are compared with the edges, scene units.
+    thresholds: list[float] = field(default_factory=list)
+
+    def segments(self, min_length: float) -> list[Segments]:
+        """Return groma's segments of each image."""
+        detector = LsdDetector(min_length=min_length)
+        return [detector.detect(image) for image in self.images]
+
+
+def boxes(name: str, settings: BoxSettings) -> LineScene:
+    """Return rendered boxes; one scene unit is taken for a metre."""
+    rendered = render_boxes(settings)
+    return LineScene(name, rendered.scene, rendered.images, rendered.edges, [0.001, 0.005])
+
+
+def strecha(name: str, folder: Path) -> LineScene:
+    """Return one of Strecha's surveyed scenes: photographs with known poses, no edges."""
+    scene = read_scene(folder / "sparse_gt")
+    return LineScene(name, scene, _photographs(folder, scene))
+
+
+def pavilion(name: str, folder: Path) -> LineScene:
+    """Return the Barcelona pavilion: renderings with exact cameras and a graph of marked edges.
+
+    Thresholds are 1, 5 and 10 thousandths of the extent, the diagonal of the box that holds the marked points between
+    their 2nd and 98th percentile: single points lie far outside of the view.
+    """
+    scene = _triangulated(folder)
+    with np.load(folder / "gt_edges.npz") as archive:
+        points, pairs = archive["points"], archive["edges"]
+    extent = float(np.linalg.norm(np.quantile(points, 0.98, axis=0) - np.quantile(points, 0.02, axis=0)))
+    return LineScene(
+        name, scene, _photographs(folder, scene), points[pairs], [k * extent for k in (0.001, 0.005, 0.01)]
+    )
+
+
+def _photographs(folder: Path, scene: Scene) -> list[np.ndarray]:
+    images = [cv2.imread(str(folder / "images" / name), cv2.IMREAD_GRAYSCALE) for name in scene.images.names]
+    missing = [name for name, image in zip(scene.images.names, images, strict=True) if image is None]
+    if missing:
+        raise SystemExit(f"{folder / 'images'} lacks {', '.join(missing[:3])}.")
+    return [image for image in images if image is not None]
+
+
+def _triangulated(folder: Path) -> Scene:
+    """Points of the pavilion from SIFT matches under the exact cameras; made once, by pycolmap."""
+    model_folder = CACHE / "pavilion"
+    if not (model_folder / "points3D.bin").is_file():
+        import pycolmap
+
+        pycolmap.logging.minloglevel = 2
+        pycolmap.set_random_seed(0)
+        model_folder.mkdir(parents=True, exist_ok=True)
+        database = model_folder / "database.db"
+        database.unlink(missing_ok=True)
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model, reader.camera_params = "PINHOLE", "700,700,320,180"
+        single, device = pycolmap.CameraMode.SINGLE, pycolmap.Device.cpu
+        pycolmap.extract_features(database, folder / "images", camera_mode=single, reader_options=reader, device=device)
+        pycolmap.match_exhaustive(database, device=device)
+        rows = [line.split() for line in (folder / "poses.txt").read_text().splitlines() if line[:1] not in ("#", "")]
+        pose_of = {row[0]: np.array(row[5:], float) for row in rows}  # qw qx qy qz tx ty tz
+        model = pycolmap.Reconstruction()
+        table = pycolmap.Database.open(database)
+        camera = table.read_all_cameras()[0]
+        model.add_camera_with_trivial_rig(camera)
+        for image in table.read_all_images():
+            qw, *rest = pose_of[image.name]
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([*rest[:3], qw])), np.array(rest[3:]))
+            posed = pycolmap.Image(name=image.name, image_id=image.image_id, camera_id=camera.camera_id)
+            model.add_image_with_trivial_frame(posed, pose)
+        table.close()
+        found = pycolmap.triangulate_points(model, database, folder / "images", model_folder, refine_intrinsics=False)
+        found.write(model_folder)
+        return from_pycolmap(found)
+    return read_scene(model_folder)
+
+
+#: By name: what makes the scene from the folder of data.
+SCENES: dict[str, Callable[[Path], LineScene]] = {
+    "boxes": lambda data: boxes("boxes", BoxSettings(seed=3)),
+    "boxes-textured": lambda data: boxes("boxes-textured", BoxSettings(seed=11, texture=8.0)),
+    "boxes-small": lambda data: boxes("boxes-small", BoxSettings(seed=5, width=640, height=480, focal=560.0)),
+    "pavilion": lambda data: pavilion("pavilion", data / "pavilion_chair"),
+    "fountain": lambda data: strecha("fountain", data / "strecha_fountain_p11"),
+    "herz-jesus": lambda data: strecha("herz-jesus", data / "strecha_herz_jesus_p8"),
+    "castle": lambda data: strecha("castle", data / "strecha_castle_p30"),
+}
+#: Shortest segment of scenes where published figures fix one, pixels; otherwise that of the options of mapping.
+MIN_LENGTH = {"fountain": 40.0, "herz-jesus": 40.0, "castle": 40.0}

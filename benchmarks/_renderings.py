@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Rendered rooms of boxes whose edges are known exactly.
+
+A world is a list of convex polygons with a grey value each. Seen from a camera, whether a pixel's ray hits a polygon
+and at what depth depends on the pixel through linear functions only, so a picture is a few dozen array operations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from groma.geometry import quaternion
+from groma.scene import Cameras, PointObservations, Points, Scene
+
+#: Places per edge at which its visibility is tested.
+PLACES = 200
+#: Half the side of the floor, scene units.
+FLOOR = 3.0
+BACKGROUND = 30.0
+#: Rays per pixel, in either direction.
+SAMPLES = 3
+#: Size of a pattern of blotches.
+BLOTCHES = 64
+
+
+@dataclass(frozen=True)
+class BoxSettings:
+    """What a world of boxes looks like, and from where."""
+
+    seed: int = 0
+    num_images: int = 24
+    width: int = 960
+    height: int = 720
+    focal: float = 850.0
+    num_boxes: int = 8
+    #: Standard deviation of the blotches on the faces, grey values.
+    texture: float = 0.0
+    #: Standard deviation of the noise of a pixel, grey values.
+    noise: float = 2.0
+    #: Standard deviation of the blur, pixels.
+    blur: float = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedScene:
+    """Images, their exact cameras, points on the surfaces, and the edges that at least two images see."""
+
+    scene: Scene
+    images: list[np.ndarray]
+    #: (E, 2, 3) visible pieces of edges.
+    edges: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _World:
+    polygons: list[np.ndarray]
+    shades: list[float]
+    edges: np.ndarray
+
+
+def render_boxes(settings: BoxSettings) -> RenderedScene:
+    """Make the world of a seed, its images and its visible edges."""
+    rng = np.random.default_rng(settings.seed)
+    world = _boxes(settings, rng)
+    poses = _ring(settings, rng)
+    camera = np.array([settings.focal, settings.focal, settings.width / 2, settings.height / 2])
+    blotches = [_blotches(rng) for _ in world.polygons] if settings.texture else None
+    images = [_picture(world, pose, camera, settings, blotches, rng) for pose in poses]
+    points, observations = _points(world, poses, camera, settings, rng)
+    scene = Scene.from_images(
+        Cameras(np.array([1]), ("PINHOLE",), camera[None], np.array([settings.width]), np.array([settings.height])),
+        [f"{i:03d}.png" for i in range(len(poses))],
+        np.zeros(len(poses), int),
+        poses,
+        points=points,
+        point_observations=observations,
+    )
+    return RenderedScene(scene, images, _visible(world, poses, camera, settings))
+
+
+# -------------------------------------------------------------------------------------------------------------- world
+def _boxes(settings: BoxSettings, rng: np.random.Generator) -> _World:
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    pairs = [(a, b) for a in range(8) for b in range(a) if (corners[a] != corners[b]).sum() == 1]
+    floor = FLOOR * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    polygons, shades = [floor], [120.0]
+    edges = [floor[[k, (k + 1) % 4]] for k in range(4)]
+    placed: list[tuple[np.ndarray, float]] = []
+    while len(placed) < settings.num_boxes:
+        half = rng.uniform(0.12, 0.4, 3)
+        center, reach = np.append(rng.uniform(-1.4, 1.4, 2), half[2]), float(np.hypot(half[0], half[1]))
+        if any(np.linalg.norm((center - other)[:2]) < reach + far + 0.03 for other, far in placed):
+            continue
+        placed.append((center, reach))
+        a = rng.uniform(0.0, np.pi)
+        turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+        box = center + (corners * half) @ turn.T
+        polygons += [box[list(side)] for side in sides]
+        shades += rng.permutation([50.0, 80, 150, 180, 210, 240]).tolist()
+        edges += [box[list(pair)] for pair in pairs]
+    return _World(polygons, shades, np.array(edges))
+
+
+def _ring(settings: BoxSettings, rng: np.random.Generator) -> np.ndarray:
+    """Poses (C, 7) on a wavy ring around the boxes, looking inwards."""
+    poses = []
+    for k in range(settings.num_images):
+        a = 2 * np.pi * k / settings.num_images
+        center = np.array([3.6 * np.cos(a), 3.6 * np.sin(a), 1.4 + 0.5 * np.sin(3 * a)]) + rng.normal(0, 0.05, 3)
+        z = np.array([0, 0, 0.3]) - center
+        z /= np.linalg.norm(z)
+        x = np.cross(z, [0, 0, 1.0])
+        x /= np.linalg.norm(x)
+        R = np.stack([x, np.cross(z, x), z])
+        poses.append(np.concatenate([quaternion.from_matrix(R[None])[0], -R @ center]))
+    return np.array(poses)
+
+
+def _blotches(rng: np.random.Generator) -> np.ndarray:
+    """A smooth random pattern of unit deviation, without edges."""
+    pattern = cv2.GaussianBlur(rng.normal(size=(BLOTCHES, BLOTCHES)), (0, 0), 3.0)
+    return ((pattern - pattern.mean()) / pattern.std()).astype(np.float32)
+
+
+# ------------------------------------------------------------------------------------------------------------ pictures
+def _inside(polygon: np.ndarray, rays: np.ndarray, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse depth along rays (n, 3) to a polygon in the camera frame, and whether they hit it."""
+    normal = np.cross(polygon[1] - polygon[0], polygon[2] - polygon[0])
+    inverse = rays @ normal / (normal @ polygon[0])
+    hit = inverse > 1e-9
+    turn = np.sign(normal @ polygon[0])
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        side = np.cross(a, b)
+        hit &= turn * (rays @ side) > margin * np.linalg.norm(side)
+    return inverse, hit
+
+
+def _picture(world, pose, camera, settings, blotches, rng) -> np.ndarray:
+    width, height = settings.width * SAMPLES, settings.height * SAMPLES
+    x = ((np.arange(width) + 0.5) / SAMPLES - camera[2]) / camera[0]
+    y = ((np.arange(height) + 0.5) / SAMPLES - camera[3]) / camera[1]
+    R = quaternion.to_matrix(pose[None, :4])[0]
+    nearest, grey = np.zeros((height, width), np.float32), np.full((height, width), BACKGROUND, np.float32)
+    for k, (polygon, shade) in enumerate(zip(world.polygons, world.shades, strict=True)):
+        local = polygon @ R.T + pose[4:]
+        columns, rows = slice(0, width), slice(0, height)
+        if local[:, 2].min() > 1e-3:
+            near = local[:, :2] / local[:, 2:]
+            columns = slice(*np.searchsorted(x, [near[:, 0].min(), near[:, 0].max()]))
+            rows = slice(*np.searchsorted(y, [near[:, 1].min(), near[:, 1].max()]))
+        at_x, at_y = x[columns].astype(np.float32), y[rows].astype(np.float32)
+
+        def over(v: np.ndarray, at_x: np.ndarray = at_x, at_y: np.ndarray = at_y) -> np.ndarray:
+            """The linear function v of the ray, at all pixels."""
+            v = v.astype(np.float32)
+            return at_x * v[0] + (at_y * v[1] + v[2])[:, None]
+
+        normal = np.cross(local[1] - local[0], local[-1] - local[0])
+        offset = normal @ local[0]
+        inverse = over(normal / offset)
+        hit = inverse > np.maximum(nearest[rows, columns], 1e-9)
+        for a, b in zip(local, np.roll(local, -1, axis=0), strict=True):
+            hit &= over(np.sign(offset) * np.cross(a, b)) > 0
+        value = np.float32(shade)
+        if blotches is not None and hit.any():
+            # Place in the polygon along its two sides at the first corner, which are perpendicular.
+            scaled = [(BLOTCHES - 1) * v / (v @ v) for v in (local[1] - local[0], local[-1] - local[0])]
+            s, t = (over(v) / np.where(hit, inverse, 1) - np.float32(v @ local[0]) for v in scaled)
+            value = value + np.float32(settings.texture) * cv2.remap(blotches[k], s, t, cv2.INTER_LINEAR)
+        nearest[rows, columns] = np.where(hit, inverse, nearest[rows, columns])
+        grey[rows, columns] = np.where(hit, value, grey[rows, columns])
+    small = grey.reshape(settings.height, SAMPLES, settings.width, SAMPLES).mean((1, 3))
+    blurred = cv2.GaussianBlur(small, (0, 0), settings.blur) if settings.blur else small
+    return np.clip(blurred + rng.normal(0, settings.noise, small.shape), 0, 255).astype(np.uint8)
+
+
+# ---------------------------------------------------------------------------------------------------------- visibility
+def _seen(world, places, pose, camera, settings) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of places (n, 3), and whether an image sees them."""
+    R = quaternion.to_matrix(pose[None, :4])[0]
+    local = places @ R.T + pose[4:]
+    ahead = local[:, 2] > 1e-6
+    rays = local / np.where(ahead, local[:, 2], 1.0)[:, None]
+    pixel = rays[:, :2] * camera[:2] + camera[2:]
+    seen = ahead & (pixel > 0).all(1) & (pixel < [settings.width, settings.height]).all(1)
+    for polygon in world.polygons:
+        inverse, hit = _inside(polygon @ R.T + pose[4:], rays, 1e-6)
+        seen &= ~(hit & (inverse * local[:, 2] > 1.0 + 1e-5))
+    return pixel, seen
+
+
+def _visible(world: _World, poses: np.ndarray, camera: np.ndarray, settings: BoxSettings) -> np.ndarray:
+    """Pieces of the edges that at least two images see."""
+    share = (np.arange(PLACES) + 0.5) / PLACES
+    places = world.edges[:, None, 0] + share[None, :, None] * (world.edges[:, 1] - world.edges[:, 0])[:, None]
+    count = sum(_seen(world, places.reshape(-1, 3), pose, camera, settings)[1].astype(int) for pose in poses)
+    pieces = []
+    for edge, seen in zip(world.edges, (np.asarray(count) >= 2).reshape(-1, PLACES), strict=True):
+        steps = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(int)))
+        for begin, end in steps.reshape(-1, 2) / PLACES:
+            pieces.append([edge[0] + t * (edge[1] - edge[0]) for t in (begin, end)])
+    return np.array(pieces)
+
+
+def _points(world, poses, camera, settings, rng) -> tuple[Points, PointObservations]:
+    """Points on all surfaces, observed with 0.3 pixels of noise."""
+    xyz = []
+    for k, polygon in enumerate(world.polygons):
+        s, t = rng.uniform(0.08, 0.92, (2, 300 if k == 0 else 25, 1))
+        xyz.append(polygon[0] + s * (polygon[1] - polygon[0]) + t * (polygon[-1] - polygon[0]))
+    xyz = np.concatenate(xyz)
+    table = []
+    for i, pose in enumerate(poses):
+        pixel, seen = _seen(world, xyz, pose, camera, settings)
+        rows = np.flatnonzero(seen)
+        table.append((np.full(len(rows), i), rows, pixel[rows] + rng.normal(0, 0.3, (len(rows), 2))))
+    image, point, pixel = (np.concatenate(column) for column in zip(*table, strict=True))
+    return Points.at(xyz), PointObservations(image, point, pixel, np.arange(len(image)))

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""groma on an archive, a few steps, with what it costs: ``scale_solve.py FILE STEPS THREADS``.
+
+Compiled functions are loaded by a small solve first.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from _common import Clock, peak_memory_mib, report
+
+from groma.io import read_scene
+from groma.pipelines._assemble import AssemblyOptions, assemble
+from groma.scene import Scene, synthetic
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
+
+
+def problem_of(scene: Scene):
+    """Return the problem of the points and lines of a scene, calibration held."""
+    return assemble(scene, AssemblyOptions(refine_intrinsics=False, drop_behind=False, planes=False)).problem
+
+
+def main() -> None:
+    path, steps, threads = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+    small = problem_of(synthetic.corridor("tiny").start.points_only())
+    for solver in ("dense", "sparse", "pcg"):
+        solve(small, SolverOptions(max_iterations=2, threads=1, linear_solver=solver))
+    before = peak_memory_mib()
+    reading = Clock()
+    scene = read_scene(path)
+    read = reading.read()
+    making = Clock()
+    problem = problem_of(scene)
+    made = making.read()
+    after_making = peak_memory_mib()
+    rule = {"function_tolerance": 0.0, "gradient_tolerance": 0.0, "step_tolerance": 0.0}
+    clock = Clock()
+    solved = solve(problem, SolverOptions(max_iterations=steps, threads=threads, **rule)).report
+    times = clock.read()
+    report(
+        contestant="groma",
+        observations=scene.num_observations,
+        images=scene.num_images,
+        landmarks=scene.num_points + scene.num_lines,
+        solver=solved.linear_solver,
+        threads=threads,
+        read_s=read["cpu_s"],
+        assemble_s=made["cpu_s"],
+        **times,
+        iterations=solved.iterations,
+        initial_cost=solved.initial_cost,
+        final_cost=solved.final_cost,
+        linear_iterations=sum(step.linear_iterations for step in solved.history),
+        # of the share of each stage in the wall time
+        stages={name: seconds / solved.seconds["total"] for name, seconds in solved.seconds.items()},
+        process_mib=before,
+        before_solve_mib=after_making,
+    )
+
+
+if __name__ == "__main__":
+    main()

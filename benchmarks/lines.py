@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Map the lines of posed images with groma and LIMAP, from the same segments and the same matches.
+
+    python benchmarks/lines.py [SCENE ...] [--data DIR] [--python-limap PYTHON]
+
+Without a Python that has pylimap 2 groma runs alone. Scenes whose data is not in the folder are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from _line_scenes import MIN_LENGTH, SCENES, LineScene
+from _workshop import CACHE, CONTESTANTS, RESULTS, ROOT, machine, run_program
+
+from groma import cameras as camera_models
+from groma.evaluation.lines import Distances, Geometry, places_on, score_lines
+from groma.frontend import Segments
+from groma.frontend.matches import LineMatches
+from groma.geometry import quaternion, segment2
+from groma.pipelines._neighbors import covisible_neighbors
+from groma.pipelines.adjust import AdjustOptions, adjust
+from groma.pipelines.find_structure import find_structure
+from groma.pipelines.map_lines import MapLinesOptions, map_lines, wide_baseline_matches
+from groma.scene import Scene
+
+#: ``all``: every segment of a neighbour is a candidate. ``wide``: groma's matches of surroundings and points.
+MATCHING = ("all", "wide")
+
+
+@dataclass(frozen=True, eq=False)
+class LineSet:
+    """Lines of one contestant, and who sees them."""
+
+    contestant: str
+    matching: str
+    ends: np.ndarray
+    #: (T, 3) line, image, segment.
+    track: np.ndarray
+    seconds: float = float("nan")
+
+    @property
+    def num_images(self) -> np.ndarray:
+        pairs = np.unique(self.track[:, :2], axis=0)
+        return np.bincount(pairs[:, 0].astype(int), minlength=len(self.ends))
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A scene with its segments and the matches that every contestant gets."""
+
+    source: LineScene
+    segments: list[Segments]
+    neighbors: list[np.ndarray]
+    min_length: float
+    matches: dict[tuple[int, int], LineMatches] = field(default_factory=dict)
+
+    @property
+    def matching(self) -> str:
+        return "wide" if self.matches else "all"
+
+
+def prepare(source: LineScene, matching: str) -> Task:
+    """Detect, choose neighbours, match."""
+    options = MapLinesOptions()
+    min_length = MIN_LENGTH.get(source.name, options.min_length)
+    segments = source.segments(min_length)
+    neighbors = covisible_neighbors(source.scene, options.num_neighbors, options.min_shared)
+    matches = {}
+    if matching == "wide":
+        provider = wide_baseline_matches(source.scene, segments, lambda i: source.images[i])
+        pairs = {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(neighbors) for j in row}
+        matches = {pair: provider(*pair) for pair in sorted(pairs)}
+    return Task(source, segments, neighbors, min_length, matches)
+
+
+# --------------------------------------------------------------------------------------------------------- contestants
+def run_groma(task: Task) -> list[LineSet]:
+    """Lines as mapped, and after the joint adjustment of everything but the exact poses."""
+    options = MapLinesOptions.selective(task.min_length)
+    map_lines(task.source.scene, task.segments, task.matches or None, options)  # kernels into memory
+    start = time.process_time()
+    found = map_lines(task.source.scene, task.segments, task.matches or None, options)
+    seconds = time.process_time() - start
+    track = np.column_stack([found.line_idx, found.image_idx, found.segment_idx])
+    mapped = LineSet("groma, no joint adjustment", task.matching, found.segments, track, seconds)
+    if not found.num_lines:
+        return [mapped]
+    scene = find_structure(found.add_to(task.source.scene, task.segments))
+    adjusted = adjust(scene, AdjustOptions(refine_poses=False, threads=1)).scene
+    seconds = time.process_time() - start
+    return [mapped, LineSet("groma", task.matching, adjusted.lines.segments, track, seconds)]
+
+
+def run_limap(task: Task, python: str) -> list[LineSet]:
+    """LIMAP's lines, as triangulated and after its own refinement."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "in.npz", Path(folder) / "out.npz"
+        np.savez(source, **for_limap(task))
+        done = run_program([python, CONTESTANTS / "limap_lines.py", source, target])
+        if done is None:
+            return []
+        with np.load(target) as found:
+            name = f"LIMAP {done['version']}"
+            return [
+                LineSet(name, task.matching, found["ends"], found["track"], done["cpu_s"]),
+                LineSet(f"{name}, refined", task.matching, found["refined_ends"], found["refined_track"]),
+            ]
+
+
+def for_limap(task: Task) -> dict[str, np.ndarray]:
+    """Return the arrays that the contestant reads."""
+    scene: Scene = task.source.scene
+    camera = scene.images.camera_idx
+    if any(scene.cameras.models[c] != "PINHOLE" for c in camera):
+        raise SystemExit(f"{task.source.name}: LIMAP needs undistorted PINHOLE images.")
+    seen, ends = scene.point_observations, [segments.ends for segments in task.segments]
+    widest = max(len(row) for row in task.neighbors)
+    neighbors = np.full((len(ends), widest), -1)
+    for i, row in enumerate(task.neighbors):
+        neighbors[i, : len(row)] = row
+    pairs = [found.pairs for found in task.matches.values()]
+    return {
+        "intrinsics": np.array([scene.cameras.params_of(c) for c in camera]),
+        "size": np.column_stack([scene.cameras.width[camera], scene.cameras.height[camera]]),
+        "pose": scene.cam_from_world,
+        "point": scene.points.xyz,
+        "observation_image": seen.image_idx,
+        "observation_point": seen.point_idx,
+        "observation_pixel": seen.pixel,
+        "segments": np.concatenate(ends),
+        "segment_start": np.cumsum([0, *map(len, ends)]),
+        "neighbors": neighbors,
+        "match_images": np.array(list(task.matches), int).reshape(-1, 2),
+        "match_pairs": np.concatenate([np.empty((0, 2), int), *pairs]),
+        "match_start": np.cumsum([0, *map(len, pairs)]),
+        "min_length": np.array(task.min_length),
+    }
+
+
+# ------------------------------------------------------------------------------------------------------------- results
+def row_of(task: Task, lines: LineSet) -> dict[str, object]:
+    """Counts, distances in the images, and agreement with the edges."""
+    many = lines.num_images >= 4
+    row: dict[str, object] = {
+        "contestant": lines.contestant,
+        "matching": lines.matching,
+        "num_lines": len(lines.ends),
+        "in_4_images": int(many.sum()),
+        "images_per_line": float(lines.num_images.mean()) if len(many) else 0.0,
+        "median_px": float(np.median(reprojection(task, lines))) if len(lines.track) else float("nan"),
+        "cpu_s": lines.seconds,
+    }
+    if task.source.edges is not None:
+        scores = score_lines(lines.ends, task.source.edges, task.source.thresholds)
+        names = ("recall_length", "precision_count", "precision_strict", "precision_length", "inlier_length")
+        row["scores"] = {name: [float(v) for v in getattr(scores, name).values()] for name in names}
+    return row
+
+
+def reprojection(task: Task, lines: LineSet) -> np.ndarray:
+    """Root mean square distance of each observation's end points from its projected line, pixels."""
+    scene = task.source.scene
+    line, image, segment = lines.track.T
+    measured = np.array([task.segments[i].ends[s] for i, s in zip(image, segment, strict=True)])
+    poses = scene.cam_from_world[image]
+    squares = np.zeros(len(line))
+    model = camera_models.model("PINHOLE")
+    local = quaternion.rotate(poses[:, None, :4], lines.ends[line]) + poses[:, None, 4:]
+    for c in np.unique(scene.images.camera_idx):
+        rows = np.flatnonzero(scene.images.camera_idx[image] == c)
+        pixel = model.project(scene.cameras.params_of(c), local[rows].reshape(-1, 3)).reshape(-1, 4)
+        projected = segment2.to_line(pixel)
+        for k in (0, 2):
+            squares[rows] += ((projected[:, :2] * measured[rows, k : k + 2]).sum(1) + projected[:, 2]) ** 2 / 2
+    return np.sqrt(squares[np.isfinite(squares)])
+
+
+def table(source: LineScene, rows: list[dict]) -> str:
+    """Return one scene's results as Markdown; thresholds one after the other within a cell."""
+    names = {"recall_length": "found %", "precision_count": "right %", "precision_strict": "wholly right %",
+             "precision_length": "right length %"}  # fmt: skip
+    scored = [name for name in names if rows and "scores" in rows[0]]
+    head = ["program", "matches", "lines", "in 4 images", "images per line", "median px", "CPU s"]
+    head += [names[name] for name in scored]
+    out = ["| " + " | ".join(head) + " |", "|---|---|" + "--:|" * (len(head) - 2)]
+    for row in rows:
+        cells = [row["contestant"], row["matching"], row["num_lines"], row["in_4_images"]]
+        cells += [f"{row['images_per_line']:.2f}", f"{row['median_px']:.3f}"]
+        cells += ["" if np.isnan(row["cpu_s"]) else f"{row['cpu_s']:.1f}"]
+        cells += [" / ".join(f"{100 * v:.1f}" for v in row["scores"][name]) for name in scored]
+        out.append("| " + " | ".join(map(str, cells)) + " |")
+    taus = ", ".join(f"{tau:.4g}" for tau in source.thresholds)
+    return f"**{source.name}**" + (f", within {taus}" if taus else "") + "\n\n" + "\n".join(out) + "\n"
+
+
+def draw(task: Task, lines: LineSet, image: int, target: Path) -> None:
+    """Draw the lines over a photograph: blue within the middle threshold of an edge, orange farther away."""
+    if task.source.edges is None or not len(lines.ends):
+        return
+    scene, limit = task.source.scene, task.source.thresholds[len(task.source.thresholds) // 2]
+    picture = cv2.cvtColor(task.source.images[image], cv2.COLOR_GRAY2BGR)
+    picture = cv2.resize(picture // 2 + 127, None, fx=2, fy=2, interpolation=cv2.INTER_AREA)
+    camera = scene.images.camera_idx[image]
+    model = camera_models.model(scene.cameras.models[camera])
+    near = Distances(Geometry(segments=task.source.edges), limit / 4, 0.0, 2 * limit)
+    for ends in lines.ends[np.unique(lines.track[lines.track[:, 1] == image, 0])]:
+        places, _ = places_on(ends[None], np.array([40]))
+        right = near.of(places) <= limit
+        local = quaternion.rotate(scene.cam_from_world[image, :4], places) + scene.cam_from_world[image, 4:]
+        pixel = np.round(2 * model.project(scene.cameras.params_of(camera), local) * 16).astype(int)
+        for a, b, good in zip(pixel[:-1], pixel[1:], right[1:], strict=True):
+            colour = (178, 114, 0) if good else (0, 94, 213)
+            cv2.line(picture, tuple(map(int, a)), tuple(map(int, b)), colour, 2, cv2.LINE_AA, 4)
+    cv2.imwrite(str(target), picture)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", help=", ".join(SCENES))
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the data sets")
+    parser.add_argument("--python-limap", help="Python that has pylimap 2; without it groma runs alone")
+    parser.add_argument("--matching", choices=MATCHING, help="one kind of matches; default: both")
+    arguments = parser.parse_args()
+    if unknown := {*arguments.scenes} - {*SCENES}:
+        parser.error(f"no such scene: {', '.join(sorted(unknown))}")
+    RESULTS.mkdir(exist_ok=True)
+    CACHE.mkdir(parents=True, exist_ok=True)
+    texts = []
+    for name in arguments.scenes or SCENES:
+        try:
+            source = SCENES[name](arguments.data)
+        except (OSError, ValueError) as error:
+            print(f"{name} is left out: {error}")
+            continue
+        rows = []
+        for matching in [arguments.matching] if arguments.matching else MATCHING:
+            task = prepare(source, matching)
+            found = run_groma(task)
+            found += run_limap(task, arguments.python_limap) if arguments.python_limap else []
+            rows += [row_of(task, lines) for lines in found]
+            for lines in found:
+                draw(task, lines, len(source.images) // 2, RESULTS / f"lines-{name}-{matching}-{lines.contestant}.png")
+        result = {"scene": name, "thresholds": source.thresholds, "machine": machine(), "rows": rows}
+        (RESULTS / f"lines-{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+        texts.append(table(source, rows))
+        print("\n" + texts[-1], flush=True)
+    return 0 if texts else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

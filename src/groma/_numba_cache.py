@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where compiled functions lie on disk, and when they are valid.
+
+**Where.** The first of these that can be written: the folder in ``NUMBA_CACHE_DIR``; ``__pycache__`` beside the
+sources; Numba's folder of the user (``~/.cache/numba`` on Linux), for installations that are read-only. Where none can
+be written, functions are compiled in every process; nothing fails.
+
+**When.** One file per function and argument types. It opens with a digest of all that it depends on: Numba's version,
+the processor and its instructions, the argument types, the function, and every file of the package that holds compiled
+code. The last is needed because kernels are inlined into their callers: Numba's own cache compares the file of the
+caller alone and would return old numbers after an edit or an upgrade. A file whose digest or checksum is wrong is
+compiled again and replaced, so that a cache shared by several versions or processors is never wrong.
+
+**Several processes.** Files are written under another name and moved into place, so a reader finds a whole file or
+none. There is no index: Numba's own keeps one per function, and two processes that compile the same function for
+different types at the same moment can leave an entry there that names the other one's code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import sys
+import threading
+import zlib
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.registry import cpu_target
+from numba.core.serialize import dumps
+
+#: A file that contains one of these holds compiled code, or chooses it.
+_MARKS = (b"_numba import", b"njit(", b"numba.extending", b"llvmlite")
+_SUFFIX = ".nbc"
+_DIGEST, _CHECKSUM = 64, 8
+
+
+@lru_cache(maxsize=1)
+def source_stamp() -> str:
+    """Return a digest of all files of the package that hold compiled code."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        content = path.read_bytes()
+        if any(mark in content for mark in _MARKS):
+            digest.update(path.name.encode() + b"\0" + content)
+    return digest.hexdigest()
+
+
+@dataclass
+class Counts:
+    """What happened in this process so far."""
+
+    #: Functions (for given argument types) that were compiled and written to disk.
+    compiled: int = 0
+    #: Functions that were found on disk.
+    loaded: int = 0
+    #: Functions that were compiled and could not be written.
+    unsaved: int = 0
+
+
+counts = Counts()
+#: Files that were written or found.
+_used: set[Path] = set()
+_lock = threading.Lock()
+
+
+class _Files:
+    """The files of one function; takes the place of Numba's index and data files."""
+
+    def __init__(self, folder: str, stem: str) -> None:
+        self._folder, self._stem = Path(folder), stem
+
+    def flush(self) -> None:
+        """Remove all files of the function."""
+        for path in self._folder.glob(f"{self._stem}.*{_SUFFIX}"):
+            path.unlink(missing_ok=True)
+
+    def load(self, key: tuple) -> Any:
+        """Return what was compiled for a key, or None."""
+        path = self._path(key)
+        try:
+            content = path.read_bytes()
+        except OSError:
+            return None
+        payload = content[_DIGEST + _CHECKSUM :]
+        if content[: _DIGEST + _CHECKSUM] != _head(key, payload):
+            return None
+        with _lock:
+            counts.loaded += 1
+            _used.add(path)
+        return pickle.loads(payload)
+
+    def save(self, key: tuple, data: Any) -> None:
+        """Write what was compiled for a key."""
+        path, payload = self._path(key), dumps(data)
+        draft = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}.tmp")
+        try:
+            draft.write_bytes(_head(key, payload) + payload)
+            os.replace(draft, path)
+        except OSError:
+            draft.unlink(missing_ok=True)
+            raise
+        with _lock:
+            counts.compiled += 1
+            _used.add(path)
+
+    def _path(self, key: tuple) -> Path:
+        """Name the file by argument types and processor only, so that the same function replaces its older self."""
+        return self._folder / f"{self._stem}.{_digest(key[:2])[:16]}{_SUFFIX}"
+
+
+def _digest(content: object) -> str:
+    return hashlib.sha256(repr(content).encode()).hexdigest()
+
+
+def _head(key: tuple, payload: bytes) -> bytes:
+    depends_on = (numba.__version__, sys.version_info[:3], source_stamp(), key)
+    return f"{_digest(depends_on)}{zlib.crc32(payload):08x}".encode()
+
+
+def environment_digest() -> str:
+    """Return a digest of all that compiled functions depend on besides themselves and their arguments."""
+    target: Any = cpu_target.target_context
+    processor = target.codegen().magic_tuple()
+    return _digest((numba.__version__, sys.version_info[:3], source_stamp(), processor))
+
+
+class _Cache(FunctionCache):
+    _impl_class = CompileResultCacheImpl
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        python = f"py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, 'abiflags', '')}"
+        stem = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}-{python}"
+        self._cache_file = _Files(self.cache_path, stem.replace("<", "").replace(">", ""))
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Save; a full disk, or a folder that became read-only, costs time in the next process and nothing else."""
+        try:
+            super().save_overload(sig, data)
+        except OSError:
+            with _lock:
+                counts.unsaved += 1
+
+
+def keep_on_disk(dispatcher: Any) -> Any:
+    """Let a compiled function be kept on disk where some folder can be written; return it."""
+    if hasattr(dispatcher, "py_func"):  # a plain function without the compiler
+        try:
+            dispatcher._cache = _Cache(dispatcher.py_func)
+        except RuntimeError:  # Numba found no folder that can be written
+            pass
+    return dispatcher
+
+
+def _probe() -> None:
+    """Stand for any compiled function of the package."""
+
+
+def folder() -> Path | None:
+    """Return the folder of compiled functions of this file's own package; None where none can be written.
+
+    Those of sub-packages lie in folders of theirs, by the same rule.
+    """
+    try:
+        return Path(_Cache(_probe).cache_path)
+    except RuntimeError:
+        return None
+
+
+def used_files() -> list[Path]:
+    """Return the files that were written or found by this process."""
+    with _lock:
+        return sorted(_used)

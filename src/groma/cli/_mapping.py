@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Mapping as a command does it: run the stages, write the folder of results, say what came out.
+
+NumPy, Numba and what needs them are imported inside the function, after everything that can be refused was refused.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from groma.cli import _output
+from groma.cli.main import INTERRUPTED
+
+if TYPE_CHECKING:
+    from groma.cli._console import Console
+    from groma.frontend.external import ExternalMatches
+    from groma.pipelines.map import MapOptions, MapResult
+    from groma.scene import Scene
+
+
+def map_and_write(
+    console: Console,
+    images: Path,
+    output: Path,
+    model: Scene | None,
+    options: MapOptions,
+    force: bool,
+    title: str,
+    *,
+    line_matches: ExternalMatches | None = None,
+    judge: Callable[[MapResult], dict[str, Any]] | None = None,
+    explain: bool = True,
+) -> dict[str, Any]:
+    """Map a folder of photographs, write all results to ``output``, say what came out, and return the numbers.
+
+    Parameters
+    ----------
+    console : Console
+        Where progress and results are said.
+    images, output : Path
+        Folder of photographs, and the folder to write.
+    model : Scene, optional
+        Poses, cameras and points; reconstructed from the images if None.
+    options : MapOptions
+        Options of the pipeline.
+    force : bool
+        Replace ``output``.
+    title : str
+        Heading of the page.
+    line_matches : ExternalMatches, optional
+        Segments and matches from elsewhere.
+    judge : callable, optional
+        Given the result, returns further numbers for the summary.
+    explain : bool
+        Say what became of the segments; otherwise only with --verbose.
+    """
+    from groma.cli._interrupt import interruptible
+    from groma.io import write_geometry, write_scene
+    from groma.pipelines._stages import has_stages, remove_stages
+    from groma.pipelines.map import map_images
+    from groma.viz.report import write_report
+
+    fresh = console.announce_compilation()
+    work = output.with_name(output.name + ".work")
+    if has_stages(work):
+        console.say(f"Going on from the finished stages in {work}, as far as they fit.")
+    try:
+        with interruptible() as interruption, console.stages() as stages:
+            result = map_images(images, work, model, options, interruption.checking(stages), line_matches)
+    except KeyboardInterrupt:
+        print(
+            f"groma: interrupted; finished stages are kept in {work}: the same command goes on from there.",
+            file=sys.stderr,
+            flush=True,
+        )
+        raise typer.Exit(INTERRUPTED) from None
+    scene = result.scene
+    numbers = _numbers(result) | (judge(result) if judge is not None else {})
+    with _output.atomic_output(output, force, work) as draft:
+        write_scene(scene, draft, format="colmap")
+        write_scene(scene, draft / "scene.npz")
+        write_geometry(scene, draft)
+        write_report(
+            draft / "report.html",
+            result.before,
+            scene,
+            result.report,
+            images,
+            title,
+            fates=result.fates,
+            explanation=result.explanation,
+            warnings=result.warnings,
+        )
+        _output.write_json(str(draft / "summary.json"), numbers)
+    remove_stages(work)
+    for line in _sentences(result):
+        console.say(line)
+    (console.say if explain else console.detail)(result.explanation)
+    for sentence in result.warnings:
+        console.warn(sentence)
+    console.detail(f"with compilation: {fresh}")
+    return numbers
+
+
+def _numbers(result: MapResult) -> dict[str, Any]:
+    scene = result.scene
+    return {
+        **result.report.to_dict(),
+        "num_images": scene.num_images,
+        "num_points": scene.num_points,
+        "num_lines": scene.num_lines,
+        "num_planes": scene.num_planes,
+        "num_directions": scene.num_directions,
+        "sigma_px": result.sigma_px,
+        "segments": result.fates,
+        "explanation": result.explanation,
+        "warnings": list(result.warnings),
+    }
+
+
+def _sentences(result: MapResult) -> list[str]:
+    scene = result.scene
+    counts = (
+        f"{scene.num_images} images, {scene.num_points:,} points, {scene.num_lines:,} lines, "
+        f"{scene.num_planes} planes, {scene.num_directions} directions"
+    )
+    lines = [counts]
+    for kind, rmse in result.report.rmse_px.items():
+        lines.append(f"  {kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms, outliers included)")
+    if any(rmse["after"] > rmse["before"] for rmse in result.report.rmse_px.values()):
+        lines.append(
+            "  The rms counts wrong matches in full and may grow while the robust cost, which doubts them, falls."
+        )
+    return lines

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma track``: follow a camera through a sequence, and map points, lines and planes on the way."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+
+import typer
+
+from groma.cli import _options
+
+if TYPE_CHECKING:
+    from groma.cli._console import Console
+    from groma.io.sequences.frame import Sequence
+    from groma.tracking import Tracker, TrackResult
+
+
+def track(
+    sequence: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SEQUENCE", help="Folder of TUM RGB-D, 7-Scenes, KITTI, EuRoC or plain images; or a video."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")],
+    camera: Annotated[
+        str | None,
+        typer.Option("--camera", metavar="CAMERA", help="File or numbers: fx fy cx cy [k1 k2 p1 p2 [k3]]."),
+    ] = None,
+    kind: Annotated[
+        str | None, typer.Option("--kind", metavar="KIND", help="rgbd, stereo or mono; told by the files otherwise.")
+    ] = None,
+    points: Annotated[bool, typer.Option("--points/--no-points", help="Follow points.")] = True,
+    lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Follow line segments.")] = True,
+    planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Find planes in depth images.")] = True,
+    loops: Annotated[bool, typer.Option("--loops/--no-loops", help="Close loops.")] = True,
+    max_frames: Annotated[
+        int | None, typer.Option("--max-frames", min=1, metavar="N", help="Stop after N frames.")
+    ] = None,
+    stride: Annotated[int, typer.Option("--stride", min=1, metavar="N", help="Take every N-th frame.")] = 1,
+    max_depth: Annotated[
+        float, typer.Option("--max-depth", min=0.1, metavar="M", help="Ignore depths beyond, metres.")
+    ] = 6.0,
+    depth_scale: Annotated[
+        float | None, typer.Option("--depth-scale", metavar="S", help="Depth in files per metre, e.g. 5000.")
+    ] = None,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    seed: _options.Seed = 0,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Track a camera through a sequence.
+
+    OUT then holds trajectory.txt (TUM format), the keyframes as a COLMAP model with lines and planes beside it
+    (structures/), scene.npz, summary.json and report.html. While it runs, OUT.work holds the keyframes that are
+    finished; Ctrl-C ends the track early and writes what there is.
+    """
+    from groma.cli import _output
+    from groma.cli._console import Console
+    from groma.errors import InputError
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_output(output, force)
+    _output.check_json(json_target, force)
+    if kind not in (None, "rgbd", "stereo", "mono"):
+        raise InputError(f"--kind must be rgbd, stereo or mono; got {kind!r}.")
+
+    import shutil
+
+    from groma.io.sequences import open_sequence
+    from groma.tracking import Tracker, TrackOptions
+
+    frames = open_sequence(
+        sequence,
+        camera=camera,
+        depth_scale=depth_scale,
+        stride=stride,
+        max_frames=max_frames,
+        kind=cast("Literal['rgbd', 'stereo', 'mono'] | None", kind),
+    )
+    options = TrackOptions(points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth, seed=seed)
+    tracker = Tracker(frames.camera, options)
+    console.announce_compilation()
+    work = output.with_name(output.name + ".work")
+    interrupted = _run(tracker, frames, work, console)
+    result = tracker.finish()
+    if not len(result.trajectory):
+        raise InputError(
+            f"No frame of {sequence} could be tracked: {' '.join([*frames.warnings, *result.warnings])} "
+            "Check the camera and the depth scale."
+        )
+    numbers = {"kind": frames.kind, "interrupted": interrupted, **result.statistics, "sequence": str(sequence)}
+    numbers["warnings"] = [*frames.warnings, *result.warnings]
+    scores = _scores(result, frames)
+    if scores:
+        numbers["reference"] = scores
+    with _output.atomic_output(output, force) as draft:
+        _write(result, draft, f"Track of {sequence.absolute().name}")
+        _output.write_json(str(draft / "summary.json"), numbers)
+    shutil.rmtree(work, ignore_errors=True)
+    _tell(console, result, scores, numbers["warnings"])
+    console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
+    _output.write_json(json_target, numbers, force)
+
+
+def _run(tracker: "Tracker", frames: "Sequence", work: Path, console: "Console") -> bool:
+    """Track all frames; return whether Ctrl-C ended it early."""
+    from groma.tracking.journal import Journal
+
+    journal = Journal(work)
+    total, done = frames.num_frames or 0, 0
+    try:
+        with console.stages() as progress:
+            for frame in frames:
+                tracked = tracker.process(frame)
+                done += 1
+                progress("tracking frame", done, total)
+                if tracked.status in ("lost", "skipped") or tracked.weak:
+                    why = tracked.reason or ("held by the prior: " + ", ".join(tracked.weak) if tracked.weak else "")
+                    console.detail(f"frame {frame.name or done}: {tracked.status} {why}".rstrip())
+                if tracked.keyframe:
+                    journal.keyframe(tracker, tracked)
+    except KeyboardInterrupt:
+        console.warn("interrupted; what was tracked so far is written.")
+        return True
+    return False
+
+
+def _write(result: "TrackResult", draft: Path, title: str) -> None:
+    from groma.io import write_scene
+    from groma.io.trajectories import write_tum
+    from groma.viz.report import write_report
+
+    write_scene(result.scene, draft, format="colmap")
+    write_scene(result.scene, draft / "scene.npz")
+    write_tum(result.trajectory, draft / "trajectory.txt")
+    write_report(draft / "report.html", None, result.scene, None, None, title)
+
+
+def _scores(result: "TrackResult", frames: "Sequence") -> dict[str, Any]:
+    """Error against the reference of the sequence, if it has one."""
+    from groma.errors import GromaError
+    from groma.evaluation.trajectory import score_trajectory
+
+    if frames.reference is None or len(result.trajectory) < 3:
+        return {}
+    align = "sim3" if frames.kind == "mono" else "se3"
+    try:
+        return score_trajectory(result.trajectory, frames.reference, align=align, max_time_difference=0.02).to_dict()
+    except GromaError as error:
+        return {"error": str(error)}
+
+
+def _tell(console: "Console", result: "TrackResult", scores: dict[str, Any], warnings: list[str]) -> None:
+    statistics = result.statistics
+    statuses = ", ".join(f"{count} {status}" for status, count in sorted(statistics["frames"].items()))
+    console.say(
+        f"Frames: {statuses}; {statistics['keyframes']} keyframes, {statistics['points']:,} points, "
+        f"{statistics['lines']:,} lines, {statistics['planes']} planes, {statistics['loops']} loops"
+    )
+    total = statistics["milliseconds"].get("total")
+    if total:
+        console.say(f"Time per frame: median {total['median']:.1f} ms, 95 % below {total['p95']:.1f} ms")
+    if "ate_rmse" in scores:
+        drift = scores["drift_percent"]
+        console.say(
+            f"Against the reference ({scores['alignment']}): position error {scores['ate_rmse']:.4f} (root mean "
+            f"square, units of the reference) over {scores['path_length']:.2f}"
+            + (f"; drift {drift:.2f} %, {scores['drift_deg_per_metre']:.4f} deg per unit" if drift is not None else "")
+        )
+    for sentence in warnings:
+        console.warn(sentence)

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Image sequences on disk: one layout per module; :func:`open_sequence` tells them apart."""
+
+from __future__ import annotations
+
+import os
+
+from groma.errors import InputError
+from groma.io._reading import existing
+from groma.io.sequences._calibration import CameraLike, calibration_of
+from groma.io.sequences._reader import Selection
+from groma.io.sequences.euroc import euroc_root, open_euroc
+from groma.io.sequences.frame import Frame, Kind, Sequence, SequenceCamera
+from groma.io.sequences.images import VIDEOS, image_files, open_images, open_video
+from groma.io.sequences.kitti import is_kitti, open_kitti
+from groma.io.sequences.seven_scenes import open_seven_scenes, seven_scenes_root
+from groma.io.sequences.tum_rgbd import is_tum_rgbd, open_tum_rgbd
+
+
+def open_sequence(
+    path: str | os.PathLike[str],
+    *,
+    camera: CameraLike | None = None,
+    depth_scale: float | None = None,
+    stride: int = 1,
+    max_frames: int | None = None,
+    kind: Kind | None = None,
+) -> Sequence:
+    """Open an image sequence; its layout is told by what lies in the folder. Frames are read when they are asked for.
+
+    Parameters
+    ----------
+    path : path
+        A folder of TUM RGB-D (``rgb.txt``), 7-Scenes (``frame-000000.color.png``), KITTI odometry (``image_0``) or
+        EuRoC (``mav0``), a folder of images, or a video file.
+    camera : SequenceCamera, numbers, str or path, optional
+        The camera that took the images, in place of what the folder says: ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` as OpenCV
+        counts (the first pixel's centre is (0, 0)), a line of COLMAP's ``cameras.txt`` (the first pixel's centre is
+        (0.5, 0.5)), or a file that holds one of these or a 3x3 matrix. Distorted images are undistorted.
+    depth_scale : float, optional
+        Depth in files per metre, in place of what the layout says (TUM 5000, 7-Scenes 1000).
+    stride : int
+        Give every n-th frame.
+    max_frames : int, optional
+        Give at most so many.
+    kind : str, optional
+        ``mono`` leaves depth or right images out; other kinds must be what the files hold.
+
+    Returns
+    -------
+    Sequence
+        Iterate over it for frames; the camera is a pinhole, in the pixel convention of groma.
+
+    Raises
+    ------
+    InputError
+        If there is nothing at ``path``, the layout is not known, or no camera is known.
+    FileFormatError
+        If a list, a calibration or a reference in the folder is damaged. Damaged images are skipped with a warning.
+    """
+    place = existing(path)
+    selection = Selection(stride, max_frames, kind)
+    if depth_scale is not None and not 0 < depth_scale < float("inf"):
+        raise InputError(f"depth_scale must be positive (depth in files per metre); got {depth_scale}.")
+    calibration = None if camera is None else calibration_of(camera)
+    if place.is_file() and place.suffix.lower() in VIDEOS:
+        return open_video(place, calibration, selection)
+    if not place.is_dir():
+        raise InputError(f"{place} is neither a folder nor a video ({', '.join(VIDEOS)}). Pass the sequence's folder.")
+    if is_tum_rgbd(place):
+        return open_tum_rgbd(place, calibration, depth_scale, selection)
+    if (root := euroc_root(place)) is not None:
+        return open_euroc(root, calibration, selection)
+    if is_kitti(place):
+        return open_kitti(place, calibration, selection)
+    if (root := seven_scenes_root(place)) is not None:
+        return open_seven_scenes(root, calibration, depth_scale, selection)
+    if image_files(place):
+        return open_images(place, calibration, selection)
+    raise InputError(
+        f"{place} is no sequence that groma knows: expected rgb.txt or associations.txt (TUM), mav0/cam0 (EuRoC), "
+        "image_0 (KITTI), frame-000000.color.png (7-Scenes), or images."
+    )
+
+
+__all__ = ["CameraLike", "Frame", "Kind", "Sequence", "SequenceCamera", "open_sequence"]

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Cameras of sequences: what a file or an option says, and the maps that take distortion away.
+
+Files of calibrations count pixels from the centre of the first pixel, COLMAP from its corner; groma counts as COLMAP
+does. Half a pixel is therefore added to principal points, except those in lines of COLMAP.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence as Numbers
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from groma import cameras
+from groma._typing import FloatArray
+from groma.errors import FileFormatError, GromaError, InputError
+from groma.io._reading import reading
+from groma.io.sequences.frame import SequenceCamera
+
+#: What callers may pass as a camera: a value, numbers, a line, or the name of a file.
+CameraLike = SequenceCamera | Numbers[float] | str | os.PathLike[str]
+#: Names under which a calibration may lie in the folder of a sequence.
+FILE_NAMES = ("cameras.txt", "camera.txt", "calibration.txt", "calib.txt", "intrinsics.txt", "camera-intrinsics.txt")
+
+_HELP = (
+    "expected 'fx fy cx cy', 'fx fy cx cy k1 k2 p1 p2 [k3]', a 3x3 matrix, or a line of COLMAP's cameras.txt "
+    "('1 PINHOLE 640 480 fx fy cx cy')"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The camera as it took the images, in the pixel convention of groma."""
+
+    #: Name of a camera model.
+    model: str
+    #: (k,) its parameters.
+    params: FloatArray
+    #: (width, height) in pixels, or None if not said.
+    size: tuple[int, int] | None = None
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether lines stay straight."""
+        return self.model in ("PINHOLE", "SIMPLE_PINHOLE")
+
+    def pinhole(self) -> FloatArray:
+        """(4,) fx, fy, cx, cy."""
+        model = cameras.model(self.model)
+        focal, center = self.params[list(model.focal_indices)], self.params[list(model.principal_point_indices)]
+        return np.array([focal[0], focal[-1], *center], float)
+
+
+@dataclass(frozen=True, eq=False)
+class Rectification:
+    """Maps from the images that frames hold to the images in files."""
+
+    #: Fixed-point maps of OpenCV for grey values, and (H, W, 2) the nearest pixels for depth.
+    gray_maps: tuple[npt.NDArray[np.int16], npt.NDArray[np.uint16]]
+    nearest: npt.NDArray[np.int16]
+
+    def gray(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """Grey image with linear interpolation; black where the file has no pixel."""
+        return np.asarray(cv2.remap(image, *self.gray_maps, interpolation=cv2.INTER_LINEAR), np.uint8)
+
+    def depth(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Depth of the nearest pixel; 0 where the file has none."""
+        empty = np.zeros(self.nearest.shape[:2], np.uint16)
+        return np.asarray(cv2.remap(image, self.nearest, empty, interpolation=cv2.INTER_NEAREST), np.float32)
+
+
+def rectification(
+    calibration: Calibration, target: FloatArray, size: tuple[int, int], camera_from_target: FloatArray | None = None
+) -> Rectification:
+    """Return the maps from a pinhole camera (4,) of the given size to a calibrated, possibly turned camera."""
+    width, height = size
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    directions = np.stack([(u - target[2]) / target[0], (v - target[3]) / target[1], np.ones_like(u)], -1)
+    rays: FloatArray = directions.reshape(-1, 3).astype(np.float64)
+    if camera_from_target is not None:
+        rays = rays @ camera_from_target.T
+    pixels = cameras.model(calibration.model).project(calibration.params, rays)
+    pixels[(rays[:, 2] <= 0) | ~np.isfinite(pixels).all(1)] = -100.0
+    # OpenCV counts from the centre of the first pixel.
+    pixels = np.clip(pixels - 0.5, -100.0, 16000.0).reshape(height, width, 2).astype(np.float32)
+    fixed, fraction = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
+    nearest = np.round(pixels).astype(np.int16)
+    return Rectification((np.asarray(fixed, np.int16), np.asarray(fraction, np.uint16)), nearest)
+
+
+def calibration_of(camera: CameraLike) -> Calibration:
+    """Return the calibration that an option means.
+
+    Raises
+    ------
+    InputError
+        If it is neither numbers, nor a line, nor a readable file that holds one.
+    """
+    if isinstance(camera, SequenceCamera):
+        return _checked(camera.model, np.asarray(camera.params, float), (camera.width, camera.height), "camera")
+    if not isinstance(camera, (str, os.PathLike)):
+        return _from_numbers(np.asarray(camera, float), "camera")
+    text = os.fspath(camera)
+    if isinstance(camera, str) and not Path(camera).is_file() and len(camera.split()) >= 4:
+        return _from_text(camera, "camera")
+    return read_calibration(Path(text))
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read a calibration from a file in one of the accepted forms."""
+    with reading(path, "camera file"):
+        return _from_text(path.read_text(encoding="utf-8"), str(path))
+
+
+def find_calibration(folder: Path) -> Calibration | None:
+    """Return the calibration that lies in a folder, or None."""
+    for name in FILE_NAMES:
+        if (folder / name).is_file():
+            return read_calibration(folder / name)
+    return None
+
+
+def from_opencv(numbers: npt.ArrayLike, size: tuple[int, int] | None = None) -> Calibration:
+    """Return the calibration for fx, fy, cx, cy and none, four or five coefficients k1, k2, p1, p2, k3 of OpenCV."""
+    calibration = _from_numbers(np.asarray(numbers, float), "camera")
+    return Calibration(calibration.model, calibration.params, size)
+
+
+def _from_text(text: str, source: str) -> Calibration:
+    lines = [line.partition("#")[0].replace(",", " ").split() for line in text.splitlines()]
+    lines = [words for words in lines if words]
+    if not lines:
+        raise FileFormatError(f"{source} holds no camera; {_HELP}.")
+    for skip in (0, 1):  # with or without the number of the camera
+        words = lines[0][skip:]
+        if len(words) > 3 and words[0][:1].isalpha():
+            if len(lines) > 1:
+                raise FileFormatError(f"{source} holds {len(lines)} cameras; expected one. Remove the others.")
+            size, params = (int(words[1]), int(words[2])), np.array([float(word) for word in words[3:]])
+            return _checked(words[0], params, size, source)
+    try:
+        numbers = np.array([float(word) for words in lines for word in words])
+    except ValueError as error:
+        raise FileFormatError(f"{source} is not a camera ({error}); {_HELP}.") from error
+    if len(lines) == 3 and len(numbers) == 9:
+        return _from_numbers(numbers[[0, 4, 2, 5]], source)
+    return _from_numbers(numbers, source)
+
+
+def _from_numbers(numbers: FloatArray, source: str) -> Calibration:
+    if numbers.ndim != 1 or len(numbers) not in (4, 8, 9):
+        raise InputError(f"{source} holds {numbers.size} numbers; {_HELP}.")
+    params = numbers + np.array([0, 0, 0.5, 0.5, *[0] * (len(numbers) - 4)])
+    if not params[4:].any():
+        return _checked("PINHOLE", params[:4], None, source)
+    if len(params) == 8 or params[8] == 0.0:
+        return _checked("OPENCV", params[:8], None, source)
+    return _checked("FULL_OPENCV", np.append(params, np.zeros(3)), None, source)
+
+
+def _checked(model: str, params: FloatArray, size: tuple[int, int] | None, source: str) -> Calibration:
+    try:
+        known = cameras.model(model)
+    except GromaError as error:
+        raise InputError(f"{source}: {error}") from error
+    if params.shape != (known.num_parameters,) or not np.isfinite(params).all():
+        raise InputError(
+            f"{source}: {model} takes {known.num_parameters} finite numbers ({', '.join(known.parameter_names)}); "
+            f"got {params.tolist()}."
+        )
+    if not (params[list(known.focal_indices)] > 0).all():
+        raise InputError(f"{source}: focal lengths must be positive; got {params.tolist()}.")
+    return Calibration(model, params, size)
+
+
+__all__ = [
+    "Calibration",
+    "CameraLike",
+    "Rectification",
+    "calibration_of",
+    "find_calibration",
+    "from_opencv",
+    "read_calibration",
+    "rectification",
+]

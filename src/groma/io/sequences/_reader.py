@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Frames from image files, read ahead of time by one thread.
+
+A layout makes a list of entries; the reader opens their files while the frames before them are worked on. What cannot
+be read is left out, and said in ``warnings``: a frame without its image is skipped, one without its depth or right
+image comes without.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from groma.errors import InputError
+from groma.io.sequences._calibration import Calibration, Rectification, rectification
+from groma.io.sequences.frame import Frame, Kind, SequenceCamera
+from groma.io.trajectories import Trajectory
+
+#: Frames that are read ahead.
+AHEAD = 2
+
+
+@dataclass(frozen=True)
+class Entry:
+    """The files of one frame."""
+
+    timestamp: float
+    gray: Path
+    depth: Path | None = None
+    right: Path | None = None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which frames of a sequence are given."""
+
+    #: Every n-th frame.
+    stride: int = 1
+    #: At most so many.
+    max_frames: int | None = None
+    #: Leave out what this kind does not hold.
+    kind: Kind | None = None
+
+    def __post_init__(self) -> None:
+        if self.stride < 1 or (self.max_frames is not None and self.max_frames < 1):
+            raise InputError(f"stride and max_frames must be at least 1; got {self.stride} and {self.max_frames}.")
+        if self.kind not in (None, "rgbd", "stereo", "mono"):
+            raise InputError(f"kind must be 'rgbd', 'stereo' or 'mono'; got {self.kind!r}.")
+
+    def kind_of(self, available: Kind) -> Kind:
+        """Return the kind to give where ``available`` is what the files hold."""
+        if self.kind not in (None, "mono", available):
+            raise InputError(f"The sequence is {available!r}, not {self.kind!r}. Pass kind={available!r} or 'mono'.")
+        return self.kind or available
+
+    def of(self, entries: list[Entry], warnings: list[str]) -> list[Entry]:
+        """Put entries in order of time, without repeated times, and choose."""
+        ordered = sorted(entries, key=lambda entry: entry.timestamp)
+        if any(a is not b for a, b in zip(ordered, entries, strict=True)):
+            warnings.append("The times of the frames were not in order; the frames are given in order of time.")
+        unique = ordered[:1]
+        for entry in ordered[1:]:
+            if entry.timestamp > unique[-1].timestamp:
+                unique.append(entry)
+            else:
+                warnings.append(f"{entry.gray.name} has the time of {unique[-1].gray.name} and is left out.")
+        return unique[:: self.stride][: self.max_frames]
+
+
+@dataclass(frozen=True, eq=False)
+class Preparation:
+    """What happens to images after they are read."""
+
+    gray: Rectification | None = None
+    right: Rectification | None = None
+    #: Depth in files per metre.
+    depth_scale: float = 1000.0
+    #: Depth (metres) from the depth camera to the camera that took ``gray``.
+    register: Callable[[npt.NDArray[np.float32]], npt.NDArray[np.float32]] | None = None
+
+
+class FileSequence:
+    """A :class:`~groma.io.sequences.frame.Sequence` of image files."""
+
+    def __init__(
+        self,
+        kind: Kind,
+        entries: list[Entry],
+        camera: SequenceCamera,
+        preparation: Preparation,
+        file_size: tuple[int, int],
+        reference: Trajectory | None,
+        warnings: list[str],
+    ) -> None:
+        self.kind: Kind = kind
+        self.camera = camera
+        self.reference = reference
+        self.warnings = warnings
+        self.num_frames: int | None = len(entries)
+        self._entries = entries
+        self._preparation = preparation
+        self._file_size = file_size
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame, remarks in read_ahead(self._load, self._entries):
+            self.warnings.extend(remark for remark in remarks if remark not in self.warnings)
+            if frame is not None:
+                yield frame
+
+    def _load(self, entry: Entry) -> tuple[Frame | None, list[str]]:
+        remarks: list[str] = []
+        preparation, width, height = self._preparation, *self._file_size
+        gray = _image(entry.gray, (height, width), remarks, "the frame is skipped")
+        if gray is None:
+            return None, remarks
+        if preparation.gray is not None:
+            gray = preparation.gray.gray(gray)
+        depth = right = None
+        if self.kind == "rgbd":
+            depth = self._depth(entry.depth, entry.gray.name, remarks)
+        if self.kind == "stereo" and entry.right is None:
+            remarks.append(f"{entry.gray.name} has no right image.")
+        elif self.kind == "stereo" and entry.right is not None:
+            right = _image(entry.right, (height, width), remarks, "the frame comes without")
+            if right is not None and preparation.right is not None:
+                right = preparation.right.gray(right)
+        return Frame(entry.timestamp, gray, depth, right, entry.gray.name), remarks
+
+    def _depth(self, path: Path | None, name: str, remarks: list[str]) -> npt.NDArray[np.float32] | None:
+        if path is None:
+            remarks.append(f"{name} has no depth image.")
+            return None
+        raw = _decode(path, cv2.IMREAD_UNCHANGED)
+        width, height = self._file_size
+        if raw is None or raw.ndim != 2 or raw.shape != (height, width):
+            what = "cannot be read" if raw is None else f"is {raw.shape[1]}x{raw.shape[0]}, not {width}x{height} grey"
+            remarks.append(f"{path.name} {what}; the frame comes without.")
+            return None
+        depth = raw.astype(np.float32) * np.float32(1.0 / self._preparation.depth_scale)
+        # 65535 stands for no value in some data; NaN in images of floats.
+        bad = raw == 65535 if raw.dtype == np.uint16 else ~(np.isfinite(depth) & (depth > 0))
+        depth[bad] = 0.0
+        if self._preparation.register is not None:
+            depth = self._preparation.register(depth)
+        elif self._preparation.gray is not None:
+            depth = self._preparation.gray.depth(depth)
+        return depth
+
+
+def read_ahead(load: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+    """Yield ``load(item)`` in order, computed by another thread up to ``AHEAD`` items before they are asked for."""
+    with ThreadPoolExecutor(1, thread_name_prefix="groma-frames") as pool:
+        waiting: deque[Future[Any]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(load, item))
+                if len(waiting) > AHEAD:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def file_size(entries: list[Entry], calibration: Calibration) -> tuple[int, int]:
+    """Return width and height that the first readable image has, and refuse a calibration of another size."""
+    for entry in entries:
+        image = _decode(entry.gray, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is not None:
+            size = (image.shape[1], image.shape[0])
+            if calibration.size not in (None, (0, 0), size):
+                raise InputError(
+                    f"The camera is for images of {calibration.size}, but {entry.gray} has {size}. Pass the camera "
+                    "of these images, or scale its focal lengths and principal point."
+                )
+            return size
+    raise InputError(f"None of the {len(entries)} images can be read, such as {entries[0].gray if entries else 'any'}.")
+
+
+def simple_sequence(
+    kind: Kind,
+    entries: list[Entry],
+    calibration: Calibration,
+    reference: Trajectory | None,
+    warnings: list[str],
+    preparation: Preparation | None = None,
+    baseline: float | None = None,
+) -> FileSequence:
+    """Return a sequence of one camera (or a rectified pair) whose images are undistorted where necessary."""
+    size = file_size(entries, calibration)
+    preparation = preparation or Preparation()
+    target = calibration.pinhole()
+    if not calibration.is_pinhole:
+        preparation = replace(preparation, gray=rectification(calibration, target, size))
+    camera = SequenceCamera("PINHOLE", target, *size, baseline if kind == "stereo" else None)
+    return FileSequence(kind, entries, camera, preparation, size, reference, warnings)
+
+
+def _decode(path: Path, flags: int) -> npt.NDArray[Any] | None:
+    """Return the image in a file, or None."""
+    try:
+        data = np.fromfile(path, np.uint8)
+        return cv2.imdecode(data, flags) if len(data) else None
+    except (OSError, cv2.error):
+        return None
+
+
+def _image(path: Path, shape: tuple[int, int], remarks: list[str], otherwise: str) -> npt.NDArray[np.uint8] | None:
+    image = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        remarks.append(f"{path.name} cannot be read; {otherwise}.")
+        return None
+    if image.shape != shape:
+        remarks.append(
+            f"{path.name} is {image.shape[1]}x{image.shape[0]}, not {shape[1]}x{shape[0]} as the others; {otherwise}."
+        )
+        return None
+    return image
+
+
+__all__ = ["Entry", "FileSequence", "Preparation", "Selection", "file_size", "read_ahead", "simple_sequence"]

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a sequence gives: frames one by one, their camera, and a reference trajectory if there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import FloatArray
+from groma.io.trajectories import Trajectory
+
+#: What the frames of a sequence hold: a depth image, a second rectified image, or neither.
+Kind = Literal["rgbd", "stereo", "mono"]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One moment: an image, and what was measured with it. All images have the size of the camera."""
+
+    #: Seconds.
+    timestamp: float
+    #: (H, W) uint8 grey image, undistorted.
+    gray: npt.NDArray[np.uint8]
+    #: (H, W) float32 depth along the optical axis, metres, registered to ``gray``; 0 where unknown.
+    depth: npt.NDArray[np.float32] | None = None
+    #: (H, W) uint8 right image, rectified: a point lies in the same row, at a column not greater than in ``gray``.
+    right: npt.NDArray[np.uint8] | None = None
+    #: Name of the image file, or the number of the frame.
+    name: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceCamera:
+    """The camera of all frames of a sequence, as the frames are given (after undistortion and rectification)."""
+
+    #: Name of a camera model of :mod:`groma.cameras`; ``PINHOLE`` for everything that ``open_sequence`` reads.
+    model: str
+    #: (k,) parameters of the model, pixels; the first pixel's centre is (0.5, 0.5).
+    params: FloatArray
+    #: Size of the images, pixels.
+    width: int
+    height: int
+    #: Distance of the right camera from the left, metres; None without a right camera.
+    baseline: float | None = None
+
+
+@runtime_checkable
+class Sequence(Protocol):
+    """Frames in order of time, read while they are asked for; never all in memory. May be iterated repeatedly."""
+
+    camera: SequenceCamera
+    kind: Kind
+    #: world_from_cam of the camera that took ``gray``, or None.
+    reference: Trajectory | None
+    #: What was left out or repaired, in sentences; grows while frames are read.
+    warnings: list[str]
+    #: Number of frames, or None where only reading tells (video); frames that cannot be read are skipped.
+    num_frames: int | None
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+
+__all__ = ["Frame", "Kind", "Sequence", "SequenceCamera"]

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One camera: the images of a folder, or a video file, with a camera that is passed or lies beside the images.
+
+Images are taken in order of the numbers in their names. Their times are the lines of ``times.txt`` if it is there, else
+the names, where all are numbers of seconds (with a decimal point) or nanoseconds (16 digits and more), else the count
+at 30 frames a second. A video says its own rate.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Generator, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from groma.errors import FileFormatError, InputError
+from groma.io._reading import reading
+from groma.io.sequences._calibration import Calibration, find_calibration, rectification
+from groma.io.sequences._reader import Entry, FileSequence, Selection, read_ahead, simple_sequence
+from groma.io.sequences.frame import Frame, Kind, SequenceCamera
+from groma.io.trajectories import Trajectory, read_trajectory
+
+#: Endings of names, in lower case.
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+#: Frames a second where nothing says it.
+RATE = 30.0
+
+_NO_CAMERA = (
+    "no camera is known for {path}. Pass one, such as camera='fx fy cx cy' or the name of a file with a line of "
+    "COLMAP's cameras.txt, or put it into cameras.txt beside the images."
+)
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Return the images of a folder (or of ``images`` or ``rgb`` in it) in order of the numbers in their names."""
+    for place in (folder, folder / "images", folder / "rgb"):
+        if place.is_dir():
+            found = [path for path in place.iterdir() if path.suffix.lower() in IMAGES and path.is_file()]
+            if found:
+                return sorted(found, key=lambda path: _natural(path.name))
+    return []
+
+
+def open_images(folder: Path, calibration: Calibration | None, selection: Selection) -> FileSequence:
+    """Open a folder of images; see :func:`groma.io.sequences.open_sequence`."""
+    warnings: list[str] = []
+    kind = selection.kind_of("mono")
+    images = image_files(folder)
+    calibration = calibration or find_calibration(folder) or find_calibration(images[0].parent)
+    if calibration is None:
+        raise InputError(_NO_CAMERA.format(path=folder))
+    entries = [Entry(time, path) for time, path in zip(_times(folder, images), images, strict=True)]
+    return simple_sequence(kind, selection.of(entries, warnings), calibration, _reference(folder), warnings)
+
+
+def open_video(path: Path, calibration: Calibration | None, selection: Selection) -> VideoSequence:
+    """Open a video file; see :func:`groma.io.sequences.open_sequence`."""
+    selection.kind_of("mono")
+    calibration = calibration or find_calibration(path.parent)
+    if calibration is None:
+        raise InputError(_NO_CAMERA.format(path=path))
+    return VideoSequence(path, calibration, selection)
+
+
+class VideoSequence:
+    """A :class:`~groma.io.sequences.frame.Sequence` of the frames of a video; their number is not known before."""
+
+    kind: Kind = "mono"
+    num_frames: int | None = None
+    reference: Trajectory | None = None
+
+    def __init__(self, path: Path, calibration: Calibration, selection: Selection) -> None:
+        self.warnings: list[str] = []
+        self._path, self._selection = path, selection
+        first = next(self._raw(), None)
+        if first is None:
+            raise FileFormatError(f"{path} is not a video that OpenCV can read, or it is empty. Convert it to MP4.")
+        size = (first[1].shape[1], first[1].shape[0])
+        if calibration.size not in (None, (0, 0), size):
+            raise InputError(
+                f"The camera is for images of {calibration.size}, but {path} has {size}. Pass the camera of the "
+                "video: phones crop and scale differently for photographs."
+            )
+        target = calibration.pinhole()
+        self.camera = SequenceCamera("PINHOLE", target, *size)
+        self._maps = None if calibration.is_pinhole else rectification(calibration, target, size)
+
+    def __iter__(self) -> Iterator[Frame]:
+        source = self._raw()
+        try:
+            # The other thread pulls; here we only wait, so the decoder is used by one thread at a time.
+            for frame in read_ahead(lambda _: self._next(source), _forever()):
+                if frame is None:
+                    break
+                yield frame
+        finally:
+            source.close()
+
+    def _next(self, source: Iterator[tuple[int, npt.NDArray[np.uint8], float]]) -> Frame | None:
+        item = next(source, None)
+        if item is None:
+            return None
+        number, image, time = item
+        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+        gray = np.asarray(gray, np.uint8)
+        return Frame(time, gray if self._maps is None else self._maps.gray(gray), name=str(number))
+
+    def _raw(self) -> Generator[tuple[int, npt.NDArray[np.uint8], float]]:
+        """Yield the chosen frames: number, image, time."""
+        capture = cv2.VideoCapture(str(self._path))
+        try:
+            rate = capture.get(cv2.CAP_PROP_FPS)
+            rate = rate if np.isfinite(rate) and 0 < rate < 10000 else RATE
+            number = given = 0
+            while self._selection.max_frames is None or given < self._selection.max_frames:
+                if not capture.grab():
+                    return
+                if number % self._selection.stride == 0:
+                    good, image = capture.retrieve()
+                    if good and image is not None:
+                        given += 1
+                        yield number, np.asarray(image, np.uint8), number / rate
+                number += 1
+        finally:
+            capture.release()
+
+
+def _forever() -> Iterator[None]:
+    while True:
+        yield None
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Return a key by which img2 comes before img10."""
+    parts = re.split(r"(\d+)", name)
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
+
+
+def _times(folder: Path, images: list[Path]) -> list[float]:
+    for name in ("times.txt", "timestamps.txt"):
+        path = folder / name
+        if path.is_file():
+            with reading(path, "list of times"):
+                rows = [line.partition("#")[0].split() for line in path.read_text(encoding="utf-8").splitlines()]
+                times = [float(row[0]) for row in rows if row]
+                if len(times) != len(images) or not np.isfinite(times).all():
+                    raise FileFormatError(f"expected {len(images)} finite times, one per image; got {len(times)}.")
+            return times
+    stems = [path.stem for path in images]
+    if all(re.fullmatch(r"\d+\.\d+", stem) for stem in stems):
+        return [float(stem) for stem in stems]
+    if all(re.fullmatch(r"\d{16,}", stem) for stem in stems):
+        return [int(stem) * 1e-9 for stem in stems]
+    return [number / RATE for number in range(len(images))]
+
+
+def _reference(folder: Path) -> Trajectory | None:
+    path = folder / "groundtruth.txt"
+    return read_trajectory(path, "tum") if path.is_file() else None
+
+
+__all__ = ["VideoSequence", "image_files", "open_images", "open_video"]

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Folders of the KITTI odometry benchmark: rectified stereo pairs, ``calib.txt``, ``times.txt``, perhaps ``poses.txt``.
+
+The grey cameras ``image_0`` and ``image_1`` are used if they are there, the colour cameras ``image_2`` and ``image_3``
+otherwise. The reference is ``poses.txt`` in the folder, or ``poses/NN.txt`` beside the folder ``sequences`` that NN
+lies in.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.errors import FileFormatError
+from groma.io._reading import reading
+from groma.io.sequences._calibration import Calibration, from_opencv
+from groma.io.sequences._reader import Entry, FileSequence, Selection, simple_sequence
+from groma.io.trajectories import Trajectory, read_trajectory
+
+#: Frames a second where there is no ``times.txt``.
+RATE = 10.0
+
+
+def is_kitti(folder: Path) -> bool:
+    """Whether a folder has this layout."""
+    return any((folder / name).is_dir() for name in ("image_0", "image_2"))
+
+
+def open_kitti(folder: Path, calibration: Calibration | None, selection: Selection) -> FileSequence:
+    """Open a folder; see :func:`groma.io.sequences.open_sequence`."""
+    left, right = ("image_0", "image_1") if (folder / "image_0").is_dir() else ("image_2", "image_3")
+    has_right = (folder / right).is_dir()
+    matrices = _matrices(folder / "calib.txt") if (folder / "calib.txt").is_file() else {}
+    projection, other = (matrices.get(f"P{name[-1]}") for name in (left, right))
+    if projection is None and calibration is None:
+        raise FileFormatError(f"{folder / 'calib.txt'} is missing or holds no P{left[-1]}. Add it, or pass camera=.")
+    baseline = None
+    if projection is not None and other is not None:
+        baseline = float(projection[0, 3] / projection[0, 0] - other[0, 3] / other[0, 0])
+    warnings: list[str] = []
+    if has_right and not (baseline is not None and baseline > 0):
+        warnings.append(f"calib.txt says no baseline from {left} to {right}; only {left} is used.")
+        has_right = False
+    kind = selection.kind_of("stereo" if has_right else "mono")
+    if calibration is None:
+        assert projection is not None
+        calibration = from_opencv(projection[[0, 1, 0, 1], [0, 1, 2, 2]])
+
+    images = sorted(path for path in (folder / left).iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
+    # The number in a name is the frame; without numbers, or with missing times, frames are counted.
+    numbers = [int(path.stem) if path.stem.isdecimal() else row for row, path in enumerate(images)]
+    last = max(numbers, default=-1)
+    times = _times(folder / "times.txt", last + 1, warnings)
+    rights = {path.name for path in (folder / right).iterdir()} if has_right else set()
+    entries = [
+        Entry(times[number], path, right=folder / right / path.name if path.name in rights else None)
+        for number, path in zip(numbers, images, strict=True)
+    ]
+    reference = _reference(folder, times, warnings)
+    return simple_sequence(kind, selection.of(entries, warnings), calibration, reference, warnings, baseline=baseline)
+
+
+def _matrices(path: Path) -> dict[str, FloatArray]:
+    """Return the 3x4 matrices P0 to P3."""
+    with reading(path, "KITTI calibration"):
+        named = (line.partition(":") for line in path.read_text(encoding="utf-8").splitlines())
+        return {
+            name.strip(): np.array([float(word) for word in values.split()]).reshape(3, 4)
+            for name, _, values in named
+            if name.strip() in ("P0", "P1", "P2", "P3")
+        }
+
+
+def _times(path: Path, count: int, warnings: list[str]) -> list[float]:
+    """Return at least ``count`` times."""
+    if not path.is_file():
+        warnings.append(f"There is no times.txt; {RATE:g} frames a second are assumed.")
+        return [number / RATE for number in range(count)]
+    with reading(path, "list of times"):
+        times = [float(word) for word in path.read_text(encoding="utf-8").split()]
+        if not np.isfinite(times).all() or len(times) < count:
+            raise FileFormatError(f"expected {count} finite times, one per frame; got {len(times)}.")
+    return times
+
+
+def _reference(folder: Path, times: list[float], warnings: list[str]) -> Trajectory | None:
+    resolved = folder.resolve()
+    for path in (folder / "poses.txt", resolved.parent.parent / "poses" / f"{resolved.name}.txt"):
+        if path.is_file():
+            poses = read_trajectory(path, "kitti")
+            if len(poses) > len(times):
+                warnings.append(f"{path.name} holds {len(poses)} poses for {len(times)} times; the rest is left out.")
+                poses = poses.take(np.arange(len(times)))
+            return poses.replace(timestamps=np.array(times[: len(poses)]))
+    return None
+
+
+__all__ = ["is_kitti", "open_kitti"]

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: BSD-3-Clause
+# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
+"""Trajectories in the formats of TUM, KITTI and EuRoC, plain or compressed by gzip.
+
+=========  =====================================================================  =================================
+``tum``    ``time tx ty tz qx qy qz qw``, separated by spaces                     seconds; world_from_cam
+``kitti``  12 numbers, the rows of the 3x4 matrix world_from_cam                  no time: the number of the line
+``euroc``  ``time, px, py, pz, qw, qx, qy, qz`` and more, separated by commas     nanoseconds; world_from_body
+=========  =====================================================================  =================================
+
+``#`` starts a comment. All of them hold where the camera (or body) is, the inverse of the ``cam_from_world`` of scenes.
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import FloatArray
+from groma.errors import FileFormatError, InputError, ShapeError
+from groma.geometry import quaternion, se3
+from groma.io._atomic import atomic_output
+from groma.io._reading import existing, reading
+from groma.scene._table import Table, column
+
+TrajectoryFormat = Literal["auto", "tum", "kitti", "euroc"]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory(Table):
+    """Poses over time. Note the direction: world_from_cam, as trajectory files hold it."""
+
+    noun: ClassVar[str] = "pose"
+    #: (N,) seconds.
+    timestamps: FloatArray = column(np.float64)
+    #: (N, 7) pose [qx qy qz qw tx ty tz]; the translation is the camera centre.
+    world_from_cam: FloatArray = column(np.float64, 7)
+
+    @property
+    def cam_from_world(self) -> FloatArray:
+        """(N, 7) poses in the direction that scenes use."""
+        return se3.inverse(self.world_from_cam)
+
+
+def read_trajectory(
+    path: str | os.PathLike[str], format: TrajectoryFormat = "auto", timestamps: npt.ArrayLike | None = None
+) -> Trajectory:
+    """Read a trajectory; quaternions are scaled to length one and matrices replaced by the nearest rotation.
+
+    Parameters
+    ----------
+    path : path
+        The file; it may be compressed by gzip.
+    format : str
+        ``tum``, ``kitti`` or ``euroc``; ``auto`` looks at the first line that holds numbers.
+    timestamps : (N,) float, optional
+        Times of the poses of a KITTI file, seconds. Without them the pose in line i has time i.
+
+    Returns
+    -------
+    Trajectory
+        The poses in the order of the file.
+
+    Raises
+    ------
+    InputError
+        If there is no such file or format.
+    FileFormatError
+        If a line does not hold the numbers of its format, or a quaternion or matrix is not a rotation.
+    """
+    if format not in ("auto", *_READERS):
+        raise InputError(f"Unknown trajectory format {format!r}. Use auto, {', '.join(_READERS)}.")
+    place = existing(path)
+    with reading(place, "trajectory"):
+        rows = _rows(place)
+        chosen = _recognise(place, rows) if format == "auto" else format
+        read = _READERS[chosen](place, rows)
+        if timestamps is None or chosen != "kitti":
+            return read
+        times = np.asarray(timestamps, float)
+        if times.shape != (len(read),):
+            raise ShapeError(f"timestamps must have shape ({len(read)},), one per pose; got {times.shape}.")
+        return read.replace(timestamps=times)
+
+
+def write_trajectory(
+    trajectory: Trajectory,
+    path: str | os.PathLike[str],
+    format: Literal["tum", "kitti", "euroc"] = "tum",
+    force: bool = False,
+) -> None:
+    """Write a trajectory, whole or not at all.
+
+    Numbers are written so that they read back exactly, apart from the times: KITTI has none, EuRoC counts nanoseconds.
+
+    Raises
+    ------
+    InputError
+        If the format is unknown.
+    OutputError
+        If something is there already or the file system refuses.
+    """
+    if format not in _WRITERS:
+        raise InputError(f"Unknown trajectory format {format!r}. Use {', '.join(_WRITERS)}.")
+    text = _WRITERS[format](trajectory)
+    with atomic_output(path, force) as draft:
+        draft.write_text(text, encoding="utf-8")
+
+
+def read_tum(path: str | os.PathLike[str]) -> Trajectory:
+    """Read a trajectory in TUM format; see :func:`read_trajectory`."""
+    return read_trajectory(path, "tum")
+
+
+def write_tum(trajectory: Trajectory, path: str | os.PathLike[str], force: bool = False) -> None:
+    """Write a trajectory in TUM format; see :func:`write_trajectory`."""
+    write_trajectory(trajectory, path, "tum", force)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file that may be compressed by gzip."""
+    content = path.read_bytes()
+    return (gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content).decode("utf-8")
+
+
+# ---------------------------------------------------------------------------------------------------------- Formats
+
+#: Lines that hold something, with their numbers.
+_Rows = list[tuple[int, str]]
+
+
+def _rows(path: Path) -> _Rows:
+    lines = (line.partition("#")[0].strip() for line in read_text(path).splitlines())
+    return [(number, line) for number, line in enumerate(lines, start=1) if line]
+
+
+def _words(line: str) -> list[str]:
+    return line.split(",") if "," in line else line.split()
+
+
+def _recognise(path: Path, rows: _Rows) -> str:
+    if not rows:
+        raise FileFormatError(f"{path} holds no pose.")
+    number, line = rows[0]
+    count = len(_words(line))
+    if "," in line and count >= 8:
+        return "euroc"
+    if "," not in line and count in (8, 12):
+        return "tum" if count == 8 else "kitti"
+    raise FileFormatError(
+        f"{path}, line {number}: expected 8 numbers (TUM), 12 (KITTI) or 8 and more separated by commas (EuRoC); "
+        f"got {count} words. Pass the format if this is not the first pose."
+    )
+
+
+def _numbers(path: Path, rows: _Rows, count: int, more: bool = False) -> FloatArray:
+    """Return the first ``count`` numbers of each row, (N, count)."""
+    table = np.empty((len(rows), count))
+    for row, (number, line) in enumerate(rows):
+        words = _words(line)
+        if len(words) != count and not (more and len(words) > count):
+            raise FileFormatError(f"{path}, line {number}: expected {count} numbers, got {len(words)}.")
+        table[row] = [float(word) for word in words[:count]]
+    return table
+
+
+def _unit(path: Path, rows: _Rows, quaternions: FloatArray) -> FloatArray:
+    length = np.linalg.norm(quaternions, axis=1)
+    bad = np.flatnonzero(~((length > 0.5) & (length < 2)))
+    if len(bad):
+        raise FileFormatError(
+            f"{path}, line {rows[bad[0]][0]}: the quaternion {quaternions[bad[0]].tolist()} is far from unit length."
+        )
+    return quaternions / length[:, None]
+
+
+def _read_tum(path: Path, rows: _Rows) -> Trajectory:
+    table = _numbers(path, rows, 8)
+    return Trajectory(table[:, 0], np.hstack([_unit(path, rows, table[:, 4:]), table[:, 1:4]]))
+
+
+def _read_euroc(path: Path, rows: _Rows) -> Trajectory:
+    table = _numbers(path, rows, 8, more=True)
+    turned = _unit(path, rows, table[:, [5, 6, 7, 4]])
+    return Trajectory(table[:, 0] * 1e-9, np.hstack([turned, table[:, 1:4]]))
+
+
+def _read_kitti(path: Path, rows: _Rows) -> Trajectory:
+    matrices = _numbers(path, rows, 12).reshape(-1, 3, 4)
+    # The nearest rotation: files hold six or seven digits.
+    u, singular, vt = np.linalg.svd(matrices[:, :, :3])
+    turned = u @ vt
+    bad = np.flatnonzero((np.abs(singular - 1.0).max(axis=1, initial=0.0) > 0.01) | (np.linalg.det(turned) < 0))
+    if len(bad):
+        raise FileFormatError(f"{path}, line {rows[bad[0]][0]}: the first three columns are not a rotation.")
+    poses = np.hstack([quaternion.from_matrix(turned), matrices[:, :, 3]])
+    return Trajectory(np.arange(len(rows), dtype=float), poses)
+
+
+def _lines(table: FloatArray) -> str:
+    return "".join(" ".join(map(repr, row)) + "\n" for row in table.tolist())
+
+
+def _write_tum(trajectory: Trajectory) -> str:
+    pose = trajectory.world_from_cam
+    return _lines(np.hstack([trajectory.timestamps[:, None], pose[:, 4:], pose[:, :4]]))
+
+
+def _write_kitti(trajectory: Trajectory) -> str:
+    return _lines(se3.to_matrix(trajectory.world_from_cam)[:, :3].reshape(-1, 12))
+
+
+def _write_euroc(trajectory: Trajectory) -> str:
+    pose = trajectory.world_from_cam
+    times = [round(time * 1e9) for time in trajectory.timestamps.tolist()]
+    rows = np.hstack([pose[:, 4:], pose[:, [3, 0, 1, 2]]]).tolist()
+    body = (f"{time:d}," + ",".join(map(repr, row)) + "\n" for time, row in zip(times, rows, strict=True))
+    return "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z []\n" + "".join(body)
+
+
+_READERS: dict[str, Callable[[Path, _Rows], Trajectory]] = {
+    "tum": _read_tum,
+    "kitti": _read_kitti,
+    "euroc": _read_euroc,
+}
+_WRITERS: dict[str, Callable[[Trajectory], str]] = {"tum": _write_tum, "kitti": _write_kitti, "euroc": _write_euroc}
+
+__all__ = ["Trajectory", "TrajectoryFormat", "read_trajectory", "read_tum", "write_trajectory", "write_tum"]

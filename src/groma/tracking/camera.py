@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The pinhole camera of a track: projection and its inverse for many points and segments at once.
+
+Frames are undistorted and rectified before they are tracked, so a track needs no other model. Pixels count from the
+corner of the image (first pixel's centre at 0.5, 0.5); OpenCV's do not, and are shifted where it is called.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray
+from groma.cameras import model as camera_model
+from groma.errors import InputError
+from groma.geometry import quaternion
+from groma.io.sequences.frame import SequenceCamera
+
+#: Nothing nearer than this share of the focal plane's unit depth is projected, scene units.
+NEAR = 1e-3
+PINHOLE = "PINHOLE"
+
+
+@dataclass(frozen=True)
+class TrackCamera:
+    """Focal lengths, principal point, size, and the baseline of a stereo pair."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    #: Distance of the right camera along x, scene units; 0 without one.
+    baseline: float = 0.0
+
+    @classmethod
+    def of(cls, camera: SequenceCamera) -> TrackCamera:
+        """Return the camera of a sequence; it must be free of distortion."""
+        model = camera_model(camera.model)
+        if not model.has_pinhole_parameters:
+            raise InputError(
+                f"Tracking needs undistorted images; the camera model is {camera.model}. "
+                "Undistort the images first, or open them with groma.io.sequences.open_sequence, which does."
+            )
+        params = np.asarray(camera.params, float)
+        focal, center = params[list(model.focal_indices)], params[list(model.principal_point_indices)]
+        if not (np.isfinite(params).all() and (focal > 0.0).all()):
+            raise InputError(f"Focal lengths must be positive and finite; got the parameters {params.tolist()}.")
+        return cls(
+            float(focal[0]), float(focal[-1]), float(center[0]), float(center[1]),
+            int(camera.width), int(camera.height), float(camera.baseline or 0.0),
+        )  # fmt: skip
+
+    @property
+    def params(self) -> FloatArray:
+        """(4,) fx, fy, cx, cy."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
+
+    @property
+    def matrix_opencv(self) -> FloatArray:
+        """(3, 3) calibration matrix in OpenCV's pixels."""
+        return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
+
+    def bearings(self, pixels: FloatArray) -> FloatArray:
+        """(N, 3) rays with z = 1 through pixels."""
+        rays = np.ones((len(pixels), 3))
+        rays[:, 0] = (pixels[:, 0] - self.cx) / self.fx
+        rays[:, 1] = (pixels[:, 1] - self.cy) / self.fy
+        return rays
+
+    def project(self, points_in_cam: FloatArray) -> FloatArray:
+        """(N, 2) pixels of points in the camera; NaN where they are not in front of it."""
+        z = np.where(points_in_cam[:, 2] > NEAR, points_in_cam[:, 2], np.nan)
+        return points_in_cam[:, :2] / z[:, None] * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def inside(self, pixels: FloatArray, border: float = 0.0) -> BoolArray:
+        """Whether pixels lie in the image, at least ``border`` from its edge."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(
+                ((pixels >= border) & (pixels <= (self.width - border, self.height - border))).all(axis=1)
+            )
+
+    def project_segments(self, ends_in_cam: FloatArray, border: float = 0.0) -> tuple[FloatArray, BoolArray]:
+        """Project segments (L, 2, 3) and clip them to what is in front of the camera and in the image.
+
+        Returns (L, 4) pixels, and which of them are seen at all.
+        """
+        first, second = ends_in_cam[:, 0].copy(), ends_in_cam[:, 1].copy()
+        near = max(NEAR, 0.02 * float(np.median(np.abs(ends_in_cam[..., 2])))) if len(ends_in_cam) else NEAR
+        seen = (first[:, 2] > near) | (second[:, 2] > near)
+        for one, other in ((first, second), (second, first)):
+            behind = seen & (one[:, 2] < near)
+            share = (near - one[behind, 2]) / (other[behind, 2] - one[behind, 2])
+            one[behind] += share[:, None] * (other[behind] - one[behind])
+        first[~seen], second[~seen] = (0, 0, 1), (0, 0, 1)
+        start, end = self.project(first), self.project(second)
+        low, high = np.zeros(len(start)), np.ones(len(start))
+        way = end - start
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for axis, size in ((0, self.width), (1, self.height)):
+                for side, sign in ((border, 1.0), (size - border, -1.0)):
+                    distance, speed = sign * (start[:, axis] - side), sign * way[:, axis]
+                    share = -distance / speed
+                    low = np.where(speed > 0, np.maximum(low, share), low)
+                    high = np.where(speed < 0, np.minimum(high, share), high)
+                    seen &= (speed != 0) | (distance >= 0)
+        seen &= high > low
+        ends = np.hstack([start + low[:, None] * way, start + high[:, None] * way])
+        ends[~seen] = 0.0
+        return ends, seen
+
+
+def rotation(pose: FloatArray) -> FloatArray:
+    """(3, 3) rotation matrix of one pose (7,)."""
+    return quaternion.to_matrix(pose[:4])
+
+
+def into(pose: FloatArray, points: FloatArray) -> FloatArray:
+    """Move points (..., 3) by one pose (7,)."""
+    return points @ rotation(pose).T + pose[4:]
+
+
+def back(pose: FloatArray, points: FloatArray) -> FloatArray:
+    """Move points (..., 3) by the inverse of one pose (7,)."""
+    return (points - pose[4:]) @ rotation(pose)
+
+
+def planes_into(pose: FloatArray, planes: FloatArray) -> FloatArray:
+    """Planes (K, 4) with unit normals, moved by one pose (7,)."""
+    normals = planes[:, :3] @ rotation(pose).T
+    return np.hstack([normals, (planes[:, 3] - normals @ pose[4:])[:, None]])
+
+
+def planes_back(pose: FloatArray, planes: FloatArray) -> FloatArray:
+    """Planes (K, 4) with unit normals, moved by the inverse of one pose (7,)."""
+    return np.hstack([planes[:, :3] @ rotation(pose), (planes[:, 3] + planes[:, :3] @ pose[4:])[:, None]])
+
+
+__all__ = ["NEAR", "PINHOLE", "TrackCamera", "back", "into", "planes_back", "planes_into", "rotation"]

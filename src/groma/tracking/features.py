@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What is found in one frame: described features, segments with depth, planes; computed when first asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import FloatArray, IntArray
+from groma.frontend.lsd import LsdDetector
+from groma.frontend.segments import Segments
+from groma.io.sequences.frame import Frame
+from groma.tracking.camera import TrackCamera
+from groma.tracking.depth import (
+    INVERSE_DEPTH_SIGMA,
+    depth_at,
+    depth_sigma,
+    fit_inverse_depth,
+    sample_inverse_depth,
+)
+from groma.tracking.options import TrackOptions
+from groma.tracking.plane_cells import DepthPlanes, find_depth_planes
+from groma.tracking.stereo import DISPARITY_SIGMA, Disparities, dense_disparities, match_columns
+
+#: Depths of a stereo pair are used where their noise is below this share of the depth.
+FAR_SHARE = 0.06
+Descriptors = npt.NDArray[np.uint8]
+
+
+@dataclass
+class Features:
+    """Described features (ORB) of a frame."""
+
+    #: (N, 2) pixels, (N,) response.
+    pixel: FloatArray
+    response: FloatArray
+    #: (N, 32) descriptors.
+    descriptor: Descriptors
+    #: (N,) depth; NaN where unknown.
+    depth: FloatArray
+    #: (N,) the map's point at this feature, or -1.
+    point: IntArray
+
+
+@dataclass(frozen=True)
+class DetectedSegments:
+    """Segments of a frame, with inverse depths of their ends where known."""
+
+    segments: Segments
+    inverse_depth: FloatArray
+    inverse_depth_sigma: FloatArray
+
+
+class FrameFeatures:
+    """One frame and what was found in it so far."""
+
+    def __init__(self, frame: Frame, camera: TrackCamera, options: TrackOptions) -> None:
+        self.frame, self.camera, self.options = frame, camera, options
+        self.gray = np.ascontiguousarray(frame.gray)
+        self._work: list[Future] = []
+
+    @cached_property
+    def features(self) -> Features:
+        """ORB features over several scales."""
+        return describe(self.gray, self.options.num_features, self.depths)
+
+    @cached_property
+    def detected(self) -> DetectedSegments:
+        """Segments by LSD, fitted to the grey levels."""
+        detector = LsdDetector(min_length=self.options.min_segment_length, max_segments=2 * self.options.num_lines)
+        segments = detector.detect(self.gray)
+        inverse, sigma = self.inverse_depths(segments.ends)
+        return DetectedSegments(segments, inverse, sigma)
+
+    def prepare(self, pool: Executor) -> None:
+        """Begin with what a keyframe needs, in other threads; :meth:`wait` ends it."""
+        if self._work:
+            return
+        if self.frame.right is not None and self.frame.depth is None:
+            _ = self.disparities
+        self._work.append(pool.submit(lambda: self.features))
+        if self.options.lines:
+            self._work.append(pool.submit(lambda: self.detected))
+
+    def wait(self) -> None:
+        """Wait for what :meth:`prepare` began."""
+        for future in self._work:
+            future.result()
+
+    @cached_property
+    def planes(self) -> DepthPlanes | None:
+        """Planes of the depth image; None without one."""
+        if self.frame.depth is None or not self.options.planes:
+            return None
+        return find_depth_planes(self.camera, self.frame.depth, self.options.max_depth)
+
+    def depths(self, pixels: FloatArray) -> FloatArray:
+        """Depths (N,) at pixels from the depth image or the right image; NaN where unknown."""
+        if self.frame.depth is not None:
+            return depth_at(self.frame.depth, pixels, self.options.max_depth)
+        if self.frame.right is not None:
+            disparity = pixels[:, 0] - self.right_columns(pixels)
+            with np.errstate(divide="ignore"):
+                depth = self.camera.fx * self.camera.baseline / disparity
+            # Far away a pair of images knows little more than the direction, and noise makes depths too small or large.
+            far = self.camera.fx * self.camera.baseline * FAR_SHARE / DISPARITY_SIGMA
+            return np.where((depth > 0) & (depth < far), depth, np.nan)
+        return np.full(len(pixels), np.nan)
+
+    @cached_property
+    def disparities(self) -> Disparities | None:
+        """Dense disparities of a pair of images."""
+        right = self.frame.right
+        return None if right is None else dense_disparities(self.gray, np.ascontiguousarray(right))
+
+    def right_columns(self, pixels: FloatArray, expected: FloatArray | None = None) -> FloatArray:
+        """Columns (N,) in the right image; NaN where not found or without one.
+
+        With ``expected`` (N,) columns only the points that have one are looked for.
+        """
+        if self.frame.right is None:
+            return np.full(len(pixels), np.nan)
+        right = np.ascontiguousarray(self.frame.right)
+        if expected is None:
+            return match_columns(self.gray, right, pixels, np.full(len(pixels), np.nan), self.disparities)
+        return match_columns(self.gray, right, pixels, expected, None)
+
+    def depth_sigma(self, depth: FloatArray) -> FloatArray:
+        """Standard deviations of depths from :meth:`depths`."""
+        if self.frame.right is not None and self.frame.depth is None:
+            return DISPARITY_SIGMA * depth**2 / (self.camera.fx * self.camera.baseline)
+        return depth_sigma(depth)
+
+    def inverse_depths(self, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Inverse depths at the ends of segments (L, 2) and their standard deviations; NaN where unknown."""
+        if self.frame.depth is not None and len(ends):
+            samples = sample_inverse_depth(self.frame.depth, ends, self.options.max_depth)
+            return fit_inverse_depth(samples, INVERSE_DEPTH_SIGMA)[:2]
+        if self.frame.right is not None and len(ends):
+            assert self.disparities is not None
+            scale = np.float32(self.camera.fx * self.camera.baseline)
+            with np.errstate(divide="ignore"):
+                depth = np.where(self.disparities > 0, scale / self.disparities, np.float32(0.0))
+            # Blocks widen what is near, so nothing beside the segment is looked at.
+            samples = sample_inverse_depth(depth, ends, float("inf"), beside=0.0)
+            return fit_inverse_depth(samples, 2.0 * DISPARITY_SIGMA / float(scale))[:2]
+        unknown = np.full((len(ends), 2), np.nan)
+        return unknown, unknown.copy()
+
+
+def describe(gray: npt.NDArray[np.uint8], count: int, depths: Callable[[FloatArray], FloatArray]) -> Features:
+    """Find and describe ORB features."""
+    orb = cv2.ORB.create(nfeatures=count, fastThreshold=7)
+    keypoints, descriptor = orb.detectAndCompute(gray, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    if not keypoints:
+        none = np.zeros(0)
+        return Features(np.zeros((0, 2)), none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
+    pixel = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64) + 0.5
+    response = np.array([keypoint.response for keypoint in keypoints])
+    return Features(pixel, response, np.asarray(descriptor, np.uint8), depths(pixel), np.full(len(pixel), -1))
+
+
+__all__ = ["Descriptors", "DetectedSegments", "Features", "FrameFeatures"]

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Where the camera will be: constant velocity, with a noise learnt from how well that held so far.
+
+The velocity is a twist per second, :math:`v = \mathrm{Log}(T_k T_{k-1}^{-1}) / \Delta t`, so missing
+frames are bridged.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.geometry import se3
+
+#: Motions are extrapolated over at most this many steps like the last one.
+MAX_STEPS = 3.0
+#: Standard deviation of the prior at least (share of what the velocity says, and radians / scene units).
+FLOOR = np.array([0.02] * 3 + [0.01] * 3)
+
+
+class MotionModel:
+    """Constant velocity and the noise of its predictions."""
+
+    def __init__(self) -> None:
+        self._velocity = np.zeros(6)
+        self._last_time: float | None = None
+        self._step = 0.0
+        self._error = np.array([0.15] * 3 + [0.15] * 3)
+        self._known = False
+        self._predicted: FloatArray | None = None
+
+    def predict(self, pose: FloatArray, timestamp: float) -> tuple[FloatArray, FloatArray]:
+        """Return the pose expected at a time, and the standard deviations (6,) of that expectation."""
+        gap = timestamp - self._last_time if self._last_time is not None else 0.0
+        steps = gap / self._step if self._step > 0 else 1.0
+        gap = min(gap, MAX_STEPS * self._step) if self._step > 0 else 0.0
+        twist = self._velocity * gap
+        predicted = se3.compose(se3.exp(twist[None]), pose[None])[0]
+        self._predicted = predicted
+        sigma = np.maximum(FLOOR, 3.0 * self._error) * max(1.0, steps) + 0.5 * np.abs(twist)
+        return predicted, sigma
+
+    def update(self, before: FloatArray | None, pose: FloatArray, timestamp: float) -> None:
+        """Learn from a pose that was found; ``before`` is the one of the frame before, None if it had none."""
+        if before is not None and self._last_time is not None and timestamp > self._last_time:
+            self._step = timestamp - self._last_time
+            twist = se3.log(se3.compose(pose[None], se3.inverse(before[None])))[0]
+            if self._predicted is not None:
+                miss = np.abs(se3.log(se3.compose(pose[None], se3.inverse(self._predicted[None])))[0])
+                grouped = np.repeat([np.linalg.norm(miss[:3]), np.linalg.norm(miss[3:])], 3)
+                self._error = np.maximum(0.8 * self._error + 0.2 * grouped, 0.5 * grouped)
+            self._velocity = twist / self._step
+        else:
+            self._velocity = np.zeros(6)
+            self._error = np.array([0.15] * 6)
+        self._last_time = timestamp
+
+
+__all__ = ["MotionModel"]

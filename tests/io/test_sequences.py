@@ -1,0 +1,496 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Image sequences: every layout from a folder made here, cameras and their pixel conventions, undistortion and
+rectification against projected points, and faults: missing, damaged, repeated, unordered files; the shared data.
+"""
+
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from groma import cameras
+from groma.errors import FileFormatError, InputError
+from groma.geometry import quaternion, se3
+from groma.io import Trajectory, write_trajectory
+from groma.io.sequences import Sequence, SequenceCamera, open_sequence
+
+SIZE = (64, 48)
+
+
+def image(path, value, size=SIZE, dtype=np.uint8):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.full((size[1], size[0]), value, dtype))
+
+
+def straight(times):
+    """A trajectory along z."""
+    count = len(times)
+    return Trajectory(
+        np.asarray(times, float), np.hstack([np.tile([0, 0, 0, 1.0, 0, 0], (count, 1)), np.arange(count)[:, None]])
+    )
+
+
+def values(sequence):
+    """The grey value of each frame."""
+    return [int(frame.gray[0, 0]) for frame in sequence]
+
+
+# ------------------------------------------------------------------------------------------------------- TUM RGB-D
+
+
+@pytest.fixture
+def tum(tmp_path):
+    """Six colour images and five depth images at times of their own."""
+    times, depth_times = [10.0, 10.1, 10.2, 10.3, 10.4, 10.5], [10.008, 10.107, 10.195, 10.305, 10.45]
+    for row in range(6):
+        image(tmp_path / f"rgb/{row}.png", 10 * row)
+    for row in range(5):
+        image(tmp_path / f"depth/{row}.png", 5000 * (row + 1), dtype=np.uint16)
+    (tmp_path / "rgb.txt").write_text("# time file\n" + "".join(f"{t} rgb/{i}.png\n" for i, t in enumerate(times)))
+    (tmp_path / "depth.txt").write_text("".join(f"{t} depth/{i}.png\n" for i, t in enumerate(depth_times)))
+    (tmp_path / "camera.txt").write_text("50 51 32 24\n")
+    write_trajectory(straight(times), tmp_path / "groundtruth.txt")
+    return tmp_path
+
+
+def test_tum(tum):
+    sequence = open_sequence(tum)
+    assert isinstance(sequence, Sequence)
+    assert (sequence.kind, sequence.num_frames, len(sequence.reference)) == ("rgbd", 6, 6)
+    camera = sequence.camera
+    assert (camera.model, camera.width, camera.height, camera.baseline) == ("PINHOLE", 64, 48, None)
+    assert camera.params.tolist() == [50, 51, 32.5, 24.5]  # files count from the first pixel's centre
+    frames = list(sequence)
+    assert [frame.timestamp for frame in frames] == [10.0, 10.1, 10.2, 10.3, 10.4, 10.5]
+    assert frames[0].gray.dtype == np.uint8
+    assert frames[0].depth.dtype == np.float32
+    # 10.4 and 10.5 have no depth within the tolerance.
+    assert [None if f.depth is None else float(f.depth[0, 0]) for f in frames] == [1, 2, 3, 4, None, None]
+    assert any("4.png has no depth" in text for text in sequence.warnings)
+    assert values(sequence) == [0, 10, 20, 30, 40, 50]  # again, from the start
+    assert len(sequence.warnings) == 2
+
+
+def test_options(tum):
+    assert values(open_sequence(tum, stride=2)) == [0, 20, 40]
+    assert values(open_sequence(tum, stride=2, max_frames=2)) == [0, 20]
+    assert next(iter(open_sequence(tum, depth_scale=1000))).depth[0, 0] == 5.0
+    mono = open_sequence(tum, kind="mono")
+    assert mono.kind == "mono"
+    assert next(iter(mono)).depth is None
+    for options, words in (
+        ({"stride": 0}, "stride"), ({"max_frames": 0}, "max_frames"), ({"kind": "stereo"}, "rgbd"),
+        ({"depth_scale": 0}, "depth_scale"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=words):
+            open_sequence(tum, **options)
+
+
+def test_associations_in_either_order(tum):
+    (tum / "associations.txt").write_text("10.0 rgb/0.png 10.0 depth/1.png\n10.1 depth/0.png 10.11 rgb/1.png\n")
+    frames = list(open_sequence(tum))
+    assert [(f.timestamp, float(f.depth[0, 0])) for f in frames] == [(10.0, 2.0), (10.11, 1.0)]
+    (tum / "associations.txt").write_text("10.0 rgb/0.png 10.0\n")
+    with pytest.raises(FileFormatError, match="line 1"):
+        open_sequence(tum)
+    (tum / "associations.txt").write_text("nan rgb/0.png 10.0 depth/0.png\n")
+    with pytest.raises(FileFormatError, match="finite"):
+        open_sequence(tum)
+
+
+def test_intrinsics_of_the_benchmark(tum, tmp_path):
+    (tum / "camera.txt").unlink()
+    with pytest.raises(InputError, match="Pass one"):
+        open_sequence(tum)
+    named = tmp_path / "rgbd_dataset_freiburg3_walk"
+    for row in range(2):
+        image(named / f"rgb/{row}.png", row, (640, 480))
+    (named / "rgb.txt").write_text("0.0 rgb/0.png\n0.1 rgb/1.png\n")
+    sequence = open_sequence(named)
+    assert sequence.kind == "mono"
+    np.testing.assert_allclose(sequence.camera.params, [535.4, 539.2, 320.6, 248.1])
+    named.rename(tmp_path / "freiburg1_xyz")
+    np.testing.assert_allclose(open_sequence(tmp_path / "freiburg1_xyz").camera.params, [517.3, 516.5, 319.1, 255.8])
+
+
+def test_faults(tum):
+    lines = (tum / "rgb.txt").read_text().splitlines()
+    # Out of order, a missing file, a repeated time.
+    lines = [lines[0], lines[3], lines[1], lines[2], *lines[4:], "10.6 rgb/none.png", "10.5 rgb/0.png"]
+    (tum / "rgb.txt").write_text("\n".join(lines))
+    (tum / "rgb/1.png").write_bytes(b"no image")
+    image(tum / "rgb/3.png", 30, (32, 24))
+    image(tum / "depth/0.png", 1000, (32, 24), np.uint16)
+    sequence = open_sequence(tum)
+    frames = list(sequence)
+    assert [frame.timestamp for frame in frames] == [10.0, 10.2, 10.4, 10.5]
+    assert frames[0].depth is None
+    text = "\n".join(sequence.warnings)
+    for words in ("not in order", "0.png has the time of 5.png", "1.png cannot be read", "none.png cannot be read"):
+        assert words in text
+    assert "3.png is 32x24, not 64x48" in text
+    assert "0.png is 32x24, not 64x48 grey" in text
+
+
+def test_depth_without_value(tum):
+    raw = np.full((48, 64), 5000, np.uint16)
+    raw[0, 0], raw[0, 1] = 65535, 0
+    cv2.imwrite(str(tum / "depth/0.png"), raw)
+    depth = next(iter(open_sequence(tum))).depth
+    assert depth[0, :3].tolist() == [0.0, 0.0, 1.0]
+
+
+def test_only_a_few_frames_are_read_ahead_and_threads_end(tum):
+    before = threading.active_count()
+    iterator = iter(open_sequence(tum))
+    next(iterator)
+    assert threading.active_count() == before + 1
+    iterator.close()
+    assert threading.active_count() == before
+
+
+# --------------------------------------------------------------------------------------------------------- Cameras
+
+
+@pytest.mark.parametrize(
+    ("camera", "params"),
+    [
+        ("50 51 32 24", [50, 51, 32.5, 24.5]),
+        ([50, 51, 32, 24], [50, 51, 32.5, 24.5]),
+        ("1 PINHOLE 64 48 50 51 32 24", [50, 51, 32, 24]),
+        ("SIMPLE_PINHOLE 64 48 50 32 24", [50, 50, 32, 24]),
+        (SequenceCamera("PINHOLE", np.array([50.0, 51, 32, 24]), 64, 48), [50, 51, 32, 24]),
+        ("50 51 32 24 -0.2 0.05 0.001 0.002", [50, 51, 32.5, 24.5]),
+    ],
+)
+def test_ways_to_say_a_camera(tum, tmp_path, camera, params):
+    np.testing.assert_array_equal(open_sequence(tum, camera=camera).camera.params, params)
+    if isinstance(camera, str):
+        (tmp_path / "other.txt").write_text(f"# a comment\n{camera}\n")
+        np.testing.assert_array_equal(open_sequence(tum, camera=tmp_path / "other.txt").camera.params, params)
+
+
+def test_matrix_file(tum):
+    (tum / "camera.txt").write_text("50 0 32\n0 51 24\n0 0 1\n")
+    np.testing.assert_array_equal(open_sequence(tum).camera.params, [50, 51, 32.5, 24.5])
+
+
+@pytest.mark.parametrize(
+    ("camera", "words"),
+    [
+        ("50 51 32", "Cannot read"),
+        ([50, 51, 32], "3 numbers"),
+        ("1 PINHOLE 64 48 50 51 32", "takes 4"),
+        ("1 CIRCLE 64 48 50 51 32", "CIRCLE"),
+        ("1 PINHOLE 640 480 500 500 320 240", "for images of"),
+        ("-50 51 32 24", "positive"),
+        ("missing.txt", "Cannot read"),
+    ],
+)
+def test_cameras_that_are_refused(tum, camera, words):
+    with pytest.raises(InputError, match=words):
+        open_sequence(tum, camera=camera)
+
+
+def blob_image(pixels, size):
+    """Bright Gaussian blobs at pixels (first pixel's centre at 0.5, 0.5)."""
+    u, v = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    total = sum(np.exp(-((u - a) ** 2 + (v - b) ** 2) / (2 * 2.0**2)) for a, b in pixels)
+    return np.clip(200 * total, 0, 255).astype(np.uint8)
+
+
+def blob_center(gray, near, radius=7):
+    """Centre of the blob nearest to a pixel."""
+    u0, v0 = int(near[0]), int(near[1])
+    patch = gray[v0 - radius : v0 + radius + 1, u0 - radius : u0 + radius + 1].astype(float)
+    v, u = np.mgrid[v0 - radius : v0 + radius + 1, u0 - radius : u0 + radius + 1] + 0.5
+    return np.array([(patch * u).sum(), (patch * v).sum()]) / patch.sum()
+
+
+POINTS = np.array([[-0.5, -0.3, 2.0], [0.4, -0.25, 1.8], [0.1, 0.3, 2.5], [-0.3, 0.25, 2.2], [0.5, 0.35, 2.4]])
+
+
+def test_undistortion_puts_points_where_a_pinhole_sees_them(tmp_path):
+    size, numbers = (320, 240), np.array([250.0, 255, 158, 121, -0.25, 0.08, 0.002, -0.001])
+    distorted = cameras.model("OPENCV").project(numbers + np.array([0, 0, 0.5, 0.5, 0, 0, 0, 0]), POINTS)
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images/0001.png"), blob_image(distorted, size))
+    sequence = open_sequence(tmp_path, camera=numbers)
+    expected = cameras.model("PINHOLE").project(sequence.camera.params, POINTS)
+    assert np.abs(expected - distorted).max() > 1.2
+    gray = next(iter(sequence)).gray
+    for point in expected:
+        np.testing.assert_allclose(blob_center(gray, point), point, atol=0.15)  # blobs are bent and rounded to 8 bits
+
+
+def test_depth_is_undistorted_with_the_image(tum):
+    ramp = np.tile(np.arange(1, 65, dtype=np.uint16) * 100, (48, 1))
+    cv2.imwrite(str(tum / "depth/0.png"), ramp)
+    cv2.imwrite(str(tum / "rgb/0.png"), (ramp // 100).astype(np.uint8))
+    frame = next(iter(open_sequence(tum, camera="50 50 31.5 23.5 -0.2 0 0 0", depth_scale=100)))
+    inside = frame.depth > 0
+    assert inside.mean() > 0.9
+    assert np.abs(frame.depth[inside] - frame.gray[inside]).max() <= 1.0
+    assert (frame.depth != ramp / 100).any()
+
+
+# ----------------------------------------------------------------------------------------------------------- KITTI
+
+
+@pytest.fixture
+def kitti(tmp_path):
+    for row in range(3):
+        image(tmp_path / f"image_0/{row:06d}.png", 10 * row)
+        image(tmp_path / f"image_1/{row:06d}.png", 10 * row + 1)
+    (tmp_path / "calib.txt").write_text("P0: 70 0 30 0 0 70 20 0 0 0 1 0\nP1: 70 0 30 -35 0 70 20 0 0 0 1 0\nTr: 1 2\n")
+    (tmp_path / "times.txt").write_text("0.0\n0.1\n0.2\n")
+    write_trajectory(straight([0, 1, 2]), tmp_path / "poses.txt", "kitti")
+    return tmp_path
+
+
+def test_kitti(kitti):
+    sequence = open_sequence(kitti)
+    assert sequence.kind == "stereo"
+    assert sequence.camera.baseline == 0.5
+    assert sequence.camera.params.tolist() == [70, 70, 30.5, 20.5]
+    assert sequence.reference.timestamps.tolist() == [0.0, 0.1, 0.2]
+    assert sequence.reference.world_from_cam[2, 6] == 2.0
+    assert [(f.timestamp, int(f.gray[0, 0]), int(f.right[0, 0])) for f in sequence] == [
+        (0.0, 0, 1),
+        (0.1, 10, 11),
+        (0.2, 20, 21),
+    ]
+    mono = open_sequence(kitti, kind="mono")
+    assert (mono.kind, mono.camera.baseline, next(iter(mono)).right) == ("mono", None, None)
+
+
+def test_kitti_with_dropped_images(kitti):
+    (kitti / "image_0/000001.png").unlink()
+    (kitti / "image_1/000002.png").unlink()
+    sequence = open_sequence(kitti)
+    assert [(frame.timestamp, frame.right is None) for frame in sequence] == [(0.0, False), (0.2, True)]
+    assert sequence.warnings == ["000002.png has no right image."]
+    (kitti / "times.txt").unlink()
+    assert [frame.timestamp for frame in open_sequence(kitti)] == [0.0, 0.2]
+    (kitti / "times.txt").write_text("0\n")
+    with pytest.raises(FileFormatError, match="expected 3 finite times"):
+        open_sequence(kitti)
+    (kitti / "calib.txt").write_text("P0: 1 2\n")
+    with pytest.raises(FileFormatError, match="calib"):
+        open_sequence(kitti)
+
+
+# ----------------------------------------------------------------------------------------------------------- EuRoC
+
+YAML = """%YAML:1.0
+sensor_type: camera  # a comment: with a colon
+T_BS:
+  cols: 4
+  rows: 4
+  data: [{data}]
+rate_hz: 20
+resolution: [320, 240]
+camera_model: pinhole
+intrinsics: [{intrinsics}] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [{distortion}]
+"""
+
+
+def pose(rotation_vector, translation):
+    matrix = np.eye(4)
+    matrix[:3, :3] = quaternion.to_matrix(quaternion.exp(np.array(rotation_vector, float)))
+    matrix[:3, 3] = translation
+    return matrix
+
+
+@pytest.fixture
+def euroc(tmp_path):
+    """Two cameras that squint and are distorted, and see blobs at known points of the left camera."""
+    body_from_left = pose([0.3, -0.2, 1.5], [0.1, 0.2, 0.3])
+    left_from_right = pose([0.02, -0.03, 0.01], [0.11, 0.002, -0.003])
+    sensors = [
+        (body_from_left, np.array([250.0, 252, 158, 121]), np.array([-0.28, 0.07, 0.0002, 0.0001])),
+        (body_from_left @ left_from_right, np.array([248.0, 249, 163, 118]), np.array([-0.27, 0.06, -0.0003, 0.0002])),
+    ]
+    stamps = [1403636579763555584 + 50000000 * row for row in range(3)]
+    for number, (body_from_cam, intrinsics, distortion) in enumerate(sensors):
+        folder = tmp_path / f"mav0/cam{number}"
+        (folder / "data").mkdir(parents=True)
+        text = {"intrinsics": intrinsics, "distortion": distortion, "data": body_from_cam.ravel()}
+        (folder / "sensor.yaml").write_text(
+            YAML.format(**{key: ",\n   ".join(map(repr, value.tolist())) for key, value in text.items()})
+        )
+        (folder / "data.csv").write_text("#timestamp [ns],filename\n" + "".join(f"{t},{t}.png\r\n" for t in stamps))
+        cam_from_left = np.linalg.inv(body_from_cam) @ body_from_left
+        points = POINTS @ cam_from_left[:3, :3].T + cam_from_left[:3, 3]
+        params = np.append(intrinsics + 0.5 * np.array([0, 0, 1, 1]), distortion)
+        gray = blob_image(cameras.model("OPENCV").project(params, points), (320, 240))
+        for stamp in stamps:
+            cv2.imwrite(str(folder / f"data/{stamp}.png"), gray)
+    world_from_body = pose([1.0, 0.4, -0.3], [4.0, 5.0, 6.0])
+    truth = Trajectory(np.array(stamps) * 1e-9, np.tile(se3.from_matrix(world_from_body), (3, 1)))
+    (tmp_path / "mav0/state_groundtruth_estimate0").mkdir()
+    write_trajectory(truth, tmp_path / "mav0/state_groundtruth_estimate0/data.csv", "euroc")
+    return tmp_path, world_from_body @ body_from_left
+
+
+def test_euroc_is_rectified(euroc):
+    folder, world_from_left = euroc
+    sequence = open_sequence(folder)
+    assert (sequence.kind, sequence.num_frames, sequence.warnings) == ("stereo", 3, [])
+    assert sequence.camera.baseline == pytest.approx(np.linalg.norm([0.11, 0.002, -0.003]))
+    frame = next(iter(sequence))
+    assert abs(frame.timestamp - 1403636579.763555584) < 1e-6
+    # Points in the world, seen from where the reference says the camera is.
+    world = POINTS @ world_from_left[:3, :3].T + world_from_left[:3, 3]
+    rectified = se3.transform_points(np.tile(sequence.reference.cam_from_world[:1], (5, 1)), world)
+    model, params = cameras.model("PINHOLE"), sequence.camera.params
+    for gray, shift in ((frame.gray, 0.0), (frame.right, sequence.camera.baseline)):
+        for pixel in model.project(params, rectified - [shift, 0, 0]):
+            np.testing.assert_allclose(blob_center(gray, pixel), pixel, atol=0.15)
+    assert open_sequence(folder / "mav0").kind == "stereo"
+
+
+def test_euroc_with_one_camera(euroc):
+    folder, world_from_left = euroc
+    sequence = open_sequence(folder, kind="mono")
+    np.testing.assert_allclose(sequence.camera.params, [250, 252, 158.5, 121.5])
+    np.testing.assert_allclose(se3.to_matrix(sequence.reference.world_from_cam)[0], world_from_left, atol=1e-9)
+    gray = next(iter(sequence)).gray
+    for pixel in cameras.model("PINHOLE").project(sequence.camera.params, POINTS):
+        np.testing.assert_allclose(blob_center(gray, pixel), pixel, atol=0.15)
+
+
+def test_euroc_faults(euroc):
+    folder, _ = euroc
+    right = sorted((folder / "mav0/cam1/data").iterdir())
+    table = folder / "mav0/cam1/data.csv"
+    table.write_text("".join(line + "\n" for line in table.read_text().splitlines() if right[1].stem not in line))
+    right[0].write_bytes(b"")
+    sequence = open_sequence(folder)
+    assert [frame.right is None for frame in sequence] == [True, True, False]
+    assert len(sequence.warnings) == 2
+    with pytest.raises(InputError, match="stereo folder"):
+        open_sequence(folder, camera="250 250 160 120")
+    sensor = folder / "mav0/cam0/sensor.yaml"
+    text = sensor.read_text()
+    for damage, words in (
+        (text.replace("intrinsics", "other"), "no entry intrinsics"),
+        (text.replace("radial-tangential", "wide"), "distortion_model"),
+        (text.replace("data: [", "data: [3, "), "sensor.yaml"),
+    ):
+        sensor.write_text(damage)
+        with pytest.raises(FileFormatError, match=words):
+            open_sequence(folder)
+
+
+# ------------------------------------------------------------------------------------------------------- 7-Scenes
+
+
+@pytest.mark.kernels
+def test_seven_scenes(tmp_path):
+    for row in (0, 1, 3):
+        image(tmp_path / f"frames/frame-{row:06d}.color.png", row, (640, 480))
+        image(tmp_path / f"frames/frame-{row:06d}.depth.png", 2000, (640, 480), np.uint16)
+        np.savetxt(tmp_path / f"frames/frame-{row:06d}.pose.txt", pose([0, 0.1 * row, 0], [row, 0, 0]))
+    sequence = open_sequence(tmp_path)
+    frames = list(sequence)
+    assert (sequence.kind, [round(30 * frame.timestamp) for frame in frames]) == ("rgbd", [0, 1, 3])
+    np.testing.assert_array_equal(sequence.camera.params, [525, 525, 320.5, 240.5])
+    # A wall two metres from the depth camera, seen by the colour camera, which is turned by half a degree.
+    depth = frames[0].depth
+    inside = depth[60:-60, 60:-60]
+    assert (inside > 0).mean() > 0.999
+    assert 1.98 < inside[inside > 0].min() < inside.max() < 2.02
+    # The colour camera lies 2.5 cm to the right of the depth camera.
+    offset = sequence.reference.world_from_cam[:, 4:] - [[0, 0, 0], [1, 0, 0], [3, 0, 0]]
+    np.testing.assert_allclose(np.linalg.norm(offset, axis=1), 0.0256, atol=1e-4)
+    assert offset[0, 0] > 0.025
+
+
+# -------------------------------------------------------------------------------------------------- Folders, videos
+
+
+def test_image_folder(tmp_path):
+    for number in (1, 2, 10):
+        image(tmp_path / f"img{number}.png", number)
+    with pytest.raises(InputError, match="no camera is known"):
+        open_sequence(tmp_path)
+    sequence = open_sequence(tmp_path, camera="50 50 32 24")
+    assert (sequence.kind, sequence.reference) == ("mono", None)
+    assert values(sequence) == [1, 2, 10]
+    (tmp_path / "times.txt").write_text("0.5\n0.25\n0.75\n")
+    sequence = open_sequence(tmp_path, camera="50 50 32 24")
+    assert values(sequence) == [2, 1, 10]
+    assert "not in order" in sequence.warnings[0]
+    (tmp_path / "times.txt").write_text("0.5\n")
+    with pytest.raises(FileFormatError, match="expected 3"):
+        open_sequence(tmp_path, camera="50 50 32 24")
+
+
+def test_times_from_names(tmp_path):
+    for name in ("1.50", "1.25"):
+        image(tmp_path / "a" / f"{name}.png", 1)
+    for name in ("1403636579763555584", "1403636579813555584"):
+        image(tmp_path / "b" / f"{name}.png", 1)
+    camera = "50 50 32 24"
+    assert [f.timestamp for f in open_sequence(tmp_path / "a", camera=camera)] == [1.25, 1.5]
+    times = [f.timestamp for f in open_sequence(tmp_path / "b", camera=camera)]
+    assert times[1] - times[0] == pytest.approx(0.05, abs=1e-6)
+
+
+def test_video(tmp_path):
+    path = tmp_path / "v.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, SIZE)
+    for row in range(7):
+        writer.write(np.full((48, 64, 3), 30 * row, np.uint8))
+    writer.release()
+    sequence = open_sequence(path, camera="50 50 32 24", stride=2, max_frames=3)
+    assert sequence.num_frames is None
+    for _ in range(2):
+        frames = list(sequence)
+        np.testing.assert_allclose([frame.timestamp for frame in frames], [0.0, 0.1, 0.2])
+        np.testing.assert_allclose([float(frame.gray.mean()) for frame in frames], [0, 60, 120], atol=3)
+    assert len(list(open_sequence(path, camera="50 50 32 24"))) == 7
+    iterator = iter(sequence)
+    next(iterator)
+    iterator.close()
+    (tmp_path / "broken.mp4").write_bytes(b"no video")
+    with pytest.raises(FileFormatError, match="not a video"):
+        open_sequence(tmp_path / "broken.mp4", camera="50 50 32 24")
+    with pytest.raises(InputError, match="no camera"):
+        open_sequence(path)
+
+
+def test_what_is_no_sequence(tmp_path):
+    for path, words in ((tmp_path, "no sequence"), (tmp_path / "none", "Cannot read")):
+        with pytest.raises(InputError, match=words):
+            open_sequence(path)
+    (tmp_path / "x.dat").write_text("x")
+    with pytest.raises(InputError, match="neither a folder nor a video"):
+        open_sequence(tmp_path / "x.dat")
+    image(tmp_path / "bad/0.png", 1)
+    (tmp_path / "bad/0.png").write_bytes(b"x")
+    with pytest.raises(InputError, match="None of the 1 images"):
+        open_sequence(tmp_path / "bad", camera="50 50 32 24")
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    ("name", "kind", "count", "size"),
+    [
+        ("rgbd_tum_fr3_cabinet", "rgbd", 58, (640, 480)),
+        ("rgbd_7scenes_redkitchen", "rgbd", 120, (640, 480)),
+        ("stereo_kitti06", "stereo", 40, (1226, 370)),
+    ],
+)
+def test_shared_sequences(shared_data, name, kind, count, size):
+    sequence = open_sequence(shared_data / name)
+    assert (sequence.kind, sequence.num_frames, len(sequence.reference)) == (kind, count, count)
+    assert (sequence.camera.width, sequence.camera.height) == size
+    frames = [frame for frame, _ in zip(sequence, range(3), strict=False)]
+    np.testing.assert_array_equal([frame.timestamp for frame in frames], sequence.reference.timestamps[:3])
+    assert all(frame.gray.shape == size[::-1] for frame in frames)
+    assert sequence.warnings == []

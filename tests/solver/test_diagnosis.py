@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The diagnosis: every case that cannot be observed is named correctly, a sound scene gives no false alarm, suspicious
+cameras are found, and the outcome is plain data."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from problems import INTRINSICS, cameras_on_a_ring, pixels_of, scene_problem
+
+from groma.factors import LineReprojection, PlaneObservation, PointOnPlane, PointReprojection, PositionPrior
+from groma.factors._factor import Ref
+from groma.geometry import quaternion, se3
+from groma.geometry._manifold import Euclidean
+from groma.geometry.line_charts import LINE_CHARTS
+from groma.geometry.plane_charts import PLANE_CHARTS
+from groma.geometry.pose_charts import POSE_CHARTS
+from groma.problem.problem import Problem
+from groma.problem.variables import Variables
+from groma.solver.diagnosis import diagnose
+
+pytestmark = pytest.mark.kernels
+
+
+def looking(centers, at=(0.0, 0.0, 0.0), forward=None):
+    """Poses at the given centres that look at a place, or all in one direction."""
+    centers = np.asarray(centers, float)
+    z = np.asarray(at, float) - centers if forward is None else np.tile(np.asarray(forward, float), (len(centers), 1))
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    x = np.cross(z, [0.0, 0.1, 1.0])
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    R = np.stack([x, np.cross(z, x), z], axis=1)
+    return np.hstack([quaternion.from_matrix(R), -np.einsum("nij,nj->ni", R, centers)])
+
+
+def problem_of(poses, points=None, lines=None, point_obs=None, line_obs=None, planes=None, on_plane=(), held=False,
+               free_intrinsics=False):  # fmt: skip
+    """An exact problem; everything is seen by every camera unless pairs (landmark, camera) are given."""
+    count = len(poses)
+    constant = held if isinstance(held, np.ndarray) else np.full(count, held)
+    variables = {
+        "poses": Variables(POSE_CHARTS["left"], poses, constant),
+        "intrinsics": Variables(Euclidean(4, "intrinsics"), INTRINSICS[None], not free_intrinsics),
+    }
+    factors = []
+
+    def pairs(given, size):
+        return np.array([(k, c) for k in range(size) for c in range(count)]) if given is None else np.asarray(given)
+
+    if points is not None:
+        points = np.asarray(points, float)
+        table = pairs(point_obs, len(points))
+        variables["points"] = Variables(Euclidean(3, "point"), points)
+        factors.append(
+            PointReprojection(
+                pose=Ref("poses", table[:, 1]), point=Ref("points", table[:, 0]), camera_model="PINHOLE",
+                intrinsics=Ref("intrinsics", np.zeros(len(table), int)),
+                pixels=pixels_of(poses[table[:, 1]], points[table[:, 0]]), require_in_front=False,
+            )
+        )  # fmt: skip
+    if lines is not None:
+        ends = np.asarray(lines, float)
+        table = pairs(line_obs, len(ends))
+        chart = LINE_CHARTS["cartesian"]
+        plucker = np.hstack([np.cross(ends[:, 0], ends[:, 1]), ends[:, 1] - ends[:, 0]])
+        variables["lines"] = Variables(chart, chart.from_ambient(plucker))
+        seen = [pixels_of(poses[table[:, 1]], ends[table[:, 0], k]) for k in (0, 1)]
+        factors.append(
+            LineReprojection(
+                pose=Ref("poses", table[:, 1]), line=Ref("lines", table[:, 0]), camera_model="PINHOLE",
+                intrinsics=Ref("intrinsics", np.zeros(len(table), int)), segments=np.hstack(seen),
+            )
+        )  # fmt: skip
+    if planes is not None:
+        chart = PLANE_CHARTS["normal_offset"]
+        variables["planes"] = Variables(chart, chart.from_ambient(np.asarray(planes, float)))
+        point, plane = np.asarray(on_plane).T
+        factors.append(PointOnPlane(point=Ref("points", point), plane=Ref("planes", plane), sqrt_information=100.0))
+    return Problem(variables, factors)
+
+
+RNG = np.random.default_rng(11)
+CLOUD = RNG.uniform(-1.5, 1.5, (40, 3))
+RING = cameras_on_a_ring(np.random.default_rng(3), 6)
+PAIR = [[0, 0, 0.5], [1, 0, 0.5]]
+PATH = looking([[x, -6.0, 0.0] for x in np.linspace(-2, 2, 5)], forward=[0, 1, 0])
+
+
+def positions_held(problem, cameras):
+    """Priors on the positions of some cameras."""
+    T = problem.variables["poses"].ambient().reshape(-1, 3, 4)
+    centers = -np.einsum("nij,ni->nj", T[:, :, :3], T[:, :, 3])
+    prior = PositionPrior(pose=Ref("poses", cameras), cam_center_in_world=centers[cameras], sqrt_information=100.0)
+    return Problem(problem.variables, [*problem.factors, prior])
+
+
+def one_pose_held():
+    return problem_of(RING, CLOUD, held=np.arange(6) == 0)
+
+
+def camera_and_planes(*planes):
+    """A camera that sees known planes only."""
+    pose = looking([[0.0, -5.0, 1.0]])
+    hesse = np.array(planes, float)
+    chart = PLANE_CHARTS["normal_offset"]
+    T = se3.to_matrix(pose)[0]
+    in_camera = hesse @ np.linalg.inv(T)
+    return Problem(
+        {"poses": Variables(POSE_CHARTS["left"], pose), "planes": Variables(chart, chart.from_ambient(hesse), True)},
+        [
+            PlaneObservation(
+                pose=Ref("poses", np.zeros(len(hesse), int)), plane=Ref("planes", np.arange(len(hesse))),
+                planes_in_cam=in_camera, sqrt_information=100.0,
+            )
+        ],
+    )  # fmt: skip
+
+
+def two_groups():
+    near, far = CLOUD, CLOUD + np.array([100.0, 0, 0])
+    poses = np.vstack([RING, looking([[100 + x, -6.0, 0.3 * x] for x in (-2, 0, 2, 3)], at=(100, 0, 0))])
+    table = [(k, c) for k in range(40) for c in range(6)] + [(40 + k, 6 + c) for k in range(40) for c in range(4)]
+    return problem_of(poses, np.vstack([near, far]), point_obs=table)
+
+
+def few_observations():
+    table = [(k, c) for k in range(40) for c in range(6) if c != 4 or k < 2]
+    return problem_of(RING, CLOUD, point_obs=table)
+
+
+# name, problem, kind of the finding, what its sentence must say
+CASES = [
+    ("free scene", lambda: problem_of(RING, CLOUD), "free_motions", ["7 ways", "translation", "rotation", "scale"]),
+    ("scale", one_pose_held, "free_motions", ["1 way", ": scale."]),
+    (
+        "axis", lambda: positions_held(problem_of(RING, CLOUD), [0, 3]), "free_motions",
+        ["1 way", "rotation about"],
+    ),
+    (
+        "one known camera position", lambda: positions_held(problem_of(RING, CLOUD), [0]), "free_motions",
+        ["4 ways", "rotation and scale"],
+    ),
+    (
+        "pure rotation",
+        lambda: problem_of(
+            np.vstack([looking([[0, -6.0, 0]], at=[x, 0, z]) for x in (-1, 0, 1) for z in (-0.5, 0.5)]), CLOUD
+        ),
+        "pure_rotation", ["only turn", "depth"],
+    ),
+    (
+        "line along the motion",
+        lambda: problem_of(PATH, CLOUD, [[[-1, 0, 1.0], [1, 0, 1.0]], [[0, 0, -1], [0.3, 1, 1]]]),
+        "line_along_motion", ["Line 0 ", "along the motion", "slide"],
+    ),
+    (
+        "line in its epipolar plane",
+        lambda: problem_of(PATH, CLOUD, [[[-1, 0, 0.0], [1, 1.5, 0.0]], [[0, 0, -1], [0.3, 1, 1]]]),
+        "line_in_epipolar_plane", ["Line 0 ", "epipolar plane", "slide"],
+    ),
+    (
+        "line seen once",
+        lambda: problem_of(
+            PATH, CLOUD, [[[-1, 0, 1.0], [1, 0.5, -1.0]], [[0, 0, -1], [0.3, 1, 1]]],
+            line_obs=[(0, 2), *[(1, c) for c in range(5)]],
+        ),
+        "line_seen_once", ["Line 0 ", "one camera only", "plane through it and the camera"],
+    ),
+    (
+        "point at infinity", lambda: problem_of(RING[:3], np.vstack([CLOUD, [[0.0, 1e5, 2e4]]]), held=True),
+        "point_no_parallax", ["Point 40 ", "no parallax", "infinity"],
+    ),
+    (
+        "point seen once",
+        lambda: problem_of(RING, CLOUD, point_obs=[(k, c) for k in range(40) for c in range(6) if k != 7 or c == 0]),
+        "point_seen_once", ["Point 7 ", "one camera only", "depth"],
+    ),
+    (
+        "plane through two points",
+        lambda: problem_of(RING, [*CLOUD, *PAIR], planes=[[0, 0, 1, -0.5]], on_plane=[(40, 0), (41, 0)]),
+        "plane_open", ["Plane 0 ", "turn about x", "2 points only"],
+    ),
+    (
+        "plane through one point",
+        lambda: problem_of(RING, [*CLOUD, [0, 0, 0.5]], planes=[[0, 0, 1, -0.5]], on_plane=[(40, 0)]),
+        "plane_open", ["Plane 0 ", "turn about every axis in it", "1 point only"],
+    ),
+    (
+        "plane seen edge-on",
+        lambda: problem_of(PATH, [*CLOUD, [0, 0, 0], [1, 0, 0]], planes=[[0, 0, 1, 0]], on_plane=[(40, 0), (41, 0)]),
+        "plane_edge_on", ["Plane 0 ", "turn about x", "edge-on"],
+    ),
+    (
+        "single plane", lambda: camera_and_planes([0, 0, 1, 0]), "camera_open",
+        ["Pose 0 ", "move in the plane across z", "turn about z"],
+    ),
+    ("two planes", lambda: camera_and_planes([0, 0, 1, 0], [1, 0, 0, -2]), "camera_open", ["Pose 0 ", "move along y"]),
+    ("planar scene", lambda: problem_of(RING, CLOUD * [1, 1, 0]), "planar_scene", ["one plane", "homography"]),
+    ("camera with two points", few_observations, "camera_open", ["Pose 4 ", "4 measured numbers"]),
+    ("two groups", two_groups, "separate_parts", ["2 groups", "6 and 4"]),
+    (
+        "camera without observations",
+        lambda: problem_of(RING, CLOUD, point_obs=[(k, c) for k in range(40) for c in range(5)]),
+        "no_observations", ["Pose 5 has no observations"],
+    ),
+    (
+        "focal length and depth",
+        lambda: problem_of(PATH, CLOUD * [1, 0, 1], free_intrinsics=True), "parameters_open",
+        ["Intrinsic 0", "compensate each other"],
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "kind", "words"), [case[1:] for case in CASES], ids=[case[0] for case in CASES])
+def test_what_is_not_observable_is_named(make, kind, words):
+    diagnosis = diagnose(make())
+    found = [finding for finding in diagnosis.findings if finding.kind == kind]
+    assert len(found) == 1, diagnosis.sentences
+    for word in words:
+        assert word in found[0].sentence
+    problems = {finding.kind for finding in diagnosis.findings if finding.severity == "problem"}
+    assert problems <= {kind}, diagnosis.sentences
+    json.dumps(diagnosis.to_dict(), allow_nan=False)
+
+
+def test_a_sound_scene_gives_no_alarm():
+    problem = problem_of(RING, CLOUD, RNG.uniform(-1, 1, (12, 2, 3)), planes=[[0, 0, 1, 0.0]], on_plane=[(0, 0)])
+    xyz = CLOUD.copy()
+    xyz[:10, 2] = 0.0
+    problem = problem_of(
+        RING, xyz, RNG.uniform(-1, 1, (12, 2, 3)), planes=[[0, 0, 1, 0.0]], on_plane=[(k, 0) for k in range(10)]
+    )
+    diagnosis = diagnose(problem)
+    assert [finding.kind for finding in diagnosis.findings] == ["determined", "free_motions"]
+    assert diagnosis.num_open_directions == 0
+    assert (diagnosis.weakness["points"] < 0.01).all()
+    held = dataclasses.replace(problem.variables["poses"], constant=np.arange(6) < 2)
+    diagnosis = diagnose(Problem({**problem.variables, "poses": held}, problem.factors))
+    assert diagnosis.sentences == ["Everything is determined by the data."]
+    assert diagnosis.free_motions == ()
+
+
+@pytest.mark.parametrize("chart", sorted(LINE_CHARTS))
+def test_weakness_does_not_depend_on_the_chart(chart):
+    expected = diagnose(scene_problem(num_points=20, num_lines=10, disturb=0.0)).weakness["lines"]
+    got = diagnose(scene_problem(num_points=20, num_lines=10, disturb=0.0, line_chart=chart)).weakness["lines"]
+    np.testing.assert_allclose(got, expected, rtol=1e-6)
+
+
+def test_a_camera_with_wrong_pixels_stands_out():
+    problem = scene_problem(num_points=60, num_cameras=8, noise=0.5)
+    factor = problem.factors[0]
+    pixels = factor.pixels.copy()
+    bad = factor.references()[0][1].index == 3
+    pixels[bad] += np.random.default_rng(0).normal(0, 30, (int(bad.sum()), 2))
+    diagnosis = diagnose(
+        Problem(problem.variables, [dataclasses.replace(factor, pixels=pixels)]), lambda group, i: f"image {i}.png"
+    )
+    found = [finding for finding in diagnosis.findings if finding.kind == "camera_residuals"]
+    assert len(found) == 1
+    assert found[0].indices == (3,)
+    assert "image 3.png" in found[0].sentence
+    assert "wrong matches" in found[0].sentence

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma track`` on a small rendered sequence in the layout of TUM RGB-D: what it writes, and what it refuses."""
+
+import json
+
+import _room
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from groma.cli.app import app
+from groma.io import read_scene
+from groma.io.trajectories import read_tum
+from groma.tracking import Tracker, TrackOptions
+from groma.tracking.journal import Journal
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("room")
+    (folder / "rgb").mkdir()
+    (folder / "depth").mkdir()
+    lists = {"rgb": [], "depth": []}
+    for k, frame in enumerate(_room.frames("rgbd", _room.poses(16))):
+        images = {"rgb": frame.gray, "depth": np.round(frame.depth * 5000).astype(np.uint16)}
+        for kind, image in images.items():
+            name = f"{kind}/{k:04d}.png"
+            cv2.imwrite(str(folder / name), image)
+            lists[kind].append(f"{frame.timestamp:.6f} {name}\n")
+    for kind, rows in lists.items():
+        (folder / f"{kind}.txt").write_text("# time file\n" + "".join(rows))
+    return folder
+
+
+# As OpenCV counts pixels, from the centre of the first one.
+CAMERA = f"{_room.FOCAL} {_room.FOCAL} {_room.WIDTH / 2 - 0.5} {_room.HEIGHT / 2 - 0.5}"
+
+
+def _run(*arguments):
+    return CliRunner().invoke(app, ["track", *map(str, arguments)])
+
+
+def test_what_it_writes(sequence, tmp_path):
+    out = tmp_path / "out"
+    result = _run(sequence, "-o", out, "--camera", CAMERA, "--json", tmp_path / "numbers.json")
+    assert result.exit_code == 0, result.output
+    assert "16 tracked" in result.output
+    trajectory = read_tum(out / "trajectory.txt")
+    assert len(trajectory) == 16
+    assert _room.position_error(trajectory, _room.poses(16)) < 0.01
+    for scene in (read_scene(out), read_scene(out / "scene.npz")):
+        assert scene.num_images >= 2
+        assert scene.num_lines > 0
+    assert "<html" in (out / "report.html").read_text().lower()
+    for path in (out / "summary.json", tmp_path / "numbers.json"):
+        numbers = json.loads(path.read_text())
+        assert numbers["frames"] == {"tracked": 16}
+        assert numbers["kind"] == "rgbd"
+    assert not (tmp_path / "out.work").exists()
+    again = _run(sequence, "-o", out, "--camera", CAMERA)
+    assert again.exit_code == 1
+    assert "--force" in again.output
+
+
+def test_less_of_it(sequence, tmp_path):
+    result = _run(sequence, "-o", tmp_path / "few", "--camera", CAMERA, "--max-frames", 4, "--no-lines", "--no-planes")
+    assert result.exit_code == 0, result.output
+    numbers = json.loads((tmp_path / "few" / "summary.json").read_text())
+    assert numbers["lines"] == numbers["planes"] == 0
+    assert numbers["frames"] == {"tracked": 4}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--kind", "sonar"], "rgbd, stereo or mono"),
+        (["--no-points", "--no-lines", "--no-planes"], "Nothing to track"),
+    ],
+)
+def test_what_it_refuses(sequence, tmp_path, arguments, word):
+    result = _run(sequence, "-o", tmp_path / "no", "--camera", CAMERA, *arguments)
+    assert result.exit_code == 1
+    assert word in result.output
+    assert not (tmp_path / "no").exists()
+
+
+def test_nothing_tracked_is_said_in_one_line(sequence, tmp_path):
+    result = _run(sequence, "-o", tmp_path / "still", "--camera", CAMERA, "--kind", "mono", "--max-frames", 1)
+    assert result.exit_code == 1
+    assert "No frame of" in result.output
+    assert not (tmp_path / "still").exists()
+
+
+def test_finished_keyframes_are_on_disk_while_it_runs(tmp_path):
+    tracker = Tracker(_room.camera(), TrackOptions(num_points=250, num_features=500))
+    journal = Journal(tmp_path / "work")
+    chosen = 0
+    for frame in _room.frames("rgbd", _room.poses(14)):
+        tracked = tracker.process(frame)
+        if tracked.keyframe:
+            chosen += 1
+            journal.keyframe(tracker, tracked)
+            assert len(read_tum(tmp_path / "work" / "keyframes.txt")) == chosen
+    assert chosen >= 2
+    assert read_scene(tmp_path / "work" / "scene.npz").num_images >= 1
+    assert len(read_tum(tmp_path / "work" / "trajectory.txt")) >= 1
+    tracker.finish()

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Real sequences: limits are those the tracker was made for, on references of a depth camera, a laboratory and GPS."""
+
+import pytest
+
+from groma.evaluation.trajectory import score_trajectory
+from groma.io.sequences import open_sequence
+from groma.tracking import Tracker, TrackOptions
+
+pytestmark = pytest.mark.shared
+
+
+def _track(folder, align="se3", options=None, **selection):
+    frames = open_sequence(folder, **selection)
+    tracker = Tracker(frames.camera, options)
+    statuses = [tracker.process(frame).status for frame in frames]
+    result = tracker.finish()
+    return statuses, result, score_trajectory(result.trajectory, frames.reference, align, max_time_difference=0.02)
+
+
+def test_kitchen(shared_data):
+    statuses, result, scores = _track(shared_data / "rgbd_7scenes_redkitchen")
+    assert set(statuses) == {"tracked"}
+    assert scores.ate.rmse < 0.02
+    assert result.scene.num_lines > 30
+
+
+def test_cabinet_needs_lines_and_planes(shared_data):
+    """Few points, wide steps: 5 cm over a path of 8.3 m with all landmarks; points alone miss that by far."""
+    statuses, result, scores = _track(shared_data / "rgbd_tum_fr3_cabinet")
+    assert "lost" not in statuses
+    assert len(result.trajectory) == 58
+    assert scores.ate.rmse < 0.05
+    points_alone = _track(shared_data / "rgbd_tum_fr3_cabinet", options=TrackOptions(lines=False, planes=False))[2]
+    assert points_alone.ate.rmse > 2 * scores.ate.rmse
+
+
+def test_street_by_a_stereo_pair(shared_data):
+    statuses, result, scores = _track(shared_data / "stereo_kitti06")
+    assert set(statuses) == {"tracked"}
+    assert scores.drift_percent < 1.0
+    # The rectification of these images is off by a third of a pixel, which the map tells.
+    assert 0.1 < result.statistics["right_offset_px"] < 0.5
+
+
+def test_street_by_one_camera(shared_data):
+    statuses, _, scores = _track(shared_data / "stereo_kitti06", "sim3", kind="mono")
+    assert "lost" not in statuses
+    assert scores.drift_percent < 2.0

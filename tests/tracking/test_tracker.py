@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The tracker on rendered sequences: depth camera, stereo pair, one camera; faults in the frames; getting lost.
+
+The camera moves 0.6 scene units among walls at 2 to 3 units; a pixel spans about 1 cm there, and poses come from some
+hundred points, so a centimetre is a generous limit for what is metric.
+"""
+
+import dataclasses
+
+import _room
+import numpy as np
+import pytest
+
+from groma.errors import InputError, ShapeError
+from groma.io.sequences import SequenceCamera
+from groma.tracking import Tracker, TrackOptions
+
+pytestmark = pytest.mark.filterwarnings("error")
+COUNT = 24
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return _room.poses(COUNT)
+
+
+@pytest.fixture(scope="module")
+def rgbd(truth):
+    return _room.frames("rgbd", truth)
+
+
+def _run(frames, camera=None, **options):
+    tracker = Tracker(camera or _room.camera(), TrackOptions(num_points=250, num_features=500, **options))
+    return [tracker.process(frame) for frame in frames], tracker.finish()
+
+
+@pytest.fixture(scope="module")
+def tracked(rgbd):
+    return _run(rgbd)
+
+
+def test_depth_camera(tracked, truth):
+    rows, result = tracked
+    assert all(row.status == "tracked" for row in rows)
+    assert _room.position_error(result.trajectory, truth) < 0.01
+    assert len(result.trajectory) == COUNT
+
+
+def test_the_scene_holds_what_was_seen(tracked, truth):
+    _, result = tracked
+    scene = result.scene
+    assert scene.num_images == len(result.keyframes) >= 2
+    assert scene.num_points > 50
+    assert scene.num_lines > 5
+    assert len(scene.relations.line_on_plane) > 0
+    # The first frame is the world; walls lie where the room says, seen from there.
+    walls = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            normal = np.zeros(3)
+            normal[axis] = sign
+            walls.append(np.append(normal, _room.ROOM[axis]))
+    walls = np.array(walls)
+    assert scene.num_planes >= 2
+    for hesse in scene.planes.hesse:
+        nearest = walls[np.argmax(walls[:, :3] @ hesse[:3])]
+        assert nearest[:3] @ hesse[:3] > np.cos(0.02)
+        assert abs(hesse[3] - nearest[3]) < 0.03
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"lines": False, "planes": False}, {"points": False}, {"lines": False}],
+    ids=["points", "lines and planes", "points and planes"],
+)
+def test_kinds_of_landmarks_apart(rgbd, truth, options):
+    rows, result = _run(rgbd[:12], **options)
+    lost = [row.status for row in rows if row.status not in ("tracked", "weak")]
+    assert not lost
+    assert _room.position_error(result.trajectory, truth) < 0.02
+
+
+def test_stereo_pair(truth):
+    frames = _room.frames("stereo", truth[:16])
+    rows, result = _run(frames, _room.camera(_room.BASELINE))
+    assert all(row.status == "tracked" for row in rows)
+    # A disparity of half a pixel at 2.5 units is 4 cm; hundreds of points bring that below 2 cm.
+    assert _room.position_error(result.trajectory, truth) < 0.02
+
+
+def test_one_camera(truth):
+    rows, result = _run(_room.frames("mono", truth))
+    statuses = [row.status for row in rows]
+    assert "lost" not in statuses
+    assert statuses.count("tracked") > COUNT // 2
+    assert not result.statistics["metric"]
+    assert _room.position_error(result.trajectory, truth, scale=True) < 0.02
+
+
+def test_runs_repeat_exactly(rgbd, tracked):
+    again = _run(rgbd)[1]
+    assert np.array_equal(again.trajectory.world_from_cam, tracked[1].trajectory.world_from_cam)
+
+
+def test_a_thread_changes_little(rgbd, truth):
+    result = _run(rgbd[:12], threaded=False)[1]
+    assert _room.position_error(result.trajectory, truth) < 0.01
+
+
+def test_frames_with_nothing_to_see_are_skipped(rgbd, truth):
+    spoilt = list(rgbd[:14])
+    spoilt[6] = dataclasses.replace(spoilt[6], gray=np.zeros_like(spoilt[6].gray))
+    spoilt[7] = dataclasses.replace(spoilt[7], gray=np.full_like(spoilt[7].gray, 255))
+    spoilt[9], spoilt[10] = spoilt[10], spoilt[9]
+    rows, result = _run(spoilt)
+    assert [k for k, row in enumerate(rows) if row.status == "skipped"] == [6, 7, 10]
+    assert "black" in rows[6].reason
+    assert "overexposed" in rows[7].reason
+    assert "time stamp" in rows[10].reason
+    assert len(result.warnings) == 3
+    assert _room.position_error(result.trajectory, truth) < 0.01
+
+
+def test_holes_in_depth(rgbd, truth):
+    rng = np.random.default_rng(3)
+    spoilt = []
+    for frame in rgbd[:14]:
+        holes = np.kron(rng.random((24, 32)), np.ones((10, 10))) < 0.9
+        spoilt.append(dataclasses.replace(frame, depth=np.where(holes, 0, frame.depth).astype(np.float32)))
+    rows, result = _run(spoilt)
+    assert all(row.pose is not None for row in rows)
+    assert _room.position_error(result.trajectory, truth) < 0.02
+
+
+def test_frozen_and_missing_frames(rgbd, truth):
+    frozen = [dataclasses.replace(rgbd[8], timestamp=frame.timestamp) if 8 <= k < 11 else frame
+              for k, frame in enumerate(rgbd[:20])]  # fmt: skip
+    rows, result = _run(frozen)
+    assert all(row.pose is not None for row in rows)
+    assert any("repeated" in sentence for sentence in result.warnings)
+    rows, result = _run([*rgbd[:6], *rgbd[10:16]])
+    assert all(row.pose is not None for row in rows)
+    assert _room.position_error(result.trajectory, truth) < 0.01
+
+
+def test_finds_its_place_again(rgbd, truth):
+    """The camera is turned to the opposite wall, which was never seen, and back to a place seen before."""
+    away = _room.poses(1)
+    away[0, :4] = [0, 1, 0, 0]
+    elsewhere = [
+        dataclasses.replace(frame, timestamp=(14 + k) / 30.0)
+        for k, frame in enumerate(_room.frames("rgbd", np.repeat(away, 3, axis=0)))
+    ]
+    back = [dataclasses.replace(rgbd[k], timestamp=(20 + k) / 30.0) for k in (5, 6, 7)]
+    tracker = Tracker(_room.camera(), TrackOptions(num_points=250, num_features=500))
+    for frame in rgbd[:14]:
+        tracker.process(frame)
+    assert {tracker.process(frame).status for frame in elsewhere} == {"lost"}
+    found = tracker.process(back[0])
+    assert found.status == "found"
+    expected = truth[5]
+    assert np.abs(found.pose[4:] - expected[4:]).max() < 0.02
+    assert tracker.process(back[1]).status == "tracked"
+    tracker.finish()
+
+
+def test_visiting_again_makes_few_keyframes(rgbd):
+    """Back and forth over the same views: keyframes of the first visit stand for the later ones."""
+    tracker = Tracker(_room.camera(), TrackOptions(num_points=250, num_features=500))
+    counts, time = [], 0.0
+    for order in (range(16), range(15, -1, -1), range(16)):
+        for k in order:
+            tracker.process(dataclasses.replace(rgbd[k], timestamp=time))
+            time += 1 / 30
+        counts.append(len(tracker.map.living()))
+    tracker.finish()
+    assert counts[2] <= 2 * counts[0]
+
+
+def test_wrong_frames_are_errors(rgbd):
+    tracker = Tracker(_room.camera())
+    with pytest.raises(ShapeError, match="size of the camera"):
+        tracker.process(dataclasses.replace(rgbd[0], gray=rgbd[0].gray[:100]))
+    with pytest.raises(InputError, match="float32"):
+        tracker.process(dataclasses.replace(rgbd[0], depth=rgbd[0].depth.astype(np.float64)))
+    with pytest.raises(InputError, match="baseline"):
+        tracker.process(dataclasses.replace(rgbd[0], depth=None, right=rgbd[0].gray))
+    tracker.finish()
+    with pytest.raises(InputError, match="finished"):
+        tracker.process(rgbd[0])
+
+
+def test_wrong_cameras_and_options_are_errors():
+    with pytest.raises(InputError, match="undistorted"):
+        Tracker(SequenceCamera("OPENCV", np.array([300, 300, 160, 120, 0.1, 0, 0, 0.0]), 320, 240))
+    with pytest.raises(InputError, match="Nothing to track"):
+        TrackOptions(points=False, lines=False, planes=False)
+    with pytest.raises(InputError, match="window"):
+        TrackOptions(window=1)
+
+
+def test_a_track_without_frames():
+    result = Tracker(_room.camera()).finish()
+    assert len(result.trajectory) == 0
+    assert result.scene.num_images == 0
+    assert "No map" in result.warnings[-1]
