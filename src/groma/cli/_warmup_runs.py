@@ -39,6 +39,7 @@ def _adjust_steps() -> Steps:
     def step(scene: Scene, **changes: Any) -> Callable[[], Any]:
         return lambda: adjust(scene, replace(few, **changes))
 
+    yield "projection", _project
     for name in HELD:
         yield f"{name}, calibration held", step(_with_model(start, name))
     yield "landmarks alone", step(start, refine_poses=False)
@@ -51,6 +52,14 @@ def _adjust_steps() -> Steps:
     own = _with_own_cameras(start.points_only(), "BAL")
     for solver in ("dense", "pcg"):
         yield f"BAL, {solver} solver", step(own, loss="none", linear_solver=solver)
+
+
+def _project() -> None:
+    """Project a point and back, by each model."""
+    for name in (*HELD, "BAL"):
+        camera, params = model(name), _cameras(name, 1).params
+        pixels = camera.project(params[0], np.array([[0.1, 0.2, 2.0]]))
+        camera.unproject(params[0], pixels)
 
 
 def _with_model(scene: Scene, name: str) -> Scene:

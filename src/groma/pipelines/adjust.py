@@ -34,7 +34,7 @@ RELATION_SCALES = {"cauchy": 2.0, "geman_mcclure": 4.0}
 #: loss would doubt good measurements.
 LAST_SCALE_SIGMAS = 12.0
 #: Relative decrease of the cost at which a stage that is not the last ends.
-STAGE_TOLERANCE = 1e-4
+STAGE_TOLERANCE = 1e-2
 #: The same for the first stage of plain least squares with lines, after which lines may be restarted.
 RESTART_TOLERANCE = 0.1
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from groma._typing import FloatArray
 from groma.frontend.point_tracks import follow
@@ -125,8 +126,6 @@ class Initialiser:
 
 def _shift_near(places: FloatArray, shift: FloatArray, wanted: FloatArray) -> FloatArray:
     """Median shift of the four nearest of some places."""
-    from scipy.spatial import KDTree
-
     near = KDTree(places).query(wanted, k=min(4, len(places)))[1].reshape(len(wanted), -1)
     return np.median(shift[near], axis=1)
 

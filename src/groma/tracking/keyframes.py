@@ -16,7 +16,7 @@ from groma.scene.landmarks import Lines
 from groma.tracking.camera import TrackCamera, back, into
 from groma.tracking.features import FrameFeatures
 from groma.tracking.landmarks import ALIVE, PENDING
-from groma.tracking.lines import FollowedSegments, assign, expected_segments
+from groma.tracking.lines import FollowedSegments, assign, expected_segments, line_ends
 from groma.tracking.observations import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.options import TrackOptions
 from groma.tracking.planes import add_planes, assign_planes, grow
@@ -341,8 +341,6 @@ def _ray_planes(camera: TrackCamera, poses: FloatArray, ends: FloatArray) -> tup
 
 def _extend_lines(track_map: TrackMap, camera: TrackCamera, pose, index, ends) -> None:
     """Lengthen lines to what is seen of them now."""
-    from groma.tracking.lines import line_ends
-
     lines = track_map.lines
     alive = np.flatnonzero(lines.alive[index])
     rows = index[alive]

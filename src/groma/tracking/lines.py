@@ -19,7 +19,7 @@ from groma.frontend.edge_fit import measure_edges
 from groma.frontend.flow_matching import Flow
 from groma.frontend.images import GrayImage
 from groma.geometry import segment2
-from groma.tracking.camera import TrackCamera, into
+from groma.tracking.camera import TrackCamera, into, rotation
 from groma.tracking.landmarks import LineTable
 
 #: The coarse flow is computed on images reduced by this factor.
@@ -178,8 +178,6 @@ def line_ends(
     """Points (n, 2, 3) of lines in the world nearest to the rays through their segments' ends, and where defined."""
     direction = plucker[:, 3:] / np.linalg.norm(plucker[:, 3:], axis=1, keepdims=True)
     foot = np.cross(direction, plucker[:, :3]) / np.linalg.norm(plucker[:, 3:], axis=1, keepdims=True)
-    from groma.tracking.camera import rotation
-
     R = rotation(pose)
     center = -R.T @ pose[4:]
     out = np.zeros((len(ends), 2, 3))

@@ -26,7 +26,7 @@ from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
 from groma.solver.solve import solve
 from groma.tracking.camera import TrackCamera, back, into
-from groma.tracking.landmarks import ALIVE, DEAD
+from groma.tracking.landmarks import ALIVE
 from groma.tracking.lines import line_ends
 from groma.tracking.motion import GATE
 from groma.tracking.observations import (
@@ -234,4 +234,4 @@ def job_of(
     )  # fmt: skip
 
 
-__all__ = ["DEAD", "AdjustmentJob", "job_of", "window_job"]
+__all__ = ["AdjustmentJob", "job_of", "window_job"]

@@ -9,11 +9,12 @@ eigenvectors of their information :math:`H = \sum w J^\top J`, scaled so that 1 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray
 from groma.factors._factor import Factor, Ref
 from groma.factors.losses import Cauchy, GemanMcClure, Loss
 from groma.factors.pose_prior import PosePrior
@@ -25,10 +26,20 @@ from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
-from groma.tracking.camera import TrackCamera
+from groma.tracking.camera import TrackCamera, into
 from groma.tracking.landmarks import LineTable, PlaneTable, PointTable
-from groma.tracking.observations import Measurements, constants, line_factors, plane_factors, point_factors
+from groma.tracking.observations import (
+    LineMeasurements,
+    Measurements,
+    PlaneMeasurements,
+    PointMeasurements,
+    constants,
+    line_factors,
+    plane_factors,
+    point_factors,
+)
 
+Table = TypeVar("Table", PointMeasurements, LineMeasurements, PlaneMeasurements)
 #: A residual beyond this many standard deviations is an outlier.
 GATE = 3.5
 #: What counts as a well-known direction: share of the median depth, and radians.
@@ -134,9 +145,8 @@ def estimate_pose(
     return PoseEstimate(pose, kept[0], kept[1], kept[2], information, weak_directions(information, depth))
 
 
-def _renumbered(table):
-    from dataclasses import replace
-
+def _renumbered(table: Table) -> Table:
+    """Return a table whose rows refer to landmarks 0, 1, ..."""
     return replace(table, index=np.arange(len(table)))
 
 
@@ -152,7 +162,7 @@ def _whitened(problem: Problem, factor: Factor, wanted: tuple[int, ...], width: 
 def _agreeing(problem: Problem, group: list[Factor], count: int) -> BoolArray:
     """Which measurements have no row beyond the gate in the first factor group(s), which cover all of them."""
     good = np.zeros(count, dtype=bool)
-    landmark = {"point": "point", "line": "line", "plane": "plane"}
+    landmark = ("point", "line", "plane")
     for factor in group:
         if factor.type_name == "point_depth" or getattr(factor, "extrinsics", None) is not None:
             continue
@@ -184,17 +194,10 @@ def weak_directions(information: FloatArray, depth: float) -> tuple[str, ...]:
 
 
 def _median_depth(view: MapView, measured: Measurements, pose: FloatArray) -> float:
-    from groma.tracking.camera import into
-
     places = [view.points.xyz[measured.points.index], view.lines.segment[measured.lines.index].mean(axis=1)]
     depths = into(pose, np.concatenate(places))[:, 2]
     depths = depths[depths > 0]
     return float(np.median(depths)) if len(depths) else 1.0
-
-
-def index_of(rows: BoolArray) -> IntArray:
-    """Return the positions of True."""
-    return np.flatnonzero(rows)
 
 
 __all__ = ["GATE", "MapView", "PoseEstimate", "estimate_pose", "pose_information", "weak_directions"]

@@ -23,6 +23,7 @@ from groma.factors.point_depth import PointDepth
 from groma.factors.point_reprojection import PointReprojection
 from groma.factors.stereo_point import StereoPoint
 from groma.geometry._manifold import Euclidean
+from groma.geometry.pose_charts import POSE_CHARTS
 from groma.problem.variables import Variables
 from groma.tracking.camera import PINHOLE, TrackCamera
 
@@ -128,8 +129,6 @@ class Measurements:
 
 def constants(camera: TrackCamera) -> dict[str, Variables]:
     """Return the groups of variables that never move: calibration and virtual cameras."""
-    from groma.geometry.pose_charts import POSE_CHARTS
-
     return {
         "intrinsics": Variables(Euclidean(4, "intrinsics"), camera.params[None], constant=True),
         "virtual": Variables(POSE_CHARTS["left"], VIRTUAL, constant=True),

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.geometry import quaternion
 from groma.tracking.camera import TrackCamera, back, into
 from groma.tracking.features import Features, FrameFeatures
 from groma.tracking.landmarks import ALIVE
@@ -85,8 +86,6 @@ def pose_from_matches(
     )  # fmt: skip
     if not found or inliers is None or len(inliers) < min_inliers or not np.isfinite(shift).all():
         return None
-    from groma.geometry import quaternion
-
     turned = quaternion.from_matrix(np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64))
     pose = np.concatenate([turned, np.asarray(shift, dtype=np.float64).ravel()])
     agree = np.zeros(len(places), dtype=bool)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -120,8 +120,6 @@ class TrackMap:
                 if (moved < 0).all():
                     break
                 index = np.where(moved >= 0, moved, index)
-            from dataclasses import replace
-
             planes = replace(planes, index=index)
         return Measurements(
             points.take(self.points.state[points.index] == ALIVE),
