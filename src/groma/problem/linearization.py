@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from groma._numba import loop
-from groma._simd import add_product, width
+from groma._simd import add_product, set_product, width
 from groma._typing import FloatArray
 from groma.problem._parallel import Workers
 from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
@@ -29,9 +29,12 @@ States = Mapping[str, FloatArray]
 
 @loop
 def _add_primary(
-    record, begin, landmark, l_column, incidence, block, c_column, V, g_l, W, H, g_c, rows, l_width, c_width, one
+    record, begin, landmark, l_column, incidence, block, c_column, V, g_l, W, H, g_c, sole, rows, l_width, c_width, one
 ):
-    """Sum the landmark, its incidence and its kept block, for factors with a landmark and a first kept block."""
+    """Sum the landmark, its incidence and its kept block, for factors with a landmark and a first kept block.
+
+    Incidences with a ``sole`` contribution are written instead of added to.
+    """
     n, m, columns = record.shape
     flat = record.reshape(record.size)
     dl, dc = len(l_width), len(c_width)
@@ -41,7 +44,10 @@ def _add_primary(
         p, q, c = np.int64(landmark[begin + i]), incidence[begin + i], np.int64(block[begin + i])
         add_product(V, p * (dl * dl), flat, at_l, columns, flat, at_l, columns, rows, l_width, l_width)
         add_product(g_l, p * dl, flat, at_r, columns, flat, at_l, columns, rows, one, l_width)
-        add_product(W, q * (dl * dc), flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
+        if sole:
+            set_product(W, q * (dl * dc), flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
+        else:
+            add_product(W, q * (dl * dc), flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
         add_product(H, c * (dc * dc), flat, at_c, columns, flat, at_c, columns, rows, c_width, c_width)
         add_product(g_c, c * dc, flat, at_r, columns, flat, at_c, columns, rows, one, c_width)
 
@@ -136,6 +142,10 @@ class NormalEquations:
         self.W = [
             {c: np.zeros(len(i.block) * e.dof * layout.kept[c].width) for c, i in e.incidences.items()}
             for e in layout.eliminated
+        ]
+        self._sole = [
+            {c: _has_sole_contributions(layout, number, c) for c in e.incidences}
+            for number, e in enumerate(layout.eliminated)
         ]
         self._H = [
             {p: np.zeros(n * layout.kept[p[0]].width * layout.kept[p[1]].width) for p, n in layout.num_direct.items()}
@@ -248,6 +258,8 @@ class NormalEquations:
         self.V[chunk.eliminated][chunk.begin * e.dof**2 : chunk.end * e.dof**2] = 0.0
         self.g_landmarks[chunk.eliminated][chunk.begin * e.dof : chunk.end * e.dof] = 0.0
         for c, incidences in e.incidences.items():
+            if self._sole[chunk.eliminated][c]:
+                continue
             size = e.dof * self.layout.kept[c].width
             first, last = incidences.pointer[chunk.begin], incidences.pointer[chunk.end]
             self.W[chunk.eliminated][c][first * size : last * size] = 0.0
@@ -297,7 +309,7 @@ class NormalEquations:
             c = first.kept_class
             _add_primary(
                 record, begin, layout.landmark, layout.landmark_column, first.incidence, first.block, first.column,
-                self.V[e], self.g_landmarks[e], self.W[e][c], H[c, c], g[c],
+                self.V[e], self.g_landmarks[e], self.W[e][c], H[c, c], g[c], self._sole[e][c],
                 rows, l_width, width(self.layout.kept[c].width), _ONE,
             )  # fmt: skip
             for entry in rest:
@@ -318,6 +330,20 @@ class NormalEquations:
                 record, begin, a.block, a.column, b.block, b.column, slot, pair[0] == pair[1], H[pair],
                 rows, width(self.layout.kept[pair[0]].width), width(self.layout.kept[pair[1]].width),
             )  # fmt: skip
+
+
+def _has_sole_contributions(layout: Layout, eliminated: int, kept_class: int) -> bool:
+    """Return whether every incidence has one factor, which is the first kept block of it: it need not be cleared."""
+    total = 0
+    for factor in layout.factors:
+        if factor.eliminated != eliminated:
+            continue
+        for position, entry in enumerate(factor.kept):
+            if entry.kept_class == kept_class and entry.incidence is not None:
+                if position > 0:
+                    return False
+                total += len(entry.incidence)
+    return total == len(layout.eliminated[eliminated].incidences[kept_class].block)
 
 
 def _shares(chunks: tuple[Chunk, ...], count: int) -> list[list[Chunk]]:
