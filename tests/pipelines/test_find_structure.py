@@ -130,7 +130,7 @@ def test_bad_options():
 def test_facade_of_real_church(shared_data):
     scene = read_scene(shared_data / "strecha_herz_jesus_p8" / "sparse_gt")
     structure = detect_structure(scene)
-    assert 2 <= len(structure.planes) <= 12
+    assert 2 <= len(structure.planes) <= 20  # the front has many parallel layers: walls, jambs, steps
     assert structure.planes.support[0] > 1000
     # The church has one front; its parallel layers agree in direction.
     cosine = np.abs(structure.planes.planes[:, :3] @ structure.planes.planes[0, :3])

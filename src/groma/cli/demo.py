@@ -8,10 +8,6 @@ import typer
 
 from groma.cli import _options
 
-#: Least part of what is near a plane that must lie on it. The faces of the cabinet are bare, and what is near one are
-#: the edges of all of them, several times where the start is bent; half the usual part must do.
-MIN_SHARE = 0.2
-
 
 def demo(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the results.")] = Path(
@@ -38,9 +34,7 @@ def demo(
 
     from groma.cli import _cabinet
     from groma.cli._mapping import map_and_write
-    from groma.estimators.plane_search import PlaneOptions
     from groma.io import read_scene
-    from groma.pipelines.find_structure import StructureOptions
     from groma.pipelines.map import MapOptions
 
     cabinet = _cabinet.folder()
@@ -51,7 +45,7 @@ def demo(
         cabinet / "images",
         output,
         read_scene(cabinet / "model"),
-        MapOptions(threads=threads, structure=StructureOptions(planes=PlaneOptions(min_share=MIN_SHARE))),
+        MapOptions(threads=threads),
         force,
         "A filing cabinet in 58 photographs",
         judge=lambda result: _cabinet.judge(result, reference),

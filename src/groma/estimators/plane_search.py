@@ -63,7 +63,7 @@ class PlaneOptions:
     #: Largest standard deviation of the normal, radians. Half a degree.
     max_tilt: float = 0.0087
     #: Least part of the features in the layer around a plane that lie on it.
-    min_share: float = 0.4
+    min_share: float = 0.2
     #: Expected number of planes found where there are none.
     max_false_alarms: float = 1e-4
     #: Most planes.
