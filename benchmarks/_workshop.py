@@ -116,11 +116,6 @@ def environment(threads: int | None = 1, **more: str) -> dict[str, str]:
     return {**inherited, **ours, **limits, **more}
 
 
-def forget_kernels() -> None:
-    """Drop the kernels compiled by earlier runs, so that a first use is measured as one."""
-    shutil.rmtree(CACHE / "numba", ignore_errors=True)
-
-
 def build_ceres() -> Path | None:
     """Build the Ceres programs; return their folder, or None (and say why) where that cannot be done."""
     folder = CACHE / "ceres"

@@ -25,7 +25,8 @@ def measured() -> dict[str, float]:
     found = {}
     for path in sorted(RESULTS.glob("*.json")):
         result = json.loads(path.read_text())
-        found.update({f"{result['problem']}.{name}": value for name, value in result["metrics"].items()})
+        if isinstance(result, dict) and "metrics" in result:
+            found.update({f"{result['problem']}.{name}": value for name, value in result["metrics"].items()})
     return found
 
 
@@ -50,7 +51,7 @@ def main() -> int:
     arguments = parser.parse_args()
     baseline, values = json.loads(BASELINE.read_text()), measured()
     if not values:
-        print(f"There are no results in {RESULTS}. Run benchmarks/run.py or benchmarks/latency.py first.")
+        print(f"There are no results in {RESULTS}. Run benchmarks/run.py or another benchmark first.")
         return 2
     if arguments.update:
         for name, entry in baseline["metrics"].items():

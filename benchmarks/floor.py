@@ -167,8 +167,9 @@ def main() -> int:
     # the stages of a report are timed by this clock: CPU time instead of wall time, so that other work does not count
     solver_report.time = SimpleNamespace(perf_counter=time.process_time)
     flops, bandwidth = peak_rates()
-    print(f"One thread: {flops / 1e9:.1f} GFLOP/s (matrix product), {bandwidth / 1e9:.1f} GB/s (sum of arrays)\n")
     lines = [
+        f"One thread: {flops / 1e9:.1f} GFLOP/s (matrix product), {bandwidth / 1e9:.1f} GB/s (sum of arrays).",
+        "",
         "| problem | stage | calls | CPU ms | MFLOP per call | MB per call | GFLOP/s | floor ms | CPU / floor |",
         "|---|---|--:|--:|--:|--:|--:|--:|--:|",
     ]

@@ -5,7 +5,7 @@
 
 groma's public functions on arrays, plain NumPy, and spatialmath, which has an object per line (its environment comes
 from ``peers.py spatialmath``). All get the same lines, and the image lines are compared with the pixels of the points
-they were made of. Writes ``benchmarks/results/geometry.json``.
+they were made of. Writes ``benchmarks/results/geometry.json`` and ``geometry.md``.
 """
 
 from __future__ import annotations
@@ -58,9 +58,11 @@ def main() -> int:
         result["metrics"] = {f"{kind}_ratio_spatialmath": rates["groma"][kind] / peer[kind] for kind in OPERATIONS}
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "geometry.json").write_text(json.dumps(result, indent=1) + "\n")
-    print("| lines per second | " + " | ".join(rates) + " |\n|---|" + "--:|" * len(rates))
+    lines = ["| lines per second | " + " | ".join(rates) + " |", "|---|" + "--:|" * len(rates)]
     for kind in OPERATIONS:
-        print(f"| {kind.replace('_', ' ')} | " + " | ".join(f"{row[kind]:.3g}" for row in rates.values()) + " |")
+        lines.append(f"| {kind.replace('_', ' ')} | " + " | ".join(f"{row[kind]:.3g}" for row in rates.values()) + " |")
+    (RESULTS / "geometry.md").write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
     for name, error in result["median_error"].items():
         if error > AGREEMENT:
             print(f"{name}: transformed lines miss the transformed points by {error:.1g} of their pixels (median).")

@@ -11,7 +11,7 @@
   which compiles the kernels, and the next one.
 - ``groma warmup``, whole process: with an empty cache, and again.
 
-Medians; writes ``benchmarks/results/latency.json``.
+Medians; writes ``benchmarks/results/latency.json`` and ``latency.md``.
 """
 
 from __future__ import annotations
@@ -107,9 +107,11 @@ def main() -> int:
         ("`groma warmup`, empty cache", *warming[0].values()),
         ("`groma warmup`, again", *warming[1].values()),
     ]
-    print("| what | wall s | CPU s |\n|---|--:|--:|")
+    lines = ["| what | wall s | CPU s |", "|---|--:|--:|"]
     for what, wall, cpu in rows:
-        print(f"| {what} | {'' if wall is None else f'{wall:.3f}'} | {cpu:.4f} |")
+        lines.append(f"| {what} | {'' if wall is None else f'{wall:.3f}'} | {cpu:.4f} |")
+    (RESULTS / "latency.md").write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
     return 0
 
 

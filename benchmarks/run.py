@@ -9,7 +9,7 @@ others go on with those that may be its best, on one and on two threads. A peer 
 one. Reported are medians; CPU time is that of the solve alone. ``--set-up`` first makes the peers' environments, as
 ``peers.py`` does; a peer that is not there is left out.
 
-Writes into ``benchmarks/results``: ``PROBLEM.json``, ``PROBLEM.svg`` (cost against CPU time), and ``table.md`` of all
+Writes into ``benchmarks/results``: ``PROBLEM.json``, ``PROBLEM.svg`` (cost against CPU time), and ``results.md`` of all
 results there; ``check.py`` compares with the baseline.
 """
 
@@ -31,7 +31,6 @@ from _workshop import (
     BenchmarkProblem,
     build_ceres,
     calibrate,
-    forget_kernels,
     machine,
     run_program,
 )
@@ -147,9 +146,14 @@ def one_run(key: Key, problem: BenchmarkProblem, pythons: dict[str, Path], runs:
 
 
 def best_solvers(runs: dict[Key, list[dict]]) -> dict[str, str]:
-    """Return the fastest linear solver of each contestant on one thread, by the first round."""
-    singles = sorted((rows[0]["cpu_s"], key) for key, rows in runs.items() if key[2] == 1)
-    return {name: solver for _, (name, solver, _) in reversed(singles)}
+    """Return by the first round the fastest linear solver of each contestant, of those that find its lowest cost."""
+    singles = {key: rows[0] for key, rows in runs.items() if key[2] == 1}
+    best: dict[str, str] = {}
+    for name in {key[0] for key in singles}:
+        mine = {key[1]: run for key, run in singles.items() if key[0] == name}
+        target = (1 + NEAR) * min(run["final_cost"] for run in mine.values())
+        best[name] = min(mine, key=lambda solver: (mine[solver]["final_cost"] > target, mine[solver]["cpu_s"]))
+    return best
 
 
 def survivors(runs: dict[Key, list[dict]]) -> list[Key]:
@@ -194,8 +198,12 @@ def mark_same_problem(rows: list[dict]) -> None:
 def best_rows(rows: list[dict], threads: int) -> dict[str, dict]:
     """Return the row of each contestant's best linear solver, groma first: least CPU time, on so many threads."""
     best: dict[str, dict] = {}
-    first_groma = sorted(rows, key=lambda row: (row["contestant"] != "groma", -row["rounds"], row["cpu_s"]))
-    for row in first_groma:
+
+    def rank(row: dict) -> tuple:
+        far = 0.0 if row["cpu_to_cost_s"] is not None else row["final_cost"]
+        return row["contestant"] != "groma", far, -row["rounds"], row["cpu_s"]
+
+    for row in sorted(rows, key=rank):
         if row["threads"] == threads:
             best.setdefault(row["contestant"], row)
     return best
@@ -256,7 +264,7 @@ def table(results: list[dict]) -> str:
                 )
     text = "\n".join(lines) + "\n"
     if "(1)" in text:
-        text += "\n(1) Leaves out observations of points behind their camera: a slightly different problem.\n"
+        text += "\n(1) Leaves out observations of points that start behind their camera: a slightly smaller problem.\n"
     return text
 
 
@@ -293,7 +301,6 @@ def main() -> int:
     rounds = arguments.rounds or (2 if arguments.quick else 5)
 
     RESULTS.mkdir(exist_ok=True)
-    forget_kernels()
     pythons = available(wanted, arguments.set_up)
     results = []
     for problem in PROBLEMS:
@@ -316,7 +323,7 @@ def main() -> int:
         path = RESULTS / f"{problem.name}.json"
         if path.is_file() and "cpu_to_cost_s" in (result := json.loads(path.read_text()))["contestants"][0]:
             everything.append(result)
-    (RESULTS / "table.md").write_text(table(everything))
+    (RESULTS / "results.md").write_text(table(everything))
     return 0
 
 

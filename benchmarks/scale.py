@@ -8,7 +8,7 @@ image and of images per point, calibration held. Every size runs in a process of
 the same kind of start, all sizes in turn within a round. Reported are CPU time of the solve per step and of its setup,
 the peak memory, the exponent of growth (the slope of a straight line through the logarithms), and what a problem of
 ``--project`` million observations (50) would need at the measured rates. A size whose memory, by the sizes before it,
-would not fit is left out. Writes ``benchmarks/results/scale.json`` and ``scale.svg``.
+would not fit is left out. Writes ``benchmarks/results/scale.json``, ``scale.md`` and ``scale.svg``.
 """
 
 from __future__ import annotations
@@ -102,6 +102,7 @@ def main() -> int:
             row[field] = statistics.median(run[field] for run in found)
         row["setup_s"] = statistics.median(run["stages"]["setup"] * run["cpu_s"] for run in found)
         row["step_s"] = (row["cpu_s"] - row["setup_s"]) / max(1, row["iterations"])
+        row["solve_s"] = statistics.median(run["stages"]["solve"] * run["cpu_s"] for run in found)
         rows.append(row)
     result = summary(rows, arguments.project)
     RESULTS.mkdir(exist_ok=True)
@@ -114,9 +115,9 @@ def main() -> int:
         "CPU seconds per step",
         [_plots.Line("groma", observations, [row["step_s"] for row in rows])],
     )
-    print("\n" + table(rows))
-    for sentence in result["sentences"]:
-        print(sentence)
+    text = table(rows) + "\n" + "\n".join(result["sentences"]) + "\n"
+    (RESULTS / "scale.md").write_text(text)
+    print("\n" + text)
     return 0
 
 
@@ -128,10 +129,13 @@ def summary(rows: list[dict], project: float) -> dict:
     sentences = [f"Memory: {base:.0f} MiB and {slope * 2**20:.0f} bytes per observation."]
     if len(rows) > 1:
         metrics["exponent"] = exponent(observations, [row["step_s"] for row in rows])
+        without = [row["step_s"] - row["solve_s"] / max(1, row["iterations"]) for row in rows]
+        metrics["exponent_without_linear_solver"] = exponent(observations, without)
         metrics["exponent_setup"] = exponent(observations, [row["setup_s"] for row in rows])
         sentences.append(
-            f"Growth of the CPU time: exponent {metrics['exponent']:.3f} per step, {metrics['exponent_setup']:.3f} for "
-            "the setup."
+            f"Growth of the CPU time: exponent {metrics['exponent']:.2f} per step, "
+            f"{metrics['exponent_without_linear_solver']:.2f} without the linear solver, "
+            f"{metrics['exponent_setup']:.2f} for the setup."
         )
         largest = rows[-1]
         factor = 1e6 * project / largest["observations"]

@@ -23,6 +23,7 @@ import os
 import pickle
 import sys
 import threading
+import uuid
 import zlib
 from dataclasses import dataclass
 from functools import lru_cache
@@ -98,7 +99,7 @@ class _Files:
     def save(self, key: tuple, data: Any) -> None:
         """Write what was compiled for a key."""
         path, payload = self._path(key), dumps(data)
-        draft = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}.tmp")
+        draft = path.with_name(f"{path.name}.{uuid.uuid4().hex[:16]}.tmp")  # unique on a shared drive too
         try:
             draft.write_bytes(_head(key, payload) + payload)
             os.replace(draft, path)

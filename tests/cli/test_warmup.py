@@ -80,6 +80,7 @@ def test_where_nothing_is_kept_it_says_so(made, monkeypatch, capsys):
     monkeypatch.setattr(_numba_cache, "folder", lambda: None)
     assert run(["warmup", "map"]) == 1
     assert "NUMBA_CACHE_DIR" in capsys.readouterr().err
+    assert not made
 
 
 def test_an_unknown_part_is_refused(made, capsys):

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import json
 import os
+import uuid
 import warnings
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,7 @@ def run(parts: tuple[str, ...], progress: Callable[[str, int, int], None]) -> di
     """Run parts and return how many functions were compiled, loaded and could not be kept."""
     from groma.cli import _warmup_runs
 
+    before = asdict(_numba_cache.counts)
     for part in parts:
         steps = list(_warmup_runs.RUNS[part]())
         for number, (name, step) in enumerate(steps):
@@ -47,12 +50,11 @@ def run(parts: tuple[str, ...], progress: Callable[[str, int, int], None]) -> di
                 warnings.simplefilter("ignore")  # what tiny scenes lack is not the user's business
                 step()
         path = _list_of(part)
-        if path is not None and not _numba_cache.counts.unsaved:
-            draft = path.with_suffix(f".{os.getpid()}.tmp")
+        if path is not None and _numba_cache.counts.unsaved == before["unsaved"]:
+            draft = path.with_suffix(f".{uuid.uuid4().hex[:16]}.tmp")
             draft.write_text(json.dumps([str(file) for file in _numba_cache.used_files()]))
             os.replace(draft, path)
-    counts = _numba_cache.counts
-    return {"compiled": counts.compiled, "loaded": counts.loaded, "unsaved": counts.unsaved}
+    return {name: count - before[name] for name, count in asdict(_numba_cache.counts).items()}
 
 
 def place() -> str:

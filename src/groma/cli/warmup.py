@@ -28,7 +28,7 @@ def warmup(
     """
     from groma.cli import _output
     from groma.cli._console import Console
-    from groma.errors import InputError
+    from groma.errors import InputError, OutputError
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
@@ -42,6 +42,10 @@ def warmup(
     if unknown := {*(parts or ())} - {*_warmup.PARTS}:
         raise InputError(f"There is nothing to compile for {', '.join(sorted(unknown))}; there are "
                          f"{', '.join(_warmup.PARTS)}.")  # fmt: skip
+    if not _warmup.place():
+        raise OutputError(
+            "No folder for compiled functions can be written, so nothing would be kept. Set NUMBA_CACHE_DIR to one."
+        )
     missing = wanted if again else tuple(name for name in wanted if not _warmup.is_ready(name))
     numbers = {"parts": list(wanted), "compiled": 0, "loaded": 0, "unsaved": 0}
     if missing:
@@ -50,11 +54,10 @@ def warmup(
     numbers |= {"seconds": time.perf_counter() - begin, "folder": _warmup.place()}
     for sentence in _sentences(numbers, bool(missing)):
         console.say(sentence)
-    kept = numbers["folder"] and not numbers["unsaved"]
-    if not kept:
-        console.warn("The folder for compiled functions cannot be written. Set NUMBA_CACHE_DIR to one that can.")
+    if numbers["unsaved"]:
+        console.warn(f"{numbers['unsaved']} functions could not be written; is the disk full?")
     _output.write_json(json_target, numbers, force)
-    if not kept:
+    if numbers["unsaved"]:
         raise typer.Exit(1)
 
 
