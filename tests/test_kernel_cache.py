@@ -53,7 +53,7 @@ print("COUNTS", counts.compiled, counts.loaded, counts.unsaved)
 
 @pytest.fixture
 def fresh(tmp_path, monkeypatch):
-    """A function that loads the module again as a new process would, and returns what ``total`` gives and the counts."""
+    """A function that loads the module as a new process would, and returns what ``total`` gives and the counts."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     path = tmp_path / "cached_sample.py"
     path.write_text(SOURCE)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         scene,
         solver,
         testing,
+        tracking,
         viz,
     )
     from groma.errors import FileFormatError, GromaError, InputError, OutputError, ProblemError, ShapeError
@@ -38,6 +39,9 @@ if TYPE_CHECKING:
     from groma.factors.user import factor
     from groma.io import read_scene, write_scene
     from groma.pipelines.adjust import AdjustOptions, AdjustResult, adjust
+    from groma.pipelines.map import MapOptions, map_images
+    from groma.pipelines.diagnosis import diagnose_scene as diagnose
+    from groma.pipelines.uncertainty import uncertainty
     from groma.problem.problem import Problem
     from groma.problem.variables import Variables
     from groma.scene import Scene
@@ -45,11 +49,13 @@ if TYPE_CHECKING:
     from groma.solver.report import SolveReport
     from groma.solver.solve import Solution, solve
     from groma.solver.termination import Termination
+    from groma.tracking import Tracker, TrackOptions
     from groma.viz.report import write_report
 
 __version__ = "0.1.0"
 
-#: Where each public name lives; with ``__all__`` and the imports above the only place to touch when one is added.
+#: Where each public name lives, and after a colon its name there if that is another; with ``__all__`` and the imports
+#: above the only place to touch when one is added.
 _HOME = {
     "AdjustOptions": "groma.pipelines.adjust",
     "AdjustResult": "groma.pipelines.adjust",
@@ -59,6 +65,7 @@ _HOME = {
     "LineBearing": "groma.factors.line_bearing",
     "LineOnPlane": "groma.factors.line_on_plane",
     "LineReprojection": "groma.factors.line_reprojection",
+    "MapOptions": "groma.pipelines.map",
     "OutputError": "groma.errors",
     "PlaneObservation": "groma.factors.plane_observation",
     "PointOnPlane": "groma.factors.point_on_plane",
@@ -73,12 +80,17 @@ _HOME = {
     "SolveReport": "groma.solver.report",
     "SolverOptions": "groma.solver.options",
     "Termination": "groma.solver.termination",
+    "TrackOptions": "groma.tracking",
+    "Tracker": "groma.tracking",
     "Variables": "groma.problem.variables",
     "adjust": "groma.pipelines.adjust",
+    "diagnose": "groma.pipelines.diagnosis:diagnose_scene",
     "factor": "groma.factors.user",
     "loss": "groma.factors.losses",
+    "map_images": "groma.pipelines.map",
     "read_scene": "groma.io",
     "solve": "groma.solver.solve",
+    "uncertainty": "groma.pipelines.uncertainty",
     "write_report": "groma.viz.report",
     "write_scene": "groma.io",
 }
@@ -94,6 +106,7 @@ _SUBPACKAGES = (
     "scene",
     "solver",
     "testing",
+    "tracking",
     "viz",
 )
 
@@ -106,6 +119,7 @@ __all__ = [
     "LineBearing",
     "LineOnPlane",
     "LineReprojection",
+    "MapOptions",
     "OutputError",
     "PlaneObservation",
     "PointOnPlane",
@@ -120,9 +134,12 @@ __all__ = [
     "SolveReport",
     "SolverOptions",
     "Termination",
+    "TrackOptions",
+    "Tracker",
     "Variables",
     "adjust",
     "cameras",
+    "diagnose",
     "errors",
     "evaluation",
     "factor",
@@ -130,6 +147,7 @@ __all__ = [
     "geometry",
     "io",
     "loss",
+    "map_images",
     "pipelines",
     "problem",
     "read_scene",
@@ -137,6 +155,8 @@ __all__ = [
     "solve",
     "solver",
     "testing",
+    "tracking",
+    "uncertainty",
     "viz",
     "write_report",
     "write_scene",
@@ -145,7 +165,8 @@ __all__ = [
 
 def __getattr__(name: str) -> object:
     if name in _HOME:
-        value = getattr(import_module(_HOME[name]), name)
+        module, _, name_there = _HOME[name].partition(":")
+        value = getattr(import_module(module), name_there or name)
     elif name in _SUBPACKAGES:
         value = import_module(f"groma.{name}")
     else:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Records written by the CUDA loops equal those of the processor to 1e-9; in the simulator, or on a device if one is there.
+"""Records written by the CUDA loops equal those of the processor to 1e-9, in the simulator or on a device.
 
 The simulator is chosen before Numba is imported, so the comparison runs in a process of its own.
 """

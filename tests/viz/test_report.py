@@ -267,3 +267,41 @@ def test_the_summary_of_a_map_stands_in_the_page(tmp_path):
 def test_a_place_that_cannot_be_written(tmp_path):
     with pytest.raises(OutputError, match="Cannot write"):
         write_report(tmp_path / "no" / "page.html", None, exact_scene())
+
+
+def test_what_the_data_determine(tmp_path):
+    """Findings and counts of a diagnosis, given or among the numbers of a saved report; relations are a table."""
+    found = {
+        "findings": [
+            {"severity": "problem", "sentence": "Line <7> is open."},
+            {"severity": "note", "sentence": "All else holds."},
+        ],
+        "observability": {"lines": {"determined": 1234, "weak": 5, "undetermined": 1}},
+    }
+    text = _write(tmp_path, None, exact_scene(), diagnosis=found)
+    for words in ("What the data determine", 'class="is-problem">Line &lt;7&gt; is open.', 'class="is-note">', "1,234"):
+        assert words in text
+    assert text.index("is-problem") < text.index('class="is-note"')
+    numbers = REPORT.to_dict() | {
+        "history": [], "termination_sentence": "", "diagnosis": found,
+        "relations": {"point_on_plane": {"held": 5678, "dropped": 12}},
+    }  # fmt: skip
+    (tmp_path / "summary.json").write_text(json.dumps(numbers))
+    text = _write(tmp_path, None, exact_scene(), saved_report(tmp_path))
+    assert "is-problem" in text and "point on plane" in text and "5,678" in text
+    text = _write(tmp_path, None, exact_scene(), REPORT)
+    assert "What the data determine" not in text and "Relations" not in text
+
+
+def test_the_first_image_is_the_one_with_most_lines(tmp_path):
+    scene = exact_scene()
+    seen = scene.line_observations
+    scene = scene.replace(line_observations=seen.take(np.flatnonzero((seen.image_idx == 1) | (seen.line_idx == 0))))
+    assert _data(_write(tmp_path, None, scene))["first"] == 1
+    assert _data(_write(tmp_path, None, scene.points_only()))["first"] == 0
+    assert _page_images._first([]) == 0
+    # one with a photograph comes before one without
+    entries = [
+        {"photo": photo, "lines_seen": n, "points_seen": 0} for photo, n in (("", 9), ("data:", 2), ("data:", 3))
+    ]
+    assert _page_images._first(entries) == 2

@@ -15,12 +15,14 @@ import typer
 
 from groma.cli import _output
 from groma.cli.main import INTERRUPTED
+from groma.errors import OutputError
 
 if TYPE_CHECKING:
     from groma.cli._console import Console
     from groma.frontend.external import ExternalMatches
     from groma.pipelines.map import MapOptions, MapResult
     from groma.scene import Scene
+    from groma.solver.diagnosis import Diagnosis
 
 
 def map_and_write(
@@ -35,6 +37,7 @@ def map_and_write(
     line_matches: ExternalMatches | None = None,
     judge: Callable[[MapResult], dict[str, Any]] | None = None,
     explain: bool = True,
+    diagnose: bool | None = None,
 ) -> dict[str, Any]:
     """Map a folder of photographs, write all results to ``output``, say what came out, and return the numbers.
 
@@ -57,11 +60,14 @@ def map_and_write(
     judge : callable, optional
         Given the result, returns further numbers for the summary.
     explain : bool
-        Say what became of the segments; otherwise only with --verbose.
+        Say what became of the segments, and what is not determined; otherwise only with --verbose.
+    diagnose : bool, optional
+        Say what the data determine; None: unless there are many images.
     """
+    from groma.cli._diagnosis import diagnosis_of, say_diagnosis
     from groma.cli._interrupt import interruptible
     from groma.io import write_geometry, write_scene
-    from groma.pipelines._stages import has_stages, remove_stages
+    from groma.pipelines._stages import has_stages, remove_stages, system_reason
     from groma.pipelines.map import map_images
     from groma.viz.report import write_report
 
@@ -80,26 +86,36 @@ def map_and_write(
         )
         raise typer.Exit(INTERRUPTED) from None
     scene = result.scene
-    numbers = _numbers(result) | (judge(result) if judge is not None else {})
-    with _output.atomic_output(output, force, work) as draft:
-        write_scene(scene, draft, format="colmap")
-        write_scene(scene, draft / "scene.npz")
-        write_geometry(scene, draft)
-        write_report(
-            draft / "report.html",
-            result.before,
-            scene,
-            result.report,
-            images,
-            title,
-            fates=result.fates,
-            explanation=result.explanation,
-            warnings=result.warnings,
-        )
-        _output.write_json(str(draft / "summary.json"), numbers)
+    diagnosis = diagnosis_of(scene, lambda: _diagnosis(result, options), console, diagnose)
+    numbers: dict[str, Any] = _numbers(result) | {"diagnosis": diagnosis} | (judge(result) if judge is not None else {})
+    try:
+        with _output.atomic_output(output, force, work) as draft:
+            write_scene(scene, draft, format="colmap")
+            write_scene(scene, draft / "scene.npz")
+            write_geometry(scene, draft)
+            write_report(
+                draft / "report.html",
+                result.before,
+                scene,
+                result.report,
+                images,
+                title,
+                fates=result.fates,
+                explanation=result.explanation,
+                warnings=result.warnings,
+                diagnosis=diagnosis,
+            )
+            _output.write_json(str(draft / "summary.json"), numbers)
+    except OutputError as error:
+        raise OutputError(
+            f"Cannot write {output}: {system_reason(error)}. Finished stages are kept in {work}: the same command goes "
+            "on from there."
+        ) from error
     remove_stages(work)
-    for line in _sentences(result):
+    for line in _sentences(result, console.verbose):
         console.say(line)
+    if explain or console.verbose:
+        say_diagnosis(diagnosis, console)
     (console.say if explain else console.detail)(result.explanation)
     for sentence in result.warnings:
         console.warn(sentence)
@@ -123,7 +139,28 @@ def _numbers(result: MapResult) -> dict[str, Any]:
     }
 
 
-def _sentences(result: MapResult) -> list[str]:
+def _diagnosis(result: MapResult, options: MapOptions) -> Diagnosis:
+    """Diagnose a map at the noise and with the kind of loss of its last adjustment."""
+    from groma.factors.losses import GemanMcClure
+    from groma.pipelines._assemble import AssemblyOptions
+    from groma.pipelines.adjust import LAST_SCALE_SIGMAS
+    from groma.pipelines.diagnosis import diagnose_scene
+
+    known = {kind: sigma for kind, sigma in result.sigma_px.items() if sigma > 0}
+    assembly = AssemblyOptions(
+        point_sigma_px=known.get("points", 1.0),
+        line_sigma_px=known.get("lines", 1.0),
+        structure_sigma_px=options.structure.surface_sigma_px,
+        refine_poses=options.refine_poses,
+        refine_intrinsics=options.refine_intrinsics,
+        loss=GemanMcClure(LAST_SCALE_SIGMAS),
+    )
+    return diagnose_scene(result.scene, assembly)
+
+
+def _sentences(result: MapResult, verbose: bool = False) -> list[str]:
+    from groma.cli._numbers import describe_relations
+
     scene = result.scene
     counts = (
         f"{scene.num_images} images, {scene.num_points:,} points, {scene.num_lines:,} lines, "
@@ -136,4 +173,6 @@ def _sentences(result: MapResult) -> list[str]:
         lines.append(
             "  The rms counts wrong matches in full and may grow while the robust cost, which doubts them, falls."
         )
+    if verbose:
+        lines += describe_relations(result.report.relations)
     return lines

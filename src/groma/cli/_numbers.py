@@ -6,6 +6,15 @@ from typing import Any
 
 _KINDS = (("images", "num_images"), ("points", "num_points"), ("lines", "num_lines"), ("planes", "num_planes"))
 
+_SIGMAS = (
+    ("centres", "center", ""),
+    ("rotations", "rotation_deg", "°"),
+    ("points", "point", ""),
+    ("segment ends across their line", "segment_end", ""),
+    ("line directions", "line_direction_deg", "°"),
+    ("plane normals", "plane_normal_deg", "°"),
+)
+
 
 def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, fresh: bool = False) -> list[str]:
     """Return what a reader wants to know after an adjustment, most important first.
@@ -17,7 +26,7 @@ def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, f
     sentence : str
         Why the solver stopped.
     verbose : bool
-        Add the seconds per stage.
+        Add the relations between landmarks and the seconds per stage.
     fresh : bool
         Say that the time includes compilation.
     """
@@ -34,6 +43,31 @@ def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, f
     compiled = " (with compilation)" if fresh else ""
     lines.append(f"  {numbers['iterations']} steps in {seconds['total']:.2f} s{compiled}. {sentence}")
     if verbose:
+        lines += describe_relations(numbers.get("relations") or {})
         stages = ", ".join(f"{name} {value:.3f} s" for name, value in seconds.items() if name != "total")
         lines.append(f"  stages: {stages}")
+    return lines
+
+
+def describe_relations(relations: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """Return how many relations between landmarks of each kind hold, and how many the robust loss gave up."""
+    return [
+        f"  {name.replace('_', ' ')}: {outcome['held']:,} hold, {outcome['dropped']:,} given up"
+        for name, outcome in relations.items()
+    ]
+
+
+def describe_uncertainty(numbers: Mapping[str, Any]) -> list[str]:
+    """Return the usual standard deviations of each kind; ``numbers`` is that of an uncertainty as a dictionary."""
+    gauge = {"inner": "all camera centres together", "held": "the first camera and the scale"}[numbers["gauge"]]
+    parts = [
+        f"{words} {numbers[key]['median']:.3g}{unit}"
+        for words, key, unit in _SIGMAS
+        if numbers[key]["median"] is not None
+    ]
+    lines = [f"  Standard deviations (medians, at sigma0 {numbers['sigma0']:.3g}, relative to {gauge}):"]
+    lines += [f"    {', '.join(parts)}" if parts else "    nothing has any"]
+    left = sum(numbers[key]["undetermined"] for key in ("point", "segment_end", "plane_normal_deg"))
+    if left:
+        lines.append(f"    {left:,} points, segment ends and planes are not determined and have none")
     return lines

@@ -2,13 +2,15 @@
 """``groma adjust``: bundle adjustment of a COLMAP model, a BAL file or a groma archive."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from groma.cli import _options
+from groma.errors import InputError, ProblemError
 
 LinearSolver = Literal["auto", "dense", "sparse", "pcg"]
+CovarianceGauge = Literal["auto", "inner", "held"]
 
 
 def adjust(
@@ -63,6 +65,38 @@ def adjust(
     page: Annotated[
         Path | None, typer.Option("--report", metavar="FILE", help="Also write an HTML page: before and after.")
     ] = None,
+    covariance: Annotated[
+        Path | None,
+        typer.Option(
+            "--covariance",
+            metavar="FILE",
+            help="Also write how certain the result is: covariances (.npz) or standard deviations (.json) of images, "
+            "points, lines, planes and directions.",
+        ),
+    ] = None,
+    covariance_gauge: Annotated[
+        CovarianceGauge,
+        typer.Option(
+            "--covariance-gauge",
+            help="What it refers to: inner, all camera centres together; held, the first camera and the scale.",
+        ),
+    ] = "auto",
+    sigma0: Annotated[
+        float,
+        typer.Option(
+            "--sigma0",
+            metavar="S",
+            help="With --covariance: the noise of the measurements in units of that stated (1 pixel unless the scene "
+            "says otherwise).",
+        ),
+    ] = 1.0,
+    diagnosis: Annotated[
+        bool | None,
+        typer.Option(
+            "--diagnosis/--no-diagnosis",
+            help="Say what the data do not determine. Default: yes up to 300 images.",
+        ),
+    ] = None,
     force: _options.Force = False,
     threads: _options.Threads = None,
     seed: _options.Seed = 0,
@@ -74,21 +108,28 @@ def adjust(
 
     Reads a scene, minimises the robust reprojection error over everything in it and writes the scene back. The input
     is never changed. LIMAP's structures beside a COLMAP model are read and written too, with what they hold besides.
+    What the data do not determine is said in words at the end.
     Chance plays no part here: --seed is accepted so that scripts can pass it everywhere.
     """
     from groma.cli import _output
     from groma.cli._console import Console
 
     console = Console(quiet, verbose, json_target, threads)
-    for path in (output, page):
+    for path in (output, page, covariance):
         if path is not None:
             _output.check_output(path, force)
+    if covariance is not None and covariance.suffix not in (".npz", ".json"):
+        raise InputError(f"--covariance must end in .npz or .json; got {covariance}.")
+    if not 0.0 < sigma0 < float("inf"):
+        raise InputError(f"--sigma0 must be positive; got {sigma0}.")
     _output.check_json(json_target, force)
 
-    from groma.cli._numbers import describe
+    from groma.cli._diagnosis import diagnosis_of, say_diagnosis
+    from groma.cli._numbers import describe, describe_uncertainty
     from groma.io import read_scene, structures_of, write_scene
     from groma.pipelines.adjust import AdjustOptions
     from groma.pipelines.adjust import adjust as run_adjust
+    from groma.pipelines.diagnosis import diagnose_scene
 
     chosen = {
         "loss_scale": loss_scale,
@@ -112,7 +153,10 @@ def adjust(
     fresh = console.announce_compilation()
     with console.progress() as progress:
         result = run_adjust(before, options, progress)
-    numbers = result.report.to_dict()
+    numbers: dict[str, Any] = result.report.to_dict()
+    numbers["diagnosis"] = diagnosis_of(
+        result.scene, lambda: diagnose_scene(result.scene, problem=result.problem), console, diagnosis
+    )
 
     if output is not None:
         write_scene(result.scene, output, force=force, like=structures_of(source))
@@ -120,14 +164,32 @@ def adjust(
         from groma.viz.report import write_report
 
         with _output.atomic_output(page, force) as draft:
-            write_report(draft, before, result.scene, result.report)
+            write_report(draft, before, result.scene, result.report, diagnosis=numbers["diagnosis"])
+    found, failure = None, None
+    if covariance is not None:
+        from groma.cli._covariance import write_covariances
+        from groma.pipelines.uncertainty import uncertainty
+
+        try:
+            found = uncertainty(result.scene, gauge=covariance_gauge, sigma0=sigma0, problem=result.problem)
+        except ProblemError as error:  # raised at the end, when all else is written and said
+            failure = error
+        else:
+            write_covariances(covariance, result.scene, found, force)
+            numbers["uncertainty"] = found.to_dict()
     for line in describe(numbers, result.report.termination.sentence, verbose=console.verbose, fresh=fresh):
         console.say(line)
+    if found is not None:
+        for line in describe_uncertainty(found.to_dict()):
+            console.say(line)
+    say_diagnosis(numbers["diagnosis"], console)
     for sentence in result.report.warnings:
         console.warn(sentence)
-    for path in (output, page):
+    for path in (output, page, covariance if found is not None else None):
         if path is not None:
             console.say(f"Wrote {path}")
-    if output is None and page is None and json_target is None:
+    if output is None and page is None and covariance is None and json_target is None:
         console.say("No -o given: the adjusted scene was not written.")
     _output.write_json(json_target, {**numbers, "warnings": list(result.report.warnings)}, force)
+    if failure is not None:
+        raise failure

@@ -44,6 +44,12 @@ def map_(
     refine_points: Annotated[
         bool, typer.Option("--refine-points/--keep-points", help="Measure the points of the model again in the images.")
     ] = False,
+    diagnosis: Annotated[
+        bool | None,
+        typer.Option(
+            "--diagnosis/--no-diagnosis", help="Say what the data do not determine. Default: yes up to 300 images."
+        ),
+    ] = None,
     force: _options.Force = False,
     threads: _options.Threads = None,
     seed: _options.Seed = 0,
@@ -92,6 +98,7 @@ def map_(
         force,
         f"Map of {images.absolute().name}",
         line_matches=read_matches(line_matches) if line_matches is not None else None,
+        diagnose=diagnosis,
     )
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)

@@ -20,8 +20,8 @@ A candidate's evidence is turned into a probability, and a match must be the bes
 
 References
 ----------
-B. Fan, F. Wu, Z. Hu, *Robust line matching through line-point invariants*, 2012, for points on the same side;
-C. Schmid, A. Zisserman, *Automatic line matching across views*, 1997, for the epipolar beam. Deviations: the points'
+Fan, Wu and Hu, *Robust line matching through line-point invariants*, 2012, for points on the same side;
+Schmid and Zisserman, *Automatic line matching across views*, 1997, for the epipolar beam. Deviations: the points'
 distances are compared by sign and ratio only, and all evidence is combined by one logistic function.
 """
 

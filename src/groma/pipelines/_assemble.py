@@ -162,7 +162,7 @@ def _camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Varia
     chart = _chart(POSE_CHARTS, options.pose_chart, "pose_chart")
     held: bool | BoolArray = not options.refine_poses
     if options.refine_poses and options.gauge == "first_camera":
-        held = _first_camera_gauge(scene)
+        held = first_camera_gauge(scene)
     elif options.gauge not in ("free", "first_camera"):
         raise InputError(f"gauge must be 'auto', 'free' or 'first_camera'; got {options.gauge!r}.")
     variables = {"frames": Variables(chart, scene.frames.rig_from_world, held)}
@@ -180,7 +180,7 @@ def _camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Varia
     return variables
 
 
-def _first_camera_gauge(scene: Scene) -> BoolArray:
+def first_camera_gauge(scene: Scene) -> BoolArray:
     """Hold frame 0, and of the frame farthest from it the translation along the line between the two."""
     poses = scene.frames.rig_from_world
     held = np.zeros((len(poses), 6), dtype=bool)

@@ -10,8 +10,9 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import InputError
-from groma.pipelines._assemble import AssemblyOptions, assemble
+from groma.pipelines._assemble import AssemblyOptions, assemble, first_camera_gauge
 from groma.problem.problem import Problem
+from groma.problem.variables import Variables
 from groma.scene import Scene
 from groma.solver.covariance import Covariances
 
@@ -92,7 +93,8 @@ def uncertainty(
         Covariances are multiplied by its square; pass the root of the report's ``reduced_chi_square`` where the stated
         noise is not to be believed.
     problem : Problem, optional
-        The problem already made from the scene; used as it is.
+        The problem already made from the scene, at its solution. For ``inner`` its frames are freed; for ``held`` the
+        first camera and the scale are held unless the problem holds something of its own.
 
     Returns
     -------
@@ -115,6 +117,8 @@ def uncertainty(
     if problem is None:
         held = "first_camera" if gauge == "held" else "free"
         problem = assemble(scene, replace(options, gauge=held)).problem
+    else:
+        problem = _in_gauge(problem, scene, gauge)
     datum = {"frames": [1, 1, 1, 0, 0, 0]} if gauge == "inner" and _free_cameras(problem) > 2 else None
     covariances = Covariances(problem, gauge=gauge, datum=datum)
     factor = sigma0**2
@@ -149,6 +153,17 @@ def uncertainty(
         directions=coordinates("directions", 3, scene.num_directions),
         covariances=covariances,
     )
+
+
+def _in_gauge(problem: Problem, scene: Scene, gauge: str) -> Problem:
+    """Return the problem with free frames, or with the first one and the scale held if nothing is held yet."""
+    frames = problem.variables["frames"]
+    free = frames.free_coordinates()
+    if _free_cameras(problem) == 0 or (free is None) == (gauge == "inner"):
+        return problem
+    constant = first_camera_gauge(scene) if gauge == "held" else False
+    variables = {**problem.variables, "frames": Variables(frames.manifold, frames.state, constant)}
+    return Problem(variables, problem.factors)
 
 
 def _free_cameras(problem: Problem) -> int:

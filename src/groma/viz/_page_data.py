@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.scene.patches import PALETTE, patch_groups
 from groma.viz import _colours
+from groma.viz._framing import starting_view
 from groma.viz._pack import pack, pack_bytes, thin
 from groma.viz._statistics import line_statistics
 
@@ -24,24 +24,12 @@ MAX_POINTS = 200_000
 MAX_LINES = 40_000
 
 
-@dataclass(frozen=True)
-class _View:
-    """Where the viewer starts."""
-
-    pivot: FloatArray
-    up: FloatArray
-    azimuth: float
-    elevation: float
-    distance: float
-    camera_size: float
-
-
 def scene_data(scenes: Sequence[Scene], states: Sequence[Drawable]) -> dict[str, Any]:
     """Return the states of a scene for the 3D view, the last one being the one that counts."""
     scene, after = scenes[-1], states[-1]
     offset = _middle(after)
     keep, lines = thin(len(after.points), MAX_POINTS), thin(len(after.segments), MAX_LINES)
-    view = _view(after, offset)
+    view = starting_view(after, offset)
     numbers = [line_statistics(one, shown) for one, shown in zip(scenes, states, strict=True)]
     point_errors = [shown.point_errors[keep] for shown in states]
     line_errors = [found.residual_px[lines] for found in numbers]
@@ -107,50 +95,3 @@ def _middle(scene: Drawable) -> FloatArray:
 
 def _camera_axes(scene: Drawable, offset: FloatArray) -> FloatArray:
     return np.concatenate([(scene.centers - offset)[:, None], scene.world_from_cam_axes], axis=1).reshape(-1, 12)
-
-
-def _view(scene: Drawable, middle: FloatArray) -> _View:
-    """Look from behind the cameras and from a little above, with nearly everything in the picture."""
-    landmarks = np.concatenate([scene.points, scene.segments.reshape(-1, 3)])
-    landmarks = landmarks[np.isfinite(landmarks).all(axis=1)]
-    center = np.median(landmarks, axis=0) if len(landmarks) else middle
-    axes = scene.world_from_cam_axes
-    up = -axes[:, 1].sum(axis=0) if len(axes) else np.zeros(3)
-    if np.linalg.norm(up) < 0.3 * max(len(axes), 1):
-        up = np.array([0.0, 0.0, 1.0])  # cameras all around: no common up
-    up = up / np.linalg.norm(up)
-    back = scene.centers.mean(axis=0) - center if len(axes) else np.array([1.0, 1.0, 0.0])
-    helper = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    first = np.cross(helper, up)
-    first /= np.linalg.norm(first)
-    second = np.cross(up, first)
-    azimuth, elevation = float(np.arctan2(back @ second, back @ first)) + 0.45, 0.38
-    back = np.cos(elevation) * (np.cos(azimuth) * first + np.sin(azimuth) * second) + np.sin(elevation) * up
-    right = np.cross(up, back) / np.cos(elevation)
-    frame = np.stack([right, np.cross(back, right), back])
-    places = (np.concatenate([landmarks, scene.centers]) - center) @ frame.T
-    low, high = (np.percentile(places, share, axis=0) if len(places) else np.zeros(3) for share in (3, 97))
-    if len(axes):
-        cameras = (scene.centers - center) @ frame.T
-        low, high = np.minimum(low, cameras.min(axis=0)), np.maximum(high, cameras.max(axis=0))
-    half = (high - low) / 2
-    # The viewer's focal length is 1.1 times its height, and it is about twice as wide as high.
-    distance = float(1.15 * max(2.2 * half[1], 1.1 * half[0]) + 0.6 * half[2]) or 1.0
-    return _View(
-        pivot=center + (low + half) @ frame,
-        up=up,
-        azimuth=azimuth,
-        elevation=elevation,
-        distance=distance,
-        camera_size=_camera_size(scene, distance),
-    )
-
-
-def _camera_size(scene: Drawable, distance: float) -> float:
-    """Return a size at which cameras can be seen and neighbours do not hide each other."""
-    if len(scene.centers) < 3:
-        return 0.018 * distance
-    from scipy.spatial import KDTree
-
-    gap = float(np.median(KDTree(scene.centers).query(scene.centers, k=2)[0][:, 1]))
-    return float(np.clip(0.4 * gap, 0.004 * distance, 0.018 * distance))

@@ -32,9 +32,10 @@ _SAMPLES = 6
 def image_data(scene: Scene, states: Sequence[Drawable], images: ImageFiles | None) -> dict[str, Any]:
     """Return, for the page, an entry per image that observes something, and the rows that the entries point to.
 
-    ``rows`` are points: measured place, then the residual in each state. ``segments`` are 2D segments: measured ends,
-    then the ways from them to the image of their line in each state; ``owners`` their lines as numbers of the table;
-    ``projected`` the images of the 3D segments in the last state, ``samples`` places each, zero where there is none.
+    ``first`` is the entry to begin with. ``rows`` are points: measured place, then the residual in each state.
+    ``segments`` are 2D segments: measured ends, then the ways from them to the image of their line in each state;
+    ``owners`` their lines as numbers of the table; ``projected`` the images of the 3D segments in the last state,
+    ``samples`` places each, zero where there is none.
     """
     after = states[-1]
     num_points = len(scene.point_observations)
@@ -71,6 +72,7 @@ def image_data(scene: Scene, states: Sequence[Drawable], images: ImageFiles | No
     ways = [state.residuals[num_points:].reshape(-1, 4)[segments] for state in states]
     return {
         "images": entries,
+        "first": _first(entries),
         "rows": pack(
             np.concatenate(
                 [after.residual_place[:num_points][rows], *(s.residuals[:num_points][rows] for s in states)], 1
@@ -82,6 +84,12 @@ def image_data(scene: Scene, states: Sequence[Drawable], images: ImageFiles | No
         "projected": pack(np.concatenate(projected)),
         "samples": samples,
     }
+
+
+def _first(entries: Sequence[dict[str, Any]]) -> int:
+    """Return the image to begin with: most lines, then most points; one with a photograph where there are any."""
+    keys = [(bool(entry["photo"]), entry["lines_seen"], entry["points_seen"]) for entry in entries]
+    return keys.index(max(keys)) if keys else 0
 
 
 def _by_image(image_idx: IntArray, num_images: int, limit: int) -> list[IntArray]:

@@ -129,13 +129,41 @@ def number_tables(scene: Scene, before: Drawable | None, after: Drawable, number
     """Return the tables of residuals, planes, directions, time and content."""
     text = _residual_table(before, after)
     text += _plane_table(scene, after) + _direction_table(scene)
+    if numbers is not None and numbers.get("relations"):
+        rows = [
+            [name.replace("_", " "), f"{outcome['held']:,}", f"{outcome['dropped']:,}"]
+            for name, outcome in numbers["relations"].items()
+        ]
+        caption = "What lies on what. Relations that the robust loss gave up are no longer in the scene."
+        text += table("Relations", caption, ["", "hold", "given up"], rows)
     rows = [[name, f"{count:,}"] for name, count in counts_of(scene, after)]
-    text += _table("Scene", "What it holds.", ["", "number"], rows)
+    text += table("Scene", "What it holds.", ["", "number"], rows)
     if numbers is not None:
         seconds = [[name, f"{value:.3f} s"] for name, value in numbers["seconds"].items() if name != "total"]
         seconds.append(["total", f"{numbers['seconds']['total']:.3f} s"])
-        text += _table("Time", "Where the last adjustment spent it.", ["stage", "seconds"], seconds)
+        text += table("Time", "Where the last adjustment spent it.", ["stage", "seconds"], seconds)
     return text
+
+
+def diagnosis_card(diagnosis: Mapping[str, Any] | None) -> str:
+    """Return what a diagnosis says, the gravest first, and how many landmarks are determined."""
+    if not diagnosis:
+        return ""
+    items = "".join(
+        f'<li class="is-{html.escape(finding["severity"])}">{html.escape(finding["sentence"])}</li>'
+        for finding in diagnosis["findings"]
+    )
+    rows = [
+        [name.replace("_", " "), *(f"{counts[key]:,}" for key in ("determined", "weak", "undetermined"))]
+        for name, counts in diagnosis.get("observability", {}).items()
+    ]
+    head = "".join(f"<th>{cell}</th>" for cell in ("cameras held", "determined", "weak", "not determined"))
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    counts = f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>' if rows else ""
+    caption = (
+        "Red: not determined, the standard deviation exceeds the viewing distance (or a radian). Yellow: weak, or odd."
+    )
+    return card("What the data determine", caption, f'<ul class="findings">{items}</ul>{counts}')
 
 
 def card(name: str, caption: str, content: str) -> str:
@@ -160,7 +188,7 @@ def _residual_table(before: Drawable | None, after: Drawable) -> str:
     if any(unseen):
         rows.append(["not visible from their camera", *(f"{count:,}" for count in unseen)])
     caption = "Residuals of all observations. The rms counts wrong matches in full; the median does not notice them."
-    return _table("Numbers", caption, ["", *columns], rows) if rows else ""
+    return table("Numbers", caption, ["", *columns], rows) if rows else ""
 
 
 def _plane_table(scene: Scene, after: Drawable) -> str:
@@ -193,7 +221,7 @@ def _plane_table(scene: Scene, after: Drawable) -> str:
     caption = "Area of what lies on them, and rms distance of it, in scene units." + (
         f" The {len(order)} with most on them; {left:,} more are in the scene." if left else ""
     )
-    return _table("Planes", caption, ["plane", "points", "lines", "area", "distance"], rows, marks)
+    return table("Planes", caption, ["plane", "points", "lines", "area", "distance"], rows, marks)
 
 
 def _direction_table(scene: Scene) -> str:
@@ -215,10 +243,11 @@ def _direction_table(scene: Scene) -> str:
     left = scene.num_directions - len(order)
     caption = "How many lines follow each, and the angles between them." + (f" {left:,} more follow." if left else "")
     marks = [_colours.css(PALETTE[direction % len(PALETTE)]) for direction in order]
-    return _table("Directions", caption, head, rows, marks)
+    return table("Directions", caption, head, rows, marks)
 
 
-def _table(name: str, caption: str, head: list[str], rows: list[list[str]], marks: Sequence[str] = ()) -> str:
+def table(name: str, caption: str, head: list[str], rows: list[list[str]], marks: Sequence[str] = ()) -> str:
+    """Return a card with a table; everything is text, and ``marks`` are colours before the rows."""
     top = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
     body = ""
     for number, row in enumerate(rows):

@@ -64,6 +64,9 @@ def write_report(
     fates: Mapping[str, int] | None = None,
     explanation: str = "",
     warnings: Sequence[str] | None = None,
+    diagnosis: Mapping[str, Any] | None = None,
+    cards: str = "",
+    tiles: str | None = None,
 ) -> None:
     """Write a page that opens in any browser.
 
@@ -86,6 +89,13 @@ def write_report(
         The same in words.
     warnings
         Sentences in a box; by default those of the report.
+    diagnosis
+        What the data determine, as :meth:`groma.solver.diagnosis.Diagnosis.to_dict` gives it; by default what the
+        numbers of the report hold under ``diagnosis``.
+    cards
+        HTML before the charts.
+    tiles
+        HTML of the large numbers instead of the usual ones.
 
     Raises
     ------
@@ -106,13 +116,17 @@ def write_report(
     numbers = report.to_dict() if report is not None else None
     history = [step for step in report.history if _iteration(step) > 0] if report is not None else None
     sentences = warnings if warnings is not None else report.warnings if report is not None else ()
+    if diagnosis is None and numbers is not None:
+        diagnosis = numbers.get("diagnosis")
     page = files("groma.viz").joinpath("_page.html").read_text(encoding="utf-8")
     parts = {
         "TITLE": html.escape(title),
         "LEAD": _lead(scene_after, after, report),
-        "TILES": _page_tables.tiles(scene_after, before, after, numbers),
+        "TILES": _page_tables.tiles(scene_after, before, after, numbers) if tiles is None else tiles,
         "WARNINGS": "".join(f'<p class="warning">{html.escape(text)}</p>' for text in sentences),
-        "CHARTS": _page_tables.chart_cards(scene_after, before, after, history, _stages(numbers), fates, explanation),
+        "CHARTS": cards
+        + _page_tables.diagnosis_card(diagnosis)
+        + _page_tables.chart_cards(scene_after, before, after, history, _stages(numbers), fates, explanation),
         "TABLES": _page_tables.number_tables(scene_after, before, after, numbers),
         "FOOTER": _footer(),
         "DATA": script_json({**scene_data(scenes, states), **image_data(scene_after, states, images)}),

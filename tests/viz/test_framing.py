@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where the 3D view starts: everything that counts is in the picture, fills it, and outliers change nothing much."""
+
+import numpy as np
+import pytest
+from _scene import exact_scene
+
+from groma.scene import Lines, Points, Scene
+from groma.scene.synthetic import holistic
+from groma.viz._drawable import drawable
+from groma.viz._framing import OPENING, StartingView, horizontal, starting_view, upward
+
+
+def _seen(view: StartingView, places: np.ndarray) -> np.ndarray:
+    """Places (N, 2) in the picture of the page, whose borders are at one; the formulas of its viewer."""
+    first, second = horizontal(view.up)
+    ca, sa, ce, se = (f(a) for a in (view.azimuth, view.elevation) for f in (np.cos, np.sin))
+    back = ce * (ca * first + sa * second) + se * view.up
+    right = np.cross(view.up, back) / ce
+    at = places - (view.pivot + view.distance * back)
+    depth = -at @ back
+    assert (depth > 0).all()
+    return np.stack([at @ right, at @ np.cross(back, right)], axis=1) / depth[:, None] / OPENING
+
+
+def _view(scene: Scene) -> StartingView:
+    return starting_view(drawable(scene), np.zeros(3))
+
+
+def _places(scene: Scene) -> np.ndarray:
+    return np.concatenate([scene.points.xyz, scene.lines.segments.reshape(-1, 3), drawable(scene).centers])
+
+
+@pytest.mark.parametrize("scene", [holistic(10, seed=1).truth, exact_scene()], ids=["room", "box"])
+def test_the_scene_fills_the_picture(scene):
+    at = np.abs(_seen(_view(scene), _places(scene)))
+    assert (at <= 1).all(axis=1).mean() > 0.9
+    assert at.max() > 0.9
+    cameras = np.abs(_seen(_view(scene), drawable(scene).centers))
+    assert (cameras <= 1).all()
+
+
+def test_outliers_do_not_count():
+    """Points and lines gone to the horizon leave the view where it was, to a little."""
+    scene = holistic(10, seed=1).truth
+    rng = np.random.default_rng(0)
+    xyz, segments = scene.points.xyz.copy(), scene.lines.segments.copy()
+    wild = rng.choice(len(xyz), len(xyz) // 10, replace=False)  # more than one in twenty
+    xyz[wild] = 1e3 * rng.normal(size=(len(wild), 3))
+    segments[0] += 1e4
+    gone = scene.replace(points=Points.at(xyz), lines=Lines.through(segments))
+    view, calm = starting_view(drawable(gone), np.zeros(3)), _view(scene)
+    assert view.distance == pytest.approx(calm.distance, rel=0.25)
+    assert np.linalg.norm(view.pivot - calm.pivot) < 0.25 * calm.distance
+
+
+def test_one_stray_camera_among_many_does_not_count():
+    scene = holistic(60, seed=1).truth
+    poses = scene.frames.rig_from_world.copy()
+    poses[7, 4:] += 1e3
+    stray = scene.replace(frames=scene.frames.replace(rig_from_world=poses))
+    assert _view(stray).distance == pytest.approx(_view(scene).distance, rel=0.25)
+
+
+def test_scenes_with_little_in_them():
+    empty = starting_view(drawable(Scene()), np.ones(3))
+    np.testing.assert_array_equal(empty.pivot, 1)
+    assert empty.distance > 0
+    one = _view(Scene(points=Points.at(np.ones((1, 3)))))
+    np.testing.assert_allclose(one.pivot, 1)
+    assert one.distance > 0
+
+
+def test_up():
+    np.testing.assert_allclose(upward(np.array([[0.0, 1.0, 0.1], [0.0, 1.0, -0.1]])), [0, -1, 0])
+    np.testing.assert_allclose(upward(np.array([[0.0, 1.0, 0], [0.0, -1.0, 0]])), [0, 0, 1])
+    np.testing.assert_allclose(upward(np.zeros((0, 3))), [0, 0, 1])
