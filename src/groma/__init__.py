@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from groma.factors.user import factor
     from groma.io import read_scene, write_scene
     from groma.pipelines.adjust import AdjustOptions, AdjustResult, adjust
-    from groma.pipelines.map import MapOptions, map_images
     from groma.pipelines.diagnosis import diagnose_scene as diagnose
+    from groma.pipelines.map import MapOptions, map_images
     from groma.pipelines.uncertainty import uncertainty
     from groma.problem.problem import Problem
     from groma.problem.variables import Variables

@@ -10,7 +10,10 @@ anything runs in parallel, and every source of random numbers is seeded.
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
+import tempfile
 import zlib  # noqa: F401 - must be loaded before pycolmap, see groma.io.colmap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from groma import cameras as camera_models
-from groma.errors import InputError
+from groma.errors import GromaError, InputError, OutputError
 from groma.io.colmap import from_pycolmap
 from groma.scene import Scene
 
@@ -30,6 +33,9 @@ _OVERLAP = 12
 _FARTHEST = 2**9
 #: Images whose pairs are matched in one call; their features are loaded once for all of them.
 _BLOCK = 8
+#: Bytes that must be free before work is handed to pycolmap, whose threads end the process where they find a full disk:
+#: in any case, for the features of an image, for the matches of a pair.
+_ROOM, _IMAGE_ROOM, _PAIR_ROOM = 8 << 20, 4 << 20, 1 << 18
 
 Progress = Callable[[str, int, int], None]
 
@@ -47,9 +53,10 @@ class PointModelOptions:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        model = camera_models.model(self.camera_model)
-        if model.colmap_name is None:
-            raise InputError(f"COLMAP has no camera model {self.camera_model}. Use SIMPLE_RADIAL, or pass a model.")
+        known = {model.name: model for model in camera_models.models() if model.colmap_name is not None}
+        model = known.get(self.camera_model)
+        if model is None:
+            raise InputError(f"The camera model must be one of {', '.join(known)}; got {self.camera_model!r}.")
         given = self.camera_params
         if given is not None and len(given) != model.num_parameters:
             raise InputError(
@@ -92,16 +99,19 @@ def reconstruct_points(
     ------
     InputError
         If no model comes out: too few images, no overlap, or no texture.
+    OutputError
+        If there is no room in ``work``, or pycolmap fails otherwise.
     """
     import pycolmap
 
     options = options or PointModelOptions()
     say = progress or (lambda stage, done, total: None)
     folder, names = Path(work), sorted(names)
-    folder.mkdir(parents=True, exist_ok=True)
     database = folder / "database.db"
     pycolmap.set_random_seed(options.seed)
-    with _quiet(pycolmap):
+    with _quiet(pycolmap), _explained(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        _check_room(folder)
         _enter_images(pycolmap, database, Path(images), names, options)
         _find_features(pycolmap, database, Path(images), names, options, say)
         _match(pycolmap, database, names, options, say)
@@ -125,10 +135,16 @@ def reconstruct_points(
 
 def _enter_images(pycolmap: Any, database: Path, images: Path, names: list[str], options: PointModelOptions) -> None:
     """Enter cameras and images, before features are found in parallel, so that their numbers are always the same."""
-    with _opened(pycolmap, database) as content:
-        if content.num_images() == len(names):
-            return
-        content.clear_all_tables()  # a run was killed here
+    try:
+        with _opened(pycolmap, database) as content:
+            if content.num_images() == len(names):
+                return
+            content.clear_all_tables()  # a run was killed here
+    except RuntimeError:  # damaged by somebody else: made again
+        for path in database.parent.glob(f"{database.name}*"):
+            path.unlink()
+        with _opened(pycolmap, database):
+            pass
     groups: dict[tuple[object, ...], list[str]] = {}
     for name in names:
         bitmap = pycolmap.Bitmap.read(str(images / name), False)
@@ -162,6 +178,7 @@ def _find_features(
     batch = options.threads or os.cpu_count() or 1
     for start in range(0, len(missing), batch):
         say("finding points in images", len(names) - len(missing) + start, len(names))
+        _check_room(database.parent, len(missing[start : start + batch]) * _IMAGE_ROOM)
         pycolmap.extract_features(
             database,
             images,
@@ -180,6 +197,7 @@ def _match(pycolmap: Any, database: Path, names: list[str], options: PointModelO
     if any(name.split() != [name] for name in names):
         # A list of pairs is cut at white space; these calls need none, but tell nothing before they end.
         say("matching points of image pairs", 0, total)
+        _check_room(database.parent, total * _PAIR_ROOM)
         if len(names) <= EXHAUSTIVE_LIMIT:
             pycolmap.match_exhaustive(database, **common)
         else:
@@ -192,6 +210,7 @@ def _match(pycolmap: Any, database: Path, names: list[str], options: PointModelO
     done = 0
     for block in pair_blocks(len(names)):
         say("matching points of image pairs", done, total)
+        _check_room(database.parent, len(block) * _PAIR_ROOM)
         done += len(block)
         lines = "".join(f"{names[i]} {names[j]}\n" for i, j in block)
         pairing.match_list_path.write_text(lines, encoding="utf-8")
@@ -233,6 +252,7 @@ def _reconstruct(
         say("placing cameras", min(placed[0], count), count)
 
     say("placing cameras", 0, count)
+    _check_room(work)
     found = pycolmap.incremental_mapping(
         database,
         images,
@@ -254,6 +274,38 @@ def _opened(pycolmap: Any, database: Path) -> Iterator[Any]:
         yield content
     finally:
         content.close()
+
+
+def _check_room(folder: Path, more: int = 0) -> None:
+    """Refuse to begin what the disk may have no room for."""
+    free, needed = shutil.disk_usage(folder).free, _ROOM + more
+    if free < needed:
+        raise OutputError(
+            f"The disk of {folder} has {free >> 20} MiB left; the points of the images need {-(-needed >> 20)} MiB. "
+            "Make room there; the same command then goes on."
+        )
+    if hasattr(os, "posix_fallocate"):  # knows of quotas and limits, too
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            try:
+                os.posix_fallocate(probe.fileno(), 0, needed)
+            except OSError as error:
+                if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                    raise
+
+
+@contextmanager
+def _explained(folder: Path) -> Iterator[None]:
+    """Turn what pycolmap and the file system raise into errors of groma."""
+    try:
+        yield
+    except GromaError:
+        raise
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
+        raise OutputError(
+            f"The points of the images cannot be reconstructed in {folder}: {reason.rstrip('.')}. See that there is "
+            "room and you may write there; the same command then goes on. If it fails again, remove that folder."
+        ) from error
 
 
 @contextmanager

@@ -153,8 +153,8 @@ class Stages:
             write(made, path)
         except OSError as error:
             raise OutputError(
-                f"Cannot keep the finished stage {name!r} in {self.folder}: {error}. Make room there; the same command "
-                "then goes on from the stages before it."
+                f"Cannot keep the finished stage {name!r} in {self.folder}: {system_reason(error)}. Make room there; "
+                "the same command then goes on from the stages before it."
             ) from error
         self._drop_others(name, path)
         return read(path)
@@ -164,6 +164,13 @@ class Stages:
         for entry in self.folder.glob(f"{name}-{'[0-9a-f]' * _KEY_LENGTH}*"):
             if entry != keep:
                 _remove(entry)
+
+
+def system_reason(error: OSError) -> str:
+    """Return what the system said, without the place, of an error that may have been wrapped."""
+    while isinstance(error, OutputError) and isinstance(error.__cause__, OSError):
+        error = error.__cause__
+    return (error.strerror or str(error)).rstrip(".")
 
 
 def has_stages(folder: Path) -> bool:
@@ -320,4 +327,4 @@ def _parted(array: Any, counts: IntArray) -> list[Any]:
     return np.split(array, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
-__all__ = ["Stages", "digest", "digest_files", "has_stages", "remove_stages"]
+__all__ = ["Stages", "digest", "digest_files", "has_stages", "remove_stages", "system_reason"]

@@ -135,6 +135,8 @@ def map_images(
     files = image_files(folder)
     names = [path.relative_to(folder).as_posix() for path in files]
     found = PointModelOptions(options.camera_model, options.camera_params, options.seed, options.threads)
+    if model is not None:  # of a finished map: its lines and planes are found anew
+        model = model.points_only()
     _check_number(folder, names, model, options.lines.min_images)
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
@@ -144,7 +146,7 @@ def map_images(
             lambda: reconstruct_points(folder, store.place("sfm"), names, found, say) if model is None else model,
             dataclasses.replace(found, threads=None),
         )
-        return _mapped(folder, names, start, store, options, say, line_matches)
+        return _mapped(folder, names, start, store, options, say, line_matches, model is not None)
 
 
 def _mapped(
@@ -155,6 +157,7 @@ def _mapped(
     options: MapOptions,
     say: StageProgress,
     line_matches: ExternalMatches | None,
+    model_given: bool,
 ) -> MapResult:
     robust = AdjustOptions(refine_intrinsics=options.refine_intrinsics, threads=options.threads)
     points = store.scene(
@@ -198,7 +201,7 @@ def _mapped(
         lined = store.scene("structure", lambda: find_structure(flat, options.structure))
     result = store.adjusted("adjusted", lambda: _adjusted(lined, weighted, options, say, "adjusting everything"))
     say("done", 1, 1)
-    warnings = [*_not_in_model(names, start)]
+    warnings = [*_not_in_model(names, start, given=model_given)]
     if lined.num_lines == 0:
         warnings.append("No line was mapped. " + explain(line_map))
     return MapResult(
@@ -229,17 +232,22 @@ def _check_number(folder: Path, names: list[str], model: Scene | None, fewest: i
             f"The model has {model.num_images} {'image' if model.num_images == 1 else 'images'} with a pose; a map "
             f"needs at least {max(2, fewest)} that overlap. Pass a model with more, or none to have it made."
         )
+    if len(model.point_observations.image_idx) == 0:
+        raise InputError(
+            "The model has no points that its images observe; they tell which images see the same, and hold the poses. "
+            "Pass a model with points, or none to have it made."
+        )
     check_names(folder, names, model)
 
 
-def _not_in_model(names: list[str], start: Scene) -> list[str]:
+def _not_in_model(names: list[str], start: Scene, given: bool) -> list[str]:
     left = sorted(set(names) - set(start.images.names))
     if not left:
         return []
     more = "" if len(left) <= 3 else f" and {len(left) - 3} more"
-    return [
-        f"{len(left)} of {len(names)} images have no pose in the model and were not used: {', '.join(left[:3])}{more}."
-    ]
+    remedy = "" if given else " They share too few points with the others: take images between them, or pass a --model."
+    which = f"{', '.join(left[:3])}{more}"
+    return [f"{len(left)} of {len(names)} images have no pose in the model and were not used: {which}.{remedy}"]
 
 
 def _by_index(line_matches: ExternalMatches | None, scene: Scene) -> Callable[[int, int], LineMatches] | None:
