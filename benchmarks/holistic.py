@@ -117,10 +117,10 @@ def table(results: list[dict]) -> str:
     for result in results:
         best = {row["kind"]: row["cpu_s"] for row in result["rows"] if row["contestant"] == "groma"}
         for row in result["rows"]:
-            e = row["errors"]
+            e, ratio = row["errors"], row["cpu_s"] / best.get(row["kind"], np.nan)
             lines.append(
                 f"| {result['images']} | {result['views']} | {row['kind']} | {row['contestant']} "
-                f"| {row['iterations']:.0f} | {row['cpu_s']:.3f} | {row['cpu_s'] / best.get(row['kind'], np.nan):.1f} | {e['centre']:.2f} "
+                f"| {row['iterations']:.0f} | {row['cpu_s']:.3f} | {ratio:.1f} | {e['centre']:.2f} "
                 f"| {e['point']:.2f} | {e['line_deg']:.3f}° {e['line']:.2f} | {e['plane_deg']:.3f}° {e['plane']:.2f} |"
             )
     return "\n".join(lines) + "\n"

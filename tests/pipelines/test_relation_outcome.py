@@ -27,7 +27,7 @@ def scenes():
 
 
 def test_wrong_relations_are_dropped_and_counted(scenes):
-    scene, tied, rows = scenes
+    _, tied, rows = scenes
     result = groma.adjust(tied)
     outcome = result.report.relations["point_on_plane"]
     assert outcome["held"] + outcome["dropped"] == len(tied.relations.point_on_plane)
