@@ -84,20 +84,26 @@ def prepare(source: LineScene, matching: str) -> Task:
 
 # --------------------------------------------------------------------------------------------------------- contestants
 def run_groma(task: Task) -> list[LineSet]:
-    """Lines as mapped, and after the joint adjustment of everything but the exact poses."""
-    options = MapLinesOptions.selective(task.min_length)
+    """Lines as mapped, and after the joint adjustment of everything but the exact poses; then the same of fewer."""
+    return [
+        *_run_groma(task, "groma", MapLinesOptions(min_length=task.min_length)),
+        *_run_groma(task, "groma, selective", MapLinesOptions.selective(task.min_length))[1:],
+    ]
+
+
+def _run_groma(task: Task, name: str, options: MapLinesOptions) -> list[LineSet]:
     map_lines(task.source.scene, task.segments, task.matches or None, options)  # kernels into memory
     start = time.process_time()
     found = map_lines(task.source.scene, task.segments, task.matches or None, options)
     seconds = time.process_time() - start
     track = np.column_stack([found.line_idx, found.image_idx, found.segment_idx])
-    mapped = LineSet("groma, no joint adjustment", task.matching, found.segments, track, seconds)
+    mapped = LineSet(f"{name}, no joint adjustment", task.matching, found.segments, track, seconds)
     if not found.num_lines:
         return [mapped]
     scene = find_structure(found.add_to(task.source.scene, task.segments))
     adjusted = adjust(scene, AdjustOptions(refine_poses=False, threads=1)).scene
     seconds = time.process_time() - start
-    return [mapped, LineSet("groma", task.matching, adjusted.lines.segments, track, seconds)]
+    return [mapped, LineSet(name, task.matching, adjusted.lines.segments, track, seconds)]
 
 
 def run_limap(task: Task, python: str) -> list[LineSet]:

@@ -398,3 +398,71 @@ def test_nothing_is_changed(world):
     before = [s.ends.copy() for s in world.segments]
     map_lines(world.scene, world.segments)
     assert all(np.array_equal(a, s.ends) for a, s in zip(before, world.segments, strict=True))
+
+
+def flipped(world: Wireframe, images: range) -> list[Segments]:
+    """The world's segments, those of some images run the other way."""
+    turned = list(world.segments)
+    for i in images:
+        turned[i] = Segments.from_ends(world.segments[i].ends[:, [2, 3, 0, 1]], 0.2)
+    return turned
+
+
+def test_an_edge_whose_darker_side_changes_is_one_line():
+    rng = np.random.default_rng(21)
+    world = wireframe(arc(12), random_lines(12, rng), rng)
+    found = map_lines(world.scene, flipped(world, range(6, 12)), options=MapLinesOptions(use_points=False))
+    true = true_lines(world, found)
+    assert (true >= 0).all()
+    assert len(np.unique(true)) == len(true) >= 10
+    assert np.median(found.num_images) > 8
+
+
+def test_an_edge_that_bent_poses_show_twice_is_one_line():
+    rng = np.random.default_rng(24)
+    world = wireframe(arc(12), random_lines(12, rng), rng)
+    poses = world.scene.cam_from_world
+    poses[6:, 5] += 0.03  # five pixels
+    found = map_lines(world.scene.with_poses(poses), flipped(world, range(6, 12)))
+    true = true_lines(world, found)
+    assert (true >= 0).all()
+    repeated = len(true) - len(np.unique(true))
+    assert len(np.unique(true)) >= 9
+    assert repeated <= 3
+
+
+def test_two_edges_of_a_bar_stay_two_lines():
+    rng = np.random.default_rng(22)
+    lines = random_lines(8, rng)
+    across = np.cross(lines[:, 1] - lines[:, 0], [0.0, 1.0, 0.0])
+    across *= 0.025 / np.linalg.norm(across, axis=1, keepdims=True)  # four pixels
+    world = wireframe(arc(10), np.concatenate([lines, lines + across[:, None]]), rng)
+    found = map_lines(world.scene, world.segments)
+    true = true_lines(world, found)
+    assert np.isin(np.arange(16), true).sum() >= 14
+    assert (true >= 0).mean() > 0.9
+
+
+def test_ends_are_where_most_images_see_them():
+    rng = np.random.default_rng(23)
+    lines = random_lines(12, rng)
+    world = wireframe(arc(12), lines, rng)
+    # All images see the whole lines, each with an error of its own along them.
+    segments = []
+    for i in range(12):
+        R, t = quaternion.to_matrix(world.scene.cam_from_world[i, None, :4])[0], world.scene.cam_from_world[i, 4:]
+        local = lines @ R.T + t
+        pixel = (700.0 * local[..., :2] / local[..., 2:] + [400.0, 300.0]).reshape(-1, 4)
+        along = pixel[:, 2:] - pixel[:, :2]
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        pixel += rng.normal(0.0, 1.0, (12, 2)).repeat(2, 1) * np.hstack([along, along])
+        segments.append(Segments.from_ends(pixel, 0.05))
+    found = map_lines(world.scene, segments)
+    assert found.num_lines >= 10
+    nearest = np.linalg.norm(found.segments.mean(1)[:, None] - lines.mean(1), axis=-1).argmin(1)
+    true = lines[nearest]
+    unit = (true[:, 1] - true[:, 0]) / np.linalg.norm(true[:, 1] - true[:, 0], axis=1, keepdims=True)
+    at = np.sort(((found.segments - true.mean(1)[:, None]) * unit[:, None]).sum(-1), axis=1)
+    half = 0.5 * np.linalg.norm(true[:, 1] - true[:, 0], axis=1)
+    beyond = np.concatenate([at[:, 1] - half, -at[:, 0] - half]) * 700.0 / 4.0
+    assert abs(np.median(beyond)) < 0.8  # pixels; the outermost but one of twelve lies 1.1 out

@@ -22,6 +22,8 @@ from groma._numba import kernel, loop
 
 #: Scale of the Cauchy loss, in sigma.
 _CAUCHY = 2.0
+#: Segments whose ends are that near to each other show the same end of a line, pixels.
+_SAME_END = 5.0
 
 
 # ------------------------------------------------------------------------------------------------------------- Refine
@@ -221,11 +223,16 @@ def _along(center, ray, X):
 
 
 @loop
-def trim(center, image, ray, pointers, rows, active, X, front):
-    """Move the end points of lines to bound what two images see; front (M,): observation lies before its camera."""
+def trim(center, image, ray, length, pointers, rows, active, X, front):
+    """Move the end points of lines to bound what two images see; front (M,): observation lies before its camera.
+
+    Where more images end a line within a few pixels of the second that does, the outer third of them counts: the
+    outermost would be too far out the more images there are.
+    """
     for n in range(len(pointers) - 1):
         begin, end = pointers[n], pointers[n + 1]
-        at, change, owner = np.empty(2 * (end - begin)), np.empty(2 * (end - begin)), np.empty(2 * (end - begin))
+        at, change, near = np.empty(2 * (end - begin)), np.empty(2 * (end - begin)), np.empty(end - begin)
+        scale = np.empty(end - begin)
         count = 0
         for m in range(begin, end):
             s = rows[m]
@@ -233,8 +240,9 @@ def trim(center, image, ray, pointers, rows, active, X, front):
             t1, z1 = _along(center[image[s]], ray[s, 1], X[n])
             front[m] = z0 > 0.0 and z1 > 0.0
             if active[m] and front[m]:
-                at[count], change[count], owner[count] = min(t0, t1), 1.0, image[s]
-                at[count + 1], change[count + 1], owner[count + 1] = max(t0, t1), -1.0, image[s]
+                at[count], change[count] = min(t0, t1), 1.0
+                at[count + 1], change[count + 1] = max(t0, t1), -1.0
+                scale[count // 2] = abs(t1 - t0) / length[s]
                 count += 2
         order = np.argsort(at[:count])
         # The hull of what two images see; of what one sees, if no two overlap.
@@ -250,6 +258,18 @@ def trim(center, image, ray, pointers, rows, active, X, front):
                     high = max(high, at[e])
                 depth -= 1
         if low < high:
+            reach = min(_SAME_END * np.median(scale[: count // 2]), 0.25 * (high - low))
+            for side in range(2):
+                outer = low if side == 0 else high
+                number = 0
+                for k in range(side, count, 2):
+                    if abs(at[k] - outer) <= reach:
+                        near[number] = at[k]
+                        number += 1
+                if side == 0:
+                    low = np.sort(near[:number])[number // 3]
+                else:
+                    high = np.sort(near[:number])[number - 1 - number // 3]
             a0, a1, a2 = X[n, 0, 0], X[n, 0, 1], X[n, 0, 2]
             d0, d1, d2 = X[n, 1, 0] - a0, X[n, 1, 1] - a1, X[n, 1, 2] - a2
             X[n, 0, 0], X[n, 0, 1], X[n, 0, 2] = a0 + low * d0, a1 + low * d1, a2 + low * d2

@@ -11,12 +11,14 @@ recover
     Lines are projected into the images of their neighbourhood. A free segment on a line joins it, also one whose own
     proposals were degenerate; a segment of another line is a vote that both are one.
 trim
-    The end points of a line bound the part of it that at least two images see.
+    The end points of a line bound the part of it that at least two images see; see :func:`._line_fit.trim`.
 
 Observations of all lines are flat arrays, stored by line: those of line n are ``pointers[n] : pointers[n + 1]``.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -170,7 +172,8 @@ class Tracks:
         self.line_of[members] = len(self.X) + group
         self.X = np.concatenate([self.X, places[reps]])
 
-    def _table(self) -> tuple[IntArray, IntArray]:
+    def table(self) -> tuple[IntArray, IntArray]:
+        """Rows of the observations by line, and the pointers of each line's."""
         rows = np.flatnonzero(self.line_of >= 0)
         rows = rows[np.argsort(self.line_of[rows], kind="stable")]  # rows are sorted by image, and stay so per line
         return rows, np.searchsorted(self.line_of[rows], np.arange(len(self.X) + 1))
@@ -184,7 +187,7 @@ class Tracks:
     def refine(self, rounds: int = 3) -> None:
         """Refine all lines, dropping observations that do not fit, then trim."""
         views = self.views
-        rows, pointers = self._table()
+        rows, pointers = self.table()
         active, squared, front = np.ones(len(rows), bool), np.zeros(len(rows)), np.zeros(len(rows), bool)
         self.uncertainty, self.unchecked = np.zeros(len(self.X)), np.zeros(len(self.X))
         for k in range(rounds):
@@ -192,7 +195,7 @@ class Tracks:
                 views.camera, views.image_idx, views.ends, views.sigma, pointers, rows, active, self.X, squared,
                 self.uncertainty, self.unchecked,
             )  # fmt: skip
-            trim(views.center, views.image_idx, views.ray, pointers, rows, active, self.X, front)
+            trim(views.center, views.image_idx, views.ray, views.length, pointers, rows, active, self.X, front)
             fits = (squared < GATE) & front
             if k == rounds - 1:
                 fits &= active
@@ -243,7 +246,7 @@ class Tracks:
             while True:
                 needed = find_on_lines(
                     views.camera[i], self.X, reach[i], rows, views.ends, views.sigma, views.usable, forward, GATE,
-                    0.5, room, value,
+                    0.3, room, value,
                 )  # fmt: skip
                 if needed <= len(room):
                     break
@@ -260,10 +263,20 @@ class Tracks:
         self.line_of[segment] = merged_line[order][best]
         return len(segment), num_merged
 
+    def join(self, alias: IntArray, deviation: FloatArray) -> None:
+        """Give the segments of line n, with ``deviation[n]`` more noise, to line ``alias[n]``; refine."""
+        member = np.flatnonzero(self.line_of >= 0)
+        sigma = self.views.sigma.copy()
+        sigma[member] = np.hypot(sigma[member], deviation[self.line_of[member]])
+        self.views = replace(self.views, sigma=sigma)
+        self.line_of[member] = alias[self.line_of[member]]
+        self.refine()
+        self.keep(self.num_images() > 0)
+
     def direction(self) -> FloatArray:
         """(L,) +1 or -1: whether most observations run from the first end point to the second in the image."""
         views = self.views
-        rows, _ = self._table()
+        rows, _ = self.table()
         P, X = views.camera[views.image_idx[rows]], self.X[self.line_of[rows]]
         x = np.einsum("mij,mkj->mki", P[:, :, :3], X) + P[:, None, :, 3]
         x = x[..., :2] / x[..., 2:]

@@ -6,7 +6,8 @@ Stages, each on all images before the next begins:
 1. neighbours by the points that images share (:mod:`groma.pipelines._neighbors`);
 2. for every segment, proposals of its place from every neighbour (:mod:`groma.pipelines._line_proposals`), and the
    one most neighbours agree on (:mod:`groma.pipelines._line_support`), one image at a time;
-3. tracks: link, refine, recover, merge, trim (:mod:`groma.pipelines._line_tracks`).
+3. tracks: link, refine, recover, merge, trim (:mod:`groma.pipelines._line_tracks`), and join what was mapped more than
+   once (:mod:`groma.pipelines._line_merge`).
 
 Every segment ends with a :class:`Fate`, so that the question why a line is missing has an answer.
 """
@@ -21,10 +22,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.pipelines._line_directions import depth_ratios
 from groma.pipelines._line_matches import MatchProvider, external_matches, flow_matches, wide_baseline_matches
+from groma.pipelines._line_merge import merge_agreeing
 from groma.pipelines._line_proposals import WEAK, Proposer
 from groma.pipelines._line_support import Choice, choose
 from groma.pipelines._line_tracks import Tracks, link
@@ -68,6 +70,8 @@ class Fate(IntEnum):
     SHORT_LINE = 12
 
 
+#: Segments whose deviation is that many times the usual one make no line by themselves.
+MAX_BLUR = 2.8
 #: Not a fate: what a segment has before its stage.
 UNKNOWN = -1
 
@@ -119,9 +123,9 @@ class MapLinesOptions:
     #: Fewest images of a line.
     min_images: int = 3
     #: Error of poses and cameras in the image, added in quadrature to the segments' sigma; pixels.
-    noise: float = 0.3
+    noise: float = 0.15
     #: The sigmas are scaled to what the first lines show, within these bounds; (1, 1) keeps them.
-    noise_scale: tuple[float, float] = (0.33, 2.0)
+    noise_scale: tuple[float, float] = (0.33, 4.0)
     #: The depth range of the points around a segment is widened by this factor at both sides.
     depth_margin: float = 2.0
     #: Segments are directed, for example dark on the left: the same line then runs the same way in all images.
@@ -131,9 +135,9 @@ class MapLinesOptions:
     #: Largest relative standard deviation of the depth of a two-view proposal.
     max_relative_sigma: float = 0.03
     #: Largest standard deviation of a line's end points over their distance from the cameras.
-    max_uncertainty: float = 0.008
+    max_uncertainty: float = 0.012
     #: The same when any one image of the line is left out: beyond it, a wrong match in that image would go unnoticed.
-    max_unchecked: float = 0.03
+    max_unchecked: float = 0.04
     #: A place is ambiguous if another one has more than this share of its support.
     max_rival: float = 0.95
     #: Use lines through known points as further proposals.
@@ -143,8 +147,8 @@ class MapLinesOptions:
 
     @staticmethod
     def selective(min_length: float = 12.0) -> MapLinesOptions:
-        """Fewer lines, of which more are right: known to four thousandths of their distance, and 25 pixels long."""
-        return MapLinesOptions(min_length=min_length, max_uncertainty=0.004, min_longest=25.0)
+        """Fewer lines, of which more are right: known to 2.5 thousandths of their distance, and 25 pixels long."""
+        return MapLinesOptions(min_length=min_length, max_uncertainty=0.0025, min_longest=25.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,6 +376,8 @@ def _build_tracks(
 ) -> Tracks:
     """Lines from places; updates the fates."""
     tracks = Tracks(views)
+    # Segments that were fitted badly run over two edges or along a curve, and do so alike in several images.
+    sharp = views.sigma <= MAX_BLUR * np.median(views.sigma[views.usable]) if views.usable.any() else views.usable
     center = views.center[views.image_idx]
     safe = np.where(places.found[:, None], places.q, 1.0)
     points = center[:, None] + views.ray / safe[:, :, None]
@@ -394,14 +400,22 @@ def _build_tracks(
             tracks.recover(neighbors, views.usable, options.directed)
             tracks.refine()
             left[tracks.keep(tracks.num_images() >= 2)] = True
+    # The darker side of an edge changes with what is behind it.
+    tracks.recover(neighbors, views.usable, False)
+    tracks.refine()
+    left[tracks.keep(tracks.num_images() >= 2)] = True
+    settled = np.append(_is_sure(tracks, options), False)[tracks.line_of]
+    merge_agreeing(tracks)
+    left[tracks.keep(tracks.num_images() >= 2)] = True
     # Left alone when all others of its line were dropped, or dropped itself; the later word counts for both.
     fate[left & (tracks.line_of < 0)] = Fate.FEW_IMAGES
     fate[tracks.dropped & (tracks.line_of < 0)] = Fate.OUTLIER
     fate[tracks.keep(tracks.num_images() >= options.min_images)] = Fate.FEW_IMAGES
-    distance = _distance(tracks)
-    sure = tracks.uncertainty <= options.max_uncertainty * distance
-    if options.min_images > 2:
-        sure &= tracks.unchecked <= options.max_unchecked * distance
+    rows = np.flatnonzero(tracks.line_of >= 0)
+    # What was sure stays so when it is joined to another line, whose noise then counts too.
+    sure = np.bincount(tracks.line_of[rows], settled[rows], len(tracks.X)) > 0
+    sure |= _is_sure(tracks, options)
+    sure &= _num_sharp(tracks, sharp) >= min(3, options.min_images)
     fate[tracks.keep(sure)] = Fate.UNCERTAIN
     longest = np.zeros(len(tracks.X))
     rows = np.flatnonzero(tracks.line_of >= 0)
@@ -410,6 +424,22 @@ def _build_tracks(
     member = tracks.line_of >= 0
     fate[member] = np.where(own[member], Fate.MAPPED, Fate.RECOVERED)
     return tracks
+
+
+def _is_sure(tracks: Tracks, options: MapLinesOptions) -> BoolArray:
+    """(L,) whether lines are known well enough for their distance, also without any one image."""
+    distance = _distance(tracks)
+    sure = tracks.uncertainty <= options.max_uncertainty * distance
+    if options.min_images > 2:
+        sure &= tracks.unchecked <= options.max_unchecked * distance
+    return sure
+
+
+def _num_sharp(tracks: Tracks, sharp: BoolArray) -> IntArray:
+    """(L,) number of images that show a line as a sharp segment."""
+    rows = np.flatnonzero((tracks.line_of >= 0) & sharp)
+    pairs = np.unique(np.column_stack([tracks.line_of[rows], tracks.views.image_idx[rows]]), axis=0)
+    return np.bincount(pairs[:, 0], minlength=len(tracks.X))
 
 
 def _distance(tracks: Tracks) -> FloatArray:
