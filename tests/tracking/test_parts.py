@@ -5,20 +5,24 @@ import _room
 import numpy as np
 import pytest
 
+from groma.factors._factor import Ref
+from groma.factors.plane_observation import PlaneObservation
 from groma.frontend.point_tracks import corners, follow, spread
 from groma.geometry import se3
 from groma.scene.landmarks import Lines
 from groma.tracking.camera import TrackCamera, back, into, planes_back, planes_into
-from groma.tracking.depth import INVERSE_DEPTH_SIGMA, depth_at, fit_inverse_depth, sample_inverse_depth
+from groma.tracking.depth import depth_at, segment_inverse_depths
+from groma.tracking.features import SEGMENT_NOISE
+from groma.tracking.frame_planes import frame_planes
 from groma.tracking.keyframes import triangulate
 from groma.tracking.landmarks import ALIVE, DEAD, LineTable, PlaneTable, PointTable
 from groma.tracking.lines import assign, carried, line_ends
 from groma.tracking.motion import MapView, estimate_pose
 from groma.tracking.observations import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
-from groma.tracking.plane_cells import find_depth_planes
 from groma.tracking.planes import add_planes, assign_planes, merge_planes
 from groma.tracking.prediction import MotionModel
 from groma.tracking.relocalise import pose_from_matches
+from groma.tracking.sparse_depth import fill_sparse
 from groma.tracking.stereo import dense_disparities, match_columns
 
 CAMERA = TrackCamera(500.0, 510.0, 320.0, 240.0, 640, 480, 0.2)
@@ -100,7 +104,7 @@ def test_planes_of_a_depth_image_and_their_noise():
     depth = _room.render(pose)[1]
     rng = np.random.default_rng(2)
     noisy = (depth + 0.002 * depth**2 * rng.normal(size=depth.shape)).astype(np.float32)
-    found = find_depth_planes(camera, noisy, 10.0)
+    found = frame_planes(camera, noisy, 10.0)
     assert len(found) == 3
     world = planes_back(pose, found.plane)
     for hesse in world:
@@ -108,17 +112,28 @@ def test_planes_of_a_depth_image_and_their_noise():
         assert abs(hesse[axis]) > np.cos(0.01)
         assert abs(hesse[3] - _room.ROOM[axis]) < 0.02
     assert (found.plane[:, 3] > 0).all()
-    assert len(find_depth_planes(camera, np.zeros_like(noisy), 10.0)) == 0
+    # In the basis of the factor, whose rows are sines of angles and the offset.
+    none = np.zeros(3, np.int64)
+    basis = PlaneObservation(pose=Ref("p", none), plane=Ref("q", none), planes_in_cam=found.plane).basis
+    axes = np.abs(world[:, :3]).argmax(axis=1)
+    true = np.zeros((3, 4))
+    true[np.arange(3), axes] = np.sign(world[np.arange(3), axes])
+    true[:, 3] = _room.ROOM[axes]
+    true = planes_into(pose, true)
+    error = np.column_stack([np.einsum("kia,ki->ka", basis, true[:, :3]), true[:, 3] - found.plane[:, 3]])
+    whitened = np.einsum("kab,kb->ka", found.sqrt_information, error)
+    assert np.sqrt((whitened**2).mean()) < 1.5
+    assert len(frame_planes(camera, np.zeros_like(noisy), 10.0)) == 0
 
 
 def test_planes_are_assigned_by_angle_distance_and_overlap():
     camera = TrackCamera.of(_room.camera())
     pose = se3.inverse(se3.exp(np.array([[0.3, 0.2, 0.2, 0.5, 0.7, 0.1]])))[0]
-    found = find_depth_planes(camera, _room.render(pose)[1], 10.0)
+    found = frame_planes(camera, _room.render(pose)[1], 10.0)
     table = PlaneTable()
     index = add_planes(table, found, np.arange(len(found)), pose)
     near = se3.compose(se3.exp(np.array([[0.02, 0, 0, 0, 0.03, 0]])), pose[None])[0]
-    again = find_depth_planes(camera, _room.render(near)[1], 10.0)
+    again = frame_planes(camera, _room.render(near)[1], 10.0)
     first, second = assign_planes(table, again, pose, 0.1, 0.1)
     assert len(first) == len(again) == 3
     assert np.abs((table.hesse[first, :3] * planes_back(near, again.plane[second])[:, :3]).sum(1)).min() > 0.999
@@ -140,21 +155,6 @@ def test_planes_merge_when_they_lie_on_each_other():
     assert table.merged_into[1] == 0
 
 
-def test_inverse_depth_along_segments():
-    rng = np.random.default_rng(4)
-    t = (np.arange(24) + 0.5) / 24
-    truth = rng.uniform(0.2, 0.8, (200, 2))
-    samples = truth[:, :1] * (1 - t) + truth[:, 1:] * t + INVERSE_DEPTH_SIGMA * rng.normal(size=(200, 24))
-    samples[:, :6] = np.nan
-    samples[:, 20:] += 0.2
-    ends, sigma, good = fit_inverse_depth(samples, INVERSE_DEPTH_SIGMA)
-    assert good.mean() > 0.95
-    ratio = ((ends - truth) / sigma)[good]
-    assert np.sqrt((ratio**2).mean()) < 1.5
-    empty = fit_inverse_depth(np.full((2, 24), np.nan), 0.003)
-    assert not empty[2].any()
-
-
 def test_depth_of_pixels_and_segments():
     depth = np.full((60, 80), 2.0, np.float32)
     depth[:, 40:] = 1.0
@@ -163,9 +163,28 @@ def test_depth_of_pixels_and_segments():
     assert found[0] == 2.0
     assert found[1] == 1.0
     assert np.isnan(found[2:]).all()
-    # An edge between two surfaces belongs to the nearer one.
-    samples = sample_inverse_depth(depth, np.array([[38.5, 20, 38.5, 50.0]]), 5.0)
-    assert (samples == 1.0).all()
+    # An edge between two surfaces belongs to the nearer one; where nothing is known, nothing is told.
+    ends = np.array([[40.0, 20, 40.0, 50.0], [10.0, 5.0, 30.0, 5.0]])
+    inverse, sigma = segment_inverse_depths(depth, ends, CAMERA.params, SEGMENT_NOISE)
+    assert np.abs(inverse[0] - 1.0).max() < 1e-6
+    assert (sigma[0] < 0.01).all()
+    assert np.isnan(inverse[1]).all()
+
+
+def test_holes_between_samples_of_a_plane_are_filled():
+    rng = np.random.default_rng(8)
+    u, v = np.meshgrid(np.arange(160), np.arange(120))
+    whole = (1.0 / (0.4 + 0.001 * u - 0.0005 * v)).astype(np.float32)
+    whole[:, 100:] = 1.0
+    sparse = np.where(rng.random(whole.shape) < 0.9, 0, whole).astype(np.float32)
+    filled = fill_sparse(sparse, 6.0)
+    new = (sparse == 0) & (filled > 0)
+    assert new.mean() > 0.4
+    assert np.abs(1 / filled[new] - 1 / whole[new]).max() < 1e-3
+    assert (filled[sparse > 0] == sparse[sparse > 0]).all()
+    # Nothing is read across the step, and dense images stay as they are.
+    assert not new[:, 92:108].any()
+    assert fill_sparse(whole, 6.0) is whole
 
 
 def test_segments_are_assigned_one_to_one():

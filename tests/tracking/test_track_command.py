@@ -52,7 +52,9 @@ def test_what_it_writes(sequence, tmp_path):
     for scene in (read_scene(out), read_scene(out / "scene.npz")):
         assert scene.num_images >= 2
         assert scene.num_lines > 0
-    assert "<html" in (out / "report.html").read_text().lower()
+    page = (out / "report.html").read_text()
+    assert "<html" in page.lower()
+    assert "Path from above" in page
     for path in (out / "summary.json", tmp_path / "numbers.json"):
         numbers = json.loads(path.read_text())
         assert numbers["frames"] == {"tracked": 16}

@@ -10,8 +10,9 @@ from groma.cli import _options
 
 if TYPE_CHECKING:
     from groma.cli._console import Console
+    from groma.evaluation.trajectory import TrajectoryScores
     from groma.io.sequences.frame import Sequence
-    from groma.tracking import Tracker, TrackResult
+    from groma.tracking import TrackedFrame, Tracker, TrackResult
 
 
 def track(
@@ -45,7 +46,6 @@ def track(
     ] = None,
     force: _options.Force = False,
     threads: _options.Threads = None,
-    seed: _options.Seed = 0,
     json_target: _options.Json = None,
     quiet: _options.Quiet = False,
     verbose: _options.Verbose = False,
@@ -69,7 +69,8 @@ def track(
     import shutil
 
     from groma.io.sequences import open_sequence
-    from groma.tracking import Tracker, TrackOptions
+    from groma.tracking import TrackedFrame, Tracker, TrackOptions
+    from groma.viz.trajectory import write_track_report
 
     frames = open_sequence(
         sequence,
@@ -79,11 +80,12 @@ def track(
         max_frames=max_frames,
         kind=cast("Literal['rgbd', 'stereo', 'mono'] | None", kind),
     )
-    options = TrackOptions(points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth, seed=seed)
+    options = TrackOptions(points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth)
     tracker = Tracker(frames.camera, options)
     console.announce_compilation()
     work = output.with_name(output.name + ".work")
-    interrupted = _run(tracker, frames, work, console)
+    rows: list[TrackedFrame] = []
+    interrupted = _run(tracker, frames, work, console, rows)
     result = tracker.finish()
     if not len(result.trajectory):
         raise InputError(
@@ -92,11 +94,19 @@ def track(
         )
     numbers = {"kind": frames.kind, "interrupted": interrupted, **result.statistics, "sequence": str(sequence)}
     numbers["warnings"] = [*frames.warnings, *result.warnings]
-    scores = _scores(result, frames)
+    compared, scores = _scores(result, frames)
     if scores:
         numbers["reference"] = scores
     with _output.atomic_output(output, force) as draft:
-        _write(result, draft, f"Track of {sequence.absolute().name}")
+        _write(result, draft)
+        write_track_report(
+            draft / "report.html",
+            result,
+            rows,
+            compared,
+            title=f"Track of {sequence.absolute().name}",
+            warnings=numbers["warnings"],
+        )
         _output.write_json(str(draft / "summary.json"), numbers)
     shutil.rmtree(work, ignore_errors=True)
     _tell(console, result, scores, numbers["warnings"])
@@ -104,8 +114,8 @@ def track(
     _output.write_json(json_target, numbers, force)
 
 
-def _run(tracker: "Tracker", frames: "Sequence", work: Path, console: "Console") -> bool:
-    """Track all frames; return whether Ctrl-C ended it early."""
+def _run(tracker: "Tracker", frames: "Sequence", work: Path, console: "Console", rows: "list[TrackedFrame]") -> bool:
+    """Track all frames, noting in ``rows`` what became of each; return whether Ctrl-C ended it early."""
     from groma.tracking.journal import Journal
 
     journal = Journal(work)
@@ -114,6 +124,7 @@ def _run(tracker: "Tracker", frames: "Sequence", work: Path, console: "Console")
         with console.stages() as progress:
             for frame in frames:
                 tracked = tracker.process(frame)
+                rows.append(tracked)
                 done += 1
                 progress("tracking frame", done, total)
                 if tracked.status in ("lost", "skipped") or tracked.weak:
@@ -127,29 +138,28 @@ def _run(tracker: "Tracker", frames: "Sequence", work: Path, console: "Console")
     return False
 
 
-def _write(result: "TrackResult", draft: Path, title: str) -> None:
+def _write(result: "TrackResult", draft: Path) -> None:
     from groma.io import write_scene
     from groma.io.trajectories import write_tum
-    from groma.viz.report import write_report
 
     write_scene(result.scene, draft, format="colmap")
     write_scene(result.scene, draft / "scene.npz")
     write_tum(result.trajectory, draft / "trajectory.txt")
-    write_report(draft / "report.html", None, result.scene, None, None, title)
 
 
-def _scores(result: "TrackResult", frames: "Sequence") -> dict[str, Any]:
-    """Error against the reference of the sequence, if it has one."""
+def _scores(result: "TrackResult", frames: "Sequence") -> "tuple[TrajectoryScores | None, dict[str, Any]]":
+    """Comparison with the reference of the sequence, if it has one, and its numbers or why there are none."""
     from groma.errors import GromaError
     from groma.evaluation.trajectory import score_trajectory
 
     if frames.reference is None or len(result.trajectory) < 3:
-        return {}
+        return None, {}
     align = "sim3" if frames.kind == "mono" else "se3"
     try:
-        return score_trajectory(result.trajectory, frames.reference, align=align, max_time_difference=0.02).to_dict()
+        scores = score_trajectory(result.trajectory, frames.reference, align=align, max_time_difference=0.02)
     except GromaError as error:
-        return {"error": str(error)}
+        return None, {"error": str(error)}
+    return scores, scores.to_dict()
 
 
 def _tell(console: "Console", result: "TrackResult", scores: dict[str, Any], warnings: list[str]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -13,23 +13,28 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
+from groma.frontend.depth_noise import DepthNoise
 from groma.frontend.lsd import LsdDetector
 from groma.frontend.segments import Segments
 from groma.io.sequences.frame import Frame
 from groma.tracking.camera import TrackCamera
 from groma.tracking.depth import (
+    DEPTH_FLOOR,
     INVERSE_DEPTH_SIGMA,
+    DepthImage,
     depth_at,
     depth_sigma,
-    fit_inverse_depth,
-    sample_inverse_depth,
+    segment_inverse_depths,
 )
+from groma.tracking.frame_planes import FramePlanes, frame_planes
 from groma.tracking.options import TrackOptions
-from groma.tracking.plane_cells import DepthPlanes, find_depth_planes
+from groma.tracking.sparse_depth import fill_sparse
 from groma.tracking.stereo import DISPARITY_SIGMA, Disparities, dense_disparities, match_columns
 
 #: Depths of a stereo pair are used where their noise is below this share of the depth.
 FAR_SHARE = 0.06
+#: Errors of depth beside a segment: so many neighbours err alike.
+SEGMENT_NOISE = DepthNoise(DEPTH_FLOOR, INVERSE_DEPTH_SIGMA, 0.0, correlation=6.0, tilt=0.0, shift=0.0)
 Descriptors = npt.NDArray[np.uint8]
 
 
@@ -82,11 +87,12 @@ class FrameFeatures:
         """Begin with what a keyframe needs, in other threads; :meth:`wait` ends it."""
         if self._work:
             return
-        if self.frame.right is not None and self.frame.depth is None:
-            _ = self.disparities
-        self._work.append(pool.submit(lambda: self.features))
+        # Both kinds ask for depths, which are found first, once.
+        first = pool.submit(lambda: self.disparities if self.frame.depth is None else self.depth)
+        self._work.append(first)
+        self._work.append(pool.submit(lambda: (first.result(), self.features)))
         if self.options.lines:
-            self._work.append(pool.submit(lambda: self.detected))
+            self._work.append(pool.submit(lambda: (first.result(), self.detected)))
 
     def wait(self) -> None:
         """Wait for what :meth:`prepare` began."""
@@ -94,16 +100,21 @@ class FrameFeatures:
             future.result()
 
     @cached_property
-    def planes(self) -> DepthPlanes | None:
+    def planes(self) -> FramePlanes | None:
         """Planes of the depth image; None without one."""
-        if self.frame.depth is None or not self.options.planes:
+        if self.depth is None or not self.options.planes:
             return None
-        return find_depth_planes(self.camera, self.frame.depth, self.options.max_depth)
+        return frame_planes(self.camera, self.depth, self.options.max_depth)
+
+    @cached_property
+    def depth(self) -> DepthImage | None:
+        """The depth image; small holes are filled where most of it is missing."""
+        return None if self.frame.depth is None else fill_sparse(self.frame.depth, self.options.max_depth)
 
     def depths(self, pixels: FloatArray) -> FloatArray:
         """Depths (N,) at pixels from the depth image or the right image; NaN where unknown."""
-        if self.frame.depth is not None:
-            return depth_at(self.frame.depth, pixels, self.options.max_depth)
+        if self.depth is not None:
+            return depth_at(self.depth, pixels, self.options.max_depth)
         if self.frame.right is not None:
             disparity = pixels[:, 0] - self.right_columns(pixels)
             with np.errstate(divide="ignore"):
@@ -139,17 +150,16 @@ class FrameFeatures:
 
     def inverse_depths(self, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Inverse depths at the ends of segments (L, 2) and their standard deviations; NaN where unknown."""
-        if self.frame.depth is not None and len(ends):
-            samples = sample_inverse_depth(self.frame.depth, ends, self.options.max_depth)
-            return fit_inverse_depth(samples, INVERSE_DEPTH_SIGMA)[:2]
+        if self.depth is not None and len(ends):
+            noise = replace(SEGMENT_NOISE, max_depth=self.options.max_depth)
+            return segment_inverse_depths(self.depth, ends, self.camera.params, noise)
         if self.frame.right is not None and len(ends):
             assert self.disparities is not None
-            scale = np.float32(self.camera.fx * self.camera.baseline)
+            scale = self.camera.fx * self.camera.baseline
             with np.errstate(divide="ignore"):
-                depth = np.where(self.disparities > 0, scale / self.disparities, np.float32(0.0))
-            # Blocks widen what is near, so nothing beside the segment is looked at.
-            samples = sample_inverse_depth(depth, ends, float("inf"), beside=0.0)
-            return fit_inverse_depth(samples, 2.0 * DISPARITY_SIGMA / float(scale))[:2]
+                depth = np.where(self.disparities > 0, np.float32(scale) / self.disparities, np.float32(0.0))
+            noise = replace(SEGMENT_NOISE, constant=0.0, quadratic=2.0 * DISPARITY_SIGMA / scale, max_depth=1e4)
+            return segment_inverse_depths(depth, ends, self.camera.params, noise)
         unknown = np.full((len(ends), 2), np.nan)
         return unknown, unknown.copy()
 

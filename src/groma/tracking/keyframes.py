@@ -368,7 +368,7 @@ def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> P
     assert seen is not None
     index, rows = assign_planes(track_map.planes, seen, pose, math.radians(8.0), 0.08)
     for k, row in zip(index, rows, strict=True):
-        grow(track_map.planes, int(k), back(pose, seen.cells[seen.cell_plane == row]), float(seen.support[row]))
+        grow(track_map.planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]))
     rest = np.setdiff1d(np.arange(len(seen)), rows)
     # Nothing new beside a plane that is there already but did not agree well enough.
     _, doubtful = assign_planes(track_map.planes, seen, pose, math.radians(15.0), 0.15)

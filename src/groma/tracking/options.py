@@ -43,8 +43,6 @@ class TrackOptions:
     relations: bool = True
     #: Adjust the window in a thread of its own; its result is taken up two frames later, so runs repeat exactly.
     threaded: bool = True
-    #: Seed of the random samples.
-    seed: int = 0
 
     def __post_init__(self) -> None:
         if not (self.points or self.lines or self.planes):

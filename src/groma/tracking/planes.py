@@ -7,15 +7,15 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.tracking.camera import back, planes_back, planes_into
+from groma.tracking.frame_planes import FramePlanes
 from groma.tracking.landmarks import ALIVE, DEAD, PlaneTable
-from groma.tracking.plane_cells import DepthPlanes
 
 #: The seen parts of one plane lie within this distance of each other, scene units.
 REACH = 0.6
 
 
 def assign_planes(
-    planes: PlaneTable, seen: DepthPlanes, pose: FloatArray, max_angle: float, max_distance: float
+    planes: PlaneTable, seen: FramePlanes, pose: FloatArray, max_angle: float, max_distance: float
 ) -> tuple[IntArray, IntArray]:
     """Pair planes of the map with planes of a frame by angle, distance and overlap.
 
@@ -37,7 +37,7 @@ def assign_planes(
     good = (cosine > np.cos(max_angle)) & (distance < max_distance)
     score = np.where(good, np.arccos(np.clip(cosine, -1, 1)) / max_angle + distance / max_distance, np.inf)
     for i, j in np.argwhere(good):
-        if not _overlap(planes.samples[alive[i]], back(pose, seen.cells[seen.cell_plane == j])):
+        if not _overlap(planes.samples[alive[i]], back(pose, seen.places_of(j))):
             score[i, j] = np.inf
     best = score.argmin(axis=1)
     rows = np.flatnonzero(np.isfinite(score[np.arange(len(alive)), best]))
@@ -45,13 +45,13 @@ def assign_planes(
     return alive[rows], best[rows]
 
 
-def add_planes(planes: PlaneTable, seen: DepthPlanes, rows: IntArray, pose: FloatArray) -> IntArray:
+def add_planes(planes: PlaneTable, seen: FramePlanes, rows: IntArray, pose: FloatArray) -> IntArray:
     """Make landmarks of planes of a frame; return their indices."""
     index = planes.extend(len(rows))
     planes.hesse[index] = planes_back(pose, seen.plane[rows])
     planes.state[index] = ALIVE
     for k, row in zip(index, rows, strict=True):
-        grow(planes, int(k), back(pose, seen.cells[seen.cell_plane == row]), float(seen.support[row]))
+        grow(planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]))
     return index
 
 
@@ -99,10 +99,10 @@ def merge_planes(planes: PlaneTable, max_angle: float = 0.06, max_distance: floa
     return merged
 
 
-def _region_means(seen: DepthPlanes) -> FloatArray:
-    count = np.bincount(seen.cell_plane, minlength=len(seen))
+def _region_means(seen: FramePlanes) -> FloatArray:
+    count = np.bincount(seen.place_plane, minlength=len(seen))
     return np.stack(
-        [np.bincount(seen.cell_plane, seen.cells[:, k], len(seen)) / np.maximum(count, 1) for k in range(3)], axis=1
+        [np.bincount(seen.place_plane, seen.places[:, k], len(seen)) / np.maximum(count, 1) for k in range(3)], axis=1
     )
 
 

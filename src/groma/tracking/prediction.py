@@ -26,7 +26,6 @@ class MotionModel:
         self._last_time: float | None = None
         self._step = 0.0
         self._error = np.array([0.15] * 3 + [0.15] * 3)
-        self._known = False
         self._predicted: FloatArray | None = None
 
     def predict(self, pose: FloatArray, timestamp: float) -> tuple[FloatArray, FloatArray]:
