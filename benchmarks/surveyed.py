@@ -3,9 +3,9 @@
 
     python benchmarks/surveyed.py SCENE ...
 
-SCENE is a folder with ``images/``, a start ``sparse_inc/`` and the survey ``sparse_gt/``, both COLMAP models. Each scene
-is mapped once with the defaults of ``groma map``; its last adjustment is then repeated from the same start with points
-alone, with lines, and with lines and planes. *Squares* is plain least squares of the points.
+SCENE is a folder with ``images/``, a start ``sparse_inc/`` and the survey ``sparse_gt/``, both COLMAP models. Each
+scene is mapped once with the defaults of ``groma map``; its last adjustment is then repeated from the same start with
+points alone, with lines, and with lines and planes. *Squares* is plain least squares of the points.
 
 Two more columns say how far the comparison can be believed. *Predicted* is the standard deviation of the camera centres
 after adjusting the points, as photographs with such noise would give it. *Misfit* is how much worse the surveyed poses
@@ -39,8 +39,8 @@ MISFIT_LOSS = 3.0
 
 def scores(scene: Scene, survey: Scene) -> str:
     """Root mean square and largest distance of the centres (thousandths of a unit), and mean rotation, degrees."""
-    found = evaluate_poses(scene, survey).to_dict()
-    return f"{1e3 * found['center_rmse']:.2f} / {1e3 * found['center_max']:.1f} / {found['rotation_deg_mean']:.3f}"
+    found = evaluate_poses(scene, survey)
+    return f"{1e3 * found.center_rmse:.2f} / {1e3 * found.center_max:.1f} / {found.rotation_deg_mean:.3f}"
 
 
 def misfit(scene: Scene, survey: Scene, sigma_px: float) -> tuple[float, float]:
