@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from groma.factors.user import factor
     from groma.io import read_scene, write_scene
     from groma.pipelines.adjust import AdjustOptions, AdjustResult, adjust
+    from groma.pipelines.adjust_parts import adjust_parts, write_parts
     from groma.pipelines.diagnosis import diagnose_scene as diagnose
     from groma.pipelines.map import MapOptions, map_images
     from groma.pipelines.uncertainty import uncertainty
@@ -84,6 +85,7 @@ _HOME = {
     "Tracker": "groma.tracking",
     "Variables": "groma.problem.variables",
     "adjust": "groma.pipelines.adjust",
+    "adjust_parts": "groma.pipelines.adjust_parts",
     "diagnose": "groma.pipelines.diagnosis:diagnose_scene",
     "factor": "groma.factors.user",
     "loss": "groma.factors.losses",
@@ -91,6 +93,7 @@ _HOME = {
     "read_scene": "groma.io",
     "solve": "groma.solver.solve",
     "uncertainty": "groma.pipelines.uncertainty",
+    "write_parts": "groma.pipelines.adjust_parts",
     "write_report": "groma.viz.report",
     "write_scene": "groma.io",
 }
@@ -138,6 +141,7 @@ __all__ = [
     "Tracker",
     "Variables",
     "adjust",
+    "adjust_parts",
     "cameras",
     "diagnose",
     "errors",
@@ -158,6 +162,7 @@ __all__ = [
     "tracking",
     "uncertainty",
     "viz",
+    "write_parts",
     "write_report",
     "write_scene",
 ]

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A scene larger than memory: time and memory of an adjustment in parts, by the number of observations.
+
+    python benchmarks/parts.py [--millions 1 4 16 50] [--steps 4] [--threads 2] [--work FOLDER]
+
+The scene is an aerial block: photographs straight down on a grid, each point of the ground in about ten of them, 9 000
+points in a photograph, 0.5 px of noise. It is written part by part, so that it never is in memory. Every size is solved
+by :func:`groma.pipelines.adjust_parts.adjust_parts` in a process of its own; 50 million observations take 2 GB of disk.
+Reported are CPU time per step, peak memory of the process, bytes per observation, and the exponent of growth.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+#: Photographs: size and focal length in pixels, height over the ground and spacing along and across, metres.
+WIDTH, HEIGHT, FOCAL, ALTITUDE = 1200, 900, 1000.0, 100.0
+SPACING = np.array([36.0, 28.0])
+NOISE_PX = 0.5
+#: Points of the ground per square metre.
+DENSITY = 9000 / (WIDTH * HEIGHT * (ALTITUDE / FOCAL) ** 2)
+PER_IMAGE = 9000
+PART = 1_000_000
+#: Start: standard deviations of rotations (radians), of camera centres and points (metres).
+START = (0.002, 0.3, 0.3)
+
+
+def make(folder: Path, observations: float, seed: int = 0) -> int:
+    """Write an aerial block in parts; return its number of observations."""
+    from groma.geometry import quaternion, se3
+    from groma.io.archive import write_archive
+    from groma.scene import Cameras, PointObservations, Points, Scene
+
+    rng = np.random.default_rng(seed)
+    count = max(64, round(observations / PER_IMAGE))
+    across = max(8, round(np.sqrt(count / 4)))
+    along = -(-count // across)
+    grid = np.stack(np.meshgrid(np.arange(along), np.arange(across), indexing="ij"), axis=-1).reshape(-1, 2)
+    centers = np.column_stack([grid * SPACING + rng.normal(0, 1.0, grid.shape), np.full(len(grid), ALTITUDE)])
+    down = np.array([1.0, 0.0, 0.0, 0.0])  # x along, y across reversed, looking down
+    turn = quaternion.multiply(quaternion.exp(rng.normal(0, 0.02, (len(grid), 3))), down)
+    poses = np.hstack([turn, -quaternion.rotate(turn, centers)])
+    rough = quaternion.multiply(quaternion.exp(rng.normal(0, START[0], (len(grid), 3))), turn)
+    start = np.hstack([rough, -quaternion.rotate(rough, centers + rng.normal(0, START[1], centers.shape))])
+    camera = Cameras(
+        np.array([1]), ("PINHOLE",), np.array([[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]]), np.array([WIDTH]),
+        np.array([HEIGHT]),
+    )  # fmt: skip
+    names = [f"{i:03d}_{j:03d}.jpg" for i, j in grid]
+    empty = Scene.from_images(camera, names, np.zeros(len(names), np.int64), start)
+    extent = np.array([along - 1, across - 1]) * SPACING
+    strips = max(1, round(observations / PART))
+    reach = np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3), indexing="ij"), axis=-1).reshape(-1, 2)
+    total = 0
+    for number in range(strips):
+        low, high = extent[0] * number / strips, extent[0] * (number + 1) / strips
+        points = rng.poisson(DENSITY * (high - low) * extent[1])
+        xyz = np.column_stack(
+            [rng.uniform(low, high, points), rng.uniform(0, extent[1], points), rng.normal(0, 3, points)]
+        )
+        near = np.round(xyz[:, :2] / SPACING).astype(np.int64)
+        image, point, pixel = [], [], []
+        for offset in reach:
+            cell = near + offset
+            rows = np.flatnonzero(((cell >= 0) & (cell < [along, across])).all(axis=1))
+            photograph = cell[rows, 0] * across + cell[rows, 1]
+            seen = se3.transform_points(poses[photograph], xyz[rows])
+            where = FOCAL * seen[:, :2] / seen[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+            inside = ((where > 0) & (where < [WIDTH, HEIGHT])).all(axis=1)
+            image.append(photograph[inside])
+            point.append(rows[inside])
+            pixel.append(where[inside] + rng.normal(0, NOISE_PX, (int(inside.sum()), 2)))
+        image_idx, point_idx, pixels = np.concatenate(image), np.concatenate(point), np.concatenate(pixel)
+        order = np.argsort(point_idx, kind="stable")
+        ids = np.arange(len(xyz)) + 1
+        part = empty.replace(
+            points=Points(
+                ids, xyz + rng.normal(0, START[2], xyz.shape), np.zeros((len(xyz), 3), np.uint8), np.zeros(len(xyz))
+            ),
+            point_observations=PointObservations(
+                image_idx[order], point_idx[order], pixels[order], np.full(len(order), -1)
+            ),
+        )
+        write_archive(part, folder / f"part-{number:05d}.npz", force=True)
+        total += len(order)
+    return total
+
+
+def run(folder: Path, steps: int, threads: int) -> dict:
+    """Adjust the parts of a folder in this process."""
+    from groma.pipelines.adjust_parts import adjust_parts
+    from groma.solver.options import SolverOptions
+
+    options = SolverOptions(
+        max_iterations=steps, threads=threads, function_tolerance=0.0, gradient_tolerance=0.0, step_tolerance=0.0
+    )
+    began = time.process_time(), time.perf_counter()
+    with tempfile.TemporaryDirectory(dir=folder.parent) as output:
+        report = adjust_parts(sorted(folder.glob("part-*.npz")), output, options=options).report
+    return {
+        "cpu_s": time.process_time() - began[0],
+        "wall_s": time.perf_counter() - began[1],
+        "steps": report.iterations,
+        "initial_cost": report.initial_cost,
+        "final_cost": report.final_cost,
+        "residuals": report.num_residuals,
+        "unknowns": report.num_unknowns,
+        "solver": report.linear_solver,
+        "seconds": report.seconds,
+        "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--millions", type=float, nargs="+", default=[1, 4, 16, 50])
+    parser.add_argument("--steps", type=int, default=4)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--work", type=Path, help="folder for the parts; default: a temporary one")
+    parser.add_argument("--run", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.run is not None:
+        print(json.dumps(run(arguments.run, arguments.steps, arguments.threads)))
+        return
+    print(
+        "| observations | parts | unknowns | solver | steps | CPU s per step | wall s | peak MiB | reduced chi-square |"
+    )
+    print("|--:|--:|--:|---|--:|--:|--:|--:|--:|")
+    rows = []
+    with tempfile.TemporaryDirectory(dir=arguments.work) as work:
+        for million in arguments.millions:
+            folder = Path(work) / f"{million:g}"
+            folder.mkdir()
+            observations = make(folder, 1e6 * million)
+            command = [
+                sys.executable,
+                __file__,
+                "--run",
+                folder,
+                "--steps",
+                arguments.steps,
+                "--threads",
+                arguments.threads,
+            ]
+            done = subprocess.run([str(part) for part in command], check=True, capture_output=True, env=os.environ)
+            row = json.loads(done.stdout.splitlines()[-1])
+            rows.append((observations, row))
+            chi = 2 * row["final_cost"] / NOISE_PX**2 / (row["residuals"] - row["unknowns"])
+            per_step = row["cpu_s"] / (row["steps"] + 1)
+            cells = (
+                f"{observations:,}", len(list(folder.iterdir())), f"{row['unknowns']:,}", row["solver"], row["steps"],
+                f"{per_step:.1f}", f"{row['wall_s']:.0f}", f"{row['peak_mib']:.0f}", f"{chi:.4f}",
+            )  # fmt: skip
+            print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+            for path in folder.iterdir():
+                path.unlink()
+    if len(rows) > 1:
+        size = np.log([observations for observations, _ in rows])
+        slope = np.polyfit(size, np.log([row["cpu_s"] for _, row in rows]), 1)[0]
+        print(f"\nGrowth of the CPU time: exponent {slope:.2f}.")
+
+
+if __name__ == "__main__":
+    main()
