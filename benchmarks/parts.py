@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A scene larger than memory: time and memory of an adjustment in parts, by the number of observations.
 
-    python benchmarks/parts.py [--millions 1 4 16 50] [--steps 4] [--threads 2] [--work FOLDER]
+    python benchmarks/parts.py [--millions 1 4 16 50] [--steps 5] [--threads 2] [--work FOLDER]
 
 The scene is an aerial block: photographs straight down on a grid, each point of the ground in about ten of them, 9 000
 points in a photograph, 0.5 px of noise. It is written part by part, so that it never is in memory. Every size is solved
@@ -122,7 +122,7 @@ def run(folder: Path, steps: int, threads: int) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--millions", type=float, nargs="+", default=[1, 4, 16, 50])
-    parser.add_argument("--steps", type=int, default=4)
+    parser.add_argument("--steps", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--work", type=Path, help="folder for the parts; default: a temporary one")
     parser.add_argument("--run", type=Path, help=argparse.SUPPRESS)
