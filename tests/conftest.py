@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Settings that hold for every test: the kernel cache, hypothesis, the data beside the checkout.
 
-Numba's disk cache does not notice that a kernel in *another* file has changed, and then returns old numbers. The
-cache folder is therefore named after a hash of all files that hold kernels. This runs before Numba is imported.
+Compiled kernels go to a folder of the checkout rather than beside the sources. Edits are noticed there as anywhere
+(:mod:`groma._numba_cache`). The variable is set before Numba is imported, which reads it then.
 """
 
-import hashlib
 import os
 from pathlib import Path
 
@@ -16,17 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
 SHARED_GOLDEN = ROOT.parent / "shared" / "math" / "golden"
 
-
-def _hash_of_kernels() -> str:
-    digest = hashlib.sha256()
-    for path in sorted((ROOT / "src" / "groma").rglob("*.py")):
-        content = path.read_bytes()
-        if b"_numba" in content:
-            digest.update(path.name.encode() + b"\0" + content)
-    return digest.hexdigest()[:16]
-
-
-os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".cache" / f"numba-{_hash_of_kernels()}"))
+os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".cache" / "numba"))
 
 hypothesis.settings.register_profile(
     "groma",

@@ -3,14 +3,12 @@
 joined, empty and hostile images; the number of planes in real images.
 """
 
-import cv2
 import numpy as np
 import pytest
 from _depth_scenes import FLOOR, PINHOLE, SHAPE, WALL, noisy, plane, render
 
 from groma.errors import InputError, ShapeError
 from groma.frontend.depth_noise import DepthNoise
-from groma.frontend.depth_normals import depth_normals
 from groma.frontend.depth_planes import PlaneSearchOptions, find_depth_planes
 from groma.geometry.plane_normal_offset import NormalOffsetPlane
 from groma.io.sequences import open_sequence
@@ -141,28 +139,6 @@ def test_arguments_are_checked():
         PlaneSearchOptions(step=0)
     with pytest.raises(InputError, match="correlation"):
         DepthNoise(correlation=0.5)
-
-
-def test_normals_of_planes():
-    depth, label = render([FLOOR, WALL])
-    normals = depth_normals(depth, PINHOLE)
-    known = normals[..., 2] != 0
-    # Pixels at the border have no pair on one of the axes; the floor is steep where it meets the wall.
-    assert known[1:-1, 1:-1].mean() > 0.99
-    np.testing.assert_allclose(np.linalg.norm(normals[known], axis=1), 1.0, rtol=1e-5)
-    # Away from the crease the window sees one plane; 32-bit depth and sums limit the digits.
-    for side, surface in enumerate((FLOOR, WALL)):
-        inside = known & (cv2.erode((label == side).astype(np.uint8), np.ones((7, 7))) > 0)
-        np.testing.assert_allclose(normals[inside], np.tile(surface[:3], (inside.sum(), 1)), rtol=0, atol=1e-3)
-    # A step of depth does not bend the normals beside it, and holes have none.
-    stepped = np.where(np.arange(SHAPE[1]) < 80, 1.0, 1.5) * np.ones(SHAPE)
-    stepped[50:60, 20:30] = 0.0
-    normals = depth_normals(stepped, PINHOLE)
-    known = normals[..., 2] != 0
-    np.testing.assert_allclose(normals[known], np.tile([0, 0, -1.0], (known.sum(), 1)), rtol=0, atol=1e-4)
-    assert not known[50:60, 20:30].any()
-    # The two columns beside the step, and the pixels around the hole, have no pairs across.
-    assert (known[1:-1, 1:-1] | (stepped[1:-1, 1:-1] == 0)).mean() > 0.98
 
 
 @pytest.mark.shared

@@ -110,6 +110,7 @@ def test_spatialmath_g2o_gtsam(rng):
     np.testing.assert_allclose(  # Line3D::fromCartesian
         line_orders.to_g2o(line), np.hstack([np.cross(foot, foot + unit), unit]), atol=1e-12
     )
+    assert line3.same_line(line_orders.from_g2o(line_orders.to_g2o(line)), line, 1e-12, oriented=True).all()
     lines = special_lines(rng)
     rotation, a, b = line_orders.to_gtsam(lines)
     np.testing.assert_allclose(np.linalg.det(rotation), 1.0)

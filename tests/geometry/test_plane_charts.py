@@ -6,8 +6,9 @@ Also: logarithms of tiny steps, both signs of a plane, drift, and what a chart c
 
 import numpy as np
 import pytest
+from _charts import STEP, by_name, differences
 
-from groma.errors import InputError, ShapeError
+from groma.errors import InputError
 from groma.geometry import quaternion
 from groma.geometry.plane_charts import PLANE_CHARTS
 
@@ -16,11 +17,6 @@ pytestmark = pytest.mark.kernels
 CHARTS = list(PLANE_CHARTS.values())
 QUATERNIONS = [chart for chart in CHARTS if chart.name.startswith("quaternion")]
 THROUGH_ORIGIN_TOO = [chart for chart in CHARTS if chart.name != "closest_point"]
-H = 1e-4
-
-
-def by_name(chart):
-    return chart.name
 
 
 def plane(normal, offset):
@@ -36,33 +32,7 @@ def same_plane(first, second, tolerance=1e-12, oriented=False):
     np.testing.assert_allclose(first, second, atol=tolerance, rtol=0)
 
 
-def differences(chart, state, step=H):
-    """Fourth-order central differences of the ambient numbers through retract, (N, 4, 3)."""
-    out = np.empty((len(state), 4, 3))
-    for k in range(3):
-
-        def at(h, k=k):
-            delta = np.zeros((len(state), 3))
-            delta[:, k] = h
-            return chart.ambient(chart.retract(state, delta))
-
-        out[:, :, k] = (8 * (at(step) - at(-step)) - (at(2 * step) - at(-2 * step))) / (12 * step)
-    return out
-
-
 # ------------------------------------------------------------------------------------------------- General position
-@pytest.mark.parametrize("chart", CHARTS, ids=by_name)
-def test_sizes_and_shapes(chart):
-    rng = np.random.default_rng(1)
-    assert (chart.kind, chart.dof, chart.ambient_size, chart.factor_columns) == ("plane", 3, 4, 4)
-    for count in (0, 1, 5):
-        state = chart.random(rng, count)
-        assert state.shape == (count, chart.state_size)
-        assert chart.ambient(state).shape == (count, 4)
-        assert chart.basis(state).shape == (count, 4, 3)
-        assert chart.retract(state, np.zeros((count, 3))).shape == state.shape
-        assert chart.local(state, state).shape == (count, 3)
-        assert chart.from_ambient(chart.ambient(state)).shape == state.shape
 
 
 @pytest.mark.parametrize("chart", CHARTS, ids=by_name)
@@ -153,7 +123,7 @@ def test_far_plane(chart, distance):
     np.testing.assert_allclose(a[0, :3] / np.linalg.norm(a[0, :3]), n, atol=1e-14)
     np.testing.assert_allclose(-a[0, 3] / np.linalg.norm(a[0, :3]), distance, rtol=1e-13)
     B = chart.basis(state)
-    numeric = differences(chart, state, H * distance if chart.name == "closest_point" else H)
+    numeric = differences(chart, state, STEP * distance if chart.name == "closest_point" else STEP)
     np.testing.assert_allclose(B, numeric, atol=4e-11 * max(np.abs(B).max(), distance), rtol=0)
 
 
@@ -224,40 +194,3 @@ def test_no_drift_after_many_steps(chart):
         state = chart.retract(state, delta)
     size = np.linalg.norm(state if chart in QUATERNIONS else state[:, :3], axis=1)
     np.testing.assert_allclose(size, 1.0, rtol=1e-14)
-
-
-@pytest.mark.parametrize("scale", [1e-300, 1e-160, 1e160, 1e300])
-@pytest.mark.parametrize("chart", CHARTS, ids=by_name)
-def test_any_scale(chart, scale):
-    ambient = plane([0.5, -1, 0.25], 1.5)
-    np.testing.assert_allclose(chart.from_ambient(scale * ambient), chart.from_ambient(ambient), rtol=1e-13)
-
-
-# ------------------------------------------------------------------------------------------------------------- Errors
-@pytest.mark.parametrize("chart", CHARTS, ids=by_name)
-def test_errors(chart):
-    good = chart.ambient(chart.random(np.random.default_rng(10), 3))
-    for bad, message in ((0.0, "all zeros"), (np.nan, "finite numbers"), (np.inf, "finite numbers")):
-        ambient = good.copy()
-        ambient[1] = bad
-        with pytest.raises(InputError, match=f"{message}.*row 1"):
-            chart.from_ambient(ambient)
-    with pytest.raises(ShapeError, match=r"ambient must have shape \(N, 4\)"):
-        chart.from_ambient(good[:, :3])
-    state = chart.from_ambient(good)
-    with pytest.raises(ShapeError, match=r"delta must have shape \(N, 3\)"):
-        chart.retract(state, np.zeros((3, 4)))
-    with pytest.raises(ShapeError, match="as many rows"):
-        chart.retract(state, np.zeros((2, 3)))
-    with pytest.raises(ShapeError, match="as many rows"):
-        chart.local(state, state[:2])
-
-
-@pytest.mark.parametrize("chart", CHARTS, ids=by_name)
-def test_arguments_are_not_changed(chart):
-    rng = np.random.default_rng(11)
-    state, other, delta = chart.random(rng, 4), chart.random(rng, 4), rng.normal(size=(4, 3))
-    copies = state.copy(), other.copy(), delta.copy()
-    chart.retract(state, delta), chart.local(state, other), chart.basis(state)
-    for now, before in zip((state, other, delta), copies, strict=True):
-        np.testing.assert_array_equal(now, before)

@@ -69,7 +69,8 @@ def test_text_model_refuses_names_with_spaces(tmp_path):
 
 
 def test_colmap_poses_are_those_of_pycolmap(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     scene = rig_scene()
     write_colmap(scene, tmp_path / "model")
     model = pycolmap.Reconstruction(str(tmp_path / "model"))
@@ -114,7 +115,8 @@ def test_keypoint_numbers_close_up_after_points_are_dropped(tmp_path):
 
 
 def test_images_without_pose_are_left_out():
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     model = to_pycolmap(rig_scene())
     model.deregister_frame(6)
     scene = from_pycolmap(model)
@@ -123,7 +125,8 @@ def test_images_without_pose_are_left_out():
 
 
 def test_unknown_camera_model_is_named():
-    pycolmap = pytest.importorskip("pycolmap")
+    import pycolmap
+
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "FOV", 500.0, 640, 480)
     model.add_camera_with_trivial_rig(camera)

@@ -1,37 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""LIMAP 2's structures: files written by LIMAP (tests/data/limap), mapping to scenes, damage, and LIMAP itself.
+"""LIMAP 2's structures: files written by LIMAP (tests/data/limap), mapping to scenes, and through the commands."""
 
-The last part runs where LIMAP can be imported, or where the environment variable GROMA_LIMAP_PYTHON names a Python
-that can: both programs read what the other wrote.
-"""
-
-import importlib.util
-import json
-import os
 import shutil
-import struct
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from _limap import LIMAP_PYTHON, through_limap
 from _models import rig_scene
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from groma.cli.main import run
-from groma.errors import FileFormatError, GromaError, InputError, OutputError
+from groma.errors import FileFormatError, OutputError
 from groma.io import read_scene, structures_of, write_colmap
-from groma.io._limap_files import LINE_2D, MEMBER_2D, MEMBER_3D, NONE, TRACK
+from groma.io._limap_files import LINE_2D, MEMBER_2D, MEMBER_3D, NONE
 from groma.io.limap import Group2d, Group3d, Lines3d, Structures, from_scene, read_limap, with_structures, write_limap
 from groma.scene import Directions, LineObservations, Lines, Planes, Relations, Scene
 from groma.scene.compare import equal, near
 from groma.scene.synthetic import holistic
 
 DATA = Path(__file__).parents[1] / "data" / "limap"
-LIMAP_PYTHON = os.environ.get("GROMA_LIMAP_PYTHON") or (sys.executable if importlib.util.find_spec("limap") else "")
 FILES = ("structures2d", "lines3D", "groups3D", "wireframe3D")
 
 
@@ -231,104 +219,6 @@ def test_nothing_is_nothing(tmp_path, form):
         write_limap(Structures(), tmp_path / "empty")
 
 
-def test_refusals(tmp_path):
-    scene = read_scene(DATA / "binary")
-    structures = read_limap(DATA / "binary")
-    track = structures.lines.track.copy()
-    track["idx"][0] = 4
-    with pytest.raises(FileFormatError, match="2D line 4 of image 1, which has 4"):
-        with_structures(scene, replace(structures, lines=replace(structures.lines, track=track)))
-    for params in ([0, 0, 0, 1.0], [np.nan, 0, 1, 0], [1e-13, 0, 0, 1]):
-        with pytest.raises(FileFormatError, match=r"no normal|not finite"):
-            with_structures(scene, replace(structures, groups=(Group3d(1, 1, np.array(params)),)))
-    huge = replace(structures.lines, ids=structures.lines.ids + np.uint64(2**63))
-    with pytest.raises(FileFormatError, match="too large"):
-        with_structures(scene, replace(structures, lines=huge))
-    with pytest.raises(InputError, match="from 0"):
-        from_scene(scene.replace(lines=scene.lines.replace(ids=[-1, 2, 3])))
-    with pytest.raises(InputError, match="binary"):
-        write_limap(structures, tmp_path / "out", "json")
-    assert structures.lines.track.dtype == TRACK
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_a_missing_file_is_named(tmp_path, name):
-    shutil.copytree(DATA / "binary", tmp_path / "model")
-    (tmp_path / "model" / "structures" / f"{name}.bin").unlink()
-    with pytest.raises(FileFormatError, match=f"{name}.bin is missing"):
-        read_scene(tmp_path / "model")
-
-
-@pytest.mark.parametrize(("form", "suffix"), [("binary", ".bin"), ("text", ".txt")])
-@pytest.mark.parametrize("name", FILES)
-def test_every_truncation_is_refused(tmp_path, name, form, suffix):
-    shutil.copytree(DATA / form, tmp_path / "model")
-    path = tmp_path / "model" / "structures" / (name + suffix)
-    content = path.read_bytes()
-    for length in range(0, len(content) - (3 if form == "text" else 0), 5):
-        # A shortened last word of text would be another number: cut at the end of a word.
-        cut = content[:length] if form == "binary" else content[:length].rpartition(b" ")[0]
-        path.write_bytes(cut)
-        with pytest.raises(FileFormatError, match=name):
-            read_scene(tmp_path / "model")
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_a_count_that_is_too_large_is_refused(tmp_path, name):
-    shutil.copytree(DATA / "binary", tmp_path / "model")
-    path = tmp_path / "model" / "structures" / f"{name}.bin"
-    path.write_bytes(struct.pack("<Q", 2**60) + path.read_bytes()[8:])
-    with pytest.raises(FileFormatError, match=f"{name}.*promises"):
-        read_scene(tmp_path / "model")
-
-
-NUMBERS = [struct.pack("<d", value) for value in (float("nan"), float("inf"), 1e308, -1.0, 0.0)]
-NUMBERS += [struct.pack("<Q", value) for value in (2**64 - 1, 2**63, 2**40, 2**31, 2**20, 0, 1)]
-WORDS = [b" nan ", b" inf ", b" -1 ", b" 1e400 ", b" 99999999999999999999999 ", b"\n", b"\0", b"#", b"\xff", b" x "]
-
-
-@pytest.mark.timeout(60)
-@pytest.mark.parametrize("form", ["binary", "text"])
-def test_damaged_files_give_a_scene_or_an_error(tmp_path, form):
-    """Single damages to one of the files, groma.npz among them: a valid scene or an error of groma."""
-    scene = rig_scene()
-    write_colmap(scene.with_lines(scene.lines.plucker + 0.01), tmp_path / "own", form)
-    shutil.copytree(DATA / form, tmp_path / "limap")
-    folders = [tmp_path / "own" / "structures", tmp_path / "limap" / "structures"]
-    source = {path: path.read_bytes() for folder in folders for path in folder.iterdir()}
-    assert any(path.name == "groma.npz" for path in source)
-
-    @settings(max_examples=300)
-    @given(
-        st.sampled_from(sorted(source)),
-        st.sampled_from(["truncate", "flip", "overwrite", "insert", "remove"]),
-        st.floats(0, 1, exclude_max=True),
-        st.sampled_from(NUMBERS + WORDS),
-        st.integers(0, 7),
-    )
-    def run(path, kind, place, blob, bit):
-        content = source[path]
-        at = int(place * len(content))
-        head, tail = content[:at], content[at:]
-        path.write_bytes(
-            {
-                "truncate": head,
-                "flip": head + bytes([tail[0] ^ 1 << bit]) + tail[1:],
-                "overwrite": head + blob + tail[len(blob) :],
-                "insert": head + blob + tail,
-                "remove": head + tail[len(blob) :],
-            }[kind]
-        )
-        try:
-            assert isinstance(read_scene(path.parents[1]), Scene)
-        except GromaError as error:
-            assert str(error)
-        finally:
-            path.write_bytes(content)
-
-    run()
-
-
 # Through the commands
 
 
@@ -394,7 +284,7 @@ def test_adjust_keeps_what_it_does_not_model(tmp_path, form):
         assert new.track.tobytes() == old.track.tobytes() and new.points.tobytes() == old.points.tobytes()
         assert np.array_equal(new.params, old.params) == (old.kind == 2)
     if LIMAP_PYTHON:
-        told = _through_limap(tmp_path / "out", tmp_path / "again_binary")
+        told = through_limap(tmp_path / "out", tmp_path / "again_binary")
         assert told["valid"] and len(told["groups"]) == len(before.groups)
         assert [tuple(edge) for edge in told["edges"]] == sorted(before.wireframe.tolist())
 
@@ -412,102 +302,3 @@ def test_structures_of_what_has_none(tmp_path):
     (tmp_path / "scene.npz").write_bytes(b"")
     assert structures_of(tmp_path / "model") is None and structures_of(tmp_path / "scene.npz") is None
     assert structures_of(DATA / "binary") is not None
-
-
-# Against LIMAP itself
-
-needs_limap = pytest.mark.skipif(not LIMAP_PYTHON, reason="needs pylimap 2.0 (or GROMA_LIMAP_PYTHON)")
-
-BRIDGE = """
-import json, sys
-import pycolmap
-from limap.scene import HolisticReconstruction
-pycolmap.logging.minloglevel = 3
-source, target = sys.argv[1:]
-model = HolisticReconstruction()
-assert HolisticReconstruction.exists_model(source)
-model.read(source)
-s = model.structure_recon
-(model.write_binary if target.endswith("binary") else model.write_text)(target)
-print(json.dumps(dict(
-    valid=model.check_validity(),
-    images=sorted(s.structures2d),
-    lines={i: [*l.start, *l.end] for i, l in s.lines3D.items()},
-    tracks={i: [(e.image_id, e.point2D_idx) for e in l.track.elements] for i, l in s.lines3D.items()},
-    segments={i: [[*l.start, *l.end] for l in v.lines] for i, v in s.structures2d.items()},
-    owners={i: [l.line3D_id for l in v.lines] for i, v in s.structures2d.items()},
-    groups={i: [g.type.name, list(g.params), [p.idx for p in g.points], [l.idx for l in g.lines],
-                [(e.image_id, e.point2D_idx) for e in g.track.elements]] for i, g in s.groups3D.items()},
-    flat={i: [[g.type.name, [p.idx for p in g.points], [l.idx for l in g.lines], g.group3D_id] for g in v.groups]
-          for i, v in s.structures2d.items()},
-    edges=sorted((e.point_idx, e.line_idx, e.w) for e in s.wireframe.get_all_edges()),
-)))
-"""
-
-
-def _through_limap(source: Path, target: Path) -> dict:
-    target.mkdir()
-    done = subprocess.run(
-        [LIMAP_PYTHON, "-c", BRIDGE, str(source), str(target)], capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-@needs_limap
-@pytest.mark.parametrize("form", ["binary", "text"])
-@pytest.mark.parametrize("scene", ["rig", "holistic"])
-def test_limap_reads_what_groma_writes_and_back(tmp_path, form, scene):
-    scene = rig_scene() if scene == "rig" else holistic(15, seed=2).truth
-    write_colmap(scene, tmp_path / "groma", form)
-    told = _through_limap(tmp_path / "groma", tmp_path / f"limap_{form}")
-    made = read_limap(tmp_path / "groma")
-    assert told["valid"]
-    assert told["images"] == scene.images.ids.tolist()
-    for row, number in enumerate(scene.lines.ids.tolist()):
-        assert told["lines"][str(number)] == scene.lines.segments[row].ravel().tolist()
-        one = made.lines.track[made.lines.start[row] : made.lines.start[row + 1]].tolist()
-        assert [tuple(pair) for pair in told["tracks"][str(number)]] == one
-    for image in made.images:
-        assert told["segments"][str(image.image_id)] == image.lines["ends"].tolist()
-        if form == "binary":
-            assert told["owners"][str(image.image_id)] == image.lines["line_id"].tolist()
-        assert [group[3] for group in told["flat"][str(image.image_id)]] == [group.group_id for group in image.groups]
-    for group in made.groups:
-        kind, params, points, lines, track = told["groups"][str(group.id)]
-        assert kind == ("PLANE" if group.kind == 1 else "VP")
-        np.testing.assert_allclose(params, group.params, rtol=1e-15, atol=1e-16)
-        assert (points, lines) == (group.points["id"].tolist(), group.lines["id"].tolist())
-        assert [tuple(pair) for pair in track] == group.track.tolist()
-    assert [tuple(edge) for edge in told["edges"]] == sorted(made.wireframe.tolist())
-    # LIMAP's copy, read by groma: exact in binary, six digits in text.
-    back = _sorted(read_scene(tmp_path / f"limap_{form}"))
-    if (tmp_path / "groma" / "structures" / "groma.npz").exists():
-        shutil.copy(tmp_path / "groma" / "structures" / "groma.npz", tmp_path / f"limap_{form}" / "structures")
-        back = _sorted(read_scene(tmp_path / f"limap_{form}"))
-    result = near(_sorted(read_scene(tmp_path / "groma")), back, 1e-12 if form == "binary" else 2e-4)
-    assert result, result.reason
-
-
-def _sorted(scene: Scene) -> Scene:
-    pairs = scene.relations.point_on_line
-    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
-    return scene.replace(relations=replace(scene.relations, point_on_line=pairs[order]))
-
-
-@needs_limap
-def test_files_of_limap_survive_groma(tmp_path):
-    """LIMAP's files, read and written by groma, with and without a scene in between, read and written by LIMAP."""
-    before = _through_limap(DATA / "binary", tmp_path / "a_binary")
-    shutil.copytree(DATA / "binary", tmp_path / "copy")
-    structures = read_limap(DATA / "binary")
-    write_limap(structures, tmp_path / "copy" / "structures", force=True)
-    assert _through_limap(tmp_path / "copy", tmp_path / "b_binary") == before
-    write_colmap(read_scene(DATA / "binary"), tmp_path / "scene", like=structures)
-    after = _through_limap(tmp_path / "scene", tmp_path / "c_binary")
-    for told in (before, after):  # image 3 has no pose and is not in the scene
-        for name in ("segments", "owners", "flat"):
-            told[name].pop("3", None)
-        told["images"] = [number for number in told["images"] if number != 3]
-        told["tracks"] = {k: [pair for pair in v if pair[0] != 3] for k, v in told["tracks"].items()}
-    assert after == before

@@ -4,10 +4,8 @@ r"""What a camera model is, and the registry of models.
 A camera model maps a point in the camera frame (x right, y down, z forward) to a pixel, in COLMAP's pixel convention
 (the centre of the first pixel is (0.5, 0.5)), and a pixel back to a unit bearing. It depends on ``k`` parameters.
 
-Compiled loops call the kernels through :mod:`groma.cameras._dispatch`, whose names are repeated here.
-
-**Cheirality.** Perspective models evaluate their formula as written for z < 0 too and refuse only
-:math:`|z| \le 10^{-12} (|x| + |y| + |z|)`. Whether a point behind the camera may take part is the caller's decision.
+Compiled loops call the kernels through :mod:`groma.cameras._dispatch`, which says what kernels promise and whose names
+are repeated here.
 """
 
 from __future__ import annotations

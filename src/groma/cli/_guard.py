@@ -8,7 +8,7 @@ from typing import ParamSpec
 
 import typer
 
-from groma.cli.main import INTERRUPTED
+from groma.cli._interrupt import INTERRUPTED
 from groma.errors import GromaError
 
 P = ParamSpec("P")

@@ -11,6 +11,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+#: Exit code of a command that was interrupted.
+INTERRUPTED = 130
+
 
 class Interruption:
     """Whether the user asked to stop."""
@@ -44,7 +47,7 @@ def interruptible() -> Iterator[Interruption]:
     before = {number: signal.signal(number, state.handle) for number in (signal.SIGINT, signal.SIGTERM) if mine}
     try:
         yield state
-    except Exception:
+    except Exception:  # of any kind: what an interrupt becomes on its way is up to the library that was interrupted
         if state.asked:
             raise KeyboardInterrupt from None
         raise
@@ -53,4 +56,4 @@ def interruptible() -> Iterator[Interruption]:
             signal.signal(number, handler)
 
 
-__all__ = ["Interruption", "interruptible"]
+__all__ = ["INTERRUPTED", "Interruption", "interruptible"]

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from groma.cli import _options
+from groma.cli import _options, _output
+from groma.cli._console import Console
 
 
 def convert(
@@ -26,9 +27,6 @@ def convert(
     verbose: _options.Verbose = False,
 ) -> None:
     """Read a scene and write it in another format."""
-    from groma.cli import _output
-    from groma.cli._console import Console
-
     console = Console(quiet, verbose, json_target, threads)
     _output.check_output(target, force)
     _output.check_json(json_target, force)

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from groma.cli import _options
+from groma.cli import _options, _output
+from groma.cli._console import Console
 
 
 def demo(
@@ -25,9 +26,6 @@ def demo(
     model with the lines and planes beside it (structures/), scene.npz, lines.obj and summary.json, as after groma map.
     The result is compared with poses by motion capture and with the size of the cabinet.
     """
-    from groma.cli import _output
-    from groma.cli._console import Console
-
     console = Console(quiet, verbose, json_target, threads)
     _output.check_output(output, force)
     _output.check_json(json_target, force)

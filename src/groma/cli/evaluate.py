@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from groma.cli import _options
+from groma.cli import _options, _output
+from groma.cli._console import Console
 
 
 def poses(
@@ -19,9 +20,6 @@ def poses(
     verbose: _options.Verbose = False,
 ) -> None:
     """Compare the camera poses of two scenes after similarity alignment; images are matched by name."""
-    from groma.cli import _output
-    from groma.cli._console import Console
-
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
 
@@ -69,9 +67,6 @@ def lines(
     verbose: _options.Verbose = False,
 ) -> None:
     """Compare 3D line segments with a reference: how much of it is covered, how much of the lines is right."""
-    from groma.cli import _output
-    from groma.cli._console import Console
-
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
 
@@ -115,9 +110,6 @@ def planes(
     verbose: _options.Verbose = False,
 ) -> None:
     """Compare planes with reference planes (angles and offsets of matches) or with points (share explained)."""
-    from groma.cli import _output
-    from groma.cli._console import Console
-
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
 
@@ -168,9 +160,6 @@ def trajectory(
     verbose: _options.Verbose = False,
 ) -> None:
     """Compare a trajectory with a reference: absolute and relative errors, and drift; poses are matched by time."""
-    from groma.cli import _output
-    from groma.cli._console import Console
-
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
 

@@ -7,7 +7,7 @@ Exit codes: 0 success, 1 a known error (one line on standard error), 2 wrong usa
 import os
 import sys
 
-INTERRUPTED = 130
+from groma.cli._interrupt import INTERRUPTED
 
 
 def run(arguments: list[str] | None = None) -> int:

@@ -24,7 +24,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.geometry import incidence, line3, projection
-from groma.geometry._algebra import cofactor, dot, matrices, norm, positive, ratio, stack, unit, vectors
+from groma.geometry._algebra import cofactor, dot, matrices, norm, not_negative, ratio, stack, unit, vectors
 
 
 class TrimStatus(IntEnum):
@@ -81,7 +81,7 @@ def trim_to_ray(
     """
     line = vectors(line, 6, "line")
     origin, ray = vectors(ray_origin, 3, "ray_origin"), unit(vectors(ray_direction, 3, "ray_direction"))
-    positive(min_sine, "min_sine")
+    not_negative(min_sine, "min_sine")
     finite = line3.is_finite(line)
     along = np.where(finite[..., None], line3.normalize(line), 0.0)[..., 3:]
     moment = np.where(finite[..., None], line3.normalize(line), 0.0)[..., :3] - np.cross(origin, along)
@@ -129,7 +129,7 @@ def trim_in_image(
     """
     camera, line = matrices(camera, 3, 4, "camera"), vectors(line, 6, "line")
     pixel = stack(vectors(pixel, 2, "pixel"), np.ones(1))
-    positive(min_sine, "min_sine")
+    not_negative(min_sine, "min_sine")
     finite = line3.is_finite(line)
     line = np.where(finite[..., None], line3.normalize(line), 0.0)
     left = camera[..., :3]
@@ -142,7 +142,7 @@ def trim_in_image(
     )
     image_line = projection.normalize_image_lines(projection.project_lines(camera, line))
     off_center = norm(np.cross(center, line[..., 3:]) - line[..., :3])
-    usable = finite & (norm(image_line) > 0.0) & (off_center > positive(min_distance, "min_distance"))
+    usable = finite & (norm(image_line) > 0.0) & (off_center > not_negative(min_distance, "min_distance"))
     normal = stack(image_line[..., :2], np.zeros(1))
     foot = pixel - dot(image_line, pixel)[..., None] * normal
     ray = unit(np.einsum("...ij,...j->...i", adjugate, foot))

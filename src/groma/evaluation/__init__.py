@@ -2,7 +2,7 @@
 """Results against references, in the scores of the field, with units."""
 
 from groma.evaluation.alignment import align_points, align_poses
-from groma.evaluation.lines import Geometry, LineScores, evaluate_lines, score_lines
+from groma.evaluation.lines import LineScores, evaluate_lines, score_lines
 from groma.evaluation.planes import (
     PlaneScores,
     PointPlaneScores,
@@ -12,6 +12,7 @@ from groma.evaluation.planes import (
     score_planes_by_points,
 )
 from groma.evaluation.poses import PoseScores, evaluate_poses, score_poses
+from groma.io.geometry import Geometry
 
 __all__ = [
     "Geometry",

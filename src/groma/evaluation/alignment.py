@@ -9,6 +9,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion
+from groma.geometry._algebra import finite_rows
 from groma.scene import Similarity
 
 #: Second singular value of the centred points, relative to the first, below which they count as collinear.
@@ -43,7 +44,7 @@ def align_points(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool 
     ----------
     S. Umeyama, *Least-squares estimation of transformation parameters between two point patterns*, 1991, eqs. 40-42.
     """
-    x, y = _points("source", source), _points("target", target)
+    x, y = finite_rows("source", source, (3,)), finite_rows("target", target, (3,))
     if x.shape != y.shape:
         raise ShapeError(f"source and target must have the same shape; got {x.shape} and {y.shape}.")
     for name, points in (("source", x), ("target", y)):
@@ -53,9 +54,7 @@ def align_points(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool 
                 "fix the rotation. Use align_poses, which looks at the orientations too."
             )
     x0, y0 = x - x.mean(0), y - y.mean(0)
-    u, _, vt = np.linalg.svd(y0.T @ x0)
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return _with_rotation(x, y, u @ mirror @ vt, with_scale)
+    return _with_rotation(x, y, _nearest_rotation(y0.T @ x0), with_scale)
 
 
 def align_poses(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool = True) -> Similarity:
@@ -75,6 +74,13 @@ def align_poses(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool =
     -------
     Similarity
         ``target_from_source`` of the two worlds.
+
+    Raises
+    ------
+    ShapeError
+        If the shapes are not (N, 7) twice.
+    InputError
+        If there is no pose.
     """
     from_source, from_target = np.asarray(source, float), np.asarray(target, float)
     if from_source.shape != from_target.shape or from_source.ndim != 2 or from_source.shape[1] != 7:
@@ -85,15 +91,20 @@ def align_poses(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool =
     if len(x) >= 3 and min(_rank(x), _rank(y)) >= 2:
         return align_points(x, y, with_scale)
     votes = quaternion.to_matrix(from_target[:, :4]).transpose(0, 2, 1) @ quaternion.to_matrix(from_source[:, :4])
-    u, _, vt = np.linalg.svd(votes.sum(0))
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return _with_rotation(x, y, u @ mirror @ vt, with_scale)
+    return _with_rotation(x, y, _nearest_rotation(votes.sum(0)), with_scale)
 
 
 def camera_centers(cam_from_world: npt.ArrayLike) -> FloatArray:
-    r"""Return the camera centres :math:`-R^\top t` of poses (N, 7), in the world."""
+    r"""Return the camera centres :math:`-R^\top t` of poses (N, 7), (N, 3) in the world."""
     poses = np.asarray(cam_from_world, float)
     return -quaternion.rotate(quaternion.conjugate(poses[:, :4]), poses[:, 4:])
+
+
+def _nearest_rotation(matrix: FloatArray) -> FloatArray:
+    """Return the rotation R (3, 3) that maximises the trace of R^T M."""
+    u, _, vt = np.linalg.svd(matrix)
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return u @ mirror @ vt
 
 
 def _with_rotation(x: FloatArray, y: FloatArray, rotation: FloatArray, with_scale: bool) -> Similarity:
@@ -104,15 +115,6 @@ def _with_rotation(x: FloatArray, y: FloatArray, rotation: FloatArray, with_scal
         fitted = float(np.einsum("ij,ij->", y0, x0 @ rotation.T)) / float((x0**2).sum())
         scale = fitted if fitted > 0 else 1.0
     return Similarity(scale, rotation, y.mean(0) - scale * rotation @ x.mean(0))
-
-
-def _points(name: str, values: npt.ArrayLike) -> FloatArray:
-    points = np.asarray(values, float)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ShapeError(f"{name} must have shape (N, 3); got {points.shape}.")
-    if not np.isfinite(points).all():
-        raise InputError(f"{name} must be finite. Remove the rows that are not.")
-    return points
 
 
 def _rank(points: FloatArray) -> int:

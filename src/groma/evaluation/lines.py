@@ -32,15 +32,17 @@ S. Liu et al., *3D Line Mapping Revisited*, CVPR 2023, section 4.1 (R_tau, P_tau
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from groma._typing import FloatArray, IntArray
-from groma.errors import InputError, ShapeError
+from groma.errors import InputError
 from groma.evaluation.poses import evaluate_poses
+from groma.geometry._algebra import finite_rows
+from groma.io.geometry import Geometry
 from groma.scene import Scene
 
 #: Places on one segment: at least, at most.
@@ -86,45 +88,6 @@ class LineScores:
         return result
 
 
-@dataclass(frozen=True, eq=False)
-class Geometry:
-    """A reference: segments, triangles, points, or several of them."""
-
-    #: (R, 2, 3) segments; pieces of a curve or edges of a graph are segments too.
-    segments: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 3)))
-    #: (T, 3, 3) corners of triangles.
-    triangles: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))
-    #: (P, 3) points of surfaces or edges.
-    points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-
-    def __post_init__(self) -> None:
-        for name, row in (("segments", (2, 3)), ("triangles", (3, 3)), ("points", (3,))):
-            object.__setattr__(self, name, checked_rows(name, getattr(self, name), row))
-
-    def __len__(self) -> int:
-        return len(self.segments) + len(self.triangles) + len(self.points)
-
-    @property
-    def extent(self) -> float:
-        """Length of the diagonal of the box around it."""
-        every = np.concatenate([part.reshape(-1, 3) for part in (self.segments, self.triangles, self.points)])
-        return float(np.linalg.norm(np.ptp(every, axis=0))) if len(every) else 0.0
-
-    def surface_points(self, count: int = 200_000, seed: int = 0) -> FloatArray:
-        """Return the points, or, where there are triangles, so many places evenly at random on them, (n, 3)."""
-        if len(self.triangles) == 0:
-            return self.points
-        rng = np.random.default_rng(seed)
-        first, second = (self.triangles[:, k] - self.triangles[:, 0] for k in (1, 2))
-        area = np.linalg.norm(np.cross(first, second), axis=1)
-        if not area.sum() > 0:
-            raise InputError("The triangles of the reference have no area.")
-        row = rng.choice(len(area), count, p=area / area.sum())
-        a, b = rng.random((2, count, 1))
-        a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
-        return self.triangles[row, 0] + a * first[row] + b * second[row]
-
-
 def score_lines(
     segments: npt.ArrayLike, reference: Geometry | npt.ArrayLike, thresholds: Sequence[float] | None = None
 ) -> LineScores:
@@ -144,7 +107,7 @@ def score_lines(
     InputError
         If the reference is empty, a threshold is not positive, or a coordinate is not finite.
     """
-    estimate = checked_rows("segments", segments, (2, 3))
+    estimate = finite_rows("segments", segments, (2, 3))
     target = reference if isinstance(reference, Geometry) else Geometry(segments=np.asarray(reference, float))
     if len(target) == 0:
         raise InputError("The reference holds no segments, triangles or points. Pass one that does.")
@@ -193,7 +156,13 @@ def _ratio(part: FloatArray, whole: float) -> FloatArray:
 
 
 def threshold_list(thresholds: Sequence[float] | None, extent: float) -> list[float]:
-    """Return thresholds in order; by default 1, 5 and 10 thousandths of an extent."""
+    """Return distances (scene units) in order; by default 1, 5 and 10 thousandths of an extent.
+
+    Raises
+    ------
+    InputError
+        If a threshold is not positive, or there is no extent to derive one from.
+    """
     if thresholds is None:
         if not extent > 0:
             raise InputError("The reference has no extent; pass thresholds in scene units.")
@@ -332,7 +301,7 @@ def _anchors_on_triangles(triangles: FloatArray, spacing: float) -> tuple[FloatA
 
 
 def segment_distance(places: FloatArray, segments: FloatArray) -> FloatArray:
-    """Return the distance of each place (n, 3) from its segment (n, 2, 3)."""
+    """Return the distance (n,) of each place (n, 3) from its segment (n, 2, 3), which may be a point."""
     start, along = segments[:, 0], segments[:, 1] - segments[:, 0]
     square = np.einsum("ij,ij->i", along, along)
     share = np.einsum("ij,ij->i", places - start, along) / np.where(square > 0, square, 1)
@@ -340,7 +309,7 @@ def segment_distance(places: FloatArray, segments: FloatArray) -> FloatArray:
 
 
 def triangle_distance(places: FloatArray, triangles: FloatArray) -> FloatArray:
-    """Return the distance of each place (n, 3) from its triangle (n, 3, 3), which may be degenerate."""
+    """Return the distance (n,) of each place (n, 3) from its triangle (n, 3, 3), which may be degenerate."""
     result = np.full(len(places), np.inf)
     inside = np.ones(len(places), bool)
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -355,15 +324,4 @@ def triangle_distance(places: FloatArray, triangles: FloatArray) -> FloatArray:
     return np.where(inside, height, result)
 
 
-def checked_rows(name: str, values: npt.ArrayLike, row: tuple[int, ...]) -> FloatArray:
-    """Return finite numbers of shape (N, *row), or raise."""
-    array = np.asarray(values, float)
-    if array.shape[1:] != row:
-        wanted = ", ".join(map(str, row))
-        raise ShapeError(f"{name} must have shape (N, {wanted}); got {array.shape}.")
-    if not np.isfinite(array).all():
-        raise InputError(f"{name} must be finite. Remove the rows that are not.")
-    return array
-
-
-__all__ = ["Geometry", "LineScores", "evaluate_lines", "score_lines"]
+__all__ = ["LineScores", "evaluate_lines", "score_lines"]

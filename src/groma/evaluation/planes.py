@@ -23,7 +23,8 @@ from scipy.optimize import linear_sum_assignment
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.evaluation.lines import checked_rows, threshold_list
+from groma.evaluation.lines import threshold_list
+from groma.geometry._algebra import finite_rows
 from groma.scene import Scene
 
 #: Numbers held at once while points are compared with planes.
@@ -101,7 +102,7 @@ def match_planes(
         Limits of a match.
     """
     planes, truth = _unit_planes("estimate", estimate), _unit_planes("reference", reference)
-    where = checked_rows("places", places, (3,))
+    where = finite_rows("places", places, (3,))
     if len(where) != len(truth):
         raise ShapeError(f"places must have one row per reference plane ({len(truth)}); got {len(where)}.")
     if not (max_angle_deg > 0 and max_offset > 0):
@@ -215,7 +216,7 @@ def score_planes_by_points(
     thresholds : sequence of float, optional
         Distances in scene units; by default 1, 5 and 10 thousandths of the points' extent.
     """
-    hesse, places = _unit_planes("planes", planes), checked_rows("points", points, (3,))
+    hesse, places = _unit_planes("planes", planes), finite_rows("points", points, (3,))
     if len(places) == 0:
         raise InputError("There are no points to compare with.")
     taus = threshold_list(thresholds, float(np.linalg.norm(np.ptp(places, axis=0))))
@@ -234,7 +235,7 @@ def score_planes_by_points(
 
 
 def _unit_planes(name: str, planes: npt.ArrayLike) -> FloatArray:
-    hesse = checked_rows(name, planes, (4,))
+    hesse = finite_rows(name, planes, (4,))
     length = np.linalg.norm(hesse[:, :3], axis=1, keepdims=True)
     if not (length > 0).all():
         raise InputError(f"{name} holds a plane without a normal, row {int(length.argmin())}. Remove it.")

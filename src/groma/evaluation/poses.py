@@ -88,7 +88,24 @@ def evaluate_poses(estimate: Scene, reference: Scene, with_scale: bool = True) -
 def score_poses(
     estimated: npt.ArrayLike, true: npt.ArrayLike, with_scale: bool = True, num_missing: int = 0
 ) -> PoseScores:
-    """Compare corresponding poses cam_from_world, (N, 7) each; see :func:`evaluate_poses`."""
+    """Compare corresponding poses after alignment; see :func:`evaluate_poses`.
+
+    Parameters
+    ----------
+    estimated, true : (N, 7) float64
+        Poses cam_from_world, row by row of the same image.
+    with_scale : bool
+        Whether the alignment may scale.
+    num_missing : int
+        Images of the reference without an estimate; their pairs count as wrong in the area under the recall curve.
+
+    Raises
+    ------
+    ShapeError
+        If the shapes are not (N, 7) twice.
+    InputError
+        If there is no pose.
+    """
     estimate, reference = np.asarray(estimated, float), np.asarray(true, float)
     alignment = align_poses(estimate, reference, with_scale)
     moved = alignment.poses(estimate)
@@ -123,7 +140,8 @@ def pairwise_auc(
     .. math:: \mathrm{AUC}_\tau = \frac{1}{n} \sum_i \max(0,\ 1 - e_i / \tau)
 
     over all pairs of the reference; pairs with a missing image have an infinite error. Where the reference's baseline
-    is zero only the rotation counts. No alignment takes part.
+    is zero only the rotation counts. No alignment takes part. Poses are cam_from_world, (N, 7); thresholds are in
+    degrees. NaN where there is no pair.
     """
     count = len(true) + num_missing
     pairs = count * (count - 1) // 2

@@ -88,3 +88,12 @@ def make_example(
         for group, count in counts.items()
     }
     return Example(factor, variables)
+
+
+def visible_scene(rng: np.random.Generator) -> dict[str, FloatArray]:
+    """Return states of 3 poses, and of 4 points and 4 lines in front of them, for examples (default charts)."""
+    poses = random_poses(rng, 3, rotation=0.4)
+    poses[:, 6] += 8.0
+    first, second = rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
+    lines = charts("line")[0].from_ambient(np.hstack([np.cross(first, second), second - first]))
+    return {"poses": poses, "points": first, "lines": lines}

@@ -115,9 +115,12 @@ class Factor(ABC):
         """
         return ambients
 
-    @abstractmethod
     def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:
-        """Write the residuals of factors begin..end to ``out`` (end-begin, m); return how many are degenerate."""
+        """Write the residuals of factors begin..end to ``out`` (end-begin, m); return how many are degenerate.
+
+        The default writes records without blocks.
+        """
+        return self.linearize(inputs, begin, end, (-1,) * len(self.references()), out[:, :, None])
 
     @abstractmethod
     def linearize(

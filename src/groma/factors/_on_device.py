@@ -17,7 +17,6 @@ from groma._cuda import device_loop
 from groma._typing import FloatArray
 from groma.cameras import CameraModel, _dispatch
 from groma.factors._rig import (
-    as_camera_model,
     put_line,
     put_line_pose,
     put_point,
@@ -134,11 +133,11 @@ def linearize_on_device(factor: PointReprojection | LineReprojection, ambients: 
         Without ``numba-cuda`` or a device.
     """
     poses, landmarks, intrinsics = (np.ascontiguousarray(array, dtype=np.float64) for array in ambients)
-    camera = as_camera_model(factor.camera_model)
+    camera = factor.camera
     record = np.empty((len(factor), 2, 6 + landmarks.shape[1] + camera.num_parameters + 1))
     cameras = (intrinsics, factor.intrinsics.index)
     if isinstance(factor, PointReprojection):
-        depth = 0.0 if factor.require_in_front and not camera.sees_behind else -np.inf
+        depth = factor.smallest_depth if factor.require_in_front else -np.inf
         observed = (poses, factor.pose.index, landmarks, factor.point.index, *cameras, factor.pixels)
         _loop("point", camera)(len(factor), depth, *observed, record)
     else:

@@ -24,11 +24,10 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
-from groma.cameras import CameraModel, model
 from groma.errors import InputError, ShapeError
-from groma.factors._examples import charts, random_poses
 from groma.factors._factor import Factor, Ref, Slot
 from groma.factors._record import set_rows
+from groma.geometry.se3 import compose_kernel
 
 POSE = Slot("pose", "pose")
 EXTRINSICS = Slot("extrinsics", "pose", optional=True)
@@ -37,7 +36,8 @@ EXTRINSICS = Slot("extrinsics", "pose", optional=True)
 # ------------------------------------------------------------------------------------------------------------ Kernels
 # Numba counts references to the arrays that a kernel passes on or branches around, with atomic instructions (5 ns
 # each). It drops the counting in straight kernels that call nothing. So these have no branches, and the loops call them
-# one by one: that took the linearisation of a point from 150 ns to 17 ns.
+# one by one: that took the linearisation of a point from 150 ns to 17 ns. What clears the rare degenerate records has
+# branches, and is a function that is called, not a kernel that is inlined.
 
 
 @kernel
@@ -110,47 +110,35 @@ def put_line(g0, g1, g2, h0, h1, h2, poses, c, record, i, row, column):
     record[i, row, column + 5] = k0 * poses[c, 2] + k1 * poses[c, 6] + k2 * poses[c, 10]
 
 
-@kernel
-def put_parameters(J_params, record, i, row, column):
-    """Copy row ``row`` of ``J_params`` (m, k) into the record at ``column``."""
-    for j in range(J_params.shape[1]):
-        record[i, row, column + j] = J_params[row, j]
-
-
-@kernel
-def clear_block(record, i, column, width):
+@loop
+def clear_block(record, i, column, size):
     """Write zeros to a block of all rows of record ``i``; -1 means it is not wanted."""
     if column >= 0:
         for row in range(record.shape[1]):
-            for j in range(width):
+            for j in range(size):
                 record[i, row, column + j] = 0.0
 
 
-@kernel
-def clear_residual(record, i):
-    """Write zeros to the residual of record ``i``."""
+@loop
+def clear_record(record, i, pose_column, landmark_column, landmark_size, intrinsics_column, intrinsics_size):
+    """Write zeros to the residual and to the blocks of record ``i`` that are wanted (columns of -1 are not)."""
     for row in range(record.shape[1]):
         record[i, row, record.shape[2] - 1] = 0.0
-
-
-@kernel
-def load_row(rows, k, previous, out):
-    """Copy row ``k`` of ``rows`` to ``out`` unless it is there already; return k."""
-    if k != previous:
-        for j in range(out.shape[0]):
-            out[j] = rows[k, j]
-    return k
+        if pose_column >= 0:
+            for j in range(6):
+                record[i, row, pose_column + j] = 0.0
+        if landmark_column >= 0:
+            for j in range(landmark_size):
+                record[i, row, landmark_column + j] = 0.0
+        if intrinsics_column >= 0:
+            for j in range(intrinsics_size):
+                record[i, row, intrinsics_column + j] = 0.0
 
 
 @loop
 def _compose_all(extrinsics, bodies, extrinsics_index, body_index, out):
     for i in range(out.shape[0]):
-        A, B, C = extrinsics[extrinsics_index[i]], bodies[body_index[i]], out[i]
-        for row in range(0, 12, 4):
-            a0, a1, a2 = A[row], A[row + 1], A[row + 2]
-            for j in range(4):
-                C[row + j] = a0 * B[j] + a1 * B[4 + j] + a2 * B[8 + j]
-            C[row + 3] += A[row + 3]
+        compose_kernel(extrinsics[extrinsics_index[i]], bodies[body_index[i]], out[i])
 
 
 @loop
@@ -256,36 +244,6 @@ class CameraFactor(Factor):
         """
 
 
-def as_camera_model(camera: CameraModel | str) -> CameraModel:
-    """Return the model itself, or the one of this name."""
-    return model(camera) if isinstance(camera, str) else camera
-
-
-def check_intrinsics(camera: CameraModel, intrinsics: FloatArray) -> FloatArray:
-    """Return ``intrinsics`` (C, k) if its width fits the model; raise ShapeError otherwise."""
-    if intrinsics.shape[1] != camera.num_parameters:
-        raise ShapeError(
-            f"{camera.name} has {camera.num_parameters} parameters; the group of intrinsics has "
-            f"{intrinsics.shape[1]}. Make one group of factors for each camera model."
-        )
-    return intrinsics
-
-
-def check_baseline(factor: Any) -> None:
-    """Make field ``baseline`` of a stereo factor a float or (N,); raise unless all are finite and positive."""
-    baseline = np.ascontiguousarray(factor.baseline, dtype=np.float64)
-    if np.ndim(factor.baseline) and baseline.shape != (len(factor),):
-        raise ShapeError(
-            f"{type(factor).__name__}.baseline must be a number or ({len(factor)},); got {baseline.shape}."
-        )
-    if not (np.isfinite(baseline) & (baseline > 0.0)).all():
-        raise InputError(
-            f"{type(factor).__name__}.baseline must be positive (the right camera's distance along x); got "
-            f"{baseline.min()}. Swap left and right if it is negative."
-        )
-    object.__setattr__(factor, "baseline", baseline if np.ndim(factor.baseline) else float(baseline[0]))
-
-
 def normalize_rows(factor: Any, field: str, size: int) -> None:
     """Scale the rows of field ``field`` so that their first ``size`` numbers have norm one.
 
@@ -302,32 +260,17 @@ def normalize_rows(factor: Any, field: str, size: int) -> None:
     object.__setattr__(factor, field, rows / norm[:, None])
 
 
-def visible_scene(rng: np.random.Generator) -> dict[str, FloatArray]:
-    """Return states of 3 poses, and of 4 points and 4 lines in front of them, for examples (default charts)."""
-    poses = random_poses(rng, 3, rotation=0.4)
-    poses[:, 6] += 8.0
-    first, second = rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
-    lines = charts("line")[0].from_ambient(np.hstack([np.cross(first, second), second - first]))
-    return {"poses": poses, "points": first, "lines": lines}
-
-
 __all__ = [
     "EXTRINSICS",
     "POSE",
     "CameraFactor",
-    "as_camera_model",
-    "check_baseline",
-    "check_intrinsics",
     "clear_block",
-    "clear_residual",
-    "load_row",
+    "clear_record",
     "normalize_rows",
     "put_line",
     "put_line_pose",
-    "put_parameters",
     "put_point",
     "put_point_pose",
     "transform_line",
     "transform_point",
-    "visible_scene",
 ]

@@ -29,19 +29,17 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.factors._examples import indices, make_example
+from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._factor import Example, Ref, Slot, register
 from groma.factors._rig import (
     EXTRINSICS,
     POSE,
     CameraFactor,
-    clear_block,
-    clear_residual,
+    clear_record,
     normalize_rows,
     put_line,
     put_line_pose,
     transform_line,
-    visible_scene,
 )
 
 
@@ -77,9 +75,7 @@ def _linearize_all(poses, pose_index, lines, line_index, starts, ends, begin, en
                 if line_column >= 0:
                     put_line(out[1], out[2], out[3], 0.0, 0.0, 0.0, poses, c, record, k, row, line_column)
         else:
-            clear_block(record, k, pose_column, 6)
-            clear_block(record, k, line_column, 6)
-            clear_residual(record, k)
+            clear_record(record, k, pose_column, line_column, 6, -1, 0)
             degenerate += 1
     return degenerate
 
@@ -116,8 +112,7 @@ class LineBearing(CameraFactor):
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
         bearings = (self.start_bearings, self.end_bearings)
-        arguments: tuple[Any, ...] = (*inputs, self.line.index, *bearings, begin, end, *columns, record)
-        return _linearize_all(*arguments)
+        return _linearize_all(*inputs, self.line.index, *bearings, begin, end, *columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

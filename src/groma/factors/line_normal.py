@@ -32,10 +32,10 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.factors._examples import indices, make_example
+from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._factor import Example, Ref, Slot, register
 from groma.factors._record import put_block, put_residual
-from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, normalize_rows, visible_scene
+from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, normalize_rows
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -135,8 +135,7 @@ class LineNormal(CameraFactor):
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        arguments: tuple[Any, ...] = (*inputs, self.line.index, self.normals, begin, end, *columns, record)
-        return _linearize_all(*arguments)
+        return _linearize_all(*inputs, self.line.index, self.normals, begin, end, *columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

@@ -126,9 +126,6 @@ class _LineAndPlane(Factor):
     def residual_size(self) -> int:
         return 2
 
-    def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:
-        return self.linearize(inputs, begin, end, (-1, -1), out[:, :, None])
-
     def _evaluate(
         self,
         with_angle: bool,

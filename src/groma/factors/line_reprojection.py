@@ -32,25 +32,11 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.cameras import CameraModel
 from groma.cameras._dispatch import pinhole_parameters, pinhole_parameters_jacobian
-from groma.factors._examples import indices, make_example
+from groma.factors._examples import indices
 from groma.factors._factor import Example, Ref, Slot, register
-from groma.factors._rig import (
-    EXTRINSICS,
-    POSE,
-    CameraFactor,
-    as_camera_model,
-    check_intrinsics,
-    clear_block,
-    clear_residual,
-    load_row,
-    put_line,
-    put_line_pose,
-    transform_line,
-    visible_scene,
-)
-from groma.geometry._manifold import Euclidean
+from groma.factors._pixels import PixelFactor, load_row, pixel_example
+from groma.factors._rig import EXTRINSICS, POSE, clear_record, put_line, put_line_pose, transform_line
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -95,11 +81,15 @@ def put_pinhole(out, J_K, record, i, row, column):
 
 
 @loop
-def _linearize_all(
-    model_tag, poses, pose_index, lines, intrinsics, line_index, intrinsics_index, segments,
+def linearize_pixels(
+    model_tag, poses, pose_index, lines, intrinsics, line_index, intrinsics_index, row_tag, pixels,
     begin, end, pose_column, line_column, intrinsics_column, record,
 ):  # fmt: skip
-    size = intrinsics.shape[1]
+    """Write one row for each of the ``pixels`` of a line: the two ends of a segment (N, 4), or one point on it (N, 2).
+
+    ``row_tag`` has a number for each row: its length is part of its type, so that Numba knows it.
+    """
+    size, rows = intrinsics.shape[1], len(row_tag)
     L, K, J_K, params, out = np.empty(6), np.empty(4), np.empty((4, size)), np.empty(size), np.empty((2, 8))
     camera, degenerate, last = -1, 0, record.shape[2] - 1
     for i in range(begin, end):
@@ -113,10 +103,10 @@ def _linearize_all(
         if (
             valid
             and h > 0.0
-            and endpoint_distance(L[0], L[1], L[2], K, h, segments[i, 0], segments[i, 1], out, 0)
-            and endpoint_distance(L[0], L[1], L[2], K, h, segments[i, 2], segments[i, 3], out, 1)
+            and endpoint_distance(L[0], L[1], L[2], K, h, pixels[i, 0], pixels[i, 1], out, 0)
+            and (rows == 1 or endpoint_distance(L[0], L[1], L[2], K, h, pixels[i, 2], pixels[i, 3], out, 1))
         ):
-            for row in range(2):
+            for row in range(rows):
                 g0, g1, g2 = out[row, 1], out[row, 2], out[row, 3]
                 record[k, row, last] = out[row, 0]
                 if pose_column >= 0:
@@ -126,10 +116,7 @@ def _linearize_all(
                 if intrinsics_column >= 0:
                     put_pinhole(out, J_K, record, k, row, intrinsics_column)
         else:
-            clear_block(record, k, pose_column, 6)
-            clear_block(record, k, line_column, 6)
-            clear_block(record, k, intrinsics_column, size)
-            clear_residual(record, k)
+            clear_record(record, k, pose_column, line_column, 6, intrinsics_column, size)
             degenerate += 1
     return degenerate
 
@@ -137,7 +124,7 @@ def _linearize_all(
 # ------------------------------------------------------------------------------------------------------------- Public
 @register("line_reprojection")
 @dataclass(frozen=True, kw_only=True)
-class LineReprojection(CameraFactor):
+class LineReprojection(PixelFactor):
     """Lines seen as image segments, cameras without distortion; residual: two distances in pixels.
 
     Under distortion use :class:`~groma.factors.line_bearing.LineBearing`. Degenerate: lines through the camera centre
@@ -146,20 +133,12 @@ class LineReprojection(CameraFactor):
 
     #: Lines in the world, any scale of (m, d).
     line: Ref
-    #: Parameters of the cameras, all of one model.
-    intrinsics: Ref
-    #: SIMPLE_PINHOLE or PINHOLE (or another model without distortion).
-    camera_model: CameraModel | str
     #: (N, 4) measured end points u1, v1, u2, v2 in pixels; their order does not matter.
     segments: FloatArray
 
+    pinhole_only: ClassVar[bool] = True
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 4),)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "camera_model", as_camera_model(self.camera_model))
-        as_camera_model(self.camera_model).require_pinhole()
 
     @property
     def residual_size(self) -> int:  # noqa: D102
@@ -168,11 +147,8 @@ class LineReprojection(CameraFactor):
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        camera = as_camera_model(self.camera_model)
-        check_intrinsics(camera, inputs[3])
-        arrays = (self.line.index, self.intrinsics.index, self.segments)
-        arguments: tuple[Any, ...] = (camera.tag, *inputs, *arrays, begin, end, *columns, record)
-        return _linearize_all(*arguments)
+        arguments = self.arguments(inputs, self.line, (0, 0), self.segments)
+        return linearize_pixels(*arguments, begin, end, *columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
@@ -183,6 +159,4 @@ class LineReprojection(CameraFactor):
             camera_model="PINHOLE",
             segments=rng.uniform(100.0, 500.0, (6, 4)),
         )
-        pinhole = np.array([[500.0, 520.0, 320.0, 240.0], [400.0, 380.0, 300.0, 200.0]])
-        manifolds = {"intrinsics": Euclidean(4, "intrinsics")}
-        return make_example(factor, rng, manifolds=manifolds, states={**visible_scene(rng), "intrinsics": pinhole})
+        return pixel_example(factor, rng)

@@ -38,22 +38,12 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.cameras import CameraModel
 from groma.cameras._dispatch import project_jacobian
-from groma.factors._examples import indices, make_example
+from groma.factors._examples import indices
 from groma.factors._factor import Example, Ref, Slot, register
-from groma.factors._rig import (
-    EXTRINSICS,
-    POSE,
-    CameraFactor,
-    as_camera_model,
-    check_intrinsics,
-    clear_block,
-    clear_residual,
-    load_row,
-    visible_scene,
-)
-from groma.geometry._manifold import Euclidean
+from groma.factors._pixels import PixelFactor, load_row, pixel_example
+from groma.factors._record import set_rows
+from groma.factors._rig import EXTRINSICS, POSE, clear_block, clear_record
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -145,8 +135,8 @@ def _put_line(s, lines, j, anchors, i, end, c, record, k, target, column):
 
 @loop
 def _linearize_all(
-    model_tag, smallest_depth, on_line, anchors, poses, pose_index, landmarks, planes, intrinsics,
-    landmark_index, plane_index, intrinsics_index, begin, end,
+    model_tag, poses, pose_index, landmarks, planes, intrinsics, landmark_index, intrinsics_index, plane_index,
+    smallest_depth, on_line, anchors, begin, end,
     pose_column, landmark_column, plane_column, intrinsics_column, record,
 ):  # fmt: skip
     size = intrinsics.shape[1]
@@ -203,30 +193,19 @@ def _linearize_all(
                 for m in range(size):
                     record[k, row, intrinsics_column + m] = J_P[coordinate, m] - J_Q[coordinate, m]
         if not good:
-            clear_block(record, k, pose_column, 6)
-            clear_block(record, k, landmark_column, 6 if on_line else 3)
+            clear_record(record, k, pose_column, landmark_column, 6 if on_line else 3, intrinsics_column, size)
             clear_block(record, k, plane_column, 4)
-            clear_block(record, k, intrinsics_column, size)
-            clear_residual(record, k)
             degenerate += 1
     return degenerate
 
 
 # ------------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True, kw_only=True)
-class _OnPlanePixels(CameraFactor):
+class _OnPlanePixels(PixelFactor):
     """What both forms share."""
 
     #: The planes, any scale of (n, w).
     plane: Ref
-    #: Parameters of the cameras, all of one model.
-    intrinsics: Ref
-    #: The camera model, or its name.
-    camera_model: CameraModel | str
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "camera_model", as_camera_model(self.camera_model))
 
     def _evaluate(
         self,
@@ -238,23 +217,9 @@ class _OnPlanePixels(CameraFactor):
         columns: tuple[int, ...],
         record: FloatArray,
     ) -> int:
-        camera = as_camera_model(self.camera_model)
-        check_intrinsics(camera, inputs[4])
-        smallest_depth = -np.inf if camera.sees_behind else 0.0
         places = np.zeros((1, 2, 3)) if anchors is None else anchors
-        arguments: tuple[Any, ...] = (
-            camera.tag, smallest_depth, anchors is not None, places, *inputs,
-            landmark.index, self.plane.index, self.intrinsics.index, begin, end, *columns, record,
-        )  # fmt: skip
-        return _linearize_all(*arguments)
-
-    @staticmethod
-    def _states(rng: np.random.Generator) -> dict[str, Any]:
-        pinhole = np.array([[500.0, 320.0, 240.0, -0.1, 0.02], [400.0, 300.0, 200.0, 0.05, -0.01]])
-        return {
-            "manifolds": {"intrinsics": Euclidean(5, "intrinsics")},
-            "states": {**visible_scene(rng), "intrinsics": pinhole},
-        }
+        measured = self.plane.index, self.smallest_depth, anchors is not None, places
+        return _linearize_all(*self.arguments(inputs, landmark, *measured), begin, end, *columns, record)
 
 
 @register("point_on_plane_pixels")
@@ -290,7 +255,7 @@ class PointOnPlanePixels(_OnPlanePixels):
             intrinsics=Ref("intrinsics", indices(rng, 2)),
             camera_model="RADIAL",
         )
-        return make_example(factor, rng, **cls._states(rng))
+        return pixel_example(factor, rng)
 
 
 @register("segment_on_plane_pixels")
@@ -312,7 +277,7 @@ class SegmentOnPlanePixels(_OnPlanePixels):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "ends", np.ascontiguousarray(self.ends, dtype=np.float64).reshape(len(self), 2, 3))
+        set_rows(self, "ends", 2, 3)
 
     @property
     def residual_size(self) -> int:  # noqa: D102
@@ -333,4 +298,4 @@ class SegmentOnPlanePixels(_OnPlanePixels):
             camera_model="RADIAL",
             ends=rng.normal(size=(6, 2, 3)),
         )
-        return make_example(factor, rng, **cls._states(rng))
+        return pixel_example(factor, rng)

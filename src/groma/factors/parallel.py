@@ -106,9 +106,6 @@ class DirectionPair(Factor):
     def _offsets(self) -> tuple[int, int]:
         return tuple(DIRECTION_OFFSET[slot.kind] for slot in self.slots)  # type: ignore[return-value]
 
-    def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
-        return self.linearize(inputs, begin, end, (-1, -1), out[:, :, None])
-
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
         # Groups of their own, so that no direction is paired with itself.

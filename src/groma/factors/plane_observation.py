@@ -34,26 +34,14 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.factors._examples import indices, make_example
+from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._factor import Example, Ref, Slot, register
 from groma.factors._record import put_block, put_residual
-from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, normalize_rows, visible_scene
+from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, normalize_rows
+from groma.geometry._chart import perpendicular_kernel
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
-@kernel
-def _tangent_basis(n, B):
-    """Write two orthonormal rows ``B`` (2, 3) that with the unit vector ``n`` (3,) form a right-handed basis.
-
-    Duff et al., *Building an orthonormal basis, revisited*, 2017; continuous but for the sign of n_z.
-    """
-    sign = 1.0 if n[2] >= 0.0 else -1.0
-    a = -1.0 / (sign + n[2])
-    b = n[0] * n[1] * a
-    B[0, 0], B[0, 1], B[0, 2] = 1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]
-    B[1, 0], B[1, 1], B[1, 2] = b, sign + n[1] * n[1] * a, -n[1]
-
-
 @kernel
 def _linearize(T, plane, measured, B, r, J_pose, J_plane):
     """Write ``r`` (3,), ``J_pose`` (3, 6), ``J_plane`` (3, 4); False for the plane at infinity."""
@@ -71,7 +59,7 @@ def _linearize(T, plane, measured, B, r, J_pose, J_plane):
     r[2] = offset - measured[3]
     if not abs(r[2]) < math.inf:
         return False
-    _tangent_basis(measured, B)
+    perpendicular_kernel(measured[0], measured[1], measured[2], B)
     # n k = s n/|n| is the unit normal with the sign s
     for i in range(2):
         b0, b1, b2 = B[i, 0], B[i, 1], B[i, 2]
@@ -108,48 +96,32 @@ def _linearize_all(poses, pose_index, planes, plane_index, measured, begin, end,
 def _basis_all(measured, out):
     B = np.empty((2, 3))
     for i in range(measured.shape[0]):
-        _tangent_basis(measured[i], B)
+        perpendicular_kernel(measured[i, 0], measured[i, 1], measured[i, 2], B)
         out[i] = B.T
 
 
 # ------------------------------------------------------------------------------------------------------------- Public
-@register("plane_observation")
 @dataclass(frozen=True, kw_only=True)
-class PlaneObservation(CameraFactor):
-    """Planes measured in the camera; residual: two sines of angles of the normal, and the offset in scene units.
-
-    Degenerate: the plane at infinity, n = 0. The rows have different units: pass square root information matrices
-    (N, 3, 3).
-    """
+class PlaneInCamera(CameraFactor):
+    """Planes measured in the camera: the base of this factor and of :mod:`groma.factors.plane_quaternion`."""
 
     #: Planes in the world, any scale of (n, w).
     plane: Ref
-    #: (N, 4) measured planes (n, w), camera frame; scaled to unit normals on construction.
+    #: (N, 4) measured planes (n, w), camera frame; scaled on construction: see ``num_normalized``.
     planes_in_cam: FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("plane", "plane"), EXTRINSICS)
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("planes_in_cam", 4),)
+    #: The measurements are scaled so that this many of their numbers have norm one: 3, the normal, or all 4.
+    num_normalized: ClassVar[int]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        normalize_rows(self, "planes_in_cam", 3)
-
-    @property
-    def basis(self) -> FloatArray:
-        """(N, 3, 2), the basis B of each measured normal, in which the first two rows of the residual are given."""
-        out = np.empty((len(self), 3, 2))
-        _basis_all(self.planes_in_cam, out)
-        return out
+        normalize_rows(self, "planes_in_cam", self.num_normalized)
 
     @property
     def residual_size(self) -> int:  # noqa: D102
         return 3
-
-    def evaluate(  # noqa: D102
-        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
-    ) -> int:
-        arguments: tuple[Any, ...] = (*inputs, self.plane.index, self.planes_in_cam, begin, end, *columns, record)
-        return _linearize_all(*arguments)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
@@ -159,3 +131,27 @@ class PlaneObservation(CameraFactor):
             planes_in_cam=rng.normal(size=(6, 4)),
         )
         return make_example(factor, rng, states={"poses": visible_scene(rng)["poses"]})
+
+
+@register("plane_observation")
+@dataclass(frozen=True, kw_only=True)
+class PlaneObservation(PlaneInCamera):
+    """Planes measured in the camera; residual: two sines of angles of the normal, and the offset in scene units.
+
+    Degenerate: the plane at infinity, n = 0. The rows have different units: pass square root information matrices
+    (N, 3, 3).
+    """
+
+    num_normalized: ClassVar[int] = 3
+
+    @property
+    def basis(self) -> FloatArray:
+        """(N, 3, 2), the basis B of each measured normal, in which the first two rows of the residual are given."""
+        out = np.empty((len(self), 3, 2))
+        _basis_all(self.planes_in_cam, out)
+        return out
+
+    def evaluate(  # noqa: D102
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        return _linearize_all(*inputs, self.plane.index, self.planes_in_cam, begin, end, *columns, record)

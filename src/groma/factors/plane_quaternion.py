@@ -38,10 +38,9 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.factors._examples import indices, make_example
-from groma.factors._factor import Example, Ref, Slot, register
+from groma.factors._factor import register
 from groma.factors._record import put_block, put_residual
-from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, normalize_rows, visible_scene
+from groma.factors.plane_observation import PlaneInCamera
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -140,39 +139,15 @@ def _linearize_all(poses, pose_index, planes, plane_index, measured, begin, end,
 # ------------------------------------------------------------------------------------------------------------- Public
 @register("plane_quaternion")
 @dataclass(frozen=True, kw_only=True)
-class PlaneQuaternion(CameraFactor):
+class PlaneQuaternion(PlaneInCamera):
     """Planes measured in the camera, compared as quaternions; residual: a rotation vector (radians).
 
     Degenerate: a plane of zeros.
     """
 
-    #: Planes in the world, any scale of (n, w).
-    plane: Ref
-    #: (N, 4) measured planes (n, w), camera frame; scaled to unit 4-vectors on construction.
-    planes_in_cam: FloatArray
-
-    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("plane", "plane"), EXTRINSICS)
-    measured: ClassVar[tuple[tuple[str, int], ...]] = (("planes_in_cam", 4),)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        normalize_rows(self, "planes_in_cam", 4)
-
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 3
+    num_normalized: ClassVar[int] = 4
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        arguments: tuple[Any, ...] = (*inputs, self.plane.index, self.planes_in_cam, begin, end, *columns, record)
-        return _linearize_all(*arguments)
-
-    @classmethod
-    def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
-        factor = cls(
-            pose=Ref("poses", indices(rng, 3)),
-            plane=Ref("planes", indices(rng, 3)),
-            planes_in_cam=rng.normal(size=(6, 4)),
-        )
-        return make_example(factor, rng, states={"poses": visible_scene(rng)["poses"]})
+        return _linearize_all(*inputs, self.plane.index, self.planes_in_cam, begin, end, *columns, record)

@@ -24,18 +24,16 @@ import numpy as np
 
 from groma._numba import loop
 from groma._typing import FloatArray
-from groma.factors._examples import indices, make_example
+from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._factor import Example, Ref, Slot, register
 from groma.factors._rig import (
     EXTRINSICS,
     POSE,
     CameraFactor,
-    clear_block,
-    clear_residual,
+    clear_record,
     put_point,
     put_point_pose,
     transform_point,
-    visible_scene,
 )
 
 
@@ -54,9 +52,7 @@ def _linearize_all(poses, pose_index, points, point_index, depths, begin, end, p
             if point_column >= 0:
                 put_point(0.0, 0.0, 1.0, poses, c, record, k, 0, point_column)
         else:
-            clear_block(record, k, pose_column, 6)
-            clear_block(record, k, point_column, 3)
-            clear_residual(record, k)
+            clear_record(record, k, pose_column, point_column, 3, -1, 0)
             degenerate += 1
     return degenerate
 
@@ -82,8 +78,7 @@ class PointDepth(CameraFactor):
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        arguments: tuple[Any, ...] = (*inputs, self.point.index, self.depths, begin, end, *columns, record)
-        return _linearize_all(*arguments)
+        return _linearize_all(*inputs, self.point.index, self.depths, begin, end, *columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

@@ -97,9 +97,6 @@ class PointOnLine(Factor):
     def residual_rank(self) -> int:  # noqa: D102
         return 2
 
-    def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
-        return self.linearize(inputs, begin, end, (-1, -1), out[:, :, None])
-
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:

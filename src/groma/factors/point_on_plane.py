@@ -72,9 +72,6 @@ class PointOnPlane(Factor):
     def residual_size(self) -> int:  # noqa: D102
         return 1
 
-    def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
-        return self.linearize(inputs, begin, end, (-1, -1), out[:, :, None])
-
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:

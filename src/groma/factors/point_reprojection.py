@@ -26,26 +26,11 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.cameras import CameraModel
 from groma.cameras._dispatch import project, project_jacobian
-from groma.factors._examples import indices, make_example
+from groma.factors._examples import indices
 from groma.factors._factor import Example, Ref, Slot, register
-from groma.factors._rig import (
-    EXTRINSICS,
-    POSE,
-    CameraFactor,
-    as_camera_model,
-    check_intrinsics,
-    clear_block,
-    clear_residual,
-    load_row,
-    put_parameters,
-    put_point,
-    put_point_pose,
-    transform_point,
-    visible_scene,
-)
-from groma.geometry._manifold import Euclidean
+from groma.factors._pixels import PixelFactor, load_row, pixel_example, put_parameters
+from groma.factors._rig import EXTRINSICS, POSE, clear_record, put_point, put_point_pose, transform_point
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -59,7 +44,7 @@ def _difference(uv, pixels, i):
 
 @loop
 def _residual_all(
-    model_tag, smallest_depth, poses, pose_index, points, intrinsics, point_index, intrinsics_index, pixels,
+    model_tag, poses, pose_index, points, intrinsics, point_index, intrinsics_index, smallest_depth, pixels,
     begin, end, out,
 ):  # fmt: skip
     P, uv, params = np.empty(3), np.empty(2), np.empty(intrinsics.shape[1])
@@ -77,7 +62,7 @@ def _residual_all(
 
 @loop
 def _linearize_all(
-    model_tag, smallest_depth, poses, pose_index, points, intrinsics, point_index, intrinsics_index, pixels,
+    model_tag, poses, pose_index, points, intrinsics, point_index, intrinsics_index, smallest_depth, pixels,
     begin, end, pose_column, point_column, intrinsics_column, record,
 ):  # fmt: skip
     P, uv, params = np.empty(3), np.empty(2), np.empty(intrinsics.shape[1])
@@ -103,10 +88,7 @@ def _linearize_all(
                 put_parameters(J_params, record, k, 0, intrinsics_column)
                 put_parameters(J_params, record, k, 1, intrinsics_column)
         else:
-            clear_block(record, k, pose_column, 6)
-            clear_block(record, k, point_column, 3)
-            clear_block(record, k, intrinsics_column, params.shape[0])
-            clear_residual(record, k)
+            clear_record(record, k, pose_column, point_column, 3, intrinsics_column, params.shape[0])
             degenerate += 1
     return degenerate
 
@@ -114,7 +96,7 @@ def _linearize_all(
 # ------------------------------------------------------------------------------------------------------------- Public
 @register("point_reprojection")
 @dataclass(frozen=True, kw_only=True)
-class PointReprojection(CameraFactor):
+class PointReprojection(PixelFactor):
     """Points seen at pixels; residual in pixels.
 
     Degenerate, thus left out of the sum: points that the model cannot project, and points not in front of a perspective
@@ -123,10 +105,6 @@ class PointReprojection(CameraFactor):
 
     #: Points in the world (with the slots of :class:`~groma.factors._rig.CameraFactor`).
     point: Ref
-    #: Parameters of the cameras, all of one model.
-    intrinsics: Ref
-    #: The camera model, or its name.
-    camera_model: CameraModel | str
     #: (N, 2) measured pixels.
     pixels: FloatArray
     #: Leave out points with z <= 0 in a perspective camera. False evaluates the formula there as it is written, which
@@ -136,33 +114,24 @@ class PointReprojection(CameraFactor):
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 2),)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "camera_model", as_camera_model(self.camera_model))
-
     @property
     def residual_size(self) -> int:  # noqa: D102
         return 2
 
     def _arguments(self, inputs: tuple[Any, ...]) -> tuple[Any, ...]:
-        camera = as_camera_model(self.camera_model)
-        smallest_depth = 0.0 if self.require_in_front and not camera.sees_behind else -np.inf
-        check_intrinsics(camera, inputs[3])
-        return camera.tag, smallest_depth, *inputs, self.point.index, self.intrinsics.index, self.pixels
+        smallest_depth = self.smallest_depth if self.require_in_front else -np.inf
+        return self.arguments(inputs, self.point, smallest_depth, self.pixels)
 
     def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
-        arguments: tuple[Any, ...] = (*self._arguments(inputs[1:]), begin, end, out)
-        return _residual_all(*arguments)
+        return _residual_all(*self._arguments(inputs[1:]), begin, end, out)
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        arguments: tuple[Any, ...] = (*self._arguments(inputs), begin, end, *columns, record)
-        return _linearize_all(*arguments)
+        return _linearize_all(*self._arguments(inputs), begin, end, *columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
-        scene = visible_scene(rng)
         factor = cls(
             pose=Ref("poses", indices(rng, 3)),
             point=Ref("points", indices(rng, 4)),
@@ -170,6 +139,4 @@ class PointReprojection(CameraFactor):
             camera_model="RADIAL",
             pixels=rng.uniform(100.0, 500.0, (6, 2)),
         )
-        radial = np.array([[500.0, 320.0, 240.0, -0.1, 0.02], [400.0, 300.0, 200.0, 0.05, -0.01]])
-        manifolds = {"intrinsics": Euclidean(5, "intrinsics")}
-        return make_example(factor, rng, manifolds=manifolds, states={**scene, "intrinsics": radial})
+        return pixel_example(factor, rng)

@@ -26,32 +26,25 @@ import numpy as np
 
 from groma._numba import loop
 from groma._typing import FloatArray
-from groma.cameras import CameraModel
 from groma.cameras._dispatch import project_jacobian
-from groma.factors._examples import indices, make_example
+from groma.factors._examples import indices
 from groma.factors._factor import Example, Ref, Slot, register
+from groma.factors._pixels import PixelFactor, load_row, pixel_example
 from groma.factors._rig import (
     EXTRINSICS,
     POSE,
-    CameraFactor,
-    as_camera_model,
-    check_intrinsics,
-    clear_block,
-    clear_residual,
-    load_row,
+    clear_record,
     normalize_rows,
     put_point,
     put_point_pose,
     transform_point,
-    visible_scene,
 )
-from groma.geometry._manifold import Euclidean
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @loop
 def _linearize_all(
-    model_tag, smallest_depth, poses, pose_index, points, intrinsics, point_index, intrinsics_index, image_lines,
+    model_tag, poses, pose_index, points, intrinsics, point_index, intrinsics_index, smallest_depth, image_lines,
     begin, end, pose_column, point_column, intrinsics_column, record,
 ):  # fmt: skip
     P, uv, params = np.empty(3), np.empty(2), np.empty(intrinsics.shape[1])
@@ -76,10 +69,7 @@ def _linearize_all(
                 for j in range(params.shape[0]):
                     record[k, 0, intrinsics_column + j] = a * J_params[0, j] + b * J_params[1, j]
         else:
-            clear_block(record, k, pose_column, 6)
-            clear_block(record, k, point_column, 3)
-            clear_block(record, k, intrinsics_column, params.shape[0])
-            clear_residual(record, k)
+            clear_record(record, k, pose_column, point_column, 3, intrinsics_column, params.shape[0])
             degenerate += 1
     return degenerate
 
@@ -87,7 +77,7 @@ def _linearize_all(
 # ------------------------------------------------------------------------------------------------------------- Public
 @register("point_to_image_line")
 @dataclass(frozen=True, kw_only=True)
-class PointToImageLine(CameraFactor):
+class PointToImageLine(PixelFactor):
     """Points on lines seen in images, any camera model; residual: distance from the image line in pixels.
 
     Degenerate: points that the model cannot project, and points not in front of a perspective camera.
@@ -95,10 +85,6 @@ class PointToImageLine(CameraFactor):
 
     #: Points in the world.
     point: Ref
-    #: Parameters of the cameras, all of one model.
-    intrinsics: Ref
-    #: The camera model, or its name.
-    camera_model: CameraModel | str
     #: (N, 3) measured image lines a, b, c with a u + b v + c = 0 in pixels, any scale.
     image_lines: FloatArray
 
@@ -107,7 +93,6 @@ class PointToImageLine(CameraFactor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "camera_model", as_camera_model(self.camera_model))
         normalize_rows(self, "image_lines", 2)
 
     @property
@@ -117,18 +102,11 @@ class PointToImageLine(CameraFactor):
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        camera = as_camera_model(self.camera_model)
-        smallest_depth = -np.inf if camera.sees_behind else 0.0
-        check_intrinsics(camera, inputs[3])
-        arrays = (self.point.index, self.intrinsics.index, self.image_lines)
-        arguments: tuple[Any, ...] = (
-            camera.tag, smallest_depth, *inputs, *arrays, begin, end, *columns, record,
-        )  # fmt: skip
-        return _linearize_all(*arguments)
+        arguments = self.arguments(inputs, self.point, self.smallest_depth, self.image_lines)
+        return _linearize_all(*arguments, begin, end, *columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
-        scene = visible_scene(rng)
         factor = cls(
             pose=Ref("poses", indices(rng, 3)),
             point=Ref("points", indices(rng, 4)),
@@ -136,6 +114,4 @@ class PointToImageLine(CameraFactor):
             camera_model="RADIAL",
             image_lines=np.hstack([rng.normal(size=(6, 2)), rng.uniform(-300.0, 300.0, (6, 1))]),
         )
-        radial = np.array([[500.0, 320.0, 240.0, -0.1, 0.02], [400.0, 300.0, 200.0, 0.05, -0.01]])
-        manifolds = {"intrinsics": Euclidean(5, "intrinsics")}
-        return make_example(factor, rng, manifolds=manifolds, states={**scene, "intrinsics": radial})
+        return pixel_example(factor, rng)

@@ -110,9 +110,6 @@ class PoseBetween(Factor):
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return *ambients, poses_from_states(self.first_from_second)
 
-    def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
-        return self.linearize(inputs, begin, end, (-1, -1), out[:, :, None])
-
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:

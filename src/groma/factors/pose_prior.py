@@ -31,6 +31,8 @@ from groma._typing import FloatArray
 from groma.factors._examples import indices, make_example, random_poses
 from groma.factors._factor import Example, Factor, Ref, Slot, register
 from groma.factors._record import poses_from_states, put_block, put_residual, set_rows
+from groma.geometry.quaternion import log_kernel
+from groma.geometry.so3 import left_jacobian_inverse_kernel
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -47,8 +49,8 @@ def compose_with_inverse(A, B, out):
 
 
 @kernel
-def _rotation_log(T, w):
-    """Write the rotation vector of the pose T, by way of its quaternion: precise at any angle up to pi."""
+def _rotation_quaternion(T, q):
+    """Write the quaternion of the pose T, of any length; precise at any angle up to pi."""
     xx, yy, zz = T[0], T[5], T[10]
     trace = xx + yy + zz
     if trace >= xx and trace >= yy and trace >= zz:
@@ -59,11 +61,7 @@ def _rotation_log(T, w):
         qw, qx, qy, qz = T[2] - T[8], T[4] + T[1], 1.0 + yy - xx - zz, T[9] + T[6]
     else:
         qw, qx, qy, qz = T[4] - T[1], T[2] + T[8], T[9] + T[6], 1.0 + zz - xx - yy
-    if qw < 0.0:
-        qw, qx, qy, qz = -qw, -qx, -qy, -qz
-    s = math.sqrt(qx * qx + qy * qy + qz * qz)
-    k = 2.0 * math.atan2(s, qw) / s if s > 1e-10 * qw and s > 0.0 else (2.0 / qw if qw > 0.0 else 0.0)
-    w[0], w[1], w[2] = k * qx, k * qy, k * qz
+    q[0], q[1], q[2], q[3] = qx, qy, qz, qw
 
 
 @kernel
@@ -85,21 +83,6 @@ def _add_hat(scale, a, M):
     M[1, 2] -= scale * a[0]
     M[2, 0] -= scale * a[1]
     M[2, 1] += scale * a[0]
-
-
-@kernel
-def _inverse_left_jacobian_so3(w, M):
-    """Write the inverse left Jacobian of the rotation vector ``w``."""
-    t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    if t2 < 1e-4:
-        c = 1.0 / 12.0 + t2 / 720.0 + t2 * t2 / 30240.0
-    else:
-        half = 0.5 * math.sqrt(t2)
-        c = (1.0 - half * math.cos(half) / math.sin(half)) / t2
-    M[:] = 0.0
-    M[0, 0], M[1, 1], M[2, 2] = 1.0, 1.0, 1.0
-    _add_hat(-0.5, w, M)
-    _add_hat_product(c, w, w, M)
 
 
 @kernel
@@ -131,9 +114,10 @@ def _q_matrix(rho, w, Q):
 @kernel
 def pose_log(T, r):
     """Write Log(T) = (rho, omega) of the pose T, twelve numbers, to r (6,)."""
-    M = np.empty((3, 3))
-    _rotation_log(T, r[3:])
-    _inverse_left_jacobian_so3(r[3:], M)
+    q, M = np.empty(4), np.empty((3, 3))
+    _rotation_quaternion(T, q)
+    log_kernel(q, r[3:])
+    left_jacobian_inverse_kernel(r[3:], M)
     for i in range(3):
         r[i] = M[i, 0] * T[3] + M[i, 1] * T[7] + M[i, 2] * T[11]
 
@@ -142,7 +126,7 @@ def pose_log(T, r):
 def inverse_left_jacobian(r, J):
     """Write the inverse left Jacobian of SE(3) at the twist ``r`` (6,) to ``J`` (6, 6)."""
     M, Q = np.empty((3, 3)), np.empty((3, 3))
-    _inverse_left_jacobian_so3(r[3:], M)
+    left_jacobian_inverse_kernel(r[3:], M)
     _q_matrix(r[:3], r[3:], Q)
     for i in range(3):
         for j in range(3):
@@ -193,9 +177,6 @@ class PosePrior(Factor):
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return ambients[0], poses_from_states(self.cam_from_world)
-
-    def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
-        return self.linearize(inputs, begin, end, (-1,), out[:, :, None])
 
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

@@ -59,9 +59,6 @@ class PositionPrior(Factor):
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return ambients[0], self.cam_center_in_world
 
-    def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
-        return self.linearize(inputs, begin, end, (-1,), out[:, :, None])
-
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:

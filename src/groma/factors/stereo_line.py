@@ -27,27 +27,12 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.cameras import CameraModel
 from groma.cameras._dispatch import pinhole_parameters, pinhole_parameters_jacobian
-from groma.factors._examples import indices, make_example
+from groma.factors._examples import indices
 from groma.factors._factor import Example, Ref, Slot, register
-from groma.factors._rig import (
-    EXTRINSICS,
-    POSE,
-    CameraFactor,
-    as_camera_model,
-    check_baseline,
-    check_intrinsics,
-    clear_block,
-    clear_residual,
-    load_row,
-    put_line,
-    put_line_pose,
-    transform_line,
-    visible_scene,
-)
+from groma.factors._pixels import StereoFactor, load_row, pixel_example
+from groma.factors._rig import EXTRINSICS, POSE, clear_record, put_line, put_line_pose, transform_line
 from groma.factors.line_reprojection import endpoint_distance, image_line_norm, put_pinhole
-from groma.geometry._manifold import Euclidean
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -101,10 +86,7 @@ def _linearize_all(
                 if intrinsics_column >= 0:
                     put_pinhole(out, J_K, record, k, row, intrinsics_column)
         else:
-            clear_block(record, k, pose_column, 6)
-            clear_block(record, k, line_column, 6)
-            clear_block(record, k, intrinsics_column, size)
-            clear_residual(record, k)
+            clear_record(record, k, pose_column, line_column, 6, intrinsics_column, size)
             degenerate += 1
     return degenerate
 
@@ -112,7 +94,7 @@ def _linearize_all(
 # ------------------------------------------------------------------------------------------------------------- Public
 @register("stereo_line")
 @dataclass(frozen=True, kw_only=True)
-class StereoLine(CameraFactor):
+class StereoLine(StereoFactor):
     """Lines seen by rectified stereo pairs; residual: end point distances, left then right, in pixels.
 
     Degenerate, both segments together: where one of the two cameras has no image of the line (see
@@ -121,23 +103,11 @@ class StereoLine(CameraFactor):
 
     #: Lines in the world, any scale of (m, d).
     line: Ref
-    #: Parameters common to both cameras of a pair.
-    intrinsics: Ref
-    #: SIMPLE_PINHOLE or PINHOLE (or another model without distortion).
-    camera_model: CameraModel | str
     #: (N, 8) measured end points u1, v1, u2, v2 on the left, then on the right, in pixels.
     segments: FloatArray
-    #: Distance of the right camera from the left one along x, scene units: a number, or (N,).
-    baseline: float | FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 8),)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "camera_model", as_camera_model(self.camera_model))
-        as_camera_model(self.camera_model).require_pinhole()
-        check_baseline(self)
 
     @property
     def residual_size(self) -> int:  # noqa: D102
@@ -146,11 +116,8 @@ class StereoLine(CameraFactor):
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        camera = as_camera_model(self.camera_model)
-        check_intrinsics(camera, inputs[3])
-        arrays = (self.line.index, self.intrinsics.index, self.segments, np.atleast_1d(self.baseline))
-        arguments: tuple[Any, ...] = (camera.tag, *inputs, *arrays, begin, end, *columns, record)
-        return _linearize_all(*arguments)
+        arguments = self.arguments(inputs, self.line, self.segments, np.atleast_1d(self.baseline))
+        return _linearize_all(*arguments, begin, end, *columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
@@ -162,6 +129,4 @@ class StereoLine(CameraFactor):
             segments=rng.uniform(100.0, 500.0, (6, 8)),
             baseline=0.5,
         )
-        pinhole = np.array([[500.0, 520.0, 320.0, 240.0], [400.0, 380.0, 300.0, 200.0]])
-        manifolds = {"intrinsics": Euclidean(4, "intrinsics")}
-        return make_example(factor, rng, manifolds=manifolds, states={**visible_scene(rng), "intrinsics": pinhole})
+        return pixel_example(factor, rng)

@@ -22,27 +22,11 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.cameras import CameraModel
 from groma.cameras._dispatch import pinhole_parameters, pinhole_parameters_jacobian
-from groma.factors._examples import indices, make_example
+from groma.factors._examples import indices
 from groma.factors._factor import Example, Ref, Slot, register
-from groma.factors._rig import (
-    EXTRINSICS,
-    POSE,
-    CameraFactor,
-    as_camera_model,
-    check_baseline,
-    check_intrinsics,
-    clear_block,
-    clear_residual,
-    load_row,
-    put_parameters,
-    put_point,
-    put_point_pose,
-    transform_point,
-    visible_scene,
-)
-from groma.geometry._manifold import Euclidean
+from groma.factors._pixels import StereoFactor, load_row, pixel_example, put_parameters
+from groma.factors._rig import EXTRINSICS, POSE, clear_record, put_point, put_point_pose, transform_point
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -102,10 +86,7 @@ def _linearize_all(
                 if intrinsics_column >= 0:
                     put_parameters(J_params, record, k, row, intrinsics_column)
         else:
-            clear_block(record, k, pose_column, 6)
-            clear_block(record, k, point_column, 3)
-            clear_block(record, k, intrinsics_column, size)
-            clear_residual(record, k)
+            clear_record(record, k, pose_column, point_column, 3, intrinsics_column, size)
             degenerate += 1
     return degenerate
 
@@ -113,7 +94,7 @@ def _linearize_all(
 # ------------------------------------------------------------------------------------------------------------- Public
 @register("stereo_point")
 @dataclass(frozen=True, kw_only=True)
-class StereoPoint(CameraFactor):
+class StereoPoint(StereoFactor):
     """Points seen by rectified stereo pairs; residual: u left, v, u right in pixels.
 
     Degenerate: points not in front of the pair.
@@ -121,23 +102,11 @@ class StereoPoint(CameraFactor):
 
     #: Points in the world.
     point: Ref
-    #: Parameters common to both cameras of a pair.
-    intrinsics: Ref
-    #: SIMPLE_PINHOLE or PINHOLE (or another model without distortion).
-    camera_model: CameraModel | str
     #: (N, 3) measured u left, v, u right in pixels; the disparity is u left - u right.
     pixels: FloatArray
-    #: Distance of the right camera from the left one along x, scene units: a number, or (N,).
-    baseline: float | FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 3),)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "camera_model", as_camera_model(self.camera_model))
-        as_camera_model(self.camera_model).require_pinhole()
-        check_baseline(self)
 
     @property
     def residual_size(self) -> int:  # noqa: D102
@@ -146,11 +115,8 @@ class StereoPoint(CameraFactor):
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        camera = as_camera_model(self.camera_model)
-        check_intrinsics(camera, inputs[3])
-        arrays = (self.point.index, self.intrinsics.index, self.pixels, np.atleast_1d(self.baseline))
-        arguments: tuple[Any, ...] = (camera.tag, *inputs, *arrays, begin, end, *columns, record)
-        return _linearize_all(*arguments)
+        arguments = self.arguments(inputs, self.point, self.pixels, np.atleast_1d(self.baseline))
+        return _linearize_all(*arguments, begin, end, *columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
@@ -162,6 +128,4 @@ class StereoPoint(CameraFactor):
             pixels=rng.uniform(100.0, 500.0, (6, 3)),
             baseline=rng.uniform(0.3, 0.6, 6),
         )
-        pinhole = np.array([[500.0, 520.0, 320.0, 240.0], [400.0, 380.0, 300.0, 200.0]])
-        manifolds = {"intrinsics": Euclidean(4, "intrinsics")}
-        return make_example(factor, rng, manifolds=manifolds, states={**visible_scene(rng), "intrinsics": pinhole})
+        return pixel_example(factor, rng)

@@ -29,7 +29,18 @@ def matrices(value: npt.ArrayLike, rows: int, columns: int, name: str) -> FloatA
     return array
 
 
-def positive(value: float, name: str) -> float:
+def finite_rows(name: str, values: npt.ArrayLike, row: tuple[int, ...]) -> FloatArray:
+    """``values`` as finite float64 of shape (N, *row), refused with a ShapeError or an InputError otherwise."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape[1:] != row:
+        wanted = ", ".join(map(str, row))
+        raise ShapeError(f"{name} must have shape (N, {wanted}); got {array.shape}.")
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} must be finite. Remove the rows that are not.")
+    return array
+
+
+def not_negative(value: float, name: str) -> float:
     """``value``, refused with an InputError unless it is zero or greater."""
     if not value >= 0.0:
         raise InputError(f"{name} must be zero or greater; got {value}. Pass a tolerance such as 1e-9.")
@@ -37,17 +48,17 @@ def positive(value: float, name: str) -> float:
 
 
 def dot(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Dot product over the last axis, the leading axes broadcast."""
+    """Dot product (...) of vectors (..., k), the leading axes broadcast."""
     return np.asarray(np.einsum("...i,...i->...", first, second))
 
 
 def norm(vector: FloatArray) -> FloatArray:
-    """Euclidean length over the last axis."""
+    """Euclidean length (...) of vectors (..., k)."""
     return np.asarray(np.sqrt(dot(vector, vector)))
 
 
 def apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
-    """Matrix times vector, the leading axes broadcast."""
+    """Matrices (..., n, k) times vectors (..., k), the leading axes broadcast: (..., n)."""
     return np.asarray(np.einsum("...ij,...j->...i", matrix, vector))
 
 
@@ -60,7 +71,7 @@ def ratio(numerator: FloatArray, denominator: FloatArray, valid: BoolArray, othe
 
 
 def unit(vector: FloatArray) -> FloatArray:
-    """Vector divided by its length, without overflow or underflow; zero where it is zero or not finite."""
+    """Vectors (..., k) divided by their lengths, without overflow or underflow; zero where zero or not finite."""
     largest = np.abs(vector).max(axis=-1, keepdims=True, initial=0.0)
     scaled = ratio(vector, largest, (largest > 0.0) & np.isfinite(largest), 0.0)
     return scaled / np.maximum(norm(scaled), 1.0)[..., None]
@@ -73,9 +84,10 @@ def stack(*parts: FloatArray) -> FloatArray:
 
 
 def perpendicular(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two unit vectors b1, b2 such that (b1, b2, d/|d|) is a right-handed orthonormal frame.
+    """Two unit vectors b1, b2 (..., 3) such that (b1, b2, d/|d|) is a right-handed orthonormal frame.
 
-    b1 lies across the smallest component of d, so no direction is nearly singular.
+    b1 lies across the smallest component of d, so no direction is nearly singular. Charts have another rule, which
+    kernels can follow: see :mod:`groma.geometry._chart`.
     """
     axis = np.zeros(direction.shape)
     np.put_along_axis(axis, np.argmin(np.abs(direction), axis=-1)[..., None], 1.0, axis=-1)
@@ -84,7 +96,7 @@ def perpendicular(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def cofactor(matrix: FloatArray) -> FloatArray:
-    r"""Cofactor matrix of a 3x3 matrix, :math:`\det(N) N^{-\top}` also where N is singular.
+    r"""Cofactor matrices of matrices (..., 3, 3), :math:`\det(N) N^{-\top}` also where N is singular.
 
     Its rows are the cross products of the other two rows: ``cofactor(N) @ (a x b) = (N a) x (N b)``.
     """

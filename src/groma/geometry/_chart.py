@@ -18,13 +18,15 @@ Duff et al., *Building an Orthonormal Basis, Revisited*, Journal of Computer Gra
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import numpy as np
 
-from groma._numba import kernel
+from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError, ShapeError
+from groma.geometry import quaternion
 from groma.geometry._manifold import Manifold
 from groma.geometry.quaternion import exp_kernel, multiply_kernel
 
@@ -57,6 +59,15 @@ def turn_kernel(q, omega, left, step, out):
         out[j] *= k
 
 
+@loop
+def turn_and_add_all(state, delta, left, out):
+    """Turn the quaternions ``state[:, :4]`` by ``delta[:, :3]``, from the left or the right; add the last numbers."""
+    step = np.empty(4)
+    for i in range(state.shape[0]):
+        turn_kernel(state[i, :4], delta[i, :3], left, step, out[i, :4])
+        out[i, 4] = state[i, 4] + delta[i, 3]
+
+
 # ------------------------------------------------------------------------------------------------------------- Public
 def perpendicular(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two unit vectors (N, 3) perpendicular to unit vectors (N, 3), by the rule at the top of this module."""
@@ -77,6 +88,14 @@ def as_rows(array: FloatArray, columns: int, name: str) -> FloatArray:
     return rows
 
 
+def as_steps(state: FloatArray, delta: FloatArray, size: int, dof: int) -> tuple[FloatArray, FloatArray]:
+    """Return states (N, size) and increments (N, dof), or raise a ShapeError."""
+    state, delta = as_rows(state, size, "state"), as_rows(delta, dof, "delta")
+    if len(state) != len(delta):
+        raise ShapeError(f"state and delta must have as many rows; got {len(state)} and {len(delta)}.")
+    return state, delta
+
+
 def reject(bad: BoolArray, rows: FloatArray, expected: str, remedy: str) -> None:
     """Raise an InputError that names the first of the ``bad`` rows, if there is one."""
     if bad.any():
@@ -89,6 +108,12 @@ def unit(vectors: FloatArray) -> FloatArray:
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     scaled = vectors / largest
     return scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
+
+
+def turn_between(first: FloatArray, second: FloatArray, left: bool) -> FloatArray:
+    """Rotation vectors (N, 3) from unit quaternions (N, 4) to others, applied from the left or from the right."""
+    inverse = quaternion.conjugate(first)
+    return quaternion.log(quaternion.multiply(second, inverse) if left else quaternion.multiply(inverse, second))
 
 
 def random_lines(rng: np.random.Generator, count: int) -> FloatArray:
@@ -120,10 +145,7 @@ class Chart(Manifold):
         return as_rows(state, self.state_size, name)
 
     def _checked_step(self, state: FloatArray, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        state, delta = self._checked_state(state), as_rows(delta, self.dof, "delta")
-        if len(state) != len(delta):
-            raise ShapeError(f"state and delta must have as many rows; got {len(state)} and {len(delta)}.")
-        return state, delta
+        return as_steps(state, delta, self.state_size, self.dof)
 
     def _checked_pair(self, state: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
         state, other = self._checked_state(state), self._checked_state(other, "other")
@@ -142,3 +164,26 @@ class Chart(Manifold):
         largest = np.abs(ambient).max(axis=1, keepdims=True, initial=0.0)
         reject(largest[:, 0] == 0.0, ambient, f"A {self.kind} {names} must not be all zeros", remedy)
         return ambient / largest
+
+    # The loops of a chart take states, then what else they need, then the output.
+
+    def _retracted(self, loop: Callable, state: FloatArray, delta: FloatArray, *form: Any) -> FloatArray:
+        """Check states and increments, and let a loop write the states they lead to."""
+        state, delta = self._checked_step(state, delta)
+        out = np.empty_like(state)
+        loop(state, delta, *form, out)
+        return out
+
+    def _ambient_by(self, loop: Callable, state: FloatArray) -> FloatArray:
+        """Check states, and let a loop write what factors read of them, (N, ambient_size)."""
+        state = self._checked_state(state)
+        out = np.empty((len(state), self.ambient_size))
+        loop(state, out)
+        return out
+
+    def _basis_by(self, loop: Callable, state: FloatArray, *form: Any) -> FloatArray:
+        """Check states, and let a loop write their bases, (N, factor_columns, dof)."""
+        state = self._checked_state(state)
+        out = np.empty((len(state), self.factor_columns, self.dof))
+        loop(state, *form, out)
+        return out

@@ -19,7 +19,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.geometry import line3
-from groma.geometry._algebra import dot, norm, positive, ratio, stack, unit, vectors
+from groma.geometry._algebra import dot, norm, not_negative, ratio, stack, unit, vectors
 
 
 class LineRelation(IntEnum):
@@ -186,8 +186,8 @@ def closest_points(
     Y.-B. Jia, *Plücker coordinates for lines in the space*, section 4.2, has the same formulas.
     """
     first, second = np.broadcast_arrays(vectors(first, 6, "first"), vectors(second, 6, "second"))
-    positive(distance_tolerance, "distance_tolerance")
-    positive(parallel_sine, "parallel_sine")
+    not_negative(distance_tolerance, "distance_tolerance")
+    not_negative(parallel_sine, "parallel_sine")
     valid = line3.is_finite(first) & line3.is_finite(second)
     placeholder = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
     first = line3.normalize(np.where(valid[..., None], first, placeholder))
@@ -332,7 +332,7 @@ def meet_lines(
     pair = closest_points(first, second, distance_tolerance)
     first, second = np.broadcast_arrays(vectors(first, 6, "first"), vectors(second, 6, "second"))
     finite = np.isin(pair.status, (LineRelation.CROSSING, LineRelation.SKEW))
-    status = np.where(finite & (pair.sine < positive(min_sine, "min_sine")), LineRelation.PARALLEL, pair.status)
+    status = np.where(finite & (pair.sine < not_negative(min_sine, "min_sine")), LineRelation.PARALLEL, pair.status)
     finite &= status != LineRelation.PARALLEL
     parallel = status == LineRelation.PARALLEL
     d1, d2 = unit(first[..., 3:]), unit(second[..., 3:])

@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.geometry._algebra import dot, matrices, norm, perpendicular, positive, ratio, stack, unit, vectors
+from groma.geometry._algebra import dot, matrices, norm, not_negative, perpendicular, ratio, stack, unit, vectors
 from groma.geometry.so3 import hat
 
 #: A line whose |d| is below this fraction of |m| counts as a line at infinity.
@@ -203,7 +203,8 @@ def is_line(line: FloatArray, tolerance: float = 1e-9) -> BoolArray:
     line = vectors(line, 6, "line")
     finite = np.asarray(np.isfinite(line).all(axis=-1))
     usable = np.where(finite[..., None], line, 0.0)
-    return finite & (usable != 0.0).any(axis=-1) & (np.abs(klein_residual(usable)) <= positive(tolerance, "tolerance"))
+    on_quadric = np.abs(klein_residual(usable)) <= not_negative(tolerance, "tolerance")
+    return finite & (usable != 0.0).any(axis=-1) & on_quadric
 
 
 def closest_line(vector: FloatArray) -> FloatArray:
@@ -286,7 +287,7 @@ def same_line(first: FloatArray, second: FloatArray, tolerance: float = 1e-9, or
     apart = norm(first - second)
     if not oriented:
         apart = np.minimum(apart, norm(first + second))
-    return (apart <= positive(tolerance, "tolerance")) & (norm(first) > 0.0) & (norm(second) > 0.0)
+    return (apart <= not_negative(tolerance, "tolerance")) & (norm(first) > 0.0) & (norm(second) > 0.0)
 
 
 # --------------------------------------------------------------------------------------------------- Points, distances

@@ -98,10 +98,7 @@ class CartesianLine(Chart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move lines (N, 6) by (alpha1, alpha2, beta1, beta2) (N, 4); m is orthogonal to d afterwards."""
-        state, delta = self._checked_step(state, delta)
-        out = np.empty_like(state)
-        _retract_all(state, delta, out)
-        return out
+        return self._retracted(_retract_all, state, delta)
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         """Increments (N, 4) that lead to the lines ``other``.
@@ -146,10 +143,7 @@ class CartesianLine(Chart):
 
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (m, d) with respect to the increment, (N, 6, 4)."""
-        state = self._checked_state(state)
-        out = np.empty((len(state), 6, 4))
-        _basis_all(state, out)
-        return out
+        return self._basis_by(_basis_all, state)
 
     def random(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Lines with unit direction, 0.5 to 2 units from the origin."""

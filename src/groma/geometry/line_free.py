@@ -35,20 +35,12 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.geometry import quaternion
-from groma.geometry._chart import Chart, random_lines, reject, turn_kernel
+from groma.geometry._chart import Chart, random_lines, reject, turn_and_add_all, turn_between
 from groma.geometry.line_orthonormal import moment_frame
 from groma.geometry.quaternion import to_matrix_kernel
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
-@loop
-def _retract_all(state, delta, left, out):
-    step = np.empty(4)
-    for i in range(state.shape[0]):
-        turn_kernel(state[i, :4], delta[i, :3], left, step, out[i, :4])
-        out[i, 4] = state[i, 4] + delta[i, 3]
-
-
 @kernel
 def _ambient(state, R, out):
     to_matrix_kernel(state, R)
@@ -127,10 +119,7 @@ class FreeLineRight(Chart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Turn the frame by delta1..3 and add delta4 to d_L, which may become negative."""
-        state, delta = self._checked_step(state, delta)
-        out = np.empty_like(state)
-        _retract_all(state, delta, self._left, out)
-        return out
+        return self._retracted(turn_and_add_all, state, delta, self._left)
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         """Increments (N, 4) that lead to the oriented lines ``other``.
@@ -139,19 +128,15 @@ class FreeLineRight(Chart):
         opposite sign of d_L, the way is to the nearer form.
         """
         state, other = self._checked_pair(state, other)
-        inverse = quaternion.conjugate(state[:, :4])
-        relative = quaternion.multiply(inverse, other[:, :4])
+        relative = quaternion.multiply(quaternion.conjugate(state[:, :4]), other[:, :4])
         turned = np.abs(relative[:, :1]) > 2.0 * np.abs(relative[:, 3:])
         goal = np.where(turned, _other_side(other), other)
-        way = quaternion.multiply(goal[:, :4], inverse) if self._left else quaternion.multiply(inverse, goal[:, :4])
-        return np.column_stack([quaternion.log(way), goal[:, 4] - state[:, 4]])
+        turn = turn_between(state[:, :4], goal[:, :4], self._left)
+        return np.column_stack([turn, goal[:, 4] - state[:, 4]])
 
     def ambient(self, state: FloatArray) -> FloatArray:
         """(m, d) = (d_L x2, x1), (N, 6), with a unit direction."""
-        state = self._checked_state(state)
-        out = np.empty((len(state), 6))
-        _ambient_all(state, out)
-        return out
+        return self._ambient_by(_ambient_all, state)
 
     def from_ambient(self, ambient: FloatArray) -> FloatArray:
         """State (N, 5) of Plücker lines (m, d) of any scale, with d_L >= 0.
@@ -183,10 +168,7 @@ class FreeLineRight(Chart):
 
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (m, d) with respect to the increment, (N, 6, 4)."""
-        state = self._checked_state(state)
-        out = np.empty((len(state), 6, 4))
-        _basis_all(state, self._left, out)
-        return out
+        return self._basis_by(_basis_all, state, self._left)
 
     def random(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Lines 0.5 to 2 units from the origin."""

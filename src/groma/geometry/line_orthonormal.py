@@ -41,19 +41,18 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.geometry import quaternion
-from groma.geometry._chart import Chart, perpendicular, random_lines, turn_kernel, unit
+from groma.geometry._chart import (
+    Chart,
+    perpendicular,
+    random_lines,
+    turn_and_add_all,
+    turn_between,
+    unit,
+)
 from groma.geometry.quaternion import to_matrix_kernel
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
-@loop
-def _retract_all(state, delta, left, out):
-    step = np.empty(4)
-    for i in range(state.shape[0]):
-        turn_kernel(state[i, :4], delta[i, :3], left, step, out[i, :4])
-        out[i, 4] = state[i, 4] + delta[i, 3]
-
-
 @kernel
 def _ambient(state, R, out):
     to_matrix_kernel(state, R)
@@ -140,10 +139,7 @@ class OrthonormalLineRight(Chart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Turn U by theta1..3 and add theta4 to phi."""
-        state, delta = self._checked_step(state, delta)
-        out = np.empty_like(state)
-        _retract_all(state, delta, self._left, out)
-        return out
+        return self._retracted(turn_and_add_all, state, delta, self._left)
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         """Increments (N, 4) that lead to the oriented lines ``other``.
@@ -156,17 +152,13 @@ class OrthonormalLineRight(Chart):
         # Component k is the scalar part of the way to the form turned about axis k. The factor keeps the stored form
         # unless another one is clearly nearer.
         goal = _turned(other, np.argmax(np.abs(relative) * [1.0, 1.0, 1.0, 2.0], axis=1))
-        inverse = quaternion.conjugate(state[:, :4])
-        way = quaternion.multiply(goal[:, :4], inverse) if self._left else quaternion.multiply(inverse, goal[:, :4])
         phi = goal[:, 4] - state[:, 4]
-        return np.column_stack([quaternion.log(way), phi - 2 * np.pi * np.round(phi / (2 * np.pi))])
+        turn = turn_between(state[:, :4], goal[:, :4], self._left)
+        return np.column_stack([turn, phi - 2 * np.pi * np.round(phi / (2 * np.pi))])
 
     def ambient(self, state: FloatArray) -> FloatArray:
         """(m, d) = (cos(phi) u1, sin(phi) u2), (N, 6)."""
-        state = self._checked_state(state)
-        out = np.empty((len(state), 6))
-        _ambient_all(state, out)
-        return out
+        return self._ambient_by(_ambient_all, state)
 
     def from_ambient(self, ambient: FloatArray) -> FloatArray:
         """State (N, 5) of Plücker lines (m, d) of any scale, with 0 <= phi <= pi/2.
@@ -199,10 +191,7 @@ class OrthonormalLineRight(Chart):
 
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (m, d) with respect to the increment, (N, 6, 4)."""
-        state = self._checked_state(state)
-        out = np.empty((len(state), 6, 4))
-        _basis_all(state, self._left, out)
-        return out
+        return self._basis_by(_basis_all, state, self._left)
 
     def random(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Lines 0.5 to 2 units from the origin."""

@@ -24,7 +24,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.geometry._algebra import dot, norm, positive, ratio, stack, unit, vectors
+from groma.geometry._algebra import dot, norm, not_negative, ratio, stack, unit, vectors
 
 
 def _first_sign(vector: FloatArray) -> FloatArray:
@@ -140,4 +140,4 @@ def same_plane(first: FloatArray, second: FloatArray, tolerance: float = 1e-9, o
     apart = norm(first - second)
     if not oriented:
         apart = np.minimum(apart, norm(first + second))
-    return (apart <= positive(tolerance, "tolerance")) & (norm(first) > 0.0) & (norm(second) > 0.0)
+    return (apart <= not_negative(tolerance, "tolerance")) & (norm(first) > 0.0) & (norm(second) > 0.0)

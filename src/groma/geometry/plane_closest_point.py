@@ -67,10 +67,7 @@ class ClosestPointPlane(Chart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Add delta (N, 3). A step that ends at the origin gives zeros, which factors count as degenerate."""
-        state, delta = self._checked_step(state, delta)
-        out = np.empty_like(state)
-        _retract_all(state, delta, out)
-        return out
+        return self._retracted(_retract_all, state, delta)
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         """Differences of the foot points, (N, 3)."""
@@ -79,10 +76,7 @@ class ClosestPointPlane(Chart):
 
     def ambient(self, state: FloatArray) -> FloatArray:
         """(n, w) = (c, -c.c), (N, 4)."""
-        state = self._checked_state(state)
-        out = np.empty((len(state), 4))
-        _ambient_all(state, out)
-        return out
+        return self._ambient_by(_ambient_all, state)
 
     def from_ambient(self, ambient: FloatArray) -> FloatArray:
         """Foot points (N, 3) of planes (n, w) of any scale and sign.
@@ -104,10 +98,7 @@ class ClosestPointPlane(Chart):
 
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (n, w) with respect to the increment, (N, 4, 3)."""
-        state = self._checked_state(state)
-        out = np.empty((len(state), 4, 3))
-        _basis_all(state, out)
-        return out
+        return self._basis_by(_basis_all, state)
 
     def random(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Planes 0.5 to 2 units from the origin."""

@@ -59,10 +59,7 @@ class NormalOffsetPlane(Chart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Turn the normals by delta1, delta2 and add delta3 to the offsets."""
-        state, delta = self._checked_step(state, delta)
-        out = np.empty_like(state)
-        _retract_all(state, delta, out)
-        return out
+        return self._retracted(_retract_all, state, delta)
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         """Increments (N, 3) that lead to the planes ``other``.
@@ -105,10 +102,7 @@ class NormalOffsetPlane(Chart):
 
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (n, w) with respect to the increment, (N, 4, 3)."""
-        state = self._checked_state(state)
-        out = np.empty((len(state), 4, 3))
-        _basis_all(state, out)
-        return out
+        return self._basis_by(_basis_all, state)
 
     def random(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Planes 0.5 to 2 units from the origin."""

@@ -28,8 +28,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.geometry import quaternion
-from groma.geometry._chart import Chart, random_planes, turn_kernel, unit
+from groma.geometry._chart import Chart, random_planes, turn_between, turn_kernel, unit
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -75,18 +74,12 @@ class QuaternionPlaneLeft(Chart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Turn the 4-vectors (N, 4) by delta (N, 3)."""
-        state, delta = self._checked_step(state, delta)
-        out = np.empty_like(state)
-        _retract_all(state, delta, self._left, out)
-        return out
+        return self._retracted(_retract_all, state, delta, self._left)
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         """Increments (N, 3), of length at most pi, that lead to the planes ``other`` or their negatives."""
         state, other = self._checked_pair(state, other)
-        inverse = quaternion.conjugate(state)
-        return quaternion.log(
-            quaternion.multiply(other, inverse) if self._left else quaternion.multiply(inverse, other)
-        )
+        return turn_between(state, other, self._left)
 
     def ambient(self, state: FloatArray) -> FloatArray:
         """(n, w) of unit norm as a 4-vector: the state itself."""
@@ -104,10 +97,7 @@ class QuaternionPlaneLeft(Chart):
 
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (n, w) with respect to the increment, (N, 4, 3)."""
-        state = self._checked_state(state)
-        out = np.empty((len(state), 4, 3))
-        _basis_all(state, self._left, out)
-        return out
+        return self._basis_by(_basis_all, state, self._left)
 
     def random(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Planes 0.5 to 2 units from the origin."""

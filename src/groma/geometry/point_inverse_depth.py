@@ -64,10 +64,7 @@ class InverseDepthPoint(Chart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move the points by steps (N, 3) in scene units; the anchors stay."""
-        state, delta = self._checked_step(state, delta)
-        out = np.empty_like(state)
-        _retract_all(state, delta, LARGEST_GROWTH, out)
-        return out
+        return self._retracted(_retract_all, state, delta, LARGEST_GROWTH)
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         """Increments (N, 3) that lead to the points ``other``; their anchors do not matter.

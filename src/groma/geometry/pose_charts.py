@@ -31,9 +31,8 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.errors import ShapeError
 from groma.geometry import quaternion, se3
-from groma.geometry._chart import as_rows, reject
+from groma.geometry._chart import as_rows, as_steps, reject
 from groma.geometry._manifold import Manifold
 from groma.geometry.quaternion import exp_kernel, multiply_kernel, to_matrix_kernel
 from groma.geometry.so3 import left_jacobian_kernel
@@ -141,13 +140,6 @@ class _PoseChart(Manifold):
         return np.hstack([quaternion.normalize(rng.normal(size=(count, 4))), rng.normal(size=(count, 3))])
 
 
-def _checked(state: FloatArray, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    state, delta = as_rows(state, 7, "state"), as_rows(delta, 6, "delta")
-    if len(state) != len(delta):
-        raise ShapeError(f"state and delta must have as many rows; got {len(state)} and {len(delta)}.")
-    return state, delta
-
-
 class PoseLeft(_PoseChart):
     """Increments in the camera frame, ``"left"``: T <- Exp(xi) T. The default."""
 
@@ -155,7 +147,7 @@ class PoseLeft(_PoseChart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move poses (N, 7) by left twists (N, 6)."""
-        state, delta = _checked(state, delta)
+        state, delta = as_steps(state, delta, 7, 6)
         out = np.empty_like(state)
         _retract_left_all(state, delta, out)
         return out
@@ -176,7 +168,7 @@ class PoseRight(_PoseChart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move poses (N, 7) by right twists (N, 6)."""
-        state, delta = _checked(state, delta)
+        state, delta = as_steps(state, delta, 7, 6)
         out = np.empty_like(state)
         _retract_right_all(state, delta, True, out)
         return out
@@ -197,7 +189,7 @@ class PoseBody(_PoseChart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move poses (N, 7) by (dt, dphi) (N, 6)."""
-        state, delta = _checked(state, delta)
+        state, delta = as_steps(state, delta, 7, 6)
         out = np.empty_like(state)
         _retract_right_all(state, delta, False, out)
         return out

@@ -20,7 +20,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.geometry import line3
-from groma.geometry._algebra import apply, cofactor, matrices, norm, positive, ratio, stack, vectors
+from groma.geometry._algebra import apply, cofactor, matrices, norm, not_negative, ratio, stack, vectors
 from groma.geometry.so3 import hat, vee
 from groma.geometry.transform import Rigid, rotation_and_translation
 
@@ -111,7 +111,7 @@ def project_primal_matrix(camera: FloatArray, primal: FloatArray) -> FloatArray:
 
 
 def visibility(line_in_cam: FloatArray, min_distance: float = 1e-9, min_sine: float = 1e-9) -> IntArray:
-    """Whether lines (..., 6) in the camera frame have an image line; :class:`LineVisibility` per line.
+    """Find out which lines have an image line, and why others have none.
 
     Parameters
     ----------
@@ -121,12 +121,22 @@ def visibility(line_in_cam: FloatArray, min_distance: float = 1e-9, min_sine: fl
         Distance from the camera centre up to which a line counts as passing through it, scene units.
     min_sine : float
         Sine of the angle between the plane of line and centre and the plane z = 0 up to which they count as one.
+
+    Returns
+    -------
+    (...) int
+        Members of :class:`LineVisibility`.
+
+    Raises
+    ------
+    ShapeError, InputError
+        If the last axis is not 6, or a tolerance is negative.
     """
     line = vectors(line_in_cam, 6, "line_in_cam")
     moment = line[..., :3]
     usable = line3.is_finite(line)
-    through = line3.distance_to_origin(line) <= positive(min_distance, "min_distance")
-    flat = np.hypot(moment[..., 0], moment[..., 1]) <= positive(min_sine, "min_sine") * norm(moment)
+    through = line3.distance_to_origin(line) <= not_negative(min_distance, "min_distance")
+    flat = np.hypot(moment[..., 0], moment[..., 1]) <= not_negative(min_sine, "min_sine") * norm(moment)
     return np.select(
         [~usable, through, flat],
         [LineVisibility.INVALID, LineVisibility.THROUGH_CENTER, LineVisibility.IN_PRINCIPAL_PLANE],

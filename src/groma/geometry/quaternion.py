@@ -68,7 +68,7 @@ def exp_kernel(w, q):
 
 @kernel
 def log_kernel(q, w):
-    """Rotation vector, of length at most pi, of the unit quaternion q (4,); q and -q give the same; zeros for zeros."""
+    """Rotation vector, of length at most pi, of q (4,), of any length; q and -q give the same; zeros for zeros."""
     sign = 1.0 if q[3] >= 0.0 else -1.0
     x, y, z, c = sign * q[0], sign * q[1], sign * q[2], sign * q[3]
     s2 = x * x + y * y + z * z

@@ -58,18 +58,6 @@ def compose_kernel(A, B, out):
         out[4 * i + 3] += A[4 * i + 3]
 
 
-@kernel
-def adjoint_kernel(T, Ad):
-    """Adjoint (6, 6), order (rho, omega), of a row-major 3x4 matrix T (12,)."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        for c in range(3):
-            Ad[i, c] = T[4 * i + c]
-            Ad[i + 3, c + 3] = T[4 * i + c]
-            Ad[i + 3, c] = 0.0
-            Ad[i, c + 3] = T[4 * j + 3] * T[4 * k + c] - T[4 * k + 3] * T[4 * j + c]
-
-
 # ----------------------------------------------------------------------------------------------------------- Public
 
 
@@ -177,6 +165,11 @@ def log(pose: FloatArray) -> FloatArray:
     -------
     (..., 6) float64
         Twists (rho, omega) with a rotation of at most pi; at pi the sign of the axis is arbitrary.
+
+    Raises
+    ------
+    ShapeError
+        If the last axis is not 7.
     """
     pose = _poses(pose)
     omega = quaternion.log(pose[..., :4])

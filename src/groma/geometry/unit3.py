@@ -20,7 +20,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
-from groma.geometry._chart import as_rows, perpendicular, perpendicular_kernel, unit
+from groma.geometry._chart import as_rows, as_steps, perpendicular, perpendicular_kernel, unit
 from groma.geometry._manifold import Manifold
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -102,9 +102,7 @@ class Unit3(Manifold):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move unit vectors (N, 3) by angles (N, 2), radians, along the tangent basis."""
-        state, delta = as_rows(state, 3, "state"), as_rows(delta, 2, "delta")
-        if len(state) != len(delta):
-            raise ShapeError(f"state and delta must have as many rows; got {len(state)} and {len(delta)}.")
+        state, delta = as_steps(state, delta, 3, 2)
         out = np.empty_like(state)
         _retract_all(state, delta, out)
         return out

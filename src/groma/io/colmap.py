@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""COLMAP models, binary and text, through pycolmap. The only file that imports pycolmap.
+"""COLMAP models, binary and text, through pycolmap.
 
 Kept: rigs, sensors, frames, images, 2D points with and without a 3D point, points with colour, error and track. Images
 and frames without a pose are left out: COLMAP does not write them to files either.
@@ -13,20 +13,18 @@ from __future__ import annotations
 
 import os
 import zlib  # noqa: F401 - must be loaded before pycolmap, whose wheel (4.2) otherwise breaks it: heap corruption
-from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from groma import cameras as camera_models
-from groma._typing import FloatArray, IntArray
+from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError
 from groma.io._atomic import atomic_output
-from groma.io._colmap_structure import check_binary_model
-from groma.io._numbering import numbered_keypoints
-from groma.io._reading import existing, reading
+from groma.io._colmap_files import check_binary_model, find_model
+from groma.io._reading import reading
+from groma.io._to_pycolmap import to_pycolmap
 from groma.io.limap import Structures, read_beside, write_beside
 from groma.scene import Cameras, Frames, Images, Keypoints, PointObservations, Points, Rigs, Scene, Sensors
 from groma.scene.camera import CAMERA, OTHER
@@ -35,32 +33,11 @@ if TYPE_CHECKING:
     import pycolmap
 
 _KIND = "COLMAP model"
-_FILES = ("cameras", "images", "points3D")
 _NO_POINT = 2**64 - 1
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 # Reading
-
-
-def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "text"]]:
-    """Return the folder of the model at ``path``, ``path/sparse`` or ``path/sparse/0``, and its form.
-
-    Raises
-    ------
-    FileFormatError
-        If none of them holds a complete model.
-    """
-    root = existing(path)
-    places = [root, root / "sparse", root / "sparse" / "0"]
-    for place in places:
-        for suffix, form in ((".bin", "binary"), (".txt", "text")):
-            if all((place / f"{name}{suffix}").is_file() for name in _FILES):
-                return place, form  # type: ignore[return-value]
-    raise FileFormatError(
-        f"No COLMAP model in {', '.join(map(str, places))}: expected cameras, images and points3D, "
-        "all .bin or all .txt."
-    )
 
 
 def read_colmap(path: str | os.PathLike[str]) -> Scene:
@@ -305,119 +282,6 @@ def write_colmap(
         draft.mkdir()
         (reconstruction.write_binary if form == "binary" else reconstruction.write_text)(str(draft))
         write_beside(scene, draft, form, like)
-
-
-def to_pycolmap(scene: Scene) -> pycolmap.Reconstruction:
-    """Return a :class:`pycolmap.Reconstruction` of cameras, rigs, frames, images and points of a scene."""
-    import pycolmap
-
-    reconstruction = pycolmap.Reconstruction()
-    for row, number in enumerate(scene.cameras.ids.tolist()):
-        name, params = _colmap_camera(scene.cameras, row)
-        reconstruction.add_camera(
-            pycolmap.Camera(
-                camera_id=number,
-                model=name,
-                width=int(scene.cameras.width[row]),
-                height=int(scene.cameras.height[row]),
-                params=params,
-            )
-        )
-    _add_rigs(pycolmap, reconstruction, scene)
-    pixels, keypoint_idx = _numbered(scene)
-    _add_images(pycolmap, reconstruction, scene, pixels)
-    _add_points(pycolmap, reconstruction, scene, keypoint_idx)
-    return reconstruction
-
-
-def _colmap_camera(cameras: Cameras, row: int) -> tuple[str, list[float]]:
-    name, params = cameras.models[row], cameras.params_of(row).tolist()
-    if name == "BAL":
-        return "RADIAL", [params[0], cameras.width[row] / 2, cameras.height[row] / 2, *params[1:]]
-    colmap_name = camera_models.model(name).colmap_name
-    if colmap_name is None:
-        raise InputError(
-            f"Camera {cameras.ids[row]} has model {name}, which COLMAP does not know. Write a groma archive (.npz)."
-        )
-    return colmap_name, params
-
-
-def _sensor(pycolmap: Any, sensors: Sensors, row: int) -> Any:
-    kind = pycolmap.SensorType.CAMERA if sensors.kind[row] == CAMERA else pycolmap.SensorType.IMU
-    return pycolmap.sensor_t(kind, int(sensors.sensor_ids[row]))
-
-
-def _add_rigs(pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: Scene) -> None:
-    sensors = scene.sensors
-    for rig_idx, number in enumerate(scene.rigs.ids.tolist()):
-        rig = pycolmap.Rig(rig_id=number)
-        rows = np.flatnonzero(sensors.rig_idx == rig_idx)
-        for row in rows[np.argsort(-sensors.is_reference[rows], kind="stable")].tolist():
-            if sensors.is_reference[row]:
-                rig.add_ref_sensor(_sensor(pycolmap, sensors, row))
-            else:
-                pose = _rigid(pycolmap, sensors.cam_from_rig[row]) if sensors.has_pose[row] else None
-                rig.add_sensor(_sensor(pycolmap, sensors, row), pose)
-        reconstruction.add_rig(rig)
-
-
-def _add_images(pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: Scene, pixels: list[FloatArray]) -> None:
-    images = scene.images
-    for frame_idx, number in enumerate(scene.frames.ids.tolist()):
-        frame = pycolmap.Frame(frame_id=number, rig_id=int(scene.rigs.ids[scene.frames.rig_idx[frame_idx]]))
-        frame.rig_from_world = _rigid(pycolmap, scene.frames.rig_from_world[frame_idx])
-        for row in np.flatnonzero(images.frame_idx == frame_idx).tolist():
-            sensor = _sensor(pycolmap, scene.sensors, int(images.sensor_idx[row]))
-            frame.add_data_id(pycolmap.data_t(sensor, int(images.ids[row])))
-        reconstruction.add_frame(frame)
-    for row, number in enumerate(images.ids.tolist()):
-        image = pycolmap.Image(
-            name=images.names[row],
-            keypoints=pixels[row],
-            camera_id=int(scene.cameras.ids[images.camera_idx[row]]),
-            image_id=number,
-        )
-        image.frame_id = int(scene.frames.ids[images.frame_idx[row]])
-        reconstruction.add_image(image)
-    for number in scene.frames.ids.tolist():
-        reconstruction.register_frame(number)
-
-
-def _numbered(scene: Scene) -> tuple[list[FloatArray], IntArray]:
-    """Return the 2D points of every image in the order of their numbers, and the number of each observation."""
-    centre = np.zeros((scene.num_cameras, 2))
-    for row, name in enumerate(scene.cameras.models):
-        if name == "BAL":  # its pixels count from the image centre, COLMAP's from the corner
-            centre[row] = scene.cameras.width[row] / 2, scene.cameras.height[row] / 2
-    tables = (scene.point_observations, scene.keypoints)
-    image_idx = np.concatenate([table.image_idx for table in tables])
-    pixel = np.concatenate([table.pixel for table in tables]) + centre[scene.images.camera_idx[image_idx]]
-    order, ends, number = numbered_keypoints(scene)
-    pixels = [pixel[order[start:end]] for start, end in pairwise(ends.tolist())]
-    return pixels, number[: len(scene.point_observations)]
-
-
-def _add_points(pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: Scene, keypoint_idx: IntArray) -> None:
-    seen, points = scene.point_observations, scene.points
-    order = np.lexsort((keypoint_idx, seen.image_idx, seen.point_idx))
-    ends = np.searchsorted(seen.point_idx[order], np.arange(len(points) + 1)).tolist()
-    image_ids = scene.images.ids[seen.image_idx[order]].tolist()
-    keypoints = keypoint_idx[order].tolist()
-    images = {number: reconstruction.image(number) for number in scene.images.ids.tolist()}
-    numbers = points.ids.tolist()
-    for row, number in enumerate(numbers):
-        span = range(ends[row], ends[row + 1])
-        elements = [pycolmap.TrackElement(image_ids[k], keypoints[k]) for k in span]
-        point = pycolmap.Point3D(
-            xyz=points.xyz[row], color=points.color[row], error=points.error[row], track=pycolmap.Track(elements)
-        )
-        reconstruction.add_point3D_with_id(number, point)
-        for k in span:
-            images[image_ids[k]].set_point3D_for_point2D(keypoints[k], number)
-
-
-def _rigid(pycolmap: Any, pose: FloatArray) -> Any:
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:4]), pose[4:])
 
 
 __all__ = ["find_model", "from_pycolmap", "read_colmap", "to_pycolmap", "write_colmap"]

@@ -39,6 +39,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import FileFormatError, InputError
 from groma.io._atomic import atomic_output
+from groma.io._colmap_files import find_model
 from groma.io._limap_files import (
     NAMES,
     PLANE,
@@ -50,10 +51,10 @@ from groma.io._limap_files import (
     Lines3d,
     Structure2d,
     Structures,
-    read_files,
-    write_files,
 )
 from groma.io._limap_from_scene import Rows, from_scene, group_ids, int_ids
+from groma.io._limap_read import read_files
+from groma.io._limap_write import write_files
 from groma.io._reading import existing, reading
 from groma.io.archive import read_archive, write_archive
 from groma.scene import Directions, LineObservations, Lines, Planes, Relations, Scene
@@ -96,10 +97,13 @@ def structures_of(source: str | os.PathLike[str]) -> Structures | None:
     Parameters
     ----------
     source : path
-        What :func:`groma.io.read_scene` read: the folder of a model, or the folder it lies in.
-    """
-    from groma.io.colmap import find_model
+        What :func:`groma.io.read_scene` read: the folder of a model, or the folder it lies in. A file has none.
 
+    Raises
+    ------
+    FileFormatError
+        If the folder holds no COLMAP model, or the structures are damaged.
+    """
     if not Path(source).is_dir():
         return None
     folder = find_model(source)[0] / "structures"

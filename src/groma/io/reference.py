@@ -26,8 +26,8 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import FileFormatError
-from groma.evaluation.lines import Geometry
 from groma.io._reading import existing, reading
+from groma.io.geometry import Geometry
 
 _KIND = "reference"
 #: PLY's names of numbers.

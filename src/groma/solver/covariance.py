@@ -26,8 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from groma._numba import loop
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ProblemError
 from groma.geometry._manifold import Manifold
 from groma.geometry.conversions import conversion_jacobian
@@ -36,16 +35,16 @@ from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.problem import Problem
 from groma.solver._blas import one_blas_thread
-from groma.solver._datum import FreeMotions, constrained, free_motions, held_coordinates
+from groma.solver._datum import constrained, free_motions, held_coordinates
 from groma.solver._fronts import Fronts
+from groma.solver._landmarks import Landmarks
 from groma.solver._modes import MODES, divided, scaled, smallest
+from groma.solver._transformation import Transformation, datum_weights, transformation
 from groma.solver.linear import Blocks
 from groma.solver.schur import ReducedSystem
 
 #: A scaled variance above this means a direction that the data do not determine.
 LARGEST_VARIANCE = 1e11
-#: A landmark whose scaled normal matrix has a smaller eigenvalue than this has an undetermined direction.
-LANDMARK_TOLERANCE = 1e-12
 #: A variable that moves by more than this in a scaled mode of zero cost is loose; so many may be, of all unknowns.
 LOOSE, MAX_LOOSE = 1e-6, 0.2
 #: Relative step of the central differences of functions of variables.
@@ -53,69 +52,6 @@ STEP = 1e-6
 
 #: A variable: the name of its group, and its index.
 Variable = tuple[str, int]
-
-# ---------------------------------------------------------------------------------------------------------- Kernels
-
-
-@loop
-def _multiply_incidences(pointer, N, W, dl, dc, out):
-    """Out = N W for every incidence, with N = -V^-1."""
-    for p in range(pointer.shape[0] - 1):
-        for k in range(pointer[p], pointer[p + 1]):
-            for r in range(dl):
-                for c in range(dc):
-                    total = 0.0
-                    for m in range(dl):
-                        total += N[(p * dl + r) * dl + m] * W[(k * dl + m) * dc + c]
-                    out[k, r, c] = total
-
-
-@loop
-def _add_outer(B_k, sigma, B_m, twice, half, out):
-    """Out += B_k sigma B_m^T, and its transpose if ``twice``."""
-    dl, da = B_k.shape
-    db = B_m.shape[1]
-    for r in range(dl):
-        for e in range(db):
-            total = 0.0
-            for c in range(da):
-                total += B_k[r, c] * sigma[c, e]
-            half[r, e] = total
-    for r in range(dl):
-        for s in range(dl):
-            total = 0.0
-            for e in range(db):
-                total += half[r, e] * B_m[s, e]
-            out[r, s] += total
-            if twice:
-                out[s, r] += total
-
-
-@loop
-def _add_within(landmarks, pointer, pair_slots, pair_pointer, B, sigma, out):
-    """Add B Sigma B^T over the pairs of incidences of one class; ``sigma`` holds the blocks by slot."""
-    half = np.zeros((out.shape[1], sigma.shape[2]))
-    for i in range(landmarks.shape[0]):
-        p = landmarks[i]
-        s = pair_pointer[p]
-        for k in range(pointer[p], pointer[p + 1]):
-            for m in range(k, pointer[p + 1]):
-                _add_outer(B[k], sigma[pair_slots[s]], B[m], m > k, half, out[i])
-                s += 1
-
-
-@loop
-def _add_between(landmarks, pointer_a, pointer_b, pair_slots, pair_pointer, B_a, B_b, sigma, out):
-    """Add B_a Sigma_ab B_b^T and its transpose over the pairs of incidences of two classes."""
-    half = np.zeros((out.shape[1], sigma.shape[2]))
-    for i in range(landmarks.shape[0]):
-        p = landmarks[i]
-        s = pair_pointer[p]
-        for k in range(pointer_b[p], pointer_b[p + 1]):
-            for m in range(pointer_a[p], pointer_a[p + 1]):
-                _add_outer(B_a[m], sigma[pair_slots[s]], B_b[k], True, half, out[i])
-                s += 1
-
 
 # ----------------------------------------------------------------------------------------------------------- Public
 
@@ -179,13 +115,14 @@ class Covariances:
         states = to_solver_order(layout)
         self._equations = equations = NormalEquations(layout, Workers(1))
         self._system = ReducedSystem(equations)
+        self._landmarks = Landmarks(layout, equations, self._system)
         equations.linearize(states, equations.prepare(states))
         self._system.eliminate(0.0)
         self._position = {e.group: np.argsort(e.order) for e in layout.eliminated}
         self._held, self._held_landmarks = held_coordinates(layout)
-        self._open = [self._open_landmarks(e) for e in range(len(layout.eliminated))]
-        self._B: dict[tuple[int, int], FloatArray] = {}
-        self._datum: _Datum | None = None
+        self._open = [self._landmarks.undetermined(e, held) for e, held in enumerate(self._held_landmarks)]
+        self._datum: Transformation | None = None
+        self._sigma: Blocks = {}
         if layout.kept:
             self._system.assemble(0.0)
             self._unseen = [
@@ -193,17 +130,6 @@ class Covariances:
             ]
             with one_blas_thread():
                 self._invert(gauge, datum)
-
-    def _open_landmarks(self, e: int) -> BoolArray:
-        """Return which landmarks have a direction that their own observations leave open."""
-        dof = self._layout.eliminated[e].dof
-        V = self._equations.V[e].reshape(-1, dof, dof).copy()
-        steps = np.arange(dof)
-        V[:, steps, steps] += self._held_landmarks[e].reshape(-1, dof)
-        size = np.sqrt(V[:, steps, steps])
-        empty = (size == 0.0).any(axis=1)
-        size[size == 0.0] = 1.0
-        return empty | (np.linalg.eigvalsh(V / size[:, :, None] / size[:, None, :])[:, 0] < LANDMARK_TOLERANCE)
 
     # Inversion
 
@@ -225,7 +151,9 @@ class Covariances:
                 raise self._deficient(S, gauge)
         self._sigma = divided(layout, inverse, self._size)
         if motions is not None and motions.count:
-            self._datum = self._transformation(motions, G, datum)
+            weights = datum_weights(layout, datum, self._open)
+            parts = self._landmarks, self._solve, motions, G, self._held_landmarks
+            self._datum = transformation(layout, *parts, weights)
 
     def _inverse(self, S: Blocks) -> Blocks | None:
         """Return the inverse of a scaled system on its pattern, None where it has no rank."""
@@ -245,11 +173,8 @@ class Covariances:
             raise self._deficient(S, gauge, modes.num_null)
         for c, kept in enumerate(self._layout.kept):
             self._unseen[c] |= np.asarray(loose)[kept.start : kept.start + kept.count * kept.width]
-        for e, eliminated in enumerate(self._layout.eliminated):
-            moved = self._seen_from_kept(e, null / self._size[:, None])
-            V = self._equations.V[e].reshape(-1, eliminated.dof, eliminated.dof)
-            size = np.sqrt(np.einsum("nii->ni", V))
-            self._open[e] |= (np.abs(moved) * size[:, :, None] > LOOSE).any(axis=(1, 2))
+        for e in range(len(self._open)):
+            self._open[e] |= self._landmarks.moved(e, null / self._size[:, None], LOOSE)
         return constrained(self._layout, S, null)
 
     def _deficient(self, S: Blocks, gauge: str, count: int | None = None) -> ProblemError:
@@ -262,109 +187,10 @@ class Covariances:
             remedy = "groma.solver.diagnosis.diagnose(problem) names what is not determined; drop it, or add priors."
         return ProblemError(f"The normal equations are rank deficient by {number}{what}. {remedy}")
 
-    def _transformation(self, motions: FreeMotions, G: FloatArray, datum: Mapping[str, npt.ArrayLike] | None) -> _Datum:
-        """Set up the S-transformation to the frame that the datum names."""
-        layout = self._layout
-        D_kept, D_landmarks = self._weights(datum)
-        G_landmarks = [
-            np.where(held[:, None], 0.0, part)
-            for part, held in zip(motions.landmarks, self._held_landmarks, strict=True)
-        ]
-        target = D_kept[:, None] * G
-        local = []
-        for e, eliminated in enumerate(layout.eliminated):
-            weighted = (D_landmarks[e][:, None] * G_landmarks[e]).reshape(eliminated.count, eliminated.dof, -1)
-            local.append(-(self._inverses(e) @ weighted))
-            if D_landmarks[e].any():
-                for c, incidences in eliminated.incidences.items():
-                    landmark = np.repeat(np.arange(eliminated.count), np.diff(incidences.pointer))
-                    parts = np.swapaxes(self._incidence(e, c), 1, 2) @ weighted[landmark]
-                    kept = layout.kept[c]
-                    view = target[kept.start : kept.start + kept.count * kept.width]
-                    np.add.at(view.reshape(kept.count, kept.width, -1), incidences.block, parts)
-        Y = self._solve(target)
-        Y_landmarks = [part + self._seen_from_kept(e, Y) for e, part in enumerate(local)]
-        weight = G.T @ (D_kept[:, None] * G)
-        inner = G.T @ (D_kept[:, None] * Y)
-        for e, part in enumerate(G_landmarks):
-            weight += part.T @ (D_landmarks[e][:, None] * part)
-            inner += part.T @ (D_landmarks[e][:, None] * Y_landmarks[e].reshape(part.shape))
-        values = np.linalg.eigvalsh(weight / np.sqrt(np.outer(np.diag(weight), np.diag(weight))))
-        if not (np.diag(weight) > 0).all() or not values[0] > 1e-14:
-            raise InputError(
-                "The datum does not fix the frame: some motion of the whole scene moves none of its coordinates. Name "
-                "more variables, for example all poses or all points."
-            )
-        Q = np.linalg.inv(weight).astype(np.float64)
-        K = Q @ inner @ Q
-        A_landmarks = [y.reshape(g.shape) @ Q for y, g in zip(Y_landmarks, G_landmarks, strict=True)]
-        return _Datum(G, Y @ Q, G_landmarks, A_landmarks, K, D_kept, D_landmarks, Q)
-
-    def _weights(self, datum: Mapping[str, npt.ArrayLike] | None) -> tuple[FloatArray, list[FloatArray]]:
-        """Weights of all unknowns, flat: of the kept ones, and of the landmarks by eliminated group."""
-        layout = self._layout
-        kept = np.zeros(layout.num_kept_unknowns)
-        landmarks = [np.zeros(e.count * e.dof) for e in layout.eliminated]
-        known = [m.group for c in layout.kept for m in c.members] + [e.group for e in layout.eliminated]
-        for name in datum or {}:
-            if name not in known:
-                raise InputError(f"The datum names {name!r}; the groups with free variables are {sorted(known)}.")
-        for c in layout.kept:
-            blocks = kept[c.start : c.start + c.count * c.width].reshape(c.count, c.width)
-            for member in c.members:
-                weight = self._weight(member.group, 1.0 if datum is None else datum.get(member.group, 0.0))
-                rows = member.blocks(np.arange(len(weight)))
-                blocks[rows, member.offset : member.offset + member.dof] = weight
-        for e, eliminated in enumerate(layout.eliminated):
-            weight = self._weight(eliminated.group, 0.0 if datum is None else datum.get(eliminated.group, 0.0))
-            landmarks[e] = np.where(self._open[e][:, None], 0.0, weight[eliminated.order]).reshape(-1)
-        return kept, landmarks
-
-    def _weight(self, group: str, value: npt.ArrayLike) -> FloatArray:
-        variables = self.problem.variables[group]
-        shape = (len(variables), variables.manifold.dof)
-        try:
-            weight = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)
-        except ValueError:
-            raise InputError(f"The datum of {group!r} must broadcast to {shape}; got {np.shape(value)}.") from None
-        if not (weight >= 0).all():
-            raise InputError(f"The weights of the datum must not be negative; those of {group!r} are.")
-        return weight
-
-    # Products
-
-    def _inverses(self, e: int) -> FloatArray:
-        """-V^-1 of every landmark, (count, dof, dof)."""
-        dof = self._layout.eliminated[e].dof
-        return self._system.N[e].reshape(-1, dof, dof)
-
-    def _incidence(self, e: int, c: int) -> FloatArray:
-        """Return B = -V^-1 W of every incidence, (incidences, dof, width)."""
-        if (e, c) not in self._B:
-            eliminated, width = self._layout.eliminated[e], self._layout.kept[c].width
-            incidences = eliminated.incidences[c]
-            B = np.empty((len(incidences.block), eliminated.dof, width))
-            _multiply_incidences(
-                incidences.pointer, self._system.N[e], self._equations.W[e][c], eliminated.dof, width, B
-            )
-            self._B[e, c] = B
-        return self._B[e, c]
-
     def _solve(self, rhs: FloatArray) -> FloatArray:
         """Return S^-1 times the columns of ``rhs``, S with the constraints of the gauge."""
         with one_blas_thread():
             return self._fronts.solve(rhs / self._size[:, None]) / self._size[:, None]
-
-    def _seen_from_kept(self, e: int, X: FloatArray) -> FloatArray:
-        """Return B X for the landmarks of a group, (count, dof, columns of X)."""
-        eliminated = self._layout.eliminated[e]
-        out = np.zeros((eliminated.count, eliminated.dof, X.shape[1]))
-        for c, incidences in eliminated.incidences.items():
-            kept = self._layout.kept[c]
-            blocks = X[kept.start : kept.start + kept.count * kept.width].reshape(kept.count, kept.width, -1)
-            landmark = np.repeat(np.arange(eliminated.count), np.diff(incidences.pointer))
-            np.add.at(out, landmark, self._incidence(e, c) @ blocks[incidences.block])
-        return out
 
     # What is asked for
 
@@ -372,6 +198,11 @@ class Covariances:
         """Return the covariances (len(index), dof, dof) of variables of a group; all of them by default.
 
         Variables held constant have covariance zero, variables that are not determined NaN.
+
+        Raises
+        ------
+        InputError
+            If there is no such group, or no such variable in it.
         """
         index = self._checked(group, index)
         dof = self.problem.variables[group].manifold.dof
@@ -405,19 +236,8 @@ class Covariances:
         return np.where(unseen[:, part].any(axis=1)[:, None, None], np.nan, sigma)
 
     def _of_landmarks(self, e: int, landmarks: IntArray) -> FloatArray:
-        eliminated = self._layout.eliminated[e]
-        dof = eliminated.dof
-        out = -self._inverses(e)[landmarks]
-        for c, incidences in eliminated.incidences.items():
-            _add_within(
-                landmarks, incidences.pointer, incidences.pair_slots, incidences.pair_pointer,
-                self._incidence(e, c), self._sigma[c, c], out,
-            )  # fmt: skip
-        for (a, b), (slots, pointer) in eliminated.cross.items():
-            _add_between(
-                landmarks, eliminated.incidences[a].pointer, eliminated.incidences[b].pointer, slots, pointer,
-                self._incidence(e, a), self._incidence(e, b), self._sigma[a, b], out,
-            )  # fmt: skip
+        dof = self._layout.eliminated[e].dof
+        out = self._landmarks.covariances(e, landmarks, self._sigma)
         if self._datum is not None:
             rows = landmarks[:, None] * dof + np.arange(dof)
             out += self._datum.correction(self._datum.G_landmarks[e][rows], self._datum.A_landmarks[e][rows])
@@ -514,11 +334,11 @@ class Covariances:
                     continue
                 p = int(self._position[group][i])
                 for c, incidences in eliminated.incidences.items():
-                    kept, B = layout.kept[c], self._incidence(e, c)
+                    kept, B = layout.kept[c], self._landmarks.incidence(e, c)
                     for k in range(incidences.pointer[p], incidences.pointer[p + 1]):
                         first = kept.start + int(incidences.block[k]) * kept.width
                         R[first : first + kept.width, at] += B[k].T
-                local = -self._inverses(e)[p]
+                local = -self._landmarks.inverses(e)[p]
                 out[at, at] += local
                 for other, place in seen.items():  # the same landmark asked for twice
                     if other == (group, i):
@@ -575,26 +395,6 @@ class Covariances:
                 columns.append((ends[0] - ends[1]) / (2 * step))
         J = np.stack(columns, axis=1)
         return Derived(center, J @ self.joint(variables) @ J.T)
-
-
-@dataclass(frozen=True)
-class _Datum:
-    """The S-transformation: rows of G and of A = Y Q of all unknowns, and K; see :mod:`groma.solver._datum`."""
-
-    G: FloatArray
-    A: FloatArray
-    G_landmarks: list[FloatArray]
-    A_landmarks: list[FloatArray]
-    K: FloatArray
-    #: Weights D, and (G^T D G)^-1.
-    D: FloatArray
-    D_landmarks: list[FloatArray]
-    Q: FloatArray
-
-    def correction(self, G: FloatArray, A: FloatArray) -> FloatArray:
-        """What P M P^T differs from M, for rows (n, dof, k) of G and A."""
-        cross = A @ np.swapaxes(G, 1, 2)
-        return G @ self.K @ np.swapaxes(G, 1, 2) - cross - np.swapaxes(cross, 1, 2)
 
 
 __all__ = ["Covariances", "Derived"]
