@@ -7,8 +7,8 @@ and anything that grows faster than the number of images shows.
 
     python benchmarks/map_scaling.py IMAGES --model MODEL --copies 1 2 4 8
 
-Each size runs in a process of its own. Columns: images, points, lines, seconds in all and per image, peak memory; then
-the seconds of every stage per image.
+Each size runs in a process of its own, with one thread unless told otherwise. Columns: images, points, lines, planes,
+seconds of processor time in all and per image, peak memory; then the same seconds of every stage per image.
 """
 
 import argparse
@@ -67,10 +67,10 @@ def measure(images, model, copies, threads):
     from groma.pipelines.map import MapOptions, map_images
 
     scene = repeat(read_scene(model).points_only(), copies)
-    seconds, last = {}, ["reading", time.perf_counter()]
+    seconds, last = {}, ["reading", time.process_time()]
 
     def progress(stage, done, total):
-        now = time.perf_counter()
+        now = time.process_time()
         seconds[last[0]] = seconds.get(last[0], 0.0) + now - last[1]
         last[:] = stage, now
 
@@ -80,13 +80,14 @@ def measure(images, model, copies, threads):
             link = photographs / name
             link.parent.mkdir(parents=True, exist_ok=True)
             link.symlink_to((Path(images) / name.split("/", 1)[1]).resolve())
-        start = time.perf_counter()
+        start = last[1] = time.process_time()
         result = map_images(photographs, Path(folder) / "work", scene, MapOptions(threads=threads), progress)
-        total = time.perf_counter() - start
+        total = time.process_time() - start
     return {
         "images": scene.num_images,
         "points": result.scene.num_points,
         "lines": result.scene.num_lines,
+        "planes": result.scene.num_planes,
         "seconds": total,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "stages": seconds,
@@ -98,27 +99,27 @@ def main():
     parser.add_argument("images")
     parser.add_argument("--model", required=True)
     parser.add_argument("--copies", type=int, nargs="+", default=[1, 2, 4])
-    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--row", action="store_true", help="print one row as JSON; used by the benchmark itself")
     arguments = parser.parse_args()
     if arguments.row:
         print(json.dumps(measure(arguments.images, arguments.model, arguments.copies[0], arguments.threads)))
         return
     rows = []
+    limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(arguments.threads))
     for copies in [arguments.copies[0], *arguments.copies]:  # the first run compiles, and is not counted
         command = [sys.executable, __file__, arguments.images, "--model", arguments.model, "--row"]
         command += ["--threads", str(arguments.threads), "--copies", str(copies)]
-        rows.append(
-            json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
-        )
-    print(f"{'images':>7} {'points':>8} {'lines':>7} {'seconds':>8} {'s/image':>8} {'peak MB':>8}")
+        said = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ | limits).stdout
+        rows.append(json.loads(said.splitlines()[-1]))
+    print(f"{'images':>7} {'points':>8} {'lines':>7} {'planes':>7} {'seconds':>8} {'s/image':>8} {'peak MB':>8}")
     for row in rows[1:]:
         per_image = row["seconds"] / row["images"]
         print(
-            f"{row['images']:7d} {row['points']:8d} {row['lines']:7d} {row['seconds']:8.1f} {per_image:8.3f} "
-            f"{row['peak_mb']:8.0f}"
+            f"{row['images']:7d} {row['points']:8d} {row['lines']:7d} {row['planes']:7d} {row['seconds']:8.1f} "
+            f"{per_image:8.3f} {row['peak_mb']:8.0f}"
         )
-    print("\nseconds per image, by stage")
+    print("\nseconds of processor time per image, by stage")
     for stage in rows[-1]["stages"]:
         values = " ".join(f"{row['stages'].get(stage, 0.0) / row['images']:8.4f}" for row in rows[1:])
         print(f"{stage:32s} {values}")

@@ -24,6 +24,7 @@ def noise_of(points):
     return np.broadcast_to(SIGMA**2 * np.eye(3), (len(points), 3, 3))
 
 
+@pytest.mark.kernels
 def test_fit_and_its_covariance():
     """Errors of the fit in its three degrees of freedom, whitened by its covariance, have mean square 3."""
     truth = np.array([2.0, -1.0, 2.0, 0.6]) / 3.0
@@ -43,6 +44,7 @@ def test_fit_and_its_covariance():
     assert np.mean(chi) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.kernels
 def test_fit_of_points_on_a_line_leaves_a_tilt_open():
     points = np.outer(np.linspace(0, 1, 20), [1.0, 2.0, 0.5])
     assert tilt_sigma(fit_plane(points, noise_of(points)).covariance) > 1.0
@@ -75,6 +77,7 @@ def test_no_plane_in_clutter_and_none_in_a_blob():
     assert len(find_planes(blob, noise_of(blob))) == 0
 
 
+@pytest.mark.kernels
 def test_coplanar_walls_far_apart_are_two_planes():
     rng = np.random.default_rng(4)
     points = np.concatenate([wall(rng, 200, 0, 0.0), wall(rng, 200, 0, 0.0, shift=(40.0, 0.0))])
@@ -83,6 +86,7 @@ def test_coplanar_walls_far_apart_are_two_planes():
     assert sorted(found.support) == pytest.approx([190, 190], abs=12)
 
 
+@pytest.mark.kernels
 def test_segments_make_planes_too():
     rng = np.random.default_rng(5)
     ends = rng.uniform(0, 4, (40, 2, 2))
@@ -107,6 +111,7 @@ def test_points_on_segments_are_no_evidence_of_their_own():
     assert len(find_planes(points, noise_of(points), segments, noise, carriers=owner)) == 0
 
 
+@pytest.mark.kernels
 def test_mixture_separates_members_from_clutter():
     rng = np.random.default_rng(7)
     members, clutter = np.abs(rng.normal(0, 0.01, 200)), rng.uniform(0, 0.1, 100)

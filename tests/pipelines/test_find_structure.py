@@ -86,6 +86,30 @@ def test_corridor_has_its_walls_and_directions():
         assert len(values) == len(getattr(relations, name))
 
 
+def test_progress_and_what_is_left_out():
+    """Every stage is said and goes forward; each direction that is kept is shared by lines."""
+    _, scene = measured("corridor", "small")
+    said: list[tuple[str, int, int]] = []
+    found = find_structure(scene, progress=lambda *event: said.append(event))
+    assert list(dict.fromkeys(stage for stage, _, _ in said)) == [
+        "finding planes",
+        "finding directions",
+        "finding what lies on what",
+    ]
+    settled = [done for stage, done, total in said if stage == "finding planes" and total > 1]
+    assert len(settled) >= found.num_planes and settled == sorted(settled)
+    assert all(0 <= done <= total for _, done, total in said)
+    lines = np.bincount(found.relations.line_along_direction[:, 1], minlength=found.num_directions)
+    assert (lines >= 2).all()
+    # With a gate that no line passes, directions have nothing on them and are not kept.
+    strict = detect_structure(scene, StructureOptions(min_probability=0.999999))
+    assert strict.scene.num_directions == len(strict.directions)
+    lines = np.bincount(strict.scene.relations.line_along_direction[:, 1], minlength=strict.scene.num_directions)
+    assert (lines >= 2).all()
+    assert strict.scene.num_directions < found.num_directions
+    assert len(strict.probability["line_along_direction"]) == len(strict.scene.relations.line_along_direction)
+
+
 def test_points_on_lines():
     truth, scene = measured("holistic", 50)
     found = {tuple(pair) for pair in find_structure(scene).relations.point_on_line}

@@ -383,7 +383,7 @@ def test_empty_maps_say_why(world):
     assert alone.fate_counts()[Fate.NO_NEIGHBOR] == len(world.segments[0])
     assert "share too few points" in explain(alone)
     short = map_lines(world.scene, world.segments, options=MapLinesOptions(min_length=1e4))
-    assert "min_length" in explain(short)
+    assert "--min-length" in explain(short)
 
 
 def test_inputs_are_checked(world):

@@ -17,10 +17,27 @@ from __future__ import annotations
 
 import numpy as np
 
+from groma._numba import loop
 from groma._typing import FloatArray, IntArray
 from groma.errors import ShapeError
 
 _ROUNDS = 30
+
+
+@loop
+def _maximise(noise, clutter, owner, count, pooled, common, rounds, share, probability):
+    """Expectation and maximisation, by turns: probabilities (N,) and shares (K,)."""
+    total = np.zeros(len(share))
+    for _ in range(rounds):
+        total[:] = 0.0
+        for n in range(len(noise)):
+            k = owner[n]
+            inner = share[k] * noise[n]
+            p = inner / (inner + (1.0 - share[k]) * clutter[n])
+            probability[n] = p
+            total[k] += p
+        for k in range(len(share)):
+            share[k] = (total[k] + pooled * common) / (count[k] + pooled)
 
 
 def inlier_probability(
@@ -71,11 +88,8 @@ def inlier_probability(
         common, pooled = 0.5, 2.0
     share = np.full(len(band), 0.5)
     probability = np.zeros(len(distance))
-    for _ in range(_ROUNDS):
-        inner = share[owner] * noise
-        probability = inner / (inner + (1.0 - share[owner]) * clutter)
-        # Some features in advance keep small structures from extremes.
-        share = (np.bincount(owner, weights=probability, minlength=len(band)) + pooled * common) / (count + pooled)
+    # Some features in advance keep small structures from extremes.
+    _maximise(noise, clutter, owner.astype(np.int64), count, pooled, common, _ROUNDS, share, probability)
     return probability, share
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
+from groma.estimators._plane_loops import fit_loop
 from groma.geometry._algebra import perpendicular, vectors
 
 
@@ -70,25 +71,12 @@ def fit_plane(
     weights = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
     if (weights > 0).sum() < 3:
         raise InputError(f"A plane needs at least 3 points of positive weight; got {int((weights > 0).sum())}.")
-    normal = None
-    for _ in range(iterations):
-        if normal is None:
-            variance = np.trace(covariances, axis1=1, axis2=2) / 3.0
-        else:
-            variance = np.einsum("i,nij,j->n", normal, covariances, normal)
-        precision = weights / np.maximum(variance, np.finfo(float).tiny)
-        center = precision @ points / precision.sum()
-        away = points - center
-        _, axes = np.linalg.eigh((precision[:, None] * away).T @ away)
-        before, normal = normal, axes[:, 0]
-        if before is not None and abs(float(before @ normal)) > 1.0 - 1e-15:
-            break
-    assert normal is not None
-    variance = np.einsum("i,nij,j->n", normal, covariances, normal)
-    precision = weights / np.maximum(variance, np.finfo(float).tiny)
-    center = precision @ points / precision.sum()
-    away = points - center
-    normal = normal * (1.0 if normal[np.argmax(np.abs(normal))] > 0 else -1.0)
+    packed = np.ascontiguousarray(covariances[:, *np.triu_indices(3)])
+    plane, center, precision = np.empty(4), np.empty(3), np.empty(len(points))
+    fit_loop(
+        np.ascontiguousarray(points), packed, np.arange(len(points)), weights, iterations, plane, center, precision
+    )
+    normal, away = plane[:3], points - center
     basis = np.stack(perpendicular(normal))
     slope = np.column_stack([away @ basis.T, np.ones(len(away))])
     information = (precision[:, None] * slope).T @ slope
@@ -100,7 +88,7 @@ def fit_plane(
     motion[:3, :2], motion[3, :2], motion[3, 2] = basis.T, -basis @ center, 1.0
     count = int((weights > 0).sum())
     chi = float((precision * (away @ normal) ** 2).sum()) / max(count - 3, 1)
-    return PlaneFit(np.append(normal, -normal @ center), motion @ inner @ motion.T, chi)
+    return PlaneFit(plane, motion @ inner @ motion.T, chi)
 
 
 def tilt_sigma(covariance: FloatArray) -> FloatArray:

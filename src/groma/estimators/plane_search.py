@@ -15,35 +15,24 @@ A segment takes part with its two end points; points on it count no more once it
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 from scipy import stats
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.estimators._plane_candidates import Features, from_neighbours, from_segments, squares
-from groma.estimators.association import inlier_probability
-from groma.estimators.plane_fit import PlaneFit, fit_plane, tilt_sigma
-from groma.geometry._algebra import norm, perpendicular, vectors
+from groma.estimators._plane_growth import BAND, RANK, Grower, Grown, connected_to
+from groma.geometry._algebra import norm, vectors
 
 #: Neighbours that make a candidate, and that improve it.
 _NEIGHBOURS = 32
 #: Features that score candidates.
 _MAX_SCORED = 6000
-#: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
-BAND = 8.0
-#: Links between inliers, as a multiple of the distance to the eighth neighbour.
-LINK = 3.0
-_RANK = 8
-#: Rounds of refinement of a candidate on its growing support.
-_GROW_STEPS = 10
-#: Rounds with the probability of membership as the weight.
-_POLISH_STEPS = 3
 #: A candidate is the same as a plane tried before if it passes its support within so many standard deviations.
 _SAME = 2.0
 #: Candidates with less than this part of the best score are not looked at.
@@ -99,19 +88,6 @@ class PlaneSet:
         return len(self.planes)
 
 
-@dataclass(frozen=True)
-class _Grown:
-    """A plane that is kept."""
-
-    fit: PlaneFit
-    share: float
-    band: float
-    log10_false_alarms: float
-    #: The features on it, and those taken out with it.
-    rows: IntArray
-    taken: IntArray
-
-
 def find_planes(
     points: FloatArray,
     covariances: FloatArray,
@@ -119,6 +95,7 @@ def find_planes(
     segment_covariances: FloatArray | None = None,
     options: PlaneOptions | None = None,
     carriers: IntArray | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> PlaneSet:
     """Find planes in points and segments; see the module.
 
@@ -137,6 +114,8 @@ def find_planes(
     carriers : (N,) int, optional
         The segment that each point lies on, -1 for none. With a segment on a plane its points are there too, and say
         nothing more about whether there is a plane.
+    progress : callable, optional
+        Called with the number of candidates that are settled, and of all.
 
     Returns
     -------
@@ -171,7 +150,8 @@ def find_planes(
     partner = np.arange(len(places))
     partner[len(points) :] = len(points) + (np.arange(2 * len(ends)) ^ 1)
     labels = np.full(len(places), -1)
-    found = _extract(places, noise, partner, carrier, len(points), labels, options) if len(places) >= 4 else []
+    say = progress or (lambda done, total: None)
+    found = _extract(places, noise, partner, carrier, len(points), labels, options, say) if len(places) >= 4 else []
     fits = [grown.fit for grown in found]
     end_label = labels[len(points) :].reshape(-1, 2)
     return PlaneSet(
@@ -195,14 +175,15 @@ def _extract(
     num_points: int,
     labels: IntArray,
     options: PlaneOptions,
-) -> list[_Grown]:
+    progress: Callable[[int, int], None],
+) -> list[Grown]:
     """Take planes out one after the other; ``labels`` is filled."""
     rng = np.random.default_rng(options.seed)
     near = min(_NEIGHBOURS, len(places))
     distance, found_near = KDTree(places).query(places, k=near)
     neighbours = np.asarray(found_near, dtype=np.int64)
     packed = np.ascontiguousarray(noise[:, *np.triu_indices(3)])
-    features = Features(places, noise, partner, carrier, np.maximum(distance[:, min(_RANK, near - 1)], 1e-12), packed)
+    features = Features(places, noise, partner, carrier, np.maximum(distance[:, min(RANK, near - 1)], 1e-12), packed)
     gate = float(stats.chi2.ppf(options.level, 1))
     extent = float(np.median(norm(places - np.median(places, axis=0)))) + 1e-300
     first = from_neighbours(features, neighbours, gate, rng)
@@ -213,17 +194,19 @@ def _extract(
         scored = np.sort(rng.choice(len(places), _MAX_SCORED, replace=False))
     score = _score(features, candidates, scored, gate, extent)
     log_tried = np.log10(10.0 * (len(first) + num_pairs) + 1.0)  # a refined candidate stands for about ten
-    found: list[_Grown] = []
+    found: list[Grown] = []
     alive, total = (
         (score > 0.0).sum(axis=1) * (len(places) / len(scored)) >= 0.5 * options.min_support,
         score.sum(axis=1),
     )
+    grower = Grower(features, neighbours, gate, float(log_tried), options)
     failures = 0
     while failures < _PATIENCE and alive.any() and len(found) < options.max_planes:
+        progress(len(alive) - int(alive.sum()), len(alive))
         best = int(np.argmax(np.where(alive, total, -1.0)))
         if total[best] <= _LEAST_SCORE * total.max(initial=1.0):
             break
-        grown, plane, rows = _grow(features, candidates[best], labels, gate, log_tried, options)
+        grown, plane, rows = grower.grow(candidates[best], labels)
         alive[best] = False
         failures += 1
         if grown is not None:
@@ -236,8 +219,11 @@ def _extract(
         if len(rows):
             # Candidates that would end at the same plane are not tried again.
             some = features.places[rows[:: max(1, len(rows) // 64)]]
-            height = np.abs(some @ candidates[:, :3].T + candidates[:, 3])
-            alive &= np.median(height, axis=0) > _SAME * np.median(features.spread(plane[:3], rows))
+            left = np.flatnonzero(alive)
+            alive[left] = _median_above(
+                np.abs(some @ candidates[left, :3].T + candidates[left, 3]),
+                _SAME * float(np.median(features.spread(plane[:3], rows))),
+            )
     return found
 
 
@@ -258,122 +244,14 @@ def _score(
     return out
 
 
-def _grow(
-    features: Features, plane: FloatArray, labels: IntArray, gate: float, log_tried: float, options: PlaneOptions
-) -> tuple[_Grown | None, FloatArray, IntArray]:
-    """Refine a candidate on its largest connected part and judge it: what is kept, where it went, and its support."""
-    free = np.flatnonzero(labels < 0)
-    fit, rows = None, np.zeros(0, np.int64)
-    for step in range(_GROW_STEPS):
-        squared = (features.places[free] @ plane[:3] + plane[3]) ** 2 / features.spread(plane[:3], free) ** 2
-        if step == 1:  # what is far away stays away
-            free, squared = free[squared < 50.0 * gate], squared[squared < 50.0 * gate]
-        # The first rounds reach farther: the candidate is not yet exact.
-        inside = squared < (4.0 if step < 2 else 1.0) * gate
-        rows = _largest_part(features, free[inside])
-        if np.count_nonzero(_independent(features, rows)) < options.min_support:
-            return None, plane, rows
-        height = features.places[rows] @ plane[:3] + plane[3]
-        # Weights that fall with the distance lead to where the layer is densest, not to the middle of what it cuts off.
-        weight = 1.0 / (1.0 + height**2 / features.spread(plane[:3], rows) ** 2) ** 2
-        fit = fit_plane(features.places[rows], features.covariances[rows], weight)
-        moved = features.places[rows] @ fit.plane[:3] + fit.plane[3] - height * np.sign(fit.plane[:3] @ plane[:3])
-        plane = fit.plane
-        if step > 1 and np.abs(moved).max() < 0.1 * np.median(features.spread(plane[:3], rows)):
-            break
-    assert fit is not None
-    if tilt_sigma(fit.covariance) > options.max_tilt:
-        return None, plane, rows
-    band = BAND * float(np.median(features.spread(plane[:3], rows)))
-    layer, share = rows, np.zeros(1)
-    for _ in range(_POLISH_STEPS):
-        height = np.abs(features.places @ plane[:3] + plane[3])
-        # Judged against all that is near, taken or not: what lies on a plane beside this one speaks against it.
-        layer = np.flatnonzero(height < band)
-        layer = layer[connected_to(features.places[rows], features.places[layer], features.spacing[layer], plane)]
-        spread = features.spread(plane[:3], layer)
-        probability, share = inlier_probability(height[layer], spread, np.zeros(len(layer), np.int64), np.array([band]))
-        weight = np.where(height[layer] < 3.0 * spread, probability, 0.0)
-        if np.count_nonzero(weight) < 3:
-            return None, plane, rows
-        # Membership as the weight: all of the plane where it is clean, its densest part where it is not.
-        fit = fit_plane(features.places[layer], features.covariances[layer], weight)
-        plane = fit.plane
-    if share[0] < options.min_share:
-        return None, plane, rows
-    alarm = _log10_false_alarms(features, plane, rows, gate) + log_tried
-    if alarm > np.log10(options.max_false_alarms):
-        return None, plane, rows
-    # The whole layer is taken out: relief so near to a plane cannot be told from it.
-    taken = layer[labels[layer] < 0]
-    grown = _Grown(fit, float(share[0]), band, float(alarm), rows, np.union1d(rows, taken))
-    return grown, plane, rows
-
-
-def _log10_false_alarms(features: Features, plane: FloatArray, rows: IntArray, gate: float) -> float:
-    """Chance that as many features of the neighbourhood lie in the layer as do, base-10 logarithm."""
-    center = features.places[rows].mean(axis=0)
-    radius = float(np.quantile(norm(features.places[rows] - center), 0.9))
-    ball = np.flatnonzero(norm(features.places - center) < radius)
-    if len(ball) == 0:
-        return 0.0
-    inside = np.intersect1d(ball, rows, assume_unique=True)
-    inside = inside[_independent(features, inside)]
-    ball = np.union1d(inside, ball[(features.carrier[ball] < 0)])
-    chance = np.minimum(np.sqrt(gate) * features.spread(plane[:3], ball) / max(radius, 1e-300), 1.0)
-    return float(stats.poisson.logsf(len(inside) - 4, chance.sum())) / np.log(10.0)  # three fix the plane
-
-
-def _independent(features: Features, rows: IntArray) -> BoolArray:
-    """Which of some features are not there just because the segment they lie on is."""
-    present = np.zeros(len(features.places) + 1, dtype=bool)
-    present[rows] = True
-    return ~present[features.carrier[rows]]
-
-
-def _largest_part(features: Features, rows: IntArray) -> IntArray:
-    """Rows of the largest part of some features that is connected in space; ends of a segment always are."""
-    if len(rows) < 3:
-        return rows
-    count = min(_RANK + 1, len(rows))
-    distance, nearest = KDTree(features.places[rows]).query(features.places[rows], k=count)
-    other = np.asarray(nearest, dtype=np.int64)
-    first = np.repeat(np.arange(len(rows)), count - 1)
-    second, apart = other[:, 1:].ravel(), distance[:, 1:].ravel()
-    linked = apart <= LINK * np.maximum(features.spacing[rows[first]], features.spacing[rows[second]])
-    position = np.full(len(features.places), -1)
-    position[rows] = np.arange(len(rows))
-    mate = position[features.partner[rows]]
-    has_mate = np.flatnonzero(mate >= 0)
-    edges = np.concatenate([first[linked], has_mate]), np.concatenate([second[linked], mate[has_mate]])
-    graph = coo_matrix((np.ones(len(edges[0])), edges), shape=(len(rows), len(rows)))
-    _, part = connected_components(graph, directed=False)
-    return rows[part == np.bincount(part).argmax()]
-
-
-def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:
-    """Whether tested points, projected to a plane, are near the support of the plane.
-
-    Parameters
-    ----------
-    places : (M, 3) float64
-        Support of the plane.
-    tested : (N, 3) float64
-        Points to test.
-    spacing : (N,) float64
-        Distance at which each has its neighbours.
-    plane : (4,) float64
-        Unit normal and offset.
-
-    Returns
-    -------
-    (N,) bool
-    """
-    if len(tested) == 0:
-        return np.zeros(0, dtype=bool)
-    basis = np.stack(perpendicular(plane[:3]), axis=1)
-    distance, _ = KDTree(places @ basis).query(tested @ basis)
-    return distance <= LINK * spacing
+def _median_above(values: FloatArray, limit: float) -> BoolArray:
+    """Whether the medians of columns are above a limit."""
+    above = 2 * np.count_nonzero(values > limit, axis=0)
+    if len(values) % 2:
+        return above > len(values)
+    even = above == len(values)
+    above[even] += np.median(values[:, even], axis=0) > limit
+    return above > len(values)
 
 
 __all__ = ["BAND", "PlaneOptions", "PlaneSet", "connected_to", "find_planes"]

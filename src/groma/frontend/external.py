@@ -13,9 +13,11 @@ Nothing is unpickled. Either order of the two images will do when asking for a p
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -64,13 +66,7 @@ def read_matches(path: str | Path) -> ExternalMatches:
     path = Path(path)
     segments: dict[str, npt.NDArray[np.float64]] = {}
     matches: dict[tuple[str, str], LineMatches] = {}
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
-    except FileNotFoundError:
-        raise FileFormatError(f"Expected an .npz file of line matches; {path} does not exist.") from None
-    except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise FileFormatError(f"Expected an .npz file of line matches; {path} cannot be read: {error}") from error
+    arrays = _arrays(path)
     for key, array in arrays.items():
         kind, *names = key.split("|")
         if kind == "segments" and len(names) == 1:
@@ -97,6 +93,35 @@ def read_matches(path: str | Path) -> ExternalMatches:
         if not (np.isfinite(found.score).all() and ((found.score >= 0.0) & (found.score <= 1.0)).all()):
             raise FileFormatError(f"{path}: scores|{first}|{second} must lie between 0 and 1.")
     return ExternalMatches(segments, matches)
+
+
+def _arrays(path: Path) -> dict[str, Any]:
+    """Arrays of an archive, and what is wrong with it in our own words: NumPy's would have strangers' code run."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if (broken := archive.testzip()) is not None:
+                raise FileFormatError(f"{path} is damaged: '{broken}' in it cannot be read. Write the file again.")
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as saved:
+            return {key: _plain(path, saved, key) for key in saved.files}
+    except FileNotFoundError:
+        raise FileFormatError(f"Expected an .npz file of line matches; {path} does not exist.") from None
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
+        raise FileFormatError(
+            f"Expected an .npz file of line matches; {path} is another kind of file, or incomplete. Write it with "
+            "numpy.savez, or groma.frontend.external.write_matches."
+        ) from error
+    except OSError as error:
+        raise FileFormatError(f"{path} cannot be read: {error.strerror or error}.") from error
+
+
+def _plain(path: Path, saved: Mapping[str, Any], key: str) -> Any:
+    try:
+        return saved[key]
+    except (ValueError, KeyError, TypeError, AttributeError, SyntaxError) as error:
+        raise FileFormatError(
+            f"{path}: array '{key}' holds Python objects or is damaged; only arrays of numbers are read. Convert it to "
+            "numbers before it is saved."
+        ) from error
 
 
 def write_matches(path: str | Path, external: ExternalMatches) -> None:

@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from groma._numba import loop
+from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.pipelines._line_fit import _across_basis, _residuals
 from groma.pipelines._line_tracks import Tracks
@@ -58,22 +58,40 @@ def _information(camera, image, ends, sigma, pointers, rows, X, H, U):
 
 
 @loop
-def _near_pairs(order, low, X, reach, max_angle, min_overlap, pairs, span):
+def _bin_lines(order, first_bin, last_bin, pointers, members):
+    """Lines of every bin, in the given order; ``members`` empty: only their numbers, in ``pointers``."""
+    fill = np.zeros(len(pointers) - 1, np.int64)
+    for n in order:
+        for k in range(first_bin[n], last_bin[n] + 1):
+            if len(members):
+                members[pointers[k] + fill[k]] = n
+            fill[k] += 1
+    if not len(members):
+        for k in range(len(fill)):
+            pointers[k + 1] = pointers[k] + fill[k]
+
+
+@loop
+def _near_pairs(pointers, members, first_bin, low, X, reach, max_angle, min_overlap, pairs, span):
     """Pairs of lines that are nearly parallel, overlap, and are near there; return the number written, or needed.
 
-    Lines come in the order of ``low`` (L, 2), their extent along one axis; span (M, 2) is the overlap, as positions on
-    the first line in units of its length.
+    Lines come in bins along one axis and, within a bin, in the order of ``low`` (L, 2), their extent along another;
+    span (M, 2) is the overlap, as positions on the first line in units of its length.
     """
-    count = 0
-    for i in range(len(order)):
-        a = order[i]
+    count, k = 0, 0
+    for i in range(len(members)):
+        while i >= pointers[k + 1]:
+            k += 1
+        a = members[i]
         d0, d1, d2 = X[a, 1, 0] - X[a, 0, 0], X[a, 1, 1] - X[a, 0, 1], X[a, 1, 2] - X[a, 0, 2]
         dd = d0 * d0 + d1 * d1 + d2 * d2
-        for j in range(i + 1, len(order)):
-            b = order[j]
+        for j in range(i + 1, pointers[k + 1]):
+            b = members[j]
             near = min(reach[a], reach[b])
             if low[b, 0] > low[a, 1] + near:
                 break
+            if max(first_bin[a], first_bin[b]) != k:
+                continue  # a pair that shares several bins counts in the first of them
             e0, e1, e2 = X[b, 1, 0] - X[b, 0, 0], X[b, 1, 1] - X[b, 0, 1], X[b, 1, 2] - X[b, 0, 2]
             ee = e0 * e0 + e1 * e1 + e2 * e2
             de = d0 * e0 + d1 * e1 + d2 * e2
@@ -97,6 +115,36 @@ def _near_pairs(order, low, X, reach, max_angle, min_overlap, pairs, span):
                     span[count, 0], span[count, 1] = first, last
                 count += 1
     return count
+
+
+@kernel
+def _side_by_side(ends, line, other):
+    """Whether two segments of an image overlap along the first one and are apart across it."""
+    ux, uy = ends[2] - ends[0], ends[3] - ends[1]
+    length2 = ux * ux + uy * uy
+    t0 = ((other[0] - ends[0]) * ux + (other[1] - ends[1]) * uy) / length2
+    t1 = ((other[2] - ends[0]) * ux + (other[3] - ends[1]) * uy) / length2
+    low, high = min(t0, t1), max(t0, t1)
+    away0 = abs(line[0] * other[0] + line[1] * other[1] + line[2])
+    away1 = abs(line[0] * other[2] + line[1] * other[3] + line[2])
+    return min(high, 1.0) - max(low, 0.0) > 0.3 * min(1.0, high - low) and max(away0, away1) > SAME_PX
+
+
+@loop
+def _apart(pairs, pointers, rows, image, ends, line, apart):
+    """Whether some image shows both lines of a pair side by side; the observations of a line come by image."""
+    for n in range(len(pairs)):
+        a, b = pairs[n, 0], pairs[n, 1]
+        i, begin = pointers[a], pointers[b]
+        while i < pointers[a + 1] and not apart[n]:
+            s = rows[i]
+            while begin < pointers[b + 1] and image[rows[begin]] < image[s]:
+                begin += 1
+            j = begin
+            while j < pointers[b + 1] and image[rows[j]] == image[s] and not apart[n]:
+                apart[n] = _side_by_side(ends[s], line[s], ends[rows[j]])
+                j += 1
+            i += 1
 
 
 # ------------------------------------------------------------------------------------------------------------- Public
@@ -132,16 +180,7 @@ def _compare(tracks: Tracks) -> tuple[IntArray, FloatArray, FloatArray, FloatArr
     _information(views.camera, views.image_idx, views.ends, views.sigma, pointers, rows, tracks.X, H, U)
     unit = _pixel_size(tracks)
     X = tracks.X
-    axis = int(np.ptp(X.reshape(-1, 3), axis=0).argmax()) if count else 0
-    low = np.sort(X[:, :, axis], axis=1)
-    order = np.argsort(low[:, 0], kind="stable")
-    pairs, span = np.empty((4096, 2), np.int64), np.empty((4096, 2))
-    while True:
-        needed = _near_pairs(order, low, X, MAX_PX * unit, MAX_ANGLE, MIN_OVERLAP, pairs, span)
-        if needed <= len(pairs):
-            break
-        pairs, span = np.empty((2 * needed, 2), np.int64), np.empty((2 * needed, 2))
-    pairs, span = pairs[:needed], span[:needed]
+    pairs, span = _candidates(X, MAX_PX * unit)
     a, b = pairs.T
     covariance = np.linalg.inv(H + 1e-9 * np.einsum("nii->n", H)[:, None, None] * np.eye(4))
     along = X[b, 1] - X[b, 0]
@@ -156,6 +195,39 @@ def _compare(tracks: Tracks) -> tuple[IntArray, FloatArray, FloatArray, FloatArr
         gain = np.einsum("mkp,mij->mkipj", weight, basis).reshape(-1, 4, 4)
         spread += gain @ covariance[n] @ np.swapaxes(gain, 1, 2)
     return pairs, offset, spread, np.minimum(unit[a], unit[b])
+
+
+def _candidates(X: FloatArray, reach: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Pairs (M, 2) of near, nearly parallel lines and their overlap (M, 2): a sweep along one axis in bins of another.
+
+    Work grows with the number of lines where their density stays the same.
+    """
+    if len(X) == 0:
+        return np.zeros((0, 2), np.int64), np.zeros((0, 2))
+    across, along = np.argsort(np.ptp(X.reshape(-1, 3), axis=0), kind="stable")[1:]
+    low = np.sort(X[:, :, along], axis=1)
+    order = np.argsort(low[:, 0], kind="stable")
+    # Bins a few times as wide as the usual line; a line is in all that it may share with another.
+    bounds = np.sort(X[:, :, across], axis=1) + reach[:, None] * np.array([-0.5, 0.5])
+    start, extent = bounds[:, 0].min(), bounds[:, 1] - bounds[:, 0]
+    width = max(4.0 * float(np.median(extent)), float(extent.sum()) / (4.0 * len(X)), np.ptp(bounds) / (4.0 * len(X)))
+    bins = np.floor((bounds - start) / max(width, 1e-300)).astype(np.int64)
+    first_bin, last_bin = np.ascontiguousarray(bins.T)
+    pointers = np.zeros(int(last_bin.max()) + 2, np.int64)
+    _bin_lines(order, first_bin, last_bin, pointers, np.empty(0, np.int64))
+    members = np.empty(pointers[-1], np.int64)
+    _bin_lines(order, first_bin, last_bin, pointers, members)
+    pairs, span = np.empty((4096, 2), np.int64), np.empty((4096, 2))
+    while True:
+        needed = _near_pairs(pointers, members, first_bin, low, X, reach, MAX_ANGLE, MIN_OVERLAP, pairs, span)
+        if needed <= len(pairs):
+            break
+        pairs, span = np.empty((2 * needed, 2), np.int64), np.empty((2 * needed, 2))
+    # In the order of one sweep without bins.
+    place = np.empty(len(X), np.int64)
+    place[order] = np.arange(len(X))
+    sorted_ = np.lexsort(place[pairs[:needed]].T[::-1])
+    return pairs[:needed][sorted_], span[:needed][sorted_]
 
 
 def _pixel_size(tracks: Tracks) -> FloatArray:
@@ -175,24 +247,9 @@ def _seen_apart(tracks: Tracks, pairs: IntArray) -> BoolArray:
     """Whether an image shows both lines of a pair as segments side by side."""
     views = tracks.views
     rows, pointers = tracks.table()
-    apart = np.zeros(len(pairs), bool)
-    for k, (a, b) in enumerate(pairs):
-        first, second = rows[pointers[a] : pointers[a + 1]], rows[pointers[b] : pointers[b + 1]]
-        same = views.image_idx[first][:, None] == views.image_idx[second][None]
-        for i, j in np.argwhere(same):
-            if _side_by_side(views.ends[first[i]], views.line[first[i]], views.ends[second[j]]):
-                apart[k] = True
-                break
+    apart = np.zeros(len(pairs), np.bool_)
+    _apart(pairs, pointers, rows, views.image_idx, views.ends, views.line, apart)
     return apart
-
-
-def _side_by_side(ends: FloatArray, line: FloatArray, other: FloatArray) -> bool:
-    along = ends[2:] - ends[:2]
-    length2 = float(along @ along)
-    t = np.sort([(other[:2] - ends[:2]) @ along / length2, (other[2:] - ends[:2]) @ along / length2])
-    overlap = min(t[1], 1.0) - max(t[0], 0.0)
-    away = max(abs(line[:2] @ other[:2] + line[2]), abs(line[:2] @ other[2:] + line[2]))
-    return bool(overlap > 0.3 * min(1.0, t[1] - t[0]) and away > SAME_PX)
 
 
 def _distance(offset: FloatArray, covariance: FloatArray, deviation: FloatArray) -> FloatArray:

@@ -24,6 +24,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.pipelines._distinct import distinct_pairs, num_distinct
 from groma.pipelines._line_fit import find_on_lines, refine, trim
 from groma.pipelines._line_views import LineViews
 
@@ -105,6 +106,20 @@ def _join(edges, rank, camera, center, image, ray, q, covariance, sigma, line, e
         parent[s] = _root(parent, s)
 
 
+@loop
+def _join_once(pairs, alias, is_target):
+    """Join second lines to first ones, best pairs first; return how many. Chains are left to the next round: a line is
+    joined once, and only to one that was not joined itself.
+    """
+    joined = 0
+    for e in range(len(pairs)):
+        a, b = pairs[e, 0], pairs[e, 1]
+        if alias[a] == a and alias[b] == b and not is_target[b]:
+            alias[b], is_target[a] = a, True
+            joined += 1
+    return joined
+
+
 def link(
     views: LineViews, q: FloatArray, covariance: FloatArray, score: FloatArray, supporters: IntArray, free: BoolArray
 ) -> tuple[IntArray, IntArray]:
@@ -130,8 +145,7 @@ def link(
     second = supporters[first, which]
     has_place = free & (score > 0)
     keep = has_place[first] & has_place[second]
-    edges = np.column_stack([np.minimum(first, second), np.maximum(first, second)])[keep]
-    edges = np.unique(edges, axis=0)
+    edges, _ = distinct_pairs(np.minimum(first, second)[keep], np.maximum(first, second)[keep])
     tables = (
         views.camera, views.center, views.image_idx, views.ray, q, covariance, views.sigma, views.line, views.ends,
     )  # fmt: skip
@@ -181,8 +195,7 @@ class Tracks:
     def num_images(self) -> IntArray:
         """(L,) number of images of each line."""
         rows = np.flatnonzero(self.line_of >= 0)
-        pairs = np.unique(np.column_stack([self.line_of[rows], self.views.image_idx[rows]]), axis=0)
-        return np.bincount(pairs[:, 0], minlength=len(self.X))
+        return num_distinct(self.line_of[rows], self.views.image_idx[rows], len(self.X))
 
     def refine(self, rounds: int = 3) -> None:
         """Refine all lines, dropping observations that do not fit, then trim."""
@@ -289,21 +302,16 @@ class Tracks:
         """Join line B to line A where A explains B's segments in most of B's images; A gives the start."""
         owner = self.line_of[hit[:, 1]]
         pair = (owner >= 0) & (owner != hit[:, 0])
-        triples = np.column_stack([hit[pair, 0], owner[pair], self.views.image_idx[hit[pair, 1]]])
         self._alias = np.arange(len(self.X))
-        if len(triples) == 0:
+        if not pair.any():
             return 0
-        triples = np.unique(triples, axis=0)
-        pairs, votes = np.unique(triples[:, :2], axis=0, return_counts=True)
+        seen, _ = distinct_pairs(hit[pair, 0] * len(self.X) + owner[pair], self.views.image_idx[hit[pair, 1]])
+        key, votes = np.unique(seen[:, 0], return_counts=True)
+        pairs = np.column_stack([key // len(self.X), key % len(self.X)])
         images = self.num_images()
         good = (votes >= 2) & (votes >= 0.6 * images[pairs[:, 1]])
         pairs, votes = pairs[good], votes[good]
-        merged, is_target = 0, np.zeros(len(self.X), bool)
-        for a, b in pairs[np.argsort(-votes, kind="stable")]:
-            # Chains are left to the next round: a line is joined once, and only to one that was not joined itself.
-            if self._alias[a] == a and self._alias[b] == b and not is_target[b]:
-                self._alias[b], is_target[a] = a, True
-                merged += 1
+        merged = _join_once(pairs[np.argsort(-votes, kind="stable")], self._alias, np.zeros(len(self.X), np.bool_))
         member = self.line_of >= 0
         self.line_of[member] = self._alias[self.line_of[member]]
         return merged

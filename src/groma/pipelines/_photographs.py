@@ -87,9 +87,12 @@ def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
     missing = [name for name in scene.images.names if name not in files]
     if not missing:
         return
+    number = f"{len(missing)} of the {scene.num_images} images of the model are not"
+    if len(missing) == scene.num_images:
+        number = f"None of the {scene.num_images} images of the model is"
+    there = "there is 1 image," if len(names) == 1 else f"there are {len(names)} images, for example"
     raise InputError(
-        f"{len(missing)} of the {scene.num_images} images of the model are not in {folder}, for example "
-        f"{missing[0]!r}; there are {len(names)} images, for example {names[0]!r}. "
+        f"{number} in {folder}, for example {missing[0]!r}; {there} {names[0]!r}. "
         + _suggestion(folder, names, missing)
     )
 

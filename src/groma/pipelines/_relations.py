@@ -19,14 +19,16 @@ from groma.estimators.association import inlier_probability
 from groma.estimators.directions import DirectionSet
 from groma.estimators.plane_search import BAND, PlaneSet, connected_to
 from groma.geometry._algebra import dot, norm, perpendicular, unit
+from groma.pipelines._distinct import distinct_pairs
 from groma.pipelines._landmark_noise import LineNoise, PointNoise
 
 #: Planes whose normals differ less compete for a landmark, radians. 15 degrees.
 _COMPETING = 0.26
 #: Least half width of the band around a direction, radians. 2 degrees.
 _LEAST_CAP = 0.035
-#: Nearest samples of segments that a point is compared with; number of samples over all segments.
-_NEAREST, _SAMPLES = 12, 50_000
+#: Nearest samples of segments that a point is compared with; least number of samples over all segments, and per
+#: segment on average.
+_NEAREST, _SAMPLES, _PER_SEGMENT = 12, 50_000, 12
 _NEIGHBOURS = 9
 
 
@@ -195,15 +197,15 @@ def _line_heights(
 def _near_segments(points: FloatArray, segments: FloatArray) -> IntArray:
     """Pairs (point, segment) of segments near points, found by samples along the segments."""
     length = norm(segments[:, 1] - segments[:, 0])
-    count = np.clip(np.ceil(_SAMPLES * length / max(length.sum(), 1e-300)), 3, 512).astype(np.int64)
+    number = max(_SAMPLES, _PER_SEGMENT * len(segments))
+    count = np.clip(np.ceil(number * length / max(length.sum(), 1e-300)), 3, 512).astype(np.int64)
     owner = np.repeat(np.arange(len(segments)), count)
     first = np.repeat(np.cumsum(count) - count, count)
     share = (np.arange(len(owner)) - first) / (count[owner] - 1)
     samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
     nearest = min(_NEAREST, len(samples))
     _, index = KDTree(samples).query(points, k=nearest)
-    pairs = np.column_stack([np.repeat(np.arange(len(points)), nearest), owner[index.reshape(len(points), -1)].ravel()])
-    return np.unique(pairs, axis=0)
+    return distinct_pairs(np.repeat(np.arange(len(points)), nearest), owner[index.reshape(len(points), -1)].ravel())[0]
 
 
 def _best_of_competing(pairs: IntArray, probability: FloatArray, competing: BoolArray, num: int) -> IntArray:

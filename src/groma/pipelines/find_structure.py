@@ -14,6 +14,7 @@ tell is left alone, for a missing relation costs little and a wrong one bends th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,9 +25,13 @@ from groma.estimators.directions import DirectionOptions, DirectionSet, directio
 from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
 from groma.geometry._algebra import norm
 from groma.pipelines import _relations
+from groma.pipelines._distinct import num_distinct
 from groma.pipelines._landmark_noise import line_noise, point_noise
 from groma.pipelines._structure_factors import SURFACE_SIGMA_PX, lengths_per_pixel
 from groma.scene import Directions, Planes, Relations, Scene
+
+#: Related lines below which a direction is not one that lines share.
+_FEWEST_PARALLEL = 2
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,10 @@ class Structure:
 
 
 def find_structure(
-    scene: Scene, options: StructureOptions | None = None, candidates: FloatArray | None = None
+    scene: Scene,
+    options: StructureOptions | None = None,
+    candidates: FloatArray | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> Scene:
     """Return the scene with planes, directions and relations found in its points and lines.
 
@@ -97,6 +105,8 @@ def find_structure(
     candidates : (H, 3) float64, optional
         Directions in the world to try for lines, such as those of
         :func:`groma.frontend.vanishing_points.consistent_directions`.
+    progress : callable, optional
+        Called with stage, number done, number in all.
 
     Returns
     -------
@@ -112,11 +122,14 @@ def find_structure(
     -----
     The poses are taken as right. Adjust the scene before: a bent reconstruction has bent walls, which are no planes.
     """
-    return detect_structure(scene, options, candidates).scene
+    return detect_structure(scene, options, candidates, progress).scene
 
 
 def detect_structure(
-    scene: Scene, options: StructureOptions | None = None, candidates: FloatArray | None = None
+    scene: Scene,
+    options: StructureOptions | None = None,
+    candidates: FloatArray | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> Structure:
     """Find planes, directions and relations, and return them with covariances and probabilities.
 
@@ -128,6 +141,8 @@ def detect_structure(
             f"level must lie between 0 and 1 and min_probability from 0 to below 1; got {options.level} and "
             f"{options.min_probability}. Usual values are 0.95 and 0.7."
         )
+    report = progress or (lambda stage, done, total: None)
+    report("finding planes", 0, 1)
     marks = _landmarks(scene, options)
     good_points, good_lines = np.flatnonzero(marks.point_usable), np.flatnonzero(marks.line_usable)
     segments = marks.segments[good_lines]
@@ -144,11 +159,14 @@ def detect_structure(
         marks.line_noise.ends()[good_lines],
         options.planes,
         carriers,
+        lambda done, total: report("finding planes", done, total),
     )
+    report("finding directions", 0, 1)
     turning = marks.line_noise.directions(norm(marks.segments[:, 1] - marks.segments[:, 0]))
     directions = directions_from_lines(
         _unit_directions(scene)[good_lines], turning[good_lines], options.directions, candidates
     )
+    report("finding what lies on what", 0, 1)
     point_plane, line_plane, p_point, p_line = _relations.on_planes(marks, planes, level, least)
     kept = np.bincount(point_plane[:, 1], minlength=len(planes)) + 2 * np.bincount(
         line_plane[:, 1], minlength=len(planes)
@@ -157,6 +175,9 @@ def detect_structure(
     stays_point, stays_line = new[point_plane[:, 1]] >= 0, new[line_plane[:, 1]] >= 0
     point_plane, line_plane = _renumbered(point_plane, new), _renumbered(line_plane, new)
     along, p_along = _relations.along_directions(marks, directions, options.directions.parallel_sigma, level, least)
+    shared = np.bincount(along[:, 1], minlength=len(directions)) >= _FEWEST_PARALLEL
+    directions, new = _only_directions(directions, shared)
+    stays_along, along = new[along[:, 1]] >= 0, _renumbered(along, new)
     if not options.points_on_lines:
         on_line, p_on = on_line[:0], p_on[:0]
     relations = Relations(
@@ -180,7 +201,7 @@ def detect_structure(
         probability={
             "point_on_plane": p_point[stays_point],
             "line_on_plane": p_line[stays_line],
-            "line_along_direction": p_along,
+            "line_along_direction": p_along[stays_along],
             "point_on_line": p_on,
         },
         point_sigma_px=marks.point_noise.sigma_px if scene.num_points else 0.0,
@@ -196,8 +217,8 @@ def _landmarks(scene: Scene, options: StructureOptions) -> _relations.Landmarks:
     lines = line_noise(scene, options.line_sigma_px).widened(
         options.surface_sigma_px * lengths_per_pixel(scene, "line")
     )
-    seen = _views(scene.point_observations.image_idx, scene.point_observations.point_idx, scene.num_points)
-    lines_seen = _views(scene.line_observations.image_idx, scene.line_observations.line_idx, scene.num_lines)
+    seen = num_distinct(scene.point_observations.point_idx, scene.point_observations.image_idx, scene.num_points)
+    lines_seen = num_distinct(scene.line_observations.line_idx, scene.line_observations.image_idx, scene.num_lines)
     point_usable = (seen >= options.min_views) & (points.misfit < options.max_misfit)
     line_usable = (lines_seen >= options.min_views) & (lines.misfit < options.max_misfit)
     line_usable &= norm(scene.lines.segments[:, 1] - scene.lines.segments[:, 0]) > 0.0
@@ -205,12 +226,6 @@ def _landmarks(scene: Scene, options: StructureOptions) -> _relations.Landmarks:
     return _relations.Landmarks(
         scene.points.xyz, points, point_usable, scene.lines.segments, lines, line_usable, *spacing
     )
-
-
-def _views(image_idx: IntArray, index: IntArray, count: int) -> IntArray:
-    """Number of different images that see each landmark."""
-    pairs = np.unique(np.column_stack([index, image_idx]), axis=0)
-    return np.bincount(pairs[:, 0], minlength=count)
 
 
 def _unit_directions(scene: Scene) -> FloatArray:
@@ -233,6 +248,21 @@ def _only(planes: PlaneSet, kept: np.ndarray) -> tuple[PlaneSet, IntArray]:
         shown[planes.point_label],
         shown[planes.segment_label],
         [planes.places[row] for row in rows],
+    )
+    return chosen, new
+
+
+def _only_directions(directions: DirectionSet, kept: np.ndarray) -> tuple[DirectionSet, IntArray]:
+    """Return some of the directions, and the new number of each old one, -1 where it is gone."""
+    new = np.where(kept, np.cumsum(kept) - 1, -1)
+    right = new[directions.orthogonal]
+    chosen = DirectionSet(
+        directions.vectors[kept],
+        directions.covariance[kept],
+        directions.support[kept],
+        directions.log10_false_alarms[kept],
+        np.append(new, -1)[directions.label],
+        right[(right >= 0).all(axis=1)],
     )
     return chosen, new
 

@@ -32,6 +32,7 @@ from groma.pipelines._image_segments import detect_segments, given_segments
 from groma.pipelines._noise import noise_px
 from groma.pipelines._photographs import check_images, check_names, image_files, read_gray
 from groma.pipelines._stages import Stages, digest, digest_files
+from groma.pipelines._unused import without_unused
 from groma.pipelines.adjust import AdjustOptions, AdjustReport, adjust
 from groma.pipelines.find_structure import StructureOptions, find_structure
 from groma.pipelines.map_lines import MapLinesOptions, explain, map_lines
@@ -195,19 +196,19 @@ def _mapped(
         lined = line_map.add_to(joint, segments)
         weighted = dataclasses.replace(weighted, point_sigma_px=sigma["points"], line_sigma_px=sigma["lines"])
     if options.find_planes:
-        say("finding planes and directions", 0, 1)
         flat = lined
         weighted = dataclasses.replace(weighted, structure_sigma_px=options.structure.surface_sigma_px)
-        lined = store.scene("structure", lambda: find_structure(flat, options.structure))
+        lined = store.scene("structure", lambda: find_structure(flat, options.structure, progress=say))
     result = store.adjusted("adjusted", lambda: _adjusted(lined, weighted, options, say, "adjusting everything"))
+    scene, before = without_unused(result.scene, lined)
     say("done", 1, 1)
     warnings = [*_not_in_model(names, start, given=model_given)]
     if lined.num_lines == 0:
-        warnings.append("No line was mapped. " + explain(line_map))
+        warnings.append("No line was mapped; see what became of the segments.")
     return MapResult(
-        scene=result.scene,
+        scene=scene,
         start=start,
-        before=lined,
+        before=before,
         report=result.report,
         sigma_px=sigma,
         explanation=explain(line_map),
@@ -247,7 +248,8 @@ def _not_in_model(names: list[str], start: Scene, given: bool) -> list[str]:
     more = "" if len(left) <= 3 else f" and {len(left) - 3} more"
     remedy = "" if given else " They share too few points with the others: take images between them, or pass a --model."
     which = f"{', '.join(left[:3])}{more}"
-    return [f"{len(left)} of {len(names)} images have no pose in the model and were not used: {which}.{remedy}"]
+    have = "has no pose in the model and was" if len(left) == 1 else "have no pose in the model and were"
+    return [f"{len(left)} of {len(names)} images {have} not used: {which}.{remedy}"]
 
 
 def _by_index(line_matches: ExternalMatches | None, scene: Scene) -> Callable[[int, int], LineMatches] | None:
@@ -279,4 +281,5 @@ def _measured(folder: Path, points: Scene, robust: AdjustOptions, options: MapOp
 
 def _adjusted(scene: Scene, adjust_options: AdjustOptions, options: MapOptions, say: StageProgress, stage: str):
     held = dataclasses.replace(adjust_options, refine_poses=options.refine_poses)
+    say(stage, 0, held.max_iterations)
     return adjust(scene, held, lambda event: say(stage, event.iteration, event.max_iterations))

@@ -4,12 +4,13 @@
 Stages, each on all images before the next begins:
 
 1. neighbours by the points that images share (:mod:`groma.pipelines._neighbors`);
-2. for every segment, proposals of its place from every neighbour (:mod:`groma.pipelines._line_proposals`), and the
-   one most neighbours agree on (:mod:`groma.pipelines._line_support`), one image at a time;
+2. for every segment, proposals of its place from every neighbour, and the one that most neighbours agree on
+   (:mod:`groma.pipelines._line_places`), one image at a time;
 3. tracks: link, refine, recover, merge, trim (:mod:`groma.pipelines._line_tracks`), and join what was mapped more than
    once (:mod:`groma.pipelines._line_merge`).
 
-Every segment ends with a :class:`Fate`, so that the question why a line is missing has an answer.
+Every segment ends with a :class:`Fate` (:mod:`groma.pipelines._line_fates`), so that the question why a line is missing
+has an answer.
 """
 
 from __future__ import annotations
@@ -17,18 +18,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
+from groma.pipelines._distinct import num_distinct
 from groma.pipelines._line_directions import depth_ratios
+from groma.pipelines._line_fates import UNKNOWN, Fate, explain
 from groma.pipelines._line_matches import MatchProvider, external_matches, flow_matches, wide_baseline_matches
 from groma.pipelines._line_merge import merge_agreeing
-from groma.pipelines._line_proposals import WEAK, Proposer
-from groma.pipelines._line_support import Choice, choose
+from groma.pipelines._line_places import choose_places
+from groma.pipelines._line_support import Choice
 from groma.pipelines._line_tracks import Tracks, link
 from groma.pipelines._line_views import LineViews, build_views
 from groma.pipelines._neighbors import covisible_neighbors
@@ -39,73 +41,8 @@ if TYPE_CHECKING:
     from groma.frontend.segments import Segments
 
 
-class Fate(IntEnum):
-    """What became of a segment. Members are in the order of the stages."""
-
-    #: It observes a line.
-    MAPPED = 0
-    #: It observes a line, found by projecting the line, not by its own proposals.
-    RECOVERED = 1
-    #: Shorter than ``min_length``, or where the camera cannot undo its distortion.
-    TOO_SHORT = 2
-    #: Its image shares too few points with others.
-    NO_NEIGHBOR = 3
-    #: No segment of a neighbour can be the same line: none in the epipolar beam at a plausible depth, or none matched.
-    NO_MATCH = 4
-    #: Every candidate leaves the depth open: the line runs along the epipolar lines of all neighbours.
-    DEGENERATE = 5
-    #: Too few neighbours agree on a place.
-    NO_SUPPORT = 6
-    #: Another place has about the same support.
-    AMBIGUOUS = 7
-    #: It has a place, but no other segment has the same.
-    NOT_LINKED = 8
-    #: It was part of a line, and its distance to it failed the test.
-    OUTLIER = 9
-    #: Its line is seen in fewer than ``min_images`` images.
-    FEW_IMAGES = 10
-    #: Its line is too uncertain for its distance, or would be without one of its images.
-    UNCERTAIN = 11
-    #: No segment of its line is as long as ``min_longest``.
-    SHORT_LINE = 12
-
-
 #: Segments whose deviation is that many times the usual one make no line by themselves.
 MAX_BLUR = 2.8
-#: Not a fate: what a segment has before its stage.
-UNKNOWN = -1
-
-_WORDS = {
-    Fate.MAPPED: "mapped",
-    Fate.RECOVERED: "recovered by projecting a line",
-    Fate.TOO_SHORT: "too short or outside the camera's valid region",
-    Fate.NO_NEIGHBOR: "in images that share too few points with others",
-    Fate.NO_MATCH: "without a candidate in any neighbour",
-    Fate.DEGENERATE: "along the epipolar lines of all neighbours",
-    Fate.NO_SUPPORT: "without agreement among neighbours",
-    Fate.AMBIGUOUS: "with two places equally well supported",
-    Fate.NOT_LINKED: "with a place of their own only",
-    Fate.OUTLIER: "dropped from a line as outliers",
-    Fate.FEW_IMAGES: "on lines seen in too few images",
-    Fate.UNCERTAIN: "on lines too uncertain for their distance",
-    Fate.SHORT_LINE: "on lines that only short segments show",
-}
-
-_REMEDIES = {
-    Fate.TOO_SHORT: "Lower min_length, or use larger images.",
-    Fate.NO_NEIGHBOR: "Check that the images overlap, and that the model has 3D points with observations.",
-    Fate.NO_MATCH: "Check that segments and poses belong to the same images and the same image size, and widen "
-    "depth_margin.",
-    Fate.DEGENERATE: "The camera moved along the lines; add images taken from another height or side.",
-    Fate.NO_SUPPORT: "Check poses and intrinsics (a few pixels of error leave no agreement), raise noise, or lower "
-    "min_images.",
-    Fate.AMBIGUOUS: "Repeated structure: pass matches, or more images.",
-    Fate.NOT_LINKED: "Add images, or raise num_neighbors.",
-    Fate.OUTLIER: "Poses disagree with the segments: adjust the points first, or raise noise.",
-    Fate.FEW_IMAGES: "Lower min_images, or add images.",
-    Fate.UNCERTAIN: "Add images from further apart, or raise max_uncertainty.",
-    Fate.SHORT_LINE: "Lower min_longest, or use larger images.",
-}
 
 
 @dataclass(frozen=True)
@@ -195,10 +132,9 @@ class LineMap:
 
     def add_to(self, scene: Scene, segments: Sequence[Segments]) -> Scene:
         """Return the scene with these lines and their observations in place of its own lines."""
-        measured, sigma = np.zeros((len(self.image_idx), 4)), np.ones(len(self.image_idx))
-        for i in np.unique(self.image_idx):
-            at = self.image_idx == i
-            measured[at], sigma[at] = segments[i].ends[self.segment_idx[at]], segments[i].sigma[self.segment_idx[at]]
+        first = np.cumsum([0, *(len(one) for one in segments)])[self.image_idx] + self.segment_idx
+        measured = np.concatenate([np.zeros((0, 4)), *(one.ends for one in segments)])[first]
+        sigma = np.concatenate([np.zeros(0), *(one.sigma for one in segments)])[first]
         usual = float(np.median(sigma)) if len(sigma) else 1.0
         return scene.replace(
             lines=Lines.through(self.segments),
@@ -267,103 +203,12 @@ def map_lines(
     fate = np.full(len(views.image_idx), UNKNOWN, np.int64)
     ratios = depth_ratios(scene, segments, views) if options.use_directions else np.zeros((len(fate), 2))
     lap("directions")
-    places = _choose_places(scene, views, ratios, neighbors, matches, options, fate, report)
+    places = choose_places(scene, views, ratios, neighbors, matches, options, fate, report)
     fate[~views.usable] = Fate.TOO_SHORT
     lap("proposals")
     tracks = _build_tracks(views, neighbors, places, options, fate, report)
     lap("tracks")
     return _result(tracks, neighbors, places, fate, seconds)
-
-
-def _choose_places(
-    scene: Scene,
-    views: LineViews,
-    ratios: FloatArray,
-    neighbors: list[IntArray],
-    matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
-    options: MapLinesOptions,
-    fate: IntArray,
-    report: Callable[[str, int, int], None],
-) -> Choice:
-    """The place of every segment of every image; writes the fates of those without one."""
-    count = len(views.image_idx)
-    places = Choice(
-        np.zeros(count, bool),
-        np.zeros((count, 2)),
-        np.zeros((count, 3)),
-        np.zeros(count),
-        np.zeros(count),
-        np.full((count, max(1, options.num_neighbors)), -1, np.int64),
-        np.zeros((count, 2), bool),
-    )
-    proposer = Proposer(views, ratios, options.directed, options.min_overlap, options.max_relative_sigma)
-    near_points = _points_by_image(scene, views) if options.use_points else [None] * scene.num_images
-    for i, others in enumerate(neighbors):
-        report("proposals", i, len(neighbors))
-        rows = views.rows(i)
-        if len(others) == 0:
-            fate[rows] = Fate.NO_NEIGHBOR
-            continue
-        given = [_given(matches, i, int(j)) for j in others]
-        for j, pairs in zip(others, given, strict=True):
-            _check_pairs(pairs, i, int(j), views)
-        proposals = proposer.propose(i, others, given, near_points[i])
-        # A line of min_images images is this segment and min_images - 1 neighbours; two of them must agree.
-        chosen = choose(proposals, rows.stop - rows.start, len(others), max(1, min(2, options.min_images - 1)))
-        ambiguous = chosen.found & (chosen.rival > options.max_rival * chosen.score)
-        found = chosen.found & ~ambiguous
-        places.found[rows], places.q[rows], places.covariance[rows] = found, chosen.q, chosen.covariance
-        places.score[rows], places.rival[rows] = np.where(found, chosen.score, 0.0), chosen.rival
-        places.assisted[rows] = found[:, None] & chosen.assisted
-        places.supporters[rows, : len(others)] = np.where(found[:, None], chosen.supporters, -1)
-        fate[rows] = np.select(
-            [found, ambiguous, proposals.reached > WEAK, proposals.reached == WEAK, proposals.reached < WEAK],
-            [Fate.NOT_LINKED, Fate.AMBIGUOUS, Fate.NO_SUPPORT, Fate.DEGENERATE, Fate.NO_MATCH],
-            UNKNOWN,
-        )
-    return places
-
-
-def _given(
-    matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None, i: int, j: int
-) -> tuple[IntArray, FloatArray] | None:
-    """Pairs and scores between two images; None where every segment is a candidate."""
-    if matches is None:
-        return None
-    if callable(matches):
-        found = matches(i, j)
-    else:
-        found, turned = matches.get((i, j)), matches.get((j, i))
-        if found is None and turned is not None:
-            return np.ascontiguousarray(turned.pairs[:, ::-1], np.int64), np.asarray(turned.score, float)
-    if found is None:
-        return np.empty((0, 2), np.int64), np.empty(0)
-    return np.ascontiguousarray(found.pairs, np.int64), np.asarray(found.score, float)
-
-
-def _check_pairs(given: tuple[IntArray, FloatArray] | None, i: int, j: int, views: LineViews) -> None:
-    if given is None or len(given[0]) == 0:
-        return
-    sizes = np.array([views.pointers[i + 1] - views.pointers[i], views.pointers[j + 1] - views.pointers[j]])
-    if given[0].min() < 0 or (given[0] >= sizes).any():
-        raise InputError(
-            f"Matches of images {i} and {j} must refer to their {sizes[0]} and {sizes[1]} segments; got indices up to "
-            f"{given[0].max(0).tolist()}. Match the same segments that are mapped."
-        )
-
-
-def _points_by_image(scene: Scene, views: LineViews) -> list[tuple[FloatArray, FloatArray]]:
-    """Pixels and inverse depths of the points seen in each image."""
-    observations = scene.point_observations
-    order = np.argsort(observations.image_idx, kind="stable")
-    bounds = np.searchsorted(observations.image_idx[order], np.arange(scene.num_images + 1))
-    near = []
-    for i in range(scene.num_images):
-        xyz = scene.points.xyz[observations.point_idx[order[bounds[i] : bounds[i + 1]]]]
-        x = xyz @ views.camera[i, :, :3].T + views.camera[i, :, 3]
-        x = x[x[:, 2] > 0.0]
-        near.append((x[:, :2] / x[:, 2:], 1.0 / x[:, 2]))
-    return near
 
 
 def _build_tracks(
@@ -438,8 +283,7 @@ def _is_sure(tracks: Tracks, options: MapLinesOptions) -> BoolArray:
 def _num_sharp(tracks: Tracks, sharp: BoolArray) -> IntArray:
     """(L,) number of images that show a line as a sharp segment."""
     rows = np.flatnonzero((tracks.line_of >= 0) & sharp)
-    pairs = np.unique(np.column_stack([tracks.line_of[rows], tracks.views.image_idx[rows]]), axis=0)
-    return np.bincount(pairs[:, 0], minlength=len(tracks.X))
+    return num_distinct(tracks.line_of[rows], tracks.views.image_idx[rows], len(tracks.X))
 
 
 def _distance(tracks: Tracks) -> FloatArray:
@@ -465,7 +309,9 @@ def _result(
         X[turned] = X[turned][:, ::-1]
     residual = np.sqrt(0.5 * tracks.squared[rows]) * views.sigma[rows]
     bounds = np.searchsorted(line_idx, np.arange(len(X) + 1))
-    median = np.array([np.median(residual[bounds[n] : bounds[n + 1]]) for n in range(len(X))])
+    ordered = residual[np.lexsort([residual, line_idx])]
+    low, high = (bounds[:-1] + bounds[1:] - 1) // 2, (bounds[:-1] + bounds[1:]) // 2
+    median = 0.5 * (ordered[low] + ordered[high]) if len(X) else np.zeros(0)
     return LineMap(
         lines=Lines.through(X).plucker if len(X) else np.zeros((0, 6)),
         segments=X,
@@ -481,28 +327,6 @@ def _result(
         assisted={name: int(places.assisted[rows, k].sum()) for k, name in enumerate(("points", "directions"))},
         seconds=seconds,
     )
-
-
-def explain(line_map: LineMap) -> str:
-    """Say in words how many segments were mapped, where the others were lost, and what to do.
-
-    Names the stage that lost most; for an empty map that is the reason.
-    """
-    counts = line_map.fate_counts()
-    total = sum(counts.values())
-    if not line_map.fates:
-        return "There are no images. Pass a scene with images and poses."
-    if total == 0:
-        return "No segments were detected in any image. Check that the images are not blank, or lower min_length."
-    mapped = counts[Fate.MAPPED] + counts[Fate.RECOVERED]
-    head = f"{line_map.num_lines} lines from {mapped} of {total} segments in {len(line_map.fates)} images."
-    lost = sorted(((n, fate) for fate, n in counts.items() if fate > Fate.RECOVERED and n), reverse=True)
-    if not lost:
-        return head
-    parts = "; ".join(f"{n} ({n / total:.0%}) {_WORDS[fate]}" for n, fate in lost)
-    worst = lost[0][1]
-    start = "The map is empty" if line_map.num_lines == 0 else "Most segments were lost"
-    return f"{head} Not mapped: {parts}. {start} because segments were {_WORDS[worst]}. {_REMEDIES[worst]}"
 
 
 __all__ = [

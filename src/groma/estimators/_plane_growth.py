@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""From a candidate of :mod:`groma.estimators.plane_search` to a plane: refined where it is connected, and judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import stats
+from scipy.spatial import KDTree
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators._plane_candidates import Features
+from groma.estimators._plane_loops import (
+    ball_loop,
+    fit_loop,
+    heights_loop,
+    largest_part_loop,
+    layer_loop,
+    near_loop,
+    nearest_rows_loop,
+)
+from groma.estimators.association import inlier_probability
+from groma.estimators.plane_fit import PlaneFit, fit_plane, tilt_sigma
+from groma.geometry._algebra import norm, perpendicular
+
+if TYPE_CHECKING:
+    from groma.estimators.plane_search import PlaneOptions
+
+#: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
+BAND = 8.0
+#: Links between inliers, as a multiple of the distance to the eighth neighbour.
+LINK = 3.0
+RANK = 8
+#: Rounds of refinement of a candidate on its growing support.
+_GROW_STEPS = 10
+#: Rounds with the probability of membership as the weight.
+_POLISH_STEPS = 3
+#: Rounds of a fit in which the variances are taken from the last normal.
+_FIT_ROUNDS = 10
+
+
+@dataclass(frozen=True)
+class Grown:
+    """A plane that is kept."""
+
+    fit: PlaneFit
+    share: float
+    band: float
+    log10_false_alarms: float
+    #: The features on it, and those taken out with it.
+    rows: IntArray
+    taken: IntArray
+
+
+class Grower:
+    """Grows candidates, one after the other, on the same features; keeps the room it works in.
+
+    Parameters
+    ----------
+    features : Features
+        Points and segment ends.
+    neighbours : (N, n) int
+        The nearest features of each, itself first.
+    gate : float
+        Squared distance over variance up to which a feature lies on a plane.
+    log_tried : float
+        Base-10 logarithm of the number of candidates that are tried in all.
+    options : PlaneOptions
+        What counts as a plane.
+    """
+
+    def __init__(
+        self, features: Features, neighbours: IntArray, gate: float, log_tried: float, options: PlaneOptions
+    ) -> None:
+        self._features, self._neighbours = features, neighbours
+        self._gate, self._log_tried, self._options = gate, log_tried, options
+        count = len(features.places)
+        self._mark = np.full(count, -1)
+        self._room, self._layer = np.empty(count, np.int64), np.empty(count, np.int64)
+
+    def grow(self, plane: FloatArray, labels: IntArray) -> tuple[Grown | None, FloatArray, IntArray]:
+        """Refine a candidate on its largest connected part and judge it: what is kept, where it went, its support."""
+        features, gate, options = self._features, self._gate, self._options
+        free = np.flatnonzero(labels < 0)
+        rows, weight = np.zeros(0, np.int64), np.zeros(0)
+        for step in range(_GROW_STEPS):
+            if step == 1:  # what is far away stays away
+                free = self._near(free, plane, 50.0 * gate)
+            # The first rounds reach farther: the candidate is not yet exact.
+            rows, independent = self._largest_part(self._near(free, plane, (4.0 if step < 2 else 1.0) * gate))
+            if independent < options.min_support:
+                return None, plane, rows
+            height, spread = self._heights(rows, plane)
+            # Weights that fall with the distance lead to where the layer is densest, not to the middle of what it
+            # cuts off.
+            weight = 1.0 / (1.0 + (height / spread) ** 2) ** 2
+            before, plane = plane, self._fitted(rows, weight)
+            turned = float(np.sign(before[:3] @ plane[:3]))
+            moved, spread = self._heights(rows, plane)
+            moved -= turned * height
+            if step > 1 and np.abs(moved).max() < 0.1 * _median(spread):
+                break
+        if (
+            tilt_sigma(fit_plane(features.places[rows], features.covariances[rows], weight).covariance)
+            > options.max_tilt
+        ):
+            return None, plane, rows
+        band = BAND * _median(self._heights(rows, plane)[1])
+        support, layer, share = features.places[rows], rows, np.zeros(1)
+        for _ in range(_POLISH_STEPS):
+            # Judged against all that is near, taken or not: what lies on a plane beside this one speaks against it.
+            layer = self._layer[: layer_loop(features.places, plane, band, self._layer)].copy()
+            joined = np.isin(layer, rows, assume_unique=True, kind="table")
+            others = layer[~joined]
+            joined[~joined] = connected_to(support, features.places[others], features.spacing[others], plane)
+            layer = layer[joined]
+            height, spread = self._heights(layer, plane)
+            height = np.abs(height)
+            probability, share = inlier_probability(height, spread, np.zeros(len(layer), np.int64), np.array([band]))
+            weight = np.where(height < 3.0 * spread, probability, 0.0)
+            if np.count_nonzero(weight) < 3:
+                return None, plane, rows
+            # Membership as the weight: all of the plane where it is clean, its densest part where it is not.
+            plane = self._fitted(layer, weight)
+        if share[0] < options.min_share:
+            return None, plane, rows
+        alarm = self._log10_false_alarms(plane, rows)
+        if alarm > np.log10(options.max_false_alarms):
+            return None, plane, rows
+        fit = fit_plane(features.places[layer], features.covariances[layer], weight)
+        # The whole layer is taken out: relief so near to a plane cannot be told from it.
+        taken = np.union1d(rows, layer[labels[layer] < 0])
+        return Grown(fit, float(share[0]), band, alarm, rows, taken), plane, rows
+
+    def _near(self, rows: IntArray, plane: FloatArray, limit: float) -> IntArray:
+        """Those of some features whose squared distance is within so many variances."""
+        features = self._features
+        return self._room[: near_loop(features.places, features.packed, rows, plane, limit, self._room)].copy()
+
+    def _heights(self, rows: IntArray, plane: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Signed distances of features from a plane, and their standard deviations."""
+        height, spread = np.empty(len(rows)), np.empty(len(rows))
+        heights_loop(self._features.places, self._features.packed, rows, plane, height, spread)
+        return height, spread
+
+    def _fitted(self, rows: IntArray, weight: FloatArray) -> FloatArray:
+        """Plane through some features."""
+        plane, center, precision = np.empty(4), np.empty(3), np.empty(len(rows))
+        fit_loop(
+            self._features.places, self._features.packed, rows, weight, _FIT_ROUNDS, plane, center, precision
+        )  # fmt: skip
+        return plane
+
+    def _largest_part(self, rows: IntArray) -> tuple[IntArray, int]:
+        """Largest part of some features that is connected in space, and how many of it no segment carries there."""
+        features, count = self._features, min(RANK + 1, len(rows))
+        if count < 3:
+            return rows, 0
+        nearest, distance = np.empty((len(rows), count), np.int64), np.empty((len(rows), count))
+        short = np.empty(len(rows), np.int64)
+        missing = nearest_rows_loop(
+            features.places, rows, self._neighbours, self._mark, nearest, distance, short
+        )  # fmt: skip
+        if missing:  # the others among their neighbours do not lie on the plane
+            places, short = features.places[rows], short[:missing]
+            tree = KDTree(places, balanced_tree=False, compact_nodes=False)
+            distance[short], nearest[short] = tree.query(places[short], k=count)
+        out, count_of = np.empty(len(rows), np.int64), np.empty(2, np.int64)
+        largest_part_loop(
+            rows, nearest, distance, LINK, features.spacing, features.partner, features.carrier, self._mark, out,
+            count_of,
+        )  # fmt: skip
+        return out[: count_of[0]], int(count_of[1])
+
+    def _log10_false_alarms(self, plane: FloatArray, rows: IntArray) -> float:
+        """Number of planes tried on which as much would lie by chance, of their neighbourhood, base-10 logarithm."""
+        features = self._features
+        center = features.places[rows].mean(axis=0)
+        radius = float(np.quantile(norm(features.places[rows] - center), 0.9))
+        found = np.zeros(2)
+        ball_loop(
+            features.places, features.packed, features.carrier, rows, center, radius, plane, self._gate, self._mark,
+            found,
+        )  # fmt: skip
+        if found[0] == 0:
+            return self._log_tried
+        return float(stats.poisson.logsf(found[0] - 4, found[1])) / np.log(10.0) + self._log_tried  # three fix it
+
+
+def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:
+    """Whether tested points, projected to a plane, are near the support of the plane.
+
+    Parameters
+    ----------
+    places : (M, 3) float64
+        Support of the plane.
+    tested : (N, 3) float64
+        Points to test.
+    spacing : (N,) float64
+        Distance at which each has its neighbours.
+    plane : (4,) float64
+        Unit normal and offset.
+
+    Returns
+    -------
+    (N,) bool
+    """
+    if len(tested) == 0:
+        return np.zeros(0, dtype=bool)
+    basis = np.stack(perpendicular(plane[:3]), axis=1)
+    tree = KDTree(places @ basis, balanced_tree=False, compact_nodes=False)
+    distance, _ = tree.query(tested @ basis, distance_upper_bound=np.nextafter(LINK * spacing.max(), np.inf))
+    return np.asarray(distance <= LINK * spacing)
+
+
+def _median(values: FloatArray) -> float:
+    """Median of a few numbers, without what NumPy does for many axes."""
+    half = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, half)[half])
+    ordered = np.partition(values, (half - 1, half))
+    return 0.5 * float(ordered[half - 1] + ordered[half])

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Loops of the plane search over points with packed covariances: fit, selection by distance, connected parts.
+
+Covariances are packed as (xx, xy, xz, yy, yz, zz). ``rows`` are the points that take part, in arrays of all points.
+``mark`` arrays have an entry per point, -1 on entry and again on return.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from groma._numba import kernel, loop
+
+#: Sweeps of Jacobi rotations: convergence is quadratic, four are enough.
+_SWEEPS = 12
+
+
+@kernel
+def _variance(c, n0, n1, n2):
+    """Variance along a normal."""
+    return n0 * (n0 * c[0] + 2.0 * (n1 * c[1] + n2 * c[2])) + n1 * (n1 * c[3] + 2.0 * n2 * c[4]) + n2 * n2 * c[5]
+
+
+@kernel
+def _height(p, plane):
+    return p[0] * plane[0] + p[1] * plane[1] + p[2] * plane[2] + plane[3]
+
+
+@kernel
+def _least_axis(A, V):
+    """Column of V that is the eigenvector of the least eigenvalue of a symmetric A (3, 3), which is overwritten."""
+    for i in range(3):
+        for j in range(3):
+            V[i, j] = 1.0 if i == j else 0.0
+    for _ in range(_SWEEPS):
+        beside = A[0, 1] ** 2 + A[0, 2] ** 2 + A[1, 2] ** 2
+        if not beside > 1e-33 * (A[0, 0] ** 2 + A[1, 1] ** 2 + A[2, 2] ** 2):
+            break
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if A[p, q] == 0.0:
+                    continue
+                turn = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
+                t = 1.0 / (abs(turn) + math.sqrt(turn * turn + 1.0))
+                if turn < 0.0:
+                    t = -t
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(3):
+                    a, b = A[k, p], A[k, q]
+                    A[k, p], A[k, q] = c * a - s * b, s * a + c * b
+                for k in range(3):
+                    a, b = A[p, k], A[q, k]
+                    A[p, k], A[q, k] = c * a - s * b, s * a + c * b
+                for k in range(3):
+                    a, b = V[k, p], V[k, q]
+                    V[k, p], V[k, q] = c * a - s * b, s * a + c * b
+    least = 0
+    for k in range(1, 3):
+        if A[k, k] < A[least, least]:
+            least = k
+    return least
+
+
+@loop
+def fit_loop(places, packed, rows, weight, iterations, plane, center, precision):
+    """Plane (4,) of least weighted squares through rows, its centroid (3,), and the weights over variances (M,)."""
+    tiny = 2.2250738585072014e-308
+    A, V = np.empty((3, 3)), np.empty((3, 3))
+    n0 = n1 = n2 = 0.0
+    last = False
+    for step in range(iterations + 1):
+        total = c0 = c1 = c2 = 0.0
+        for k in range(len(rows)):
+            i = rows[k]
+            if step == 0:
+                variance = (packed[i, 0] + packed[i, 3] + packed[i, 5]) / 3.0
+            else:
+                variance = _variance(packed[i], n0, n1, n2)
+            p = weight[k] / max(variance, tiny)
+            precision[k] = p
+            total += p
+            c0 += p * places[i, 0]
+            c1 += p * places[i, 1]
+            c2 += p * places[i, 2]
+        center[0], center[1], center[2] = c0 / total, c1 / total, c2 / total
+        if last or step == iterations:
+            break
+        s00 = s01 = s02 = s11 = s12 = s22 = 0.0
+        for k in range(len(rows)):
+            i, p = rows[k], precision[k]
+            x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
+            s00 += p * x * x
+            s01 += p * x * y
+            s02 += p * x * z
+            s11 += p * y * y
+            s12 += p * y * z
+            s22 += p * z * z
+        A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2] = s00, s01, s02, s11, s12, s22
+        A[1, 0], A[2, 0], A[2, 1] = s01, s02, s12
+        least = _least_axis(A, V)
+        last = abs(n0 * V[0, least] + n1 * V[1, least] + n2 * V[2, least]) > 1.0 - 1e-15
+        n0, n1, n2 = V[0, least], V[1, least], V[2, least]
+    sign = n0
+    if abs(n1) > abs(sign):
+        sign = n1
+    if abs(n2) > abs(sign):
+        sign = n2
+    if sign < 0.0:
+        n0, n1, n2 = -n0, -n1, -n2
+    plane[0], plane[1], plane[2] = n0, n1, n2
+    plane[3] = -(n0 * center[0] + n1 * center[1] + n2 * center[2])
+
+
+@loop
+def near_loop(places, packed, rows, plane, limit, out):
+    """Write the rows whose squared distance from a plane is below ``limit`` variances; return how many."""
+    count = 0
+    n0, n1, n2 = plane[0], plane[1], plane[2]
+    for k in range(len(rows)):
+        i = rows[k]
+        height = _height(places[i], plane)
+        if height * height < limit * max(_variance(packed[i], n0, n1, n2), 1e-300):
+            out[count] = i
+            count += 1
+    return count
+
+
+@loop
+def layer_loop(places, plane, band, out):
+    """Write the points nearer to a plane than ``band``; return how many."""
+    count = 0
+    for i in range(len(places)):
+        if abs(_height(places[i], plane)) < band:
+            out[count] = i
+            count += 1
+    return count
+
+
+@loop
+def heights_loop(places, packed, rows, plane, height, spread):
+    """Signed distances (M,) of rows from a plane, and their standard deviations (M,)."""
+    for k in range(len(rows)):
+        i = rows[k]
+        height[k] = _height(places[i], plane)
+        spread[k] = math.sqrt(max(_variance(packed[i], plane[0], plane[1], plane[2]), 1e-300))
+
+
+@loop
+def nearest_rows_loop(places, rows, neighbours, mark, nearest, distance, short):
+    """Nearest rows of each row, itself first, as positions in ``rows`` (M, n), among its neighbours in space (N, m).
+
+    ``short`` gets the positions of rows that have fewer than n among them; return how many. Sets ``mark`` to positions.
+    """
+    missing = 0
+    for k in range(len(rows)):
+        mark[rows[k]] = k
+    for k in range(len(rows)):
+        i = rows[k]
+        nearest[k, 0], distance[k, 0] = k, 0.0
+        count = 1
+        for m in range(neighbours.shape[1]):
+            other = neighbours[i, m]
+            if mark[other] < 0 or other == i:
+                continue
+            x, y, z = places[other, 0] - places[i, 0], places[other, 1] - places[i, 1], places[other, 2] - places[i, 2]
+            nearest[k, count], distance[k, count] = mark[other], math.sqrt(x * x + y * y + z * z)
+            count += 1
+            if count == nearest.shape[1]:
+                break
+        if count < nearest.shape[1]:
+            short[missing] = k
+            missing += 1
+    return missing
+
+
+@loop
+def largest_part_loop(rows, nearest, distance, reach, spacing, partner, carrier, mark, out, count_of):
+    """Write the largest connected part of rows; ``count_of`` (2,): its size, and without what segments carry.
+
+    ``nearest``, ``distance`` (M, n): neighbours of each row, itself first, as positions in ``rows``, and ``mark`` the
+    position of each row. Two are linked if they are nearer than ``reach`` times the larger of their spacings, and if
+    they are the two ends of a segment.
+    """
+    number = len(rows)
+    parent = np.arange(number)
+    for k in range(number):
+        for m in range(nearest.shape[1]):
+            other = partner[rows[k]] if m == 0 else rows[nearest[k, m]]
+            j = mark[other]
+            if j < 0 or j == k:
+                continue
+            if m > 0 and distance[k, m] > reach * max(spacing[rows[k]], spacing[other]):
+                continue
+            a, b = k, j
+            while parent[a] != a:
+                parent[a] = parent[parent[a]]
+                a = parent[a]
+            while parent[b] != b:
+                parent[b] = parent[parent[b]]
+                b = parent[b]
+            if a < b:
+                parent[b] = a
+            else:
+                parent[a] = b
+    size = np.zeros(number, np.int64)
+    for k in range(number):
+        parent[k] = parent[parent[k]]  # parents come before their children
+        size[parent[k]] += 1
+    best = 0
+    for k in range(1, number):
+        if size[k] > size[best]:
+            best = k
+    for k in range(number):
+        mark[rows[k]] = k if parent[k] == best else -1
+    count = independent = 0
+    for k in range(number):
+        i = rows[k]
+        if parent[k] == best:
+            out[count] = i
+            count += 1
+            if carrier[i] < 0 or mark[carrier[i]] < 0:
+                independent += 1
+    for k in range(number):
+        mark[rows[k]] = -1
+    count_of[0], count_of[1] = count, independent
+
+
+@loop
+def ball_loop(places, packed, carrier, rows, center, radius, plane, gate, mark, out):
+    """Support in a ball, out[0], and how much would be in the layer by chance, out[1]; carried points do not count."""
+    squared = radius * radius
+    for k in range(len(rows)):
+        i = rows[k]
+        x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
+        if x * x + y * y + z * z < squared:
+            mark[i] = 0
+    inside, chance = 0, 0.0
+    for i in range(len(places)):
+        carried = carrier[i] >= 0
+        support = mark[i] >= 0 and not (carried and mark[carrier[i]] >= 0)
+        if carried and not support:
+            continue
+        x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
+        if not x * x + y * y + z * z < squared:
+            continue
+        inside += support
+        spread = math.sqrt(max(_variance(packed[i], plane[0], plane[1], plane[2]), 1e-300))
+        chance += min(math.sqrt(gate) * spread / max(radius, 1e-300), 1.0)
+    for k in range(len(rows)):
+        mark[rows[k]] = -1
+    out[0], out[1] = inside, chance

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Distinct pairs of numbers, and how often they come: sorting one key is many times faster than sorting rows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._typing import IntArray
+
+
+def distinct_pairs(first: IntArray, second: IntArray) -> tuple[IntArray, IntArray]:
+    """Distinct pairs (M, 2) of numbers from zero, sorted by the first and then by the second, and their counts (M,)."""
+    size = np.int64(second.max(initial=0)) + 1
+    keys, counts = np.unique(first.astype(np.int64) * size + second, return_counts=True)
+    return np.column_stack([keys // size, keys % size]), counts
+
+
+def num_distinct(owner: IntArray, member: IntArray, count: int) -> IntArray:
+    """(count,) how many different members each owner has, such as the images that see a landmark."""
+    pairs, _ = distinct_pairs(owner, member)
+    return np.bincount(pairs[:, 0], minlength=count)

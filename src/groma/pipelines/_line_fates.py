@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What became of every segment while lines were mapped, and how to say it."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from groma.pipelines.map_lines import LineMap
+
+
+class Fate(IntEnum):
+    """What became of a segment. Members are in the order of the stages."""
+
+    #: It observes a line.
+    MAPPED = 0
+    #: It observes a line, found by projecting the line, not by its own proposals.
+    RECOVERED = 1
+    #: Shorter than ``min_length``, or where the camera cannot undo its distortion.
+    TOO_SHORT = 2
+    #: Its image shares too few points with others.
+    NO_NEIGHBOR = 3
+    #: No segment of a neighbour can be the same line: none in the epipolar beam at a plausible depth, or none matched.
+    NO_MATCH = 4
+    #: Every candidate leaves the depth open: the line runs along the epipolar lines of all neighbours.
+    DEGENERATE = 5
+    #: Too few neighbours agree on a place.
+    NO_SUPPORT = 6
+    #: Another place has about the same support.
+    AMBIGUOUS = 7
+    #: It has a place, but no other segment has the same.
+    NOT_LINKED = 8
+    #: It was part of a line, and its distance to it failed the test.
+    OUTLIER = 9
+    #: Its line is seen in fewer than ``min_images`` images.
+    FEW_IMAGES = 10
+    #: Its line is too uncertain for its distance, or would be without one of its images.
+    UNCERTAIN = 11
+    #: No segment of its line is as long as ``min_longest``.
+    SHORT_LINE = 12
+
+
+#: Not a fate: what a segment has before its stage.
+UNKNOWN = -1
+#: Groups of segments that :func:`explain` names; the others are counted together.
+_NAMED = 4
+
+#: What is said of so many segments.
+_WORDS = {
+    Fate.TOO_SHORT: "fell short of the least length, or lay where the lens model does not hold",
+    Fate.NO_NEIGHBOR: "lay in images that share too few points with others",
+    Fate.NO_MATCH: "had no counterpart in any neighbouring image",
+    Fate.DEGENERATE: "ran along the epipolar lines of all neighbours, which leaves the depth open",
+    Fate.NO_SUPPORT: "had no place in space on which neighbouring images agree",
+    Fate.AMBIGUOUS: "had two places in space that fit equally well",
+    Fate.NOT_LINKED: "had a place in space that no other segment shares",
+    Fate.OUTLIER: "did not fit the line on which other segments lie",
+    Fate.FEW_IMAGES: "lay on lines that too few images see",
+    Fate.UNCERTAIN: "lay on lines too uncertain for their distance",
+    Fate.SHORT_LINE: "lay on lines that only short segments show",
+}
+
+#: What would help.
+_REMEDIES = {
+    Fate.TOO_SHORT: "a smaller least length (--min-length), or larger images",
+    Fate.NO_NEIGHBOR: "photographs that overlap more, or a model with more points",
+    Fate.NO_MATCH: "a model with the right poses, calibration and image size; sharp photographs",
+    Fate.DEGENERATE: "photographs from another height or side: the camera moved along these lines",
+    Fate.NO_SUPPORT: "better poses and calibration (--refine-intrinsics): an error of a few pixels leaves no agreement",
+    Fate.AMBIGUOUS: "more photographs, or matches from elsewhere (--line-matches): the structure repeats itself",
+    Fate.NOT_LINKED: "more photographs of the same parts",
+    Fate.OUTLIER: "better poses and calibration (--refine-intrinsics)",
+    Fate.FEW_IMAGES: "more photographs of the same parts",
+    Fate.UNCERTAIN: "photographs from further apart",
+    Fate.SHORT_LINE: "a smaller MapLinesOptions.min_longest, or larger images",
+}
+
+
+def explain(line_map: LineMap) -> str:
+    """Say in words how many segments were mapped, where the others were lost, and what would help."""
+    counts = line_map.fate_counts()
+    total = sum(counts.values())
+    if not line_map.fates:
+        return "There are no images. Pass a scene with images and poses."
+    if total == 0:
+        return (
+            "No segments were found in any image. The photographs may be blank, blurred or very dark; a smaller least "
+            "length (--min-length) finds shorter ones."
+        )
+    mapped = counts[Fate.MAPPED] + counts[Fate.RECOVERED]
+    number = f"{line_map.num_lines:,} {'line' if line_map.num_lines == 1 else 'lines'}"
+    head = f"{number} from {mapped:,} of {total:,} segments in {_images(len(line_map.fates))}."
+    lost = sorted(((n, fate) for fate, n in counts.items() if fate > Fate.RECOVERED and n), reverse=True)
+    if not lost:
+        return head
+    parts = [f"{n:,} ({_percent(n, total)}) {_WORDS[fate]}" for n, fate in lost[:_NAMED]]
+    others = sum(n for n, _ in lost[_NAMED:])
+    if others:
+        parts.append(f"{others:,} ({_percent(others, total)}) were lost for other reasons")
+    start = "The map is empty" if line_map.num_lines == 0 else "Of the other segments"
+    return f"{head} {start}: {'; '.join(parts)}. What would help most: {_REMEDIES[lost[0][1]]}."
+
+
+def _images(number: int) -> str:
+    return f"{number} {'image' if number == 1 else 'images'}"
+
+
+def _percent(part: int, total: int) -> str:
+    return f"{100.0 * part / total:.0f} %" if 200 * part >= total else "under 1 %"
+
+
+__all__ = ["UNKNOWN", "Fate", "explain"]
