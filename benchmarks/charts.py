@@ -5,7 +5,8 @@ Lines of known place are seen by known cameras on a path, with noise, and are st
 is a least-squares problem of its own, solved by Levenberg-Marquardt in each chart; so what differs is the chart alone.
 Varied are the noise, the baseline (length of the path over the distance) and the distance of the scene from the origin.
 
-    python benchmarks/charts.py [--json FILE]
+    python benchmarks/charts.py [--json FILE]     the tables of docs/charts.md, under a minute
+    python benchmarks/charts.py --why             the table of reasons there, some seconds
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from groma.geometry.line_charts import LINE_CHARTS
 from groma.geometry.pose_charts import POSE_CHARTS
 from groma.problem._parallel import Workers
 from groma.problem.lay_out import lay_out
-from groma.problem.linearization import to_solver_order
+from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.independent import IndependentBlocks
@@ -36,11 +37,15 @@ DISTANCES = (0.0, 1.0, 10.0, 100.0)
 #: Starts: end points moved by this share of the viewing distance, standard deviation per coordinate.
 STARTS = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5)
 VIEWING_DISTANCE = 5.0
+#: Where the scene lies when it is away from the origin.
+AWAY = np.array([0.6, 0.64, 0.48])
+#: Turns in place and initial dampings of the table of reasons.
+ANGLES, DAMPINGS = (0.02, 0.1), (1e-4, 1e-10)
 
 
 def problem_of(rng, chart, noise: float, baseline: float, distance: float, start: float) -> tuple[Problem, Problem]:
     """Return a problem from a disturbed start, and the same from the truth."""
-    offset = distance * np.array([0.6, 0.64, 0.48])
+    offset = distance * AWAY
     x = np.linspace(-0.5, 0.5, VIEWS) * baseline * VIEWING_DISTANCE
     centers = np.column_stack([x, np.full(VIEWS, -VIEWING_DISTANCE), 0.2 * x**2])
     z = -centers / np.linalg.norm(centers, axis=1, keepdims=True)
@@ -72,18 +77,18 @@ def problem_of(rng, chart, noise: float, baseline: float, distance: float, start
     return problems[0], problems[1]
 
 
-def run(problem: Problem, steps: int) -> tuple[np.ndarray, float]:
-    """Return the cost of every line after every step (steps + 1, lines), and seconds per step."""
+def run(problem: Problem, steps: int, damping: float = 1e-4) -> tuple[np.ndarray, float]:
+    """Return the cost of every line after every step (steps + 1, lines), and processor seconds per step."""
     layout = lay_out(problem)
-    blocks = IndependentBlocks(layout, Workers(1), 1e-4, 1e-12)
+    blocks = IndependentBlocks(layout, Workers(1), damping, 1e-12)
     states = to_solver_order(layout)
     costs = blocks.costs(states)
     history = [costs[0].copy()]
-    begin = time.perf_counter()
+    begin = time.process_time()
     for _ in range(steps):
         states, costs, _ = blocks.step(states, costs)
         history.append(costs[0].copy())
-    return np.array(history), (time.perf_counter() - begin) / steps
+    return np.array(history), (time.process_time() - begin) / steps
 
 
 def measure(name: str, noise: float, baseline: float, distance: float, seed: int = 0) -> dict:
@@ -111,6 +116,70 @@ def measure(name: str, noise: float, baseline: float, distance: float, seed: int
     }  # fmt: skip
 
 
+def bend(name: str, distance: float, angle: float, seed: int = 0) -> float:
+    """Return how far a line leaves its place, over the viewing distance, when a chart turns it in place; the median.
+
+    The step is the one of first order that turns a line about its middle by ``angle`` radians. A chart in which turning
+    in place is a straight motion keeps the middle on the line.
+    """
+    rng, chart = np.random.default_rng(seed), LINE_CHARTS[name]
+    ends = rng.uniform(-1.0, 1.0, (LINES, 2, 3)) + distance * AWAY
+    d = ends[:, 1] - ends[:, 0]
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    middle = ends.mean(axis=1)
+    axis = np.cross(d, rng.normal(size=d.shape))
+    turn = np.cross(axis / np.linalg.norm(axis, axis=1, keepdims=True), d)
+    state = chart.from_ambient(np.hstack([np.cross(middle, d), d]))
+    L = chart.ambient(state)
+    rate = np.hstack([np.cross(middle, turn), turn]) * (L[:, 3:] * d).sum(axis=1, keepdims=True)
+    # the increments whose motion is the rate, up to the scale of (m, d), which means nothing
+    rows = np.array([1.0 / max(distance, 1.0)] * 3 + [1.0] * 3)
+    M = np.concatenate([np.asarray(chart.basis(state)), L[:, :, None]], axis=2) * rows[:, None]
+    steps = np.stack([np.linalg.lstsq(A, b, rcond=None)[0][:4] for A, b in zip(M, rate * rows, strict=True)])
+    moved = chart.ambient(chart.retract(state, angle * steps))
+    gap = np.cross(middle, moved[:, 3:]) - moved[:, :3]
+    return float(np.median(np.linalg.norm(gap, axis=1) / np.linalg.norm(moved[:, 3:], axis=1))) / VIEWING_DISTANCE
+
+
+def condition(problem: Problem) -> float:
+    """Return the median condition number of the normal matrices of the lines, scaled to a diagonal of ones."""
+    layout = lay_out(problem)
+    equations, states = NormalEquations(layout, Workers(1)), to_solver_order(layout)
+    equations.linearize(states, equations.prepare(states))
+    V = equations.V[0].reshape(-1, 4, 4)
+    size = 1.0 / np.sqrt(np.einsum("nii->ni", V))
+    values = np.linalg.eigvalsh(V * size[:, :, None] * size[:, None, :])
+    return float(np.median(values[:, -1] / np.maximum(values[:, 0], 1e-300)))
+
+
+def why(distances: tuple = DISTANCES) -> list[dict]:
+    """Return what could make charts differ: condition, damping, and how much a turn in place bends the line away."""
+    rows = []
+    for name, chart in LINE_CHARTS.items():
+        for distance in distances:
+            settings = (1.0, 1.0, distance, 0.1)
+            disturbed, true = problem_of(np.random.default_rng(0), chart, *settings)
+            best = problem_of(np.random.default_rng(0), LINE_CHARTS["cartesian"], *settings)[1]
+            limit = run(best, STEPS)[0][-1] * 1.001 + 1e-9
+            share = {damping: float((run(disturbed, STEPS, damping)[0][-1] <= limit).mean()) for damping in DAMPINGS}
+            rows.append(
+                {"chart": name, "distance": distance, "condition": condition(true), "share": share}
+                | {"bend": {angle: bend(name, distance, angle) for angle in ANGLES}}
+            )
+    return rows
+
+
+def print_why() -> None:
+    """Print the table of reasons."""
+    dampings = " | ".join(f"reach it, damping {damping:g}" for damping in DAMPINGS)
+    print(f"| chart | distance | condition | {dampings} | {' | '.join(f'bend at {angle} rad' for angle in ANGLES)} |")
+    print("|---|" + "---|" * (2 + len(DAMPINGS) + len(ANGLES)))
+    for row in why():
+        shares = " | ".join(f"{100 * share:.0f} %" for share in row["share"].values())
+        bends = " | ".join(f"{100 * bend:.2f} %" for bend in row["bend"].values())
+        print(f"| `{row['chart']}` | {row['distance']:g} | {row['condition']:.0f} | {shares} | {bends} |")
+
+
 def table(rows: list[dict], over: str, values: tuple) -> str:
     """Return a Markdown table: one line a chart, one column a value, averaged over the other settings."""
     head = f"| chart | {' | '.join(f'{over} {value:g}' for value in values)} |\n|---|{'---|' * len(values)}"
@@ -130,7 +199,11 @@ def main() -> None:
     """Run all settings and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", metavar="FILE")
+    parser.add_argument("--why", action="store_true", help="print what could make the charts differ instead")
     chosen = parser.parse_args()
+    if chosen.why:
+        print_why()
+        return
     rows = []
     for name in LINE_CHARTS:
         for noise in NOISES:

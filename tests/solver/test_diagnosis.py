@@ -1,16 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The diagnosis: every case that cannot be observed is named correctly, a sound scene gives no false alarm, suspicious
-cameras are found, and the outcome is plain data."""
+cameras are found, what is said agrees with the covariances, and the outcome is plain data."""
 
 import dataclasses
 import json
+from typing import Any
 
 import numpy as np
 import pytest
 from problems import INTRINSICS, cameras_on_a_ring, pixels_of, scene_problem
 
-from groma.factors import LineReprojection, PlaneObservation, PointOnPlane, PointReprojection, PositionPrior
+from groma.factors import (
+    LineReprojection,
+    PlaneObservation,
+    PointOnLine,
+    PointOnPlane,
+    PointReprojection,
+    PositionPrior,
+)
 from groma.factors._factor import Ref
+from groma.factors.losses import Tukey
 from groma.geometry import quaternion, se3
 from groma.geometry._manifold import Euclidean
 from groma.geometry.line_charts import LINE_CHARTS
@@ -18,6 +27,8 @@ from groma.geometry.plane_charts import PLANE_CHARTS
 from groma.geometry.pose_charts import POSE_CHARTS
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
+from groma.solver._observability import camera_centers, motion, observers
+from groma.solver.covariance import Covariances
 from groma.solver.diagnosis import diagnose
 
 pytestmark = pytest.mark.kernels
@@ -149,6 +160,18 @@ CASES = [
         "pure_rotation", ["only turn", "depth"],
     ),
     (
+        "cameras that hardly move",
+        lambda: problem_of(
+            np.vstack([looking([[0.006 * x, -6.0, 0.006 * z]], at=[x, 0, z]) for x in (-1, 0, 1) for z in (-0.5, 0.5)]),
+            CLOUD,
+        ),
+        "pure_rotation", ["hardly move", "0.1% of the viewing distance", "all 40 points"],
+    ),
+    (
+        "one camera", lambda: problem_of(looking([[0, -6.0, 0]]), CLOUD), "point_seen_once",
+        ["All points (40 of 40)", "one camera only"],
+    ),
+    (
         "line along the motion",
         lambda: problem_of(PATH, CLOUD, [[[-1, 0, 1.0], [1, 0, 1.0]], [[0, 0, -1], [0.3, 1, 1]]]),
         "line_along_motion", ["Line 0 ", "along the motion", "slide"],
@@ -192,7 +215,7 @@ CASES = [
     ),
     (
         "single plane", lambda: camera_and_planes([0, 0, 1, 0]), "camera_open",
-        ["Pose 0 ", "move in the plane across z", "turn about z"],
+        ["Pose 0 ", "move in the plane perpendicular to z", "turn about z"],
     ),
     ("two planes", lambda: camera_and_planes([0, 0, 1, 0], [1, 0, 0, -2]), "camera_open", ["Pose 0 ", "move along y"]),
     ("planar scene", lambda: problem_of(RING, CLOUD * [1, 1, 0]), "planar_scene", ["one plane", "homography"]),
@@ -206,9 +229,12 @@ CASES = [
     (
         "focal length and depth",
         lambda: problem_of(PATH, CLOUD * [1, 0, 1], free_intrinsics=True), "parameters_open",
-        ["Intrinsic 0", "compensate each other"],
+        ["Intrinsic 0", "fx, fy, cx and cy", "makes up for them"],
     ),
 ]  # fmt: skip
+
+
+CASES_BY_NAME = {case[0]: case[1] for case in CASES}
 
 
 @pytest.mark.parametrize(("make", "kind", "words"), [case[1:] for case in CASES], ids=[case[0] for case in CASES])
@@ -221,6 +247,99 @@ def test_what_is_not_observable_is_named(make, kind, words):
     problems = {finding.kind for finding in diagnosis.findings if finding.severity == "problem"}
     assert problems <= {kind}, diagnosis.sentences
     json.dumps(diagnosis.to_dict(), allow_nan=False)
+
+
+@pytest.mark.parametrize("centers", [[[0, -6, 0], [1, -6, 0]], [[0, -6, 0], [1, -6, 0], [2, -6, 0.5]]])
+def test_few_cameras_are_no_reason_for_alarm(centers):
+    """The frame and the scale of two cameras are those of the scene; no camera is open."""
+    diagnosis = diagnose(problem_of(looking(centers), CLOUD))
+    assert [finding.kind for finding in diagnosis.findings] == ["determined", "free_motions"], diagnosis.sentences
+    assert diagnosis.num_free_motions == 7
+
+
+@pytest.mark.parametrize(
+    ("make", "gauge", "group"),
+    [
+        (few_observations, "inner", "poses"),
+        (lambda: camera_and_planes([0, 0, 1, 0]), "held", "poses"),
+        (lambda: CASES_BY_NAME["plane through two points"](), "inner", "planes"),
+    ],
+    ids=["camera with two points", "single plane", "plane through two points"],
+)
+def test_what_can_move_has_no_covariance(make, gauge, group):
+    problem = make()
+    found = [finding for finding in diagnose(problem).findings if finding.group == group and finding.indices]
+    open_ones = sorted(i for finding in found for i in finding.indices)
+    assert open_ones == Covariances(problem, gauge=gauge).undetermined(group).tolist() != []
+
+
+@pytest.mark.parametrize("kept", ["eliminated", "kept"])
+def test_weakness_is_the_covariance_with_cameras_held(kept):
+    """Points near and far and lines, eliminated or not: the largest standard deviation over the distance."""
+    xyz = np.vstack([CLOUD, [[0.0, 10.0**k, 0.2 * 10**k] for k in (3.5, 3.8, 4.2)]])
+    problem = problem_of(RING[:3], xyz, RNG.uniform(-1, 1, (12, 2, 3)), held=True)
+    if kept == "kept":  # a pair of lines and points that touch: one of the two groups stays
+        touch = PointOnLine(point=Ref("points", np.arange(2)), line=Ref("lines", np.arange(2)), sqrt_information=1e-9)
+        problem = Problem(problem.variables, [*problem.factors, touch])
+    weakness = diagnose(problem).weakness
+    covariances = Covariances(problem)
+    for name in ("points", "lines"):
+        group, seen = problem.variables[name], observers(problem, name, camera_centers(problem))
+        J = motion(group.manifold, group.state, seen.middle, seen.distance)
+        sigma = np.sqrt(np.linalg.eigvalsh(J @ covariances.of(name) @ np.swapaxes(J, 1, 2))[:, -1])
+        # up to a fifth the bound is given that costs nothing, at most the root of the number of directions larger
+        weak = sigma > 0.2
+        assert weak.sum() == (3 if name == "points" else 0)
+        np.testing.assert_allclose(weakness[name][weak], sigma[weak], rtol=1e-4)
+        assert (weakness[name][~weak] < 0.2).all() and (weakness[name] > (1 - 1e-4) * sigma).all()
+
+
+def test_a_point_of_contradicting_matches_is_not_said_to_be_far():
+    """Two observations that a robust loss takes the weight of, and wide angles between all rays."""
+    problem = problem_of(RING[:3], CLOUD, held=True)
+    factor: Any = problem.factors[0]
+    pixels = factor.pixels.copy()
+    mine = np.flatnonzero(factor.references()[1][1].index == 7)
+    pixels[mine[1:]] += 4000.0
+    factor = dataclasses.replace(factor, pixels=pixels, loss=Tukey(5.0))
+    diagnosis = diagnose(Problem(problem.variables, [factor]))
+    found = [finding for finding in diagnosis.findings if finding.severity == "problem"]
+    assert [(finding.kind, finding.indices) for finding in found] == [("point_open", (7,))], diagnosis.sentences
+    assert "contradict" in found[0].sentence
+
+
+def test_a_plane_that_nothing_lies_on_is_no_problem():
+    problem = problem_of(RING, CLOUD, planes=[[0, 0, 1, 0.0], [0, 1, 0, 5.0]], on_plane=[(k, 0) for k in range(10)])
+    diagnosis = diagnose(problem)
+    found = [finding for finding in diagnosis.findings if finding.kind == "plane_unused"]
+    assert [(finding.severity, finding.indices) for finding in found] == [("warning", (1,))]
+    assert found[0].sentence == "Nothing lies on plane 1: it takes no part."
+
+
+@pytest.mark.parametrize("dense", [300, 0], ids=["decomposed", "by iteration"])
+@pytest.mark.parametrize("on_a_line", [1, 40], ids=["alone", "touching each other"])
+def test_lines_that_stay_in_the_system_are_judged_like_others(on_a_line, dense, monkeypatch):
+    """More points than lines, tied to each other: lines are kept, and those in an epipolar plane are found."""
+    monkeypatch.setattr("groma.solver._weak_modes.DENSE", dense)
+    ends = np.array([[[-1, 0, 1.0], [1, 0, 1.0]], [[0, 0, -1], [0.3, 1, 1]], [[-1, 0, 0.0], [1, 1.5, 0.0]]])
+    xyz = np.vstack([CLOUD, ends[1:2].mean(axis=1)])
+    problem = problem_of(PATH, xyz, ends)
+    touch = PointOnLine(
+        point=Ref("points", np.full(on_a_line, 40)), line=Ref("lines", np.arange(on_a_line) % 2 + (on_a_line == 1)),
+        sqrt_information=1e-9,
+    )  # fmt: skip
+    diagnosis = diagnose(Problem(problem.variables, [*problem.factors, touch]))
+    found = {finding.kind: finding.indices for finding in diagnosis.findings if finding.severity == "problem"}
+    assert found == {"line_along_motion": (0,), "line_in_epipolar_plane": (2,)}, diagnosis.sentences
+
+
+@pytest.mark.parametrize("name", ["camera with two points", "two planes", "focal length and depth", "free scene"])
+def test_large_systems_are_judged_like_small_ones(name, monkeypatch):
+    small = diagnose(CASES_BY_NAME[name]())
+    monkeypatch.setattr("groma.solver._weak_modes.DENSE", 0)
+    large = diagnose(CASES_BY_NAME[name]())
+    assert [finding.kind for finding in large.findings] == [finding.kind for finding in small.findings]
+    assert large.num_open_directions == small.num_open_directions
 
 
 def test_a_sound_scene_gives_no_alarm():
@@ -249,7 +368,7 @@ def test_weakness_does_not_depend_on_the_chart(chart):
 
 def test_a_camera_with_wrong_pixels_stands_out():
     problem = scene_problem(num_points=60, num_cameras=8, noise=0.5)
-    factor = problem.factors[0]
+    factor: Any = problem.factors[0]
     pixels = factor.pixels.copy()
     bad = factor.references()[0][1].index == 3
     pixels[bad] += np.random.default_rng(0).normal(0, 30, (int(bad.sum()), 2))
@@ -260,4 +379,4 @@ def test_a_camera_with_wrong_pixels_stands_out():
     assert len(found) == 1
     assert found[0].indices == (3,)
     assert "image 3.png" in found[0].sentence
-    assert "wrong matches" in found[0].sentence
+    assert "Wrong matches" in found[0].sentence

@@ -18,7 +18,9 @@ def selfcheck(
         bool,
         typer.Option("--nees", help="Check covariances instead: errors of simulated scenes against what they predict."),
     ] = False,
-    runs: Annotated[int, typer.Option(min=2, metavar="N", help="Scenes simulated with --nees.")] = 20,
+    runs: Annotated[
+        int, typer.Option(min=2, metavar="N", help="Scenes simulated with --nees, for either gauge.")
+    ] = 100,
     seed: _options.Seed = 0,
     force: _options.Force = False,
     threads: _options.Threads = None,
@@ -29,7 +31,8 @@ def selfcheck(
     """Compare the analytic derivatives of every factor with numeric ones, and with reference values.
 
     Prints the worst deviation per factor and block. With --nees, simulates scenes of known noise and prints how the
-    errors of poses, points, lines and planes compare with their covariances. Exit code 1 if something is too large.
+    errors of poses, points, lines, planes, directions and intrinsics compare with their covariances. Exit code 1 if
+    something is too large.
     """
     from groma.cli import _output
     from groma.cli._console import Console
@@ -61,11 +64,11 @@ def _check_covariances(console, runs: int, seed: int) -> tuple[bool, dict]:
 
     outcome = consistency(runs, seed)
     console.say("Normalised estimation error squared: its average should be the degrees of freedom.")
-    console.say(f"{'gauge':<8}{'kind':<10}{'expected':>9}{'average':>9}{'95 % band':>19}{'errors':>9}")
+    console.say(f"{'gauge':<8}{'kind':<12}{'expected':>9}{'average':>9}{'95 % band':>19}{'errors':>9}")
     for row in outcome.rows:
         mark = "" if row.inside else "   outside" if row.passed else "   FAILED"
         band = f"{row.low:.3f} .. {row.high:.3f}"
-        console.say(f"{row.gauge:<8}{row.kind:<10}{row.dof:>9}{row.average:>9.3f}{band:>19}{row.count:>9}{mark}")
+        console.say(f"{row.gauge:<8}{row.kind:<12}{row.dof:>9}{row.average:>9.3f}{band:>19}{row.count:>9}{mark}")
     inside = sum(row.inside for row in outcome.rows)
     failures = sum(not row.passed for row in outcome.rows)
     console.say(

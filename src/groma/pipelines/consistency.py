@@ -11,9 +11,11 @@ with 95 % probability. Variables of one run are correlated through the cameras, 
 covariance of all of them, whitened block by block, the sum of their NEES has the variance
 :math:`2\lVert C\rVert_F^2`; a scaled :math:`\chi^2` of that mean and variance gives the band.
 
-Frames: with ``held``, the first camera and the scale are held at their true values. With ``inner`` nothing is held, and
-errors are freed of their common motion as the covariances are (:mod:`groma.solver._datum`). Planes take part in the
-first only: their relations are measured in lengths, so the scale of the scene is not quite free with them.
+Two problems are tested, both with unknown intrinsics and without robust losses. With ``held`` the first camera and the
+scale are held at their true values, and everything is adjusted together: points, lines, planes and directions, and the
+relations between them (:mod:`groma.pipelines._consistency_scenes`). With ``inner`` nothing is held, and errors are
+freed of their common motion as the covariances are (:mod:`groma.solver._datum`). There are no relations then: they are
+measured in lengths, so the scale of the scene is not quite free with them.
 
 References
 ----------
@@ -31,21 +33,25 @@ from scipy.stats import chi2
 from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.pipelines._assemble import AssemblyOptions, assemble
-from groma.pipelines._structure_factors import lengths_per_pixel
+from groma.pipelines._consistency_scenes import STRUCTURE_SIGMA_PX, drawn
 from groma.problem.problem import Problem
-from groma.scene import Scene
-from groma.scene.landmarks import Lines
-from groma.scene.observations import Relations
-from groma.scene.synthetic import holistic, project_pinhole
 from groma.solver.covariance import Covariances
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
 #: Names of the groups of variables in rows of the result.
-KINDS = {"frames": "poses", "points": "points", "lines": "lines", "planes": "planes"}
+KINDS = {
+    "frames": "poses",
+    "points": "points",
+    "lines": "lines",
+    "planes": "planes",
+    "directions": "directions",
+    "intrinsics/PINHOLE": "intrinsics",
+}
 #: Probability of the band, and of the wider one outside of which the check fails.
 BAND, LIMIT = 0.95, 0.999
-STRUCTURE_SIGMA_PX = 0.1
+#: Runs of which the variance is taken to be that of all.
+SAMPLED = 5
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ class ConsistencyRow:
 
     #: ``held`` or ``inner``.
     gauge: str
-    #: ``poses``, ``points``, ``lines`` or ``planes``.
+    #: ``poses``, ``points``, ``lines``, ``planes``, ``directions`` or ``intrinsics``.
     kind: str
     #: Degrees of freedom: the mean that is expected.
     dof: int
@@ -94,9 +100,9 @@ class ConsistencyReport:
 
 
 def consistency(
-    runs: int = 20,
+    runs: int = 100,
     seed: int = 0,
-    num_images: int = 10,
+    num_images: int = 15,
     noise_px: float = 0.5,
     believed_px: float | None = None,
     gauges: tuple[str, ...] = ("held", "inner"),
@@ -147,14 +153,16 @@ def _check(
         point_sigma_px=believed_px,
         line_sigma_px=believed_px,
         structure_sigma_px=STRUCTURE_SIGMA_PX,
+        refine_intrinsics=True,
+        refine_principal_point=True,
         drop_behind=False,
     )
-    sums: dict[str, list[float]] = {}
-    degrees: dict[str, float] = {}
+    values: dict[str, list[float]] = {}
+    spreads: dict[str, list[tuple[float, float]]] = {}
     dofs: dict[str, int] = {}
     for run in range(runs):
         rng = np.random.default_rng([seed, run, gauge == "held"])
-        truth = assemble(_drawn(num_images, int(rng.integers(2**31)), noise_px, rng, options.planes), options).problem
+        truth = assemble(drawn(num_images, noise_px, rng, options.planes), options).problem
         estimate = solve(truth, SolverOptions(function_tolerance=1e-12, max_iterations=30)).problem
         covariances = Covariances(estimate, gauge=gauge)
         errors = covariances.in_datum(
@@ -166,41 +174,11 @@ def _check(
         for name, kind in KINDS.items():
             if name not in errors:
                 continue
-            values = _nees(errors[name], covariances.of(name))
-            sums.setdefault(kind, []).extend(values)
+            values.setdefault(kind, []).extend(_nees(errors[name], covariances.of(name)))
             dofs[kind] = estimate.variables[name].manifold.dof
-            if run == 0:
-                degrees[kind] = _effective_degrees(covariances, estimate, name)
-    return [_row(gauge, kind, dofs[kind], np.array(values), runs * degrees[kind]) for kind, values in sums.items()]
-
-
-def _drawn(num_images: int, seed: int, noise_px: float, rng: np.random.Generator, planes: bool) -> Scene:
-    """Return a true scene measured with noise, in which relations hold up to the noise that they are given."""
-    scene = holistic(num_images, seed, noise_px=0.0).truth
-    relations = scene.relations
-    scene = scene.replace(
-        relations=Relations(point_on_plane=relations.point_on_plane, line_on_plane=relations.line_on_plane)
-    )
-    if planes:
-        point, plane = scene.relations.point_on_plane.T
-        normal = scene.planes.hesse[:, :3]
-        xyz = scene.points.xyz.copy()
-        sigma = STRUCTURE_SIGMA_PX * lengths_per_pixel(scene, "point")
-        xyz[point] += (sigma[point] * rng.normal(size=len(point)))[:, None] * normal[plane]
-        line, plane = scene.relations.line_on_plane.T
-        ends = scene.lines.segments.copy()
-        sigma = STRUCTURE_SIGMA_PX * lengths_per_pixel(scene, "line")
-        ends[line] += (sigma[line, None] * rng.normal(size=(len(line), 2)))[:, :, None] * normal[plane][:, None]
-        scene = scene.replace(points=scene.points.replace(xyz=xyz), lines=Lines.through(ends))
-    params, poses = scene.cameras.params[0, :4], scene.cam_from_world
-    seen, table = scene.point_observations, scene.line_observations
-    pixel = project_pinhole(params, poses[seen.image_idx], scene.points.xyz[seen.point_idx])[0]
-    ends = scene.lines.segments[table.line_idx]
-    segment = np.hstack([project_pinhole(params, poses[table.image_idx], ends[:, k])[0] for k in (0, 1)])
-    return scene.replace(
-        point_observations=seen.replace(pixel=pixel + rng.normal(0, noise_px, pixel.shape)),
-        line_observations=table.replace(segment=segment + rng.normal(0, noise_px, segment.shape)),
-    )
+            if run < SAMPLED:
+                spreads.setdefault(kind, []).append(_spread(covariances, estimate, name))
+    return [_row(gauge, kind, dofs[kind], np.array(values[kind]), runs, spreads[kind]) for kind in dofs]
 
 
 def _nees(errors: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -211,8 +189,8 @@ def _nees(errors: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.einsum("ni,ni->n", e, np.linalg.solve(sigma, e[:, :, None])[:, :, 0])
 
 
-def _effective_degrees(covariances: Covariances, problem: Problem, name: str) -> float:
-    """Degrees of freedom of a chi square that varies as much as the summed NEES of one run."""
+def _spread(covariances: Covariances, problem: Problem, name: str) -> tuple[float, float]:
+    """Mean of the summed NEES of one run, and half of its variance."""
     blocks = covariances.of(name)
     diagonal = np.einsum("nii->ni", blocks)
     free = np.flatnonzero(np.isfinite(diagonal).all(axis=1) & (diagonal > 0).all(axis=1))
@@ -222,11 +200,15 @@ def _effective_degrees(covariances: Covariances, problem: Problem, name: str) ->
     for k, i in enumerate(free):
         at = slice(k * dof, (k + 1) * dof)
         W[at, at] = np.linalg.inv(np.linalg.cholesky(blocks[i]))
-    mean = len(joint)
-    return mean**2 / float(((W @ joint @ W.T) ** 2).sum())
+    return float(len(joint)), float(((W @ joint @ W.T) ** 2).sum())
 
 
-def _row(gauge: str, kind: str, dof: int, values: FloatArray, degrees: float) -> ConsistencyRow:
+def _row(
+    gauge: str, kind: str, dof: int, values: FloatArray, runs: int, spreads: list[tuple[float, float]]
+) -> ConsistencyRow:
+    """Average, and the bands of a chi square that has the mean and the variance of the sum over all runs."""
+    mean, half_variance = np.mean(spreads, axis=0)
+    degrees = runs * mean**2 / half_variance
     average = float(values.mean())
     low, high = (float(dof / degrees * chi2.ppf(0.5 + side * BAND / 2, degrees)) for side in (-1, 1))
     least, most = (float(dof / degrees * chi2.ppf(0.5 + side * LIMIT / 2, degrees)) for side in (-1, 1))

@@ -11,11 +11,13 @@ the chart. A standard deviation of 1 means that the distance could as well be tw
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._numba import loop
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.geometry._manifold import Manifold
 from groma.problem.problem import Problem
 
@@ -23,18 +25,47 @@ from groma.problem.problem import Problem
 SEEN = ("point", "line", "plane", "direction")
 
 
+# ------------------------------------------------------------------------------------------------------------ Kernels
+@loop
+def _add_centers(variable, pose, centers, count, middle):
+    """Count the observations of each variable and sum the centres they are made from."""
+    for i in range(variable.shape[0]):
+        v, p = variable[i], pose[i]
+        count[v] += 1
+        for k in range(3):
+            middle[v, k] += centers[p, k]
+
+
+@loop
+def _add_distances(variable, pose, centers, at, distance):
+    """Sum the distances of each variable from the centres that see it."""
+    for i in range(variable.shape[0]):
+        v, p = variable[i], pose[i]
+        x, y, z = at[v, 0] - centers[p, 0], at[v, 1] - centers[p, 1], at[v, 2] - centers[p, 2]
+        distance[v] += math.sqrt(x * x + y * y + z * z)
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True)
 class Observers:
-    """Which poses see the variables of a group, distinct pairs sorted by variable."""
+    """Which poses see the variables of a group: one pair for each observation, in no particular order."""
 
     variable: IntArray
     #: Row of the pose in ``centers``.
     pose: IntArray
-    #: (count,) number of distinct poses, and the mean distance from them, of every variable.
+    #: (C, 3) centres of all poses.
+    centers: FloatArray
+    #: (count,) number of observations, and the mean distance from where they are made, of every variable.
     count: IntArray
     distance: FloatArray
-    #: (count, 3) middle of the camera centres that see it.
+    #: (count, 3) mean of the centres that see it.
     middle: FloatArray
+
+    def of(self, chosen: BoolArray) -> tuple[IntArray, IntArray]:
+        """Return the distinct pairs (variable, pose) of the chosen variables, sorted."""
+        mine = np.flatnonzero(chosen[self.variable])
+        key = distinct(self.variable[mine] * max(len(self.centers), 1) + self.pose[mine])
+        return key // max(len(self.centers), 1), key % max(len(self.centers), 1)
 
 
 def camera_centers(problem: Problem) -> dict[str, FloatArray]:
@@ -51,30 +82,30 @@ def camera_centers(problem: Problem) -> dict[str, FloatArray]:
 
 def observers(problem: Problem, name: str, centers: dict[str, FloatArray]) -> Observers:
     """Find the poses that see each variable of a group, directly or by what lies on it."""
-    count = len(problem.variables[name])
+    number = len(problem.variables[name])
     offsets, every = {}, [np.zeros((0, 3))]
     for group, part in centers.items():
         offsets[group] = sum(len(x) for x in every)
         every.append(part)
-    all_centers = np.concatenate(every)
-    keys = [np.zeros(0, np.int64)]
+    all_centers = np.ascontiguousarray(np.concatenate(every))
+    none = np.zeros(0, np.int64)
+    variables, poses = [none], [none]
     for factor in problem.factors:
         mine = [ref for _, ref in factor.references() if ref.group == name]
-        poses = [ref for slot, ref in factor.references() if ref.group in offsets and slot.name != "extrinsics"]
-        if len(mine) == 1 and len(poses) == 1 and poses[0].group != name:
-            pose = poses[0].index.astype(np.int64) + offsets[poses[0].group]
-            keys.append(mine[0].index.astype(np.int64) * len(all_centers) + pose)
-    key = distinct(np.concatenate(keys))
-    variable, pose = (key // max(len(all_centers), 1)), (key % max(len(all_centers), 1))
-    seen = np.bincount(variable, minlength=count)
-    middle = np.zeros((count, 3))
-    for k in range(3):
-        middle[:, k] = np.bincount(variable, weights=all_centers[pose, k], minlength=count) / np.maximum(seen, 1)
-    at = nearest_place(problem.variables[name].manifold, problem.variables[name].state, middle)
-    gap = np.linalg.norm(at[variable] - all_centers[pose], axis=1)
-    distance = np.bincount(variable, weights=gap, minlength=count) / np.maximum(seen, 1)
-    fallback = float(np.median(distance[seen > 0])) if (seen > 0).any() else 1.0
-    return Observers(variable, pose, seen, np.where(distance > 0, distance, max(fallback, 1e-300)), middle)
+        from_pose = [ref for slot, ref in factor.references() if ref.group in offsets and slot.name != "extrinsics"]
+        if len(mine) == 1 and len(from_pose) == 1 and from_pose[0].group != name:
+            variables.append(mine[0].index.astype(np.int64))
+            poses.append(from_pose[0].index.astype(np.int64) + offsets[from_pose[0].group])
+    variable, pose = np.concatenate(variables), np.concatenate(poses)
+    count, middle, distance = np.zeros(number, np.int64), np.zeros((number, 3)), np.zeros(number)
+    _add_centers(variable, pose, all_centers, count, middle)
+    middle /= np.maximum(count, 1)[:, None]
+    group = problem.variables[name]
+    _add_distances(variable, pose, all_centers, nearest_place(group.manifold, group.state, middle), distance)
+    distance /= np.maximum(count, 1)
+    fallback = float(np.median(distance[count > 0])) if (count > 0).any() else 1.0
+    distance = np.where(distance > 0, distance, max(fallback, 1e-300))
+    return Observers(variable, pose, all_centers, count, distance, middle)
 
 
 def distinct(values: IntArray) -> IntArray:
@@ -87,7 +118,7 @@ def nearest_place(manifold: Manifold, state: FloatArray, middle: FloatArray) -> 
     """Place (count, 3) of points, or the place of lines and planes nearest to ``middle``."""
     ambient = manifold.ambient(state)
     if manifold.kind == "point":
-        return ambient
+        return np.ascontiguousarray(ambient)
     if manifold.kind == "line":
         m, d = ambient[:, :3], ambient[:, 3:]
         size = np.maximum((d * d).sum(axis=1, keepdims=True), 1e-300)

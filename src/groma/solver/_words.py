@@ -56,7 +56,7 @@ def _shift_words(shifts: FloatArray) -> list[str]:
     if shifts.shape[1] == 1:
         return [f"move along {axis(shifts[:, 0])}"]
     if shifts.shape[1] == 2:
-        return [f"move in the plane across {axis(np.cross(shifts[:, 0], shifts[:, 1]))}"]
+        return [f"move in the plane perpendicular to {axis(np.cross(shifts[:, 0], shifts[:, 1]))}"]
     return ["move in every direction"]
 
 
@@ -66,7 +66,7 @@ def _turn_words(turns: FloatArray) -> list[str]:
     if turns.shape[1] == 3:
         return ["turn about every axis"]
     if turns.shape[1] == 2:
-        return [f"turn about every axis across {axis(np.cross(turns[:, 0], turns[:, 1]))}"]
+        return [f"turn about every axis perpendicular to {axis(np.cross(turns[:, 0], turns[:, 1]))}"]
     return [f"turn about {axis(turns[:, 0])}"]
 
 
@@ -100,13 +100,13 @@ def scene_freedom(combinations: FloatArray) -> list[str]:
     if shifts.shape[1] == 3:
         words.append("translation")
     elif shifts.shape[1] == 2:
-        words.append(f"translation across {axis(np.cross(shifts[:, 0], shifts[:, 1]))}")
+        words.append(f"translation perpendicular to {axis(np.cross(shifts[:, 0], shifts[:, 1]))}")
     elif shifts.shape[1] == 1:
         words.append(f"translation along {axis(shifts[:, 0])}")
     if turns.shape[1] == 3:
         words.append("rotation")
     elif turns.shape[1] == 2:
-        words.append(f"rotation about every axis across {axis(np.cross(turns[:, 0], turns[:, 1]))}")
+        words.append(f"rotation about every axis perpendicular to {axis(np.cross(turns[:, 0], turns[:, 1]))}")
     elif turns.shape[1] == 1:
         words.append(f"rotation about {axis(turns[:, 0])}")
     return words + (["scale"] if scaling else [])
