@@ -109,3 +109,39 @@ def test_the_derivatives_given_to_scipy_are_right(benchmark, tmp_path):
         numeric[:, k] = (problem.residuals(start + step) - problem.residuals(start - step)) / (2 * step[k])
     np.testing.assert_allclose(problem.jacobian(start).toarray(), numeric, rtol=1e-6, atol=1e-5)
     assert problem.pattern().nnz == 6 * 2 * 12
+
+
+def _holistic_run(images, contestant, cpu_s, iterations=4, kind="lines", seed=0, line=1.0):
+    errors = {"centre": 1.0, "point": 1.0, "line_deg": 1.0, "line": line, "plane_deg": 1.0, "plane": 1.0}
+    return {
+        "images": images, "views": "near", "seed": seed, "kind": kind, "contestant": contestant, "cpu_s": cpu_s,
+        "iterations": iterations, "errors": errors,
+    }  # fmt: skip
+
+
+def test_holistic_promises(benchmark):
+    holistic = benchmark("holistic")
+    sizes = (100, 200, 500, 1000)
+    runs = holistic.Runs([_holistic_run(n, "groma", 1e-5 * n**1.1) for n in sizes])
+    for n in sizes:
+        runs.add(_holistic_run(n, "limap", 1e-5 * n**1.1 * (11 if n >= 500 else 3.1), iterations=20))
+    assert holistic.broken_promises(runs) == []
+    assert holistic.growth(runs)["near", "lines"][0] == pytest.approx(1.1)
+    runs.add(_holistic_run(1000, "groma", 1e-5 * 1000**1.1, iterations=9))
+    assert len(runs.of(images=1000, contestant="groma")) == 1
+    assert ["9 steps" in sentence for sentence in holistic.broken_promises(runs)] == [True]
+    for n in sizes:
+        runs.add(_holistic_run(n, "groma", 1e-7 * n**2))
+    broken = " ".join(holistic.broken_promises(runs))
+    assert "exponent 2.00" in broken and "times longer" in broken
+
+
+def test_holistic_errors_are_compared_over_enough_scenes(benchmark):
+    holistic = benchmark("holistic")
+    rows = [_holistic_run(100, "groma", 1.0, seed=s, line=2.0) for s in range(10)]
+    rows += [_holistic_run(100, "limap", 9.0, seed=s) for s in range(10)]
+    assert len(holistic.broken_promises(holistic.Runs(rows))) == 1
+    assert holistic.broken_promises(holistic.Runs(rows[:-1])) == []
+    text = holistic.accuracy_table(holistic.Runs([{**row, "views": "random"} for row in rows]))
+    assert "| lines | groma | 10 | 1.00 | 1.00 | 1.000° 2.00 | – |" in text
+    assert "| lines | limap, as published | 10 | 4.37 | 5.39 | 0.309° 6.05 | – |" in text

@@ -31,6 +31,17 @@ def reduced(scene: groma.Scene, kind: str) -> tuple[groma.Scene, groma.AdjustOpt
     return scene.replace(relations=kept), options
 
 
+def arrays_of(scene: groma.Scene) -> dict[str, np.ndarray]:
+    """Return what is compared with the truth, landmarks in the order of their identifiers."""
+    return {
+        "images": np.array(scene.images.names),
+        "poses": se3.to_matrix(scene.cam_from_world)[:, :3],
+        "points": scene.points.xyz[np.argsort(scene.points.ids)],
+        "lines": scene.lines.segments[np.argsort(scene.lines.ids)],
+        "planes": scene.planes.hesse[np.argsort(scene.planes.ids)],
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder")
@@ -47,15 +58,7 @@ def main() -> None:
     clock = Clock()
     result = groma.adjust(scene, options)
     times = clock.read()
-    adjusted = result.scene
-    np.savez(
-        arguments.result,
-        images=np.array(adjusted.images.names),
-        poses=se3.to_matrix(adjusted.cam_from_world)[:, :3],
-        points=adjusted.points.xyz[np.argsort(adjusted.points.ids)],
-        lines=adjusted.lines.segments[np.argsort(adjusted.lines.ids)],
-        planes=adjusted.planes.hesse[np.argsort(adjusted.planes.ids)],
-    )
+    np.savez(arguments.result, **arrays_of(result.scene))
     solved = result.report.solve
     report(
         contestant="groma",

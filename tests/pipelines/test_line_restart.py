@@ -8,7 +8,7 @@ import pytest
 
 import groma
 from groma.pipelines._assemble import LINE_FACTORS, AssemblyOptions, assemble
-from groma.pipelines._line_restart import restart_lines
+from groma.pipelines._line_restart import _line_costs, restart_lines, settle_lines
 from groma.scene import Relations, synthetic
 
 pytestmark = pytest.mark.kernels
@@ -65,3 +65,26 @@ def test_adjust_recovers(scenes, loss):
     result = groma.adjust(wrong, groma.AdjustOptions(loss=loss, planes=False))
     assert _sine(result.scene.lines.plucker[BAD], truth.lines.plucker[BAD]) < 0.02
     assert result.report.solve.iterations <= 15
+
+
+def test_settled_lines_are_at_their_minima_and_nothing_else_moves(scenes):
+    truth, _ = scenes
+    problem = _problem(truth)
+    settled = settle_lines(problem)
+    for name, group in problem.variables.items():
+        if name != "lines":
+            np.testing.assert_array_equal(settled.variables[name].state, group.state)
+    factors = [factor for factor in problem.factors if factor.type_name in LINE_FACTORS]
+    costs = [_line_costs(p, factors)[0] for p in (problem, settled, settle_lines(settled))]
+    assert (costs[1] < costs[0]).all()
+    np.testing.assert_allclose(costs[2], costs[1], rtol=1e-4)
+    held = {**problem.variables, "lines": replace(problem.variables["lines"], constant=True)}
+    assert settle_lines(type(problem)(held, problem.factors)).variables["lines"] is held["lines"]
+
+
+def test_few_steps_where_a_line_starts_in_a_wrong_minimum():
+    """Twelve steps were needed before the first stage ended at a refused step."""
+    start = synthetic.holistic(100, noise_px=1.0, seed=1, views="near").start
+    result = groma.adjust(start.replace(relations=Relations()), groma.AdjustOptions(loss="none", planes=False))
+    assert result.report.solve.iterations <= 8
+    assert result.report.solve.converged

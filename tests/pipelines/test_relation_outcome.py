@@ -52,3 +52,37 @@ def test_plain_least_squares_drops_nothing(scenes):
     result = groma.adjust(tied, groma.AdjustOptions(loss="none"))
     assert result.report.relations["point_on_plane"]["dropped"] == 0
     assert len(result.scene.relations) == len(tied.relations)
+
+
+def _real_like():
+    """A walk with the noise of matches: a narrow core, one point match in twenty wrong, and an eighth of ties wrong."""
+    scene = synthetic.corridor(24, noise_px=0.3, seed=4)
+    rng = np.random.default_rng(0)
+    table = scene.start.point_observations
+    pixel = table.pixel.copy()
+    wrong = rng.random(len(pixel)) < 0.05
+    pixel[wrong] += rng.uniform(-30.0, 30.0, (int(wrong.sum()), 2))
+    right = scene.start.relations
+    tied = {}
+    for name in ("point_on_plane", "line_on_plane"):
+        pairs = getattr(right, name).copy()
+        rows = np.flatnonzero(rng.random(len(pairs)) < 0.125)
+        pairs[rows, 1] = (pairs[rows, 1] + rng.integers(1, scene.start.num_planes, len(rows))) % scene.start.num_planes
+        tied[name] = pairs
+    start = scene.start.replace(point_observations=table.replace(pixel=pixel), relations=Relations(**tied))
+    return scene.truth, start
+
+
+def test_wrong_ties_beside_wrong_matches_are_never_worse_than_points_alone():
+    truth, start = _real_like()
+    assert len(start.relations.point_on_plane) > 100
+    errors = {}
+    for name, scene, options in (
+        ("points", start.replace(relations=Relations()), groma.AdjustOptions(lines=False, planes=False)),
+        ("everything", start, groma.AdjustOptions()),
+    ):
+        result = groma.adjust(scene, options)
+        errors[name] = evaluate_poses(result.scene, truth)
+    assert result.report.relations["point_on_plane"]["dropped"] > 0.8 * 0.125 * len(start.relations.point_on_plane)
+    assert errors["everything"].center_rmse <= errors["points"].center_rmse
+    assert errors["everything"].rotation_deg_mean <= errors["points"].rotation_deg_mean

@@ -68,3 +68,10 @@ def test_both_forms_pull_landmarks_to_their_planes(holistic):
 def test_unknown_form_is_refused(holistic):
     with pytest.raises(groma.InputError, match="structure_form"):
         groma.adjust(holistic.start, groma.AdjustOptions(structure_form="inches"))
+
+
+def test_robust_pixel_form_does_not_drift(holistic):
+    """Segments on planes are compared at ends that do not move with the scene; a free gauge would creep for ever."""
+    result = groma.adjust(holistic.start, groma.AdjustOptions(structure_form="pixels"))
+    assert result.report.solve.converged
+    assert result.report.solve.iterations <= 20

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from groma.cli import _output
-from groma.cli.main import INTERRUPTED
+from groma.cli._interrupt import INTERRUPTED
 from groma.errors import OutputError
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ def map_and_write(
     judge: Callable[[MapResult], dict[str, Any]] | None = None,
     explain: bool = True,
     diagnose: bool | None = None,
+    contributions: bool = False,
+    truth: Scene | None = None,
 ) -> dict[str, Any]:
     """Map a folder of photographs, write all results to ``output``, say what came out, and return the numbers.
 
@@ -63,15 +65,21 @@ def map_and_write(
         Say what became of the segments, and what is not determined; otherwise only with --verbose.
     diagnose : bool, optional
         Say what the data determine; None: unless there are many images.
+    contributions : bool
+        Adjust by points alone, with lines, with planes, and say what each of them changes.
+    truth : Scene, optional
+        With ``contributions``: poses to compare with.
     """
+    from groma.cli._contributions import describe_contributions
     from groma.cli._diagnosis import diagnosis_of, say_diagnosis
     from groma.cli._interrupt import interruptible
     from groma.io import write_geometry, write_scene
     from groma.pipelines._stages import has_stages, remove_stages, system_reason
     from groma.pipelines.map import map_images
+    from groma.viz._page_tables import contributions_card
     from groma.viz.report import write_report
 
-    fresh = console.announce_compilation()
+    console.announce_compilation()
     work = output.with_name(output.name + ".work")
     if has_stages(work):
         console.say(f"Going on from the finished stages in {work}, as far as they fit.")
@@ -88,6 +96,8 @@ def map_and_write(
     scene = result.scene
     diagnosis = diagnosis_of(scene, lambda: _diagnosis(result, options), console, diagnose)
     numbers: dict[str, Any] = _numbers(result) | {"diagnosis": diagnosis} | (judge(result) if judge is not None else {})
+    if contributions:
+        numbers["contributions"] = _contributions(result, options, truth)
     try:
         with _output.atomic_output(output, force, work) as draft:
             write_scene(scene, draft, format="colmap")
@@ -104,6 +114,7 @@ def map_and_write(
                 explanation=result.explanation,
                 warnings=result.warnings,
                 diagnosis=diagnosis,
+                cards=contributions_card(numbers.get("contributions")),
             )
             _output.write_json(str(draft / "summary.json"), numbers)
     except OutputError as error:
@@ -114,12 +125,13 @@ def map_and_write(
     remove_stages(work)
     for line in _sentences(result, console.verbose):
         console.say(line)
+    for line in describe_contributions(numbers.get("contributions", [])):
+        console.say(line)
     if explain or console.verbose:
         say_diagnosis(diagnosis, console)
     (console.say if explain else console.detail)(result.explanation)
     for sentence in result.warnings:
         console.warn(sentence)
-    console.detail(f"with compilation: {fresh}")
     return numbers
 
 
@@ -156,6 +168,25 @@ def _diagnosis(result: MapResult, options: MapOptions) -> Diagnosis:
         loss=GemanMcClure(LAST_SCALE_SIGMAS),
     )
     return diagnose_scene(result.scene, assembly)
+
+
+def _contributions(result: MapResult, options: MapOptions, truth: Scene | None) -> list[dict[str, Any]]:
+    """Repeat the last adjustment of a map, with its noise, by points alone and with more and more."""
+    from groma.pipelines.adjust import AdjustOptions
+    from groma.pipelines.contributions import contributions
+    from groma.pipelines.map import LOSS_SIGMAS
+
+    known = {kind: sigma for kind, sigma in result.sigma_px.items() if sigma > 0}
+    weighted = AdjustOptions(
+        point_sigma_px=known.get("points", 1.0),
+        line_sigma_px=known.get("lines", 1.0),
+        structure_sigma_px=options.structure.surface_sigma_px,
+        loss_scale=LOSS_SIGMAS,
+        refine_poses=options.refine_poses,
+        refine_intrinsics=options.refine_intrinsics,
+        threads=options.threads,
+    )
+    return [entry.to_dict() for entry in contributions(result.before, weighted, truth)]
 
 
 def _sentences(result: MapResult, verbose: bool = False) -> list[str]:

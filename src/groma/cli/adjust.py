@@ -97,6 +97,19 @@ def adjust(
             help="Say what the data do not determine. Default: yes up to 300 images.",
         ),
     ] = None,
+    contributions: Annotated[
+        bool,
+        typer.Option(
+            "--contributions",
+            help="Also adjust by points alone, with lines, with planes, and say what each of them changes.",
+        ),
+    ] = False,
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            "--truth", metavar="SCENE", help="With --contributions: a scene to compare the camera poses with, by name."
+        ),
+    ] = None,
     force: _options.Force = False,
     threads: _options.Threads = None,
     seed: _options.Seed = 0,
@@ -122,8 +135,11 @@ def adjust(
         raise InputError(f"--covariance must end in .npz or .json; got {covariance}.")
     if not 0.0 < sigma0 < float("inf"):
         raise InputError(f"--sigma0 must be positive; got {sigma0}.")
+    if truth is not None and not contributions:
+        raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
     _output.check_json(json_target, force)
 
+    from groma.cli._contributions import describe_contributions
     from groma.cli._diagnosis import diagnosis_of, say_diagnosis
     from groma.cli._numbers import describe, describe_uncertainty
     from groma.io import read_scene, structures_of, write_scene
@@ -150,10 +166,15 @@ def adjust(
         **{name: value for name, value in chosen.items() if value is not None},  # type: ignore[arg-type]
     )
     before = read_scene(source)
+    true = None if truth is None else read_scene(truth)
     fresh = console.announce_compilation()
     with console.progress() as progress:
         result = run_adjust(before, options, progress)
     numbers: dict[str, Any] = result.report.to_dict()
+    if contributions:
+        from groma.pipelines.contributions import contributions as find_contributions
+
+        numbers["contributions"] = [entry.to_dict() for entry in find_contributions(before, options, true)]
     numbers["diagnosis"] = diagnosis_of(
         result.scene, lambda: diagnose_scene(result.scene, problem=result.problem), console, diagnosis
     )
@@ -161,10 +182,12 @@ def adjust(
     if output is not None:
         write_scene(result.scene, output, force=force, like=structures_of(source))
     if page is not None:
+        from groma.viz._page_tables import contributions_card
         from groma.viz.report import write_report
 
         with _output.atomic_output(page, force) as draft:
-            write_report(draft, before, result.scene, result.report, diagnosis=numbers["diagnosis"])
+            cards = contributions_card(numbers.get("contributions"))
+            write_report(draft, before, result.scene, result.report, diagnosis=numbers["diagnosis"], cards=cards)
     found, failure = None, None
     if covariance is not None:
         from groma.cli._covariance import write_covariances
@@ -182,6 +205,8 @@ def adjust(
     if found is not None:
         for line in describe_uncertainty(found.to_dict()):
             console.say(line)
+    for line in describe_contributions(numbers.get("contributions", [])):
+        console.say(line)
     say_diagnosis(numbers["diagnosis"], console)
     for sentence in result.report.warnings:
         console.warn(sentence)

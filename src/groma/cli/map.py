@@ -30,7 +30,7 @@ def map_(
     line_matches: Annotated[
         Path | None,
         typer.Option(
-            metavar="NPZ", help="Segments and their matches from elsewhere; see groma.frontend.external for the layout."
+            metavar="NPZ", help="Segments and their matches from elsewhere; the documentation has the layout."
         ),
     ] = None,
     min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
@@ -48,6 +48,19 @@ def map_(
         bool | None,
         typer.Option(
             "--diagnosis/--no-diagnosis", help="Say what the data do not determine. Default: yes up to 300 images."
+        ),
+    ] = None,
+    contributions: Annotated[
+        bool,
+        typer.Option(
+            "--contributions",
+            help="Also adjust by points alone, with lines, with planes, and say what each of them changes.",
+        ),
+    ] = False,
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            "--truth", metavar="SCENE", help="With --contributions: a scene to compare the camera poses with, by name."
         ),
     ] = None,
     force: _options.Force = False,
@@ -72,6 +85,9 @@ def map_(
 
     if model is not None and (camera_params is not None or camera_model != "SIMPLE_RADIAL"):
         raise InputError("--camera-model and --camera-params are for images without a model. Leave them out.")
+
+    if truth is not None and not contributions:
+        raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
 
     from groma.cli._mapping import map_and_write
     from groma.frontend.external import read_matches
@@ -99,6 +115,8 @@ def map_(
         f"Map of {images.absolute().name}",
         line_matches=read_matches(line_matches) if line_matches is not None else None,
         diagnose=diagnosis,
+        contributions=contributions,
+        truth=read_scene(truth) if truth is not None else None,
     )
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)

@@ -67,7 +67,7 @@ class AssemblyOptions:
     drop_behind: bool = True
     #: ``free``: damping holds the scene; ``first_camera``: the first frame is held, and the scale by the farthest one;
     #: ``auto``: ``first_camera`` where relations between landmarks are measured in lengths, which would shrink a scene
-    #: of free scale, else ``free``.
+    #: of free scale, or at the ends of segments, which stay where they are when the scene moves; else ``free``.
     gauge: str = "auto"
 
 
@@ -88,7 +88,8 @@ def assemble(scene: Scene, options: AssemblyOptions) -> Assembly:
     if options.gauge == "auto":
         wireframe = options.points and options.lines and len(scene.relations.point_on_line) > 0
         metric = (wireframe or (options.planes and len(scene.relations) > 0)) and options.structure_form == "metric"
-        options = replace(options, gauge="first_camera" if metric else "free")
+        ends = options.lines and options.planes and len(scene.relations.line_on_plane) > 0
+        options = replace(options, gauge="first_camera" if metric or ends else "free")
     variables = _camera_variables(scene, options)
     factors: list[Factor] = []
     pixels_of_residual: dict[int, FloatArray] = {}

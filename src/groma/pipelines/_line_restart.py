@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Lines that settled in a minimum of their own are triangulated anew.
+r"""Lines that settled in a minimum of their own are triangulated anew, and all of them settle under held cameras.
 
 The reprojection cost of a line has several local minima: a start on the wrong side of a short baseline ends in one that
 small steps never leave. A few such lines hold up the whole adjustment, because cameras move to please them. With the
 cameras nearly right the linear triangulation of a line is near its global minimum. It replaces a line that fits
 :data:`SUSPICIOUS` times worse than lines usually do, if after some steps on its own its cost is lower.
+
+A line that is seen nearly along its length is strongly bent: Gauss-Newton steps of it overshoot, and joint steps of all
+variables are refused because of one line. Lines that start in the minimum that the cameras at hand give them hardly
+move in later steps.
 """
 
 from __future__ import annotations
@@ -24,9 +28,11 @@ from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
 #: A line is suspicious if its mean squared residual is this many times the median of all lines.
-SUSPICIOUS = 9.0
+SUSPICIOUS = 4.0
 #: Steps of a suspicious line on its own, from both starts.
 STEPS = 10
+#: Most steps of all lines on their own; most need two or three.
+SETTLING_STEPS = 20
 
 
 def restart_lines(scene: Scene, problem: Problem, line_factors: tuple[str, ...]) -> Problem | None:
@@ -74,6 +80,27 @@ def restart_lines(scene: Scene, problem: Problem, line_factors: tuple[str, ...])
         return None
     state = np.where(better[:, None], best, variables.state)
     return Problem({**problem.variables, "lines": replace(variables, state=state)}, problem.factors)
+
+
+def settle_lines(problem: Problem, threads: int | None = None) -> Problem:
+    """Return the problem with each line at the minimum of its own cost, everything else held.
+
+    Parameters
+    ----------
+    problem : Problem
+        A problem; without free lines it comes back as it is.
+    threads : int, optional
+        Threads; None takes one for small problems and all cores for large ones.
+    """
+    lines = problem.variables.get("lines")
+    mine = [factor for factor in problem.factors if any(ref.group == "lines" for _, ref in factor.references())]
+    if lines is None or lines.is_constant or not mine:
+        return problem
+    used = {ref.group for factor in mine for _, ref in factor.references()}
+    alone = {n: replace(group, constant=True) for n, group in problem.variables.items() if n in used and n != "lines"}
+    options = SolverOptions(max_iterations=SETTLING_STEPS, threads=threads)
+    settled = solve(Problem({**alone, "lines": lines}, mine), options).problem.variables["lines"]
+    return Problem({**problem.variables, "lines": settled}, problem.factors)
 
 
 def _of_lines(factor: Factor, lines: IntArray) -> Factor:

@@ -26,8 +26,8 @@ RELATION_FACTORS = {
     "point_on_line": "point_on_line",
 }
 #: Points on lines tie points to lines, and only one of the two can be eliminated. With more lines than this they are
-#: measured in pixels instead, which leaves points and lines uncoupled.
-MAX_COUPLED_LINES = 1000
+#: measured in pixels instead, which leaves points and lines uncoupled. The solver keeps no more of its own accord.
+MAX_COUPLED_LINES = 4000
 
 
 def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:

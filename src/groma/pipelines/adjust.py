@@ -15,7 +15,7 @@ from groma.factors._factor import Factor
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
 from groma.pipelines._assemble import LINE_FACTORS, POINT_FACTORS, Assembly, AssemblyOptions, assemble, disassemble
-from groma.pipelines._line_restart import restart_lines
+from groma.pipelines._line_restart import restart_lines, settle_lines
 from groma.pipelines._relation_outcome import drop_failed_relations
 from groma.pipelines._structure_factors import RELATION_FACTORS, SURFACE_SIGMA_PX
 from groma.problem.problem import Problem
@@ -35,8 +35,9 @@ RELATION_SCALES = {"cauchy": 2.0, "geman_mcclure": 4.0}
 LAST_SCALE_SIGMAS = 12.0
 #: Relative decrease of the cost at which a stage that is not the last ends.
 STAGE_TOLERANCE = 1e-2
-#: The same for the first stage of plain least squares with lines, after which lines may be restarted.
-RESTART_TOLERANCE = 0.1
+#: The same for the first stage of plain least squares with lines, after which lines may be restarted. It also ends at
+#: the first step that is refused: mostly a single line in a wrong minimum is to blame.
+RESTART_TOLERANCE = 0.3
 
 
 @dataclass(frozen=True)
@@ -212,12 +213,17 @@ def adjust(
             linear_solver=options.linear_solver,
             landmark_steps=_landmark_steps(options, loss, problem),
             landmark_groups=("lines",) if isinstance(loss, Trivial) else None,
+            initial_damping=_damping_after(reports, loss),
             threads=options.threads,
         )
 
-        def tell(record, spent=spent) -> bool | None:
+        patient, stopped = last or not isinstance(loss, Trivial), []
+
+        def tell(record, spent=spent, patient=patient, stopped=stopped) -> bool:
             event = Progress(spent + record.iteration, options.max_iterations, record.cost)
-            return None if progress is None else progress(event)
+            if progress is not None and progress(event) is False:
+                stopped.append(event)
+            return not stopped and (record.accepted or patient)
 
         if last and number:
             loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
@@ -225,10 +231,11 @@ def adjust(
         solution = solve(staged, solver_options, tell)
         problem = solution.problem
         reports.append(solution.report)
-        if solution.report.termination is Termination.STOPPED_BY_CALLER:
+        if stopped:
             break
         if not last:
             problem = restart_lines(disassemble(scene, problem), problem, LINE_FACTORS) or problem
+            problem = settle_lines(problem, options.threads)
     report = _combined(reports, assembly.problem, stages)
     adjusted, relations = drop_failed_relations(disassemble(scene, problem), problem)
     before, after = (_rmse_px(replace(assembly, problem=p)) for p in (assembly.problem, problem))
@@ -276,6 +283,13 @@ def _wide_enough(loss: Loss, assembly: Assembly) -> Loss:
 
 def _stage_tolerance(loss: Loss) -> float:
     return RESTART_TOLERANCE if isinstance(loss, Trivial) else STAGE_TOLERANCE
+
+
+def _damping_after(reports: list[SolveReport], loss: Loss) -> float | None:
+    """Plain least squares goes on as boldly as it ended; another loss begins anew."""
+    if not reports or not reports[-1].history or not isinstance(loss, Trivial):
+        return None
+    return reports[-1].history[-1].damping
 
 
 def _landmark_steps(options: AdjustOptions, loss: Loss, problem: Problem) -> int:

@@ -166,6 +166,41 @@ def diagnosis_card(diagnosis: Mapping[str, Any] | None) -> str:
     return card("What the data determine", caption, f'<ul class="findings">{items}</ul>{counts}')
 
 
+def contributions_card(entries: Sequence[Mapping[str, Any]] | None) -> str:
+    """Return adjustments with more and more kinds of landmarks, as a table."""
+    if not entries:
+        return ""
+    pixels = list(dict.fromkeys(name for entry in entries for name in entry["rmse_px"]))
+    columns: list[tuple[str, Callable[[Mapping[str, Any]], Any]]] = [
+        ("landmarks", lambda entry: f"{entry['num_landmarks']:,}"),
+        ("relations", lambda entry: f"{entry['num_relations']:,}"),
+        ("given up", lambda entry: f"{entry['num_dropped']:,}"),
+        *((f"{name}, px", lambda entry, name=name: entry["rmse_px"].get(name)) for name in pixels),
+        ("cameras moved", lambda entry: entry["moved"]),
+        ("centre, predicted", lambda entry: entry["center_sigma"]),
+        ("centre error", lambda entry: entry["center_error"]),
+        ("rotation error, °", lambda entry: entry["rotation_error_deg"]),
+        ("steps", lambda entry: f"{entry['iterations']}"),
+    ]
+    columns = [(name, value) for name, value in columns if any(value(entry) is not None for entry in entries)]
+    rows = [
+        [
+            ("and " if number else "") + entry["added"],
+            *(
+                "–" if cell is None else cell if isinstance(cell, str) else _digits(cell)
+                for cell in (value(entry) for _, value in columns)
+            ),
+        ]
+        for number, entry in enumerate(entries)
+    ]
+    caption = (
+        "The same scene adjusted by points alone, then by more and more. Residuals: rms, wrong matches in full. "
+        "Cameras moved: median distance from where points alone put them; predicted: median standard deviation of the "
+        "camera centres, seen from the first; both in scene units."
+    )
+    return table("With and without", caption, ["adjusted", *(name for name, _ in columns)], rows)
+
+
 def card(name: str, caption: str, content: str) -> str:
     """Return a titled box; caption and content are HTML."""
     return f'<section class="card"><h2>{html.escape(name)}</h2><p class="caption">{caption}</p>{content}</section>'
