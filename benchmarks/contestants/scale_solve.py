@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """groma on an archive, a few steps, with what it costs: ``scale_solve.py FILE STEPS THREADS``.
 
-Compiled functions are loaded by a small solve first.
+Compiled functions are loaded by small solves first, those that only large problems need too.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from pathlib import Path
 
 from _common import Clock, peak_memory_mib, report
 
+import groma.solver.solve as solve_module
 from groma.io import read_scene
 from groma.pipelines._assemble import AssemblyOptions, assemble
 from groma.scene import Scene, synthetic
@@ -25,9 +26,13 @@ def problem_of(scene: Scene):
 
 def main() -> None:
     path, steps, threads = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-    small = problem_of(synthetic.corridor("tiny").start.points_only())
-    for solver in ("dense", "sparse", "pcg"):
-        solve(small, SolverOptions(max_iterations=2, threads=1, linear_solver=solver))
+    small = problem_of(synthetic.corridor(120).start.points_only())
+    threshold = solve_module.COMPACT_FROM
+    for bytes_ in (threshold, 0):
+        solve_module.COMPACT_FROM = bytes_
+        for solver in ("dense", "pcg"):
+            solve(small, SolverOptions(max_iterations=2, threads=threads, linear_solver=solver))
+    solve_module.COMPACT_FROM = threshold
     before = peak_memory_mib()
     reading = Clock()
     scene = read_scene(path)

@@ -50,6 +50,13 @@ class _Vectors:
         value.align = 8
         return value
 
+    def load_single(self, pointer) -> Any:
+        """Load single-precision numbers as doubles."""
+        type_ = ir.VectorType(ir.FloatType(), self.lanes)
+        value: Any = self.builder.load(self.builder.bitcast(pointer, type_.as_pointer()))
+        value.align = 4
+        return self.builder.fpext(value, self.type)
+
     def store(self, value, pointer) -> None:
         store: Any = self.builder.store(value, self.builder.bitcast(pointer, self.type.as_pointer()))
         store.align = 8
@@ -127,8 +134,10 @@ def _add_matvec(typing, y, y0, A, a0, x, x0, rows, lanes):
         A_pointer = _pointer(context, builder, signature.args[2], args[2], args[3])
         x_value = vectors.load(_pointer(context, builder, signature.args[4], args[4], args[5]))
         sums = []
+        single = signature.args[2].dtype == types.float32
         for i in range(num_rows):
-            row = vectors.load(builder.gep(A_pointer, [ir.Constant(_I64, i * num_lanes)]))
+            place = builder.gep(A_pointer, [ir.Constant(_I64, i * num_lanes)])
+            row = vectors.load_single(place) if single else vectors.load(place)
             sums.append(vectors.sum(builder.fmul(row, x_value)))
         for i, value in enumerate(sums):
             target = builder.gep(y_pointer, [ir.Constant(_I64, i)])
@@ -169,5 +178,6 @@ _plain = bool(config.DISABLE_JIT)  # type: ignore[attr-defined]
 add_product: Callable[..., None] = _add_product_plain if _plain else _add_product
 #: As :data:`add_product`, but C = A^T B.
 set_product: Callable[..., None] = _set_product_plain if _plain else _set_product
-#: ``add_matvec(y, y0, A, a0, x, x0, rows, lanes)``: y += A x for the rows x lanes block A, without gaps.
+#: ``add_matvec(y, y0, A, a0, x, x0, rows, lanes)``: y += A x for the rows x lanes block A, without gaps; A may be
+#: float32.
 add_matvec: Callable[..., None] = _add_matvec_plain if _plain else _add_matvec

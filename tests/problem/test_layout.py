@@ -1,5 +1,8 @@
 """The layout of a problem: every factor once, landmarks in order, chunks, shared blocks, what is eliminated."""
 
+import dataclasses
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -132,3 +135,46 @@ def test_pair_table_numbers_pairs_once():
     rows, columns = table.pairs()
     assert rows.tolist() == [0, 1]
     assert columns.tolist() == [1, 2]
+
+
+def test_pair_table_grows():
+    rng = np.random.default_rng(7)
+    rows, columns = rng.integers(0, 300, 3000).astype(np.int32), rng.integers(0, 400, 3000).astype(np.int32)
+    table = PairTable(2, 400)  # far too small at first
+    slots = table.add_list(rows, columns)
+    known = {}
+    for pair in zip(rows.tolist(), columns.tolist(), strict=True):
+        known.setdefault(pair, len(known))
+    assert slots.tolist() == [known[pair] for pair in zip(rows.tolist(), columns.tolist(), strict=True)]
+    np.testing.assert_array_equal(np.stack(table.pairs(), axis=1), list(known))
+    pointer = np.array([0, 3, 3, 5])
+    column = np.array([1, 4, 399, 0, 7], np.int32)
+    slots, pair_pointer = table.add_pairs(pointer, column)
+    found = np.stack(table.pairs(), axis=1)[slots].tolist()
+    assert found == [[1, 1], [1, 4], [1, 399], [4, 4], [4, 399], [399, 399], [0, 0], [0, 7], [7, 7]]
+    np.testing.assert_array_equal(pair_pointer, [0, 6, 6, 9])
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Weighted(PointReprojection):
+    """A factor that derives something from its rows when it is made."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        object.__setattr__(self, "total", self.pixels.sum(axis=1))
+
+
+def test_sorted_factors_keep_what_belongs_to_their_rows():
+    camera, point, num_cameras, num_points = random_graph(6)
+    problem = problem_with(camera, point, num_cameras, num_points)
+    rng = np.random.default_rng(6)
+    (plain,) = problem.factors
+    values = {field.name: getattr(plain, field.name) for field in dataclasses.fields(plain)}
+    values["sqrt_information"] = rng.uniform(1.0, 2.0, len(camera))
+    for factor in (PointReprojection(**values), _Weighted(**values)):
+        (layout,) = lay_out(Problem(problem.variables, [factor])).factors
+        original = (layout.factor.pixels[:, 0] / 2).astype(int)
+        np.testing.assert_array_equal(layout.factor.sqrt_information, values["sqrt_information"][original])
+        np.testing.assert_array_equal(layout.factor.pose.index, camera[original])
+        if isinstance(factor, _Weighted):
+            np.testing.assert_array_equal(layout.factor.total, layout.factor.pixels.sum(axis=1))

@@ -66,6 +66,26 @@ def dense_step(problem, damping):
     }
 
 
+@pytest.mark.parametrize("case", ["points, own intrinsics", "points and lines", "planes"])
+def test_compact_equations_give_the_same_step(case):
+    """Blocks kept in single precision serve back-substitution alone: cameras are exact, landmarks nearly."""
+    problem = scene_problem(**CASES[case])
+    expected = eliminated_step(problem, 1e-2)[-1]
+    layout = lay_out(problem, chunk_size=16)
+    equations = NormalEquations(layout, Workers(1), compact=True)
+    system = ReducedSystem(equations)
+    states = to_solver_order(layout)
+    inputs = equations.prepare(states)
+    equations.linearize(states, inputs, lambda share, chunk: system.eliminate_chunk(share, chunk, 1e-2))
+    system.assemble(1e-2)
+    kept = choose(layout, "dense").solve(system.S, system.rhs)
+    for got, wanted in zip(kept, expected.kept, strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-12 * np.abs(wanted).max())
+    assert all(W.dtype == np.float32 for blocks in equations.W for W in blocks.values())
+    for got, wanted in zip(system.landmark_steps(kept), expected.landmarks, strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-4 * np.abs(wanted).max())
+
+
 @pytest.mark.parametrize("solver", ["dense", "sparse", "pcg"])
 @pytest.mark.parametrize("case", CASES)
 def test_step_equals_dense_step(case, solver):

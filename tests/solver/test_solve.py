@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from problems import dense_normal_equations, scene_problem
 
+import groma.solver.solve as solve_module
 from groma.errors import ProblemError
 from groma.factors import PointOnLine, VectorPrior
 from groma.factors._factor import Ref
@@ -197,3 +198,23 @@ def test_points_are_not_hidden_behind_the_camera():
     spoiled = Problem(problem.variables, [dataclasses.replace(factor, pixels=pixels, require_in_front=True)])
     solution = solve(spoiled)
     assert solution.report.num_degenerate.get("point_reprojection", 0) <= 2
+
+
+@pytest.mark.parametrize("strategy", ["levenberg_marquardt", "dogleg"])
+def test_single_precision_blocks_reach_the_same_minimum(monkeypatch, strategy):
+    problem = scene_problem(num_lines=6, disturb=0.05)  # far enough that steps are refused
+    options = SolverOptions(strategy=strategy, function_tolerance=1e-12, max_iterations=100)
+    plain = solve(problem, options).report
+    monkeypatch.setattr(solve_module, "COMPACT_FROM", 0)
+    compact = solve(problem, options).report
+    assert compact.final_cost == pytest.approx(plain.final_cost, rel=1e-9)
+
+
+def test_what_a_landmark_becomes_does_not_depend_on_the_others():
+    problem = scene_problem(constant_poses=True, num_points=30, disturb=0.05)
+    (factor,) = problem.factors
+    few = factor.take(np.flatnonzero(factor.point.index < 10))
+    options = SolverOptions(gradient_tolerance=0.0)
+    together, alone = (solve(Problem(problem.variables, [f]), options)["points"] for f in (factor, few))
+    np.testing.assert_allclose(together[:10], alone[:10], rtol=1e-12)
+    np.testing.assert_array_equal(alone[10:], problem.variables["points"].state[10:])

@@ -74,7 +74,7 @@ def read_bal(path: str | os.PathLike[str]) -> Scene:
             _index(observations[:, 0], num_cameras, "camera", place),
             _index(observations[:, 1], num_points, "point", place),
         ]
-        return _scene(index[0], index[1], observations[:, 2:], camera_params.reshape(-1, 9), xyz.reshape(-1, 3))
+        return _scene(index[0], index[1], observations[:, 2:], camera_params.reshape(-1, 9), xyz.reshape(-1, 3).copy())
 
 
 def write_bal(scene: Scene, path: str | os.PathLike[str], force: bool = False) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma._numba import loop
+from groma._numba import kernel, loop
 from groma._typing import IntArray
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -13,14 +13,15 @@ from groma._typing import IntArray
 
 @loop
 def _counting_argsort(keys, num_keys, order, result):
-    """Stable order of keys[order]; one pass to count, one to place."""
+    """Stable order of keys[order], or of keys where ``order`` is empty; one pass to count, one to place."""
     start = np.zeros(num_keys + 1, np.int64)
     for i in range(keys.shape[0]):
         start[keys[i] + 1] += 1
     for k in range(num_keys):
         start[k + 1] += start[k]
-    for j in range(order.shape[0]):
-        i = order[j]
+    given = order.shape[0] > 0
+    for j in range(keys.shape[0]):
+        i = order[j] if given else np.int32(j)
         k = keys[i]
         result[start[k]] = i
         start[k] += 1
@@ -54,51 +55,68 @@ def _merge_runs(groups, values, slot, pointer, value_of_slot):
     return count
 
 
-@loop
-def _pair_slots(pointer, column, pair_pointer, table, slots, count):
-    """Slot of every pair k <= l of a row's columns; new pairs get the next free number."""
-    for p in range(pointer.shape[0] - 1):
-        s = pair_pointer[p]
-        for k in range(pointer[p], pointer[p + 1]):
-            for m in range(k, pointer[p + 1]):
-                t = table[column[k], column[m]]
-                if t < 0:
-                    t = count
-                    table[column[k], column[m]] = t
-                    count += 1
-                slots[s] = t
-                s += 1
-    return count
+@kernel
+def _line_of(keys, row, column, num_columns):
+    """Line of the hash table where a pair lies: the one that has its key, or the free one where it belongs.
+
+    Eight neighbouring columns of a row share a line, because a landmark's cameras are often neighbours.
+    """
+    mask = keys.shape[0] - 1
+    key = row * ((num_columns >> 3) + 1) + (column >> 3)
+    h = ((((key ^ (key >> 31)) & 0x7FFFFFFF) * 0x4F6CDD1D) >> 17) & mask
+    while keys[h] >= 0 and keys[h] != key:
+        h = (h + 1) & mask
+    return h
 
 
 @loop
-def _cross_slots(pointer_a, column_a, pointer_b, column_b, pair_pointer, table, slots, count):
-    """Slot of every pair (a, b) of a row's columns in two classes; b is the outer loop."""
-    for p in range(pointer_a.shape[0] - 1):
+def _insert(first, second, num_columns, keys, lines):
+    """Put pairs that are not in the table yet into it, with their position as their number; return lines taken."""
+    taken = 0
+    for i in range(first.shape[0]):
+        row, column = np.int64(first[i]), np.int64(second[i])
+        h = _line_of(keys, row, column, num_columns)
+        if keys[h] < 0:
+            keys[h] = row * ((num_columns >> 3) + 1) + (column >> 3)
+            taken += 1
+        lines[h, column & 7] = i
+    return taken
+
+
+@loop
+def _pair_slots(pointer_a, column_a, pointer_b, column_b, same, begin, pair_pointer, num_columns, keys, lines,
+                first, second, slots, count, taken):  # fmt: skip
+    """Slot of every pair of a row's columns; new pairs get the next free number.
+
+    The columns are those of one class, pairs k <= l (``same``; both lists are then the same), or of two, b in the outer
+    loop. Returns the row where the table was full, else the number of rows; the count; lines taken.
+    """
+    limit = first.shape[0]
+    for p in range(begin, pointer_a.shape[0] - 1):
         s = pair_pointer[p]
         for k in range(pointer_b[p], pointer_b[p + 1]):
-            for m in range(pointer_a[p], pointer_a[p + 1]):
-                t = table[column_a[m], column_b[k]]
-                if t < 0:
-                    t = count
-                    table[column_a[m], column_b[k]] = t
+            for m in range(k if same else pointer_a[p], pointer_a[p + 1]):
+                row, column = np.int64(column_a[m]), np.int64(column_b[k])
+                if same:
+                    row, column = column, row
+                h = _line_of(keys, row, column, num_columns)
+                if keys[h] < 0:
+                    if 2 * taken >= keys.shape[0]:
+                        return p, count, taken
+                    keys[h] = row * ((num_columns >> 3) + 1) + (column >> 3)
+                    taken += 1
+                slot = lines[h, column & 7]
+                if slot < 0:
+                    if count == limit:
+                        return p, count, taken
+                    slot = count
+                    lines[h, column & 7] = slot
+                    first[count] = row
+                    second[count] = column
                     count += 1
-                slots[s] = t
+                slots[s] = slot
                 s += 1
-    return count
-
-
-@loop
-def _list_slots(first, second, table, slots, count):
-    """Slot of each listed pair (first, second)."""
-    for i in range(first.shape[0]):
-        t = table[first[i], second[i]]
-        if t < 0:
-            t = count
-            table[first[i], second[i]] = t
-            count += 1
-        slots[i] = t
-    return count
+    return pointer_a.shape[0] - 1, count, taken
 
 
 # ----------------------------------------------------------------------------------------------------------- Public
@@ -109,9 +127,9 @@ def argsort_by(keys: tuple[tuple[IntArray, int], ...], count: int) -> IntArray:
 
     Each key is an array of integers in ``0..n-1`` with its ``n``; the cost is linear in ``count`` and in each ``n``.
     """
-    order = np.arange(count, dtype=np.int64)
+    order = np.empty(0, np.int32)
     for key, num_keys in reversed(keys):
-        result = np.empty(count, np.int64)
+        result = np.empty(count, np.int32)
         _counting_argsort(key, num_keys, order, result)
         order = result
     return order
@@ -127,7 +145,7 @@ def first_and_last(groups: IntArray, values: IntArray, num_groups: int, num_valu
 
 def distinct_pairs(groups: IntArray, values: IntArray, num_groups: int) -> tuple[IntArray, IntArray, IntArray]:
     """Number the distinct pairs of sorted input: slot of each entry, row pointer by group, value of each slot."""
-    slot = np.empty(len(groups), np.int64)
+    slot = np.empty(len(groups), np.int32)
     pointer = np.zeros(num_groups + 1, np.int64)
     value_of_slot = np.empty(len(groups), np.int32)
     count = _merge_runs(groups, values, slot, pointer, value_of_slot)
@@ -135,39 +153,57 @@ def distinct_pairs(groups: IntArray, values: IntArray, num_groups: int) -> tuple
 
 
 class PairTable:
-    """Consecutive numbers for the block pairs (row, column) that occur, in the order of their first use."""
+    """Consecutive numbers for the block pairs (row, column) that occur, in the order of their first use.
+
+    A hash table that grows, so that memory and time follow the pairs that occur and not all that are possible.
+    """
 
     def __init__(self, num_rows: int, num_columns: int) -> None:
-        self._table = np.full((num_rows, num_columns), -1, np.int32)
-        self.count = 0
+        self._num_columns = num_columns
+        self._first = self._second = np.empty(0, np.int32)
+        self.count = self._taken = 0
+        self._make(max(64, 8 * num_rows), max(64, 4 * num_rows))
+
+    def _make(self, num_pairs: int, num_lines: int) -> None:
+        """Make room for so many pairs, and for so many lines of the hash table; a power of two."""
+        first, second = np.empty(num_pairs, np.int32), np.empty(num_pairs, np.int32)
+        first[: self.count], second[: self.count] = self._first[: self.count], self._second[: self.count]
+        self._first, self._second = first, second
+        num_lines = 1 << (num_lines - 1).bit_length()
+        self._keys, self._lines = np.full(num_lines, -1, np.int64), np.full((num_lines, 8), -1, np.int32)
+        self._taken = _insert(first[: self.count], second[: self.count], self._num_columns, self._keys, self._lines)
 
     def add_list(self, rows: IntArray, columns: IntArray) -> IntArray:
         """Return the slot of each listed pair."""
-        slots = np.empty(len(rows), np.int32)
-        self.count = _list_slots(rows, columns, self._table, slots, self.count)
-        return slots
+        pointer = np.arange(len(rows) + 1)
+        return self.add_cross(pointer, rows, pointer, columns)[0]
 
     def add_pairs(self, pointer: IntArray, column: IntArray) -> tuple[IntArray, IntArray]:
         """Return (slots, pointer) of all pairs k <= l within each row of a compressed list."""
         length = np.diff(pointer)
-        pair_pointer = np.concatenate([[0], np.cumsum(length * (length + 1) // 2)])
-        slots = np.empty(pair_pointer[-1], np.int32)
-        self.count = _pair_slots(pointer, column, pair_pointer, self._table, slots, self.count)
-        return slots, pair_pointer
+        return self._add(pointer, column, pointer, column, length * (length + 1) // 2, True)
 
     def add_cross(
         self, pointer_a: IntArray, column_a: IntArray, pointer_b: IntArray, column_b: IntArray
     ) -> tuple[IntArray, IntArray]:
         """Return (slots, pointer) of all pairs between the rows of two compressed lists."""
-        pair_pointer = np.concatenate([[0], np.cumsum(np.diff(pointer_a) * np.diff(pointer_b))])
+        return self._add(pointer_a, column_a, pointer_b, column_b, np.diff(pointer_a) * np.diff(pointer_b), False)
+
+    def _add(self, pointer_a, column_a, pointer_b, column_b, lengths, same: bool) -> tuple[IntArray, IntArray]:
+        pair_pointer = np.concatenate([[0], np.cumsum(lengths)])
         slots = np.empty(pair_pointer[-1], np.int32)
-        self.count = _cross_slots(
-            pointer_a, column_a, pointer_b, column_b, pair_pointer, self._table, slots, self.count
-        )
+        done = 0
+        while done < len(lengths):
+            done, self.count, self._taken = _pair_slots(
+                pointer_a, column_a, pointer_b, column_b, same, done, pair_pointer, self._num_columns, self._keys,
+                self._lines, self._first, self._second, slots, self.count, self._taken,
+            )  # fmt: skip
+            if done < len(lengths):
+                full = self.count == len(self._first)
+                crowded = 2 * self._taken >= len(self._keys)
+                self._make(len(self._first) * (2 if full else 1), len(self._keys) * (2 if crowded else 1))
         return slots, pair_pointer
 
     def pairs(self) -> tuple[IntArray, IntArray]:
         """Return (rows, columns) of the slots, in slot order."""
-        rows, columns = np.nonzero(self._table >= 0)
-        order = np.argsort(self._table[rows, columns])
-        return rows[order].astype(np.int32), columns[order].astype(np.int32)
+        return self._first[: self.count].copy(), self._second[: self.count].copy()

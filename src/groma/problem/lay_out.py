@@ -7,7 +7,9 @@ factor group, sort landmarks and factors, number the blocks of the reduced syste
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+from functools import cached_property
 
 import numpy as np
 
@@ -122,7 +124,7 @@ def _choose_landmarks(problem: Problem, eliminate: str | tuple[str, ...], warnin
 def _private_intrinsics(problem: Problem, group: str, kept: list[str]) -> tuple[str, IntArray] | None:
     """Find a pose group that uses each variable of ``group`` in exactly one pose, one variable a pose."""
     partner: str | None = None
-    pairs = []
+    uses: list[tuple[IntArray, IntArray]] = []
     for factor in problem.factors:
         refs = {slot.name: ref for slot, ref in factor.references()}
         mine = [ref for ref in refs.values() if ref.group == group]
@@ -133,22 +135,20 @@ def _private_intrinsics(problem: Problem, group: str, kept: list[str]) -> tuple[
         poses = [
             ref for ref in refs.values() if ref.group in kept and problem.variables[ref.group].manifold.kind == "pose"
         ]
-        if len(factor.references()) > 1:
+        if len(refs) > 1:
             if len(poses) != 1 or (partner is not None and poses[0].group != partner):
                 return None
             partner = poses[0].group
-            key = mine[0].index.astype(np.int64) * len(problem.variables[partner]) + poses[0].index
-            pairs.append(np.unique(key))
-    if partner is None or len(problem.variables[partner]) != len(problem.variables[group]):
+            uses.append((mine[0].index, poses[0].index))
+    count = len(problem.variables[group])
+    if partner is None or len(problem.variables[partner]) != count:
         return None
-    keys = np.unique(np.concatenate(pairs))
-    num_poses = len(problem.variables[partner])
-    mine_index, pose_index = keys // num_poses, keys % num_poses
-    if len(keys) != num_poses or len(np.unique(pose_index)) != num_poses or len(np.unique(mine_index)) != num_poses:
+    block_of = np.full(count, -1, np.int32)
+    for index, pose in uses:
+        block_of[index] = pose
+    if any((block_of.take(index) != pose).any() for index, pose in uses):
         return None
-    block_of = np.empty(num_poses, np.int32)
-    block_of[mine_index] = pose_index
-    return partner, block_of
+    return (partner, block_of) if (np.sort(block_of) == np.arange(count)).all() else None
 
 
 def _kept_classes(
@@ -187,6 +187,33 @@ def _kept_classes(
 
 
 # ---------------------------------------------------------------------------------------------------------- factors
+
+
+def _reordered(factor: Factor, order: IntArray, name: str, landmarks: Ref) -> Factor:
+    """Return the factors ``order`` of a group, with other references in the slot ``name``.
+
+    Rows that were checked once need not be checked again in another order. So no ``__post_init__`` runs, unless a
+    factor derives something there.
+    """
+    fields = [field.name for field in dataclasses.fields(factor)]
+    derived = [key for key in vars(factor) if key not in fields]
+    plain = all(isinstance(getattr(type(factor), key, None), cached_property) for key in derived)
+    if not plain or type(factor).take is not Factor.take:
+        return dataclasses.replace(factor.take(order), **{name: landmarks})
+    result = copy.copy(factor)
+    for key in derived:
+        del vars(result)[key]
+    for key in fields:
+        value = getattr(factor, key)
+        if key == name:
+            value = landmarks
+        elif isinstance(value, Ref):
+            value = Ref(value.group, value.index.take(order))
+        elif isinstance(value, np.ndarray) and value.ndim > 0:
+            same = key == "sqrt_information" and value.ndim == 1 and (value == value[0]).all()
+            value = float(value[0]) if same else value.take(order, axis=0)
+        object.__setattr__(result, key, value)
+    return result
 
 
 class _Draft:
@@ -254,17 +281,24 @@ class _Draft:
             self.landmark = np.zeros(0, np.int32)
             return
         _, position = orders[self.landmark_group]
-        slot, ref = self.factor.references()[self.landmark_reference]
-        landmark = position[ref.index]
+        references = self.factor.references()
+        slot, ref = references[self.landmark_reference]
+        landmark = position.take(ref.index)
         keys = [(landmark, len(position))]
         if self.entries:
             c, block, _ = self.entries[0]
             keys.append((block, self.kept[c].count))
         order = argsort_by(tuple(keys), len(landmark))
-        factor = self.factor.take(order)
-        self.landmark = np.ascontiguousarray(landmark[order])
-        self.factor = dataclasses.replace(factor, **{slot.name: Ref(ref.group, self.landmark)})
-        self.entries = [(c, np.ascontiguousarray(block[order]), column) for c, block, column in self.entries]
+        self.landmark = landmark.take(order)
+        self.factor = _reordered(self.factor, order, slot.name, Ref(ref.group, self.landmark))
+        sorted_index = {
+            id(ref.index): moved.index
+            for (_, ref), (_, moved) in zip(references, self.factor.references(), strict=True)
+        }
+        self.entries = [
+            (c, sorted_index[id(block)] if id(block) in sorted_index else block.take(order), column)
+            for c, block, column in self.entries
+        ]
 
     def finish(self, tables: dict[tuple[int, int], PairTable], landmarks: tuple[str, ...]) -> FactorLayout:
         """Number the blocks of the reduced system that these factors touch directly."""
@@ -304,11 +338,15 @@ def _landmark_order(problem, group: str, drafts: list[_Draft], kept) -> tuple[In
     num_blocks = max(kept[draft.entries[0][0]].count for draft in mine)
     indices = [draft.factor.references()[draft.landmark_reference][1].index for draft in mine]
     blocks = [draft.entries[0][1] for draft in mine]
-    first, last = first_and_last(np.concatenate(indices), np.concatenate(blocks), count, num_blocks)
-    order = argsort_by(((first, num_blocks), (last, num_blocks)), count).astype(np.int32)
+    first, last = first_and_last(_joined(indices), _joined(blocks), count, num_blocks)
+    order = argsort_by(((first, num_blocks), (last, num_blocks)), count)
     position = np.empty(count, np.int32)
     position[order] = np.arange(count, dtype=np.int32)
     return order, position
+
+
+def _joined(parts: list[IntArray]) -> IntArray:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _incidences(problem, group, e, order, layouts: list[FactorLayout], kept, tables) -> Eliminated:
@@ -322,18 +360,22 @@ def _incidences(problem, group, e, order, layouts: list[FactorLayout], kept, tab
         ]  # fmt: skip
         if not uses:
             continue
-        landmark = np.concatenate([layouts[f].landmark for f, _ in uses])
-        block = np.concatenate([layouts[f].kept[k].block for f, k in uses])
-        order_of = argsort_by(((landmark, count), (block, kept_class.count)), len(landmark))
-        slot_sorted, pointer, block_of_slot = distinct_pairs(landmark[order_of], block[order_of], count)
-        slot = np.empty(len(landmark), np.int64)
-        slot[order_of] = slot_sorted
+        landmark = _joined([layouts[f].landmark for f, _ in uses])
+        block = _joined([layouts[f].kept[k].block for f, k in uses])
+        if len(uses) == 1 and uses[0][1] == 0:  # the order in which factors are sorted
+            slot, pointer, block_of_slot = distinct_pairs(landmark, block, count)
+        else:
+            order_of = argsort_by(((landmark, count), (block, kept_class.count)), len(landmark))
+            sorted_pairs = landmark.take(order_of), block.take(order_of)
+            slot_sorted, pointer, block_of_slot = distinct_pairs(*sorted_pairs, count)
+            slot = np.empty(len(landmark), np.int32)
+            slot[order_of] = slot_sorted
         pair_slots, pair_pointer = tables[c, c].add_pairs(pointer, block_of_slot)
         incidences[c] = Incidences(pointer, block_of_slot, pair_slots, pair_pointer)
         offset = 0
         for f, k in uses:
             n = len(layouts[f].factor)
-            entry = dataclasses.replace(layouts[f].kept[k], incidence=slot[offset : offset + n].copy())
+            entry = dataclasses.replace(layouts[f].kept[k], incidence=slot[offset : offset + n])
             entries = (*layouts[f].kept[:k], entry, *layouts[f].kept[k + 1 :])
             layouts[f] = dataclasses.replace(layouts[f], kept=entries)
             offset += n

@@ -11,7 +11,8 @@ V, W and the landmarks' gradient belong to a chunk alone; H and the cameras' gra
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -29,11 +30,12 @@ States = Mapping[str, FloatArray]
 
 @loop
 def _add_primary(
-    record, begin, landmark, l_column, incidence, block, c_column, V, g_l, W, H, g_c, sole, rows, l_width, c_width, one
-):
+    record, begin, first, landmark, l_column, incidence, block, c_column, V, g_l, W, H, g_c, sole,
+    rows, l_width, c_width, one,
+):  # fmt: skip
     """Sum the landmark, its incidence and its kept block, for factors with a landmark and a first kept block.
 
-    Incidences with a ``sole`` contribution are written instead of added to.
+    Incidences with a ``sole`` contribution are written instead of added to. W begins with the incidence ``first``.
     """
     n, m, columns = record.shape
     flat = record.reshape(record.size)
@@ -41,7 +43,7 @@ def _add_primary(
     for i in range(n):
         base = i * m * columns
         at_l, at_c, at_r = base + l_column, base + c_column, base + columns - 1
-        p, q, c = np.int64(landmark[begin + i]), incidence[begin + i], np.int64(block[begin + i])
+        p, q, c = np.int64(landmark[begin + i]), incidence[begin + i] - first, np.int64(block[begin + i])
         add_product(V, p * (dl * dl), flat, at_l, columns, flat, at_l, columns, rows, l_width, l_width)
         add_product(g_l, p * dl, flat, at_r, columns, flat, at_l, columns, rows, one, l_width)
         if sole:
@@ -53,14 +55,15 @@ def _add_primary(
 
 
 @loop
-def _add_incidence(record, begin, l_column, incidence, c_column, W, rows, l_width, c_width):
+def _add_incidence(record, begin, first, l_column, incidence, c_column, W, rows, l_width, c_width):
     n, m, columns = record.shape
     flat = record.reshape(record.size)
     size = len(l_width) * len(c_width)
     for i in range(n):
         base = i * m * columns
         at_l, at_c = base + l_column, base + c_column
-        add_product(W, incidence[begin + i] * size, flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
+        q = incidence[begin + i] - first
+        add_product(W, q * size, flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
 
 
 @loop
@@ -119,11 +122,21 @@ class Noise:
 
 
 class NormalEquations:
-    """The sums V, W, H and g of a layout, and the scratch to form them."""
+    """The sums V, W, H and g of a layout, and the scratch to form them.
 
-    def __init__(self, layout: Layout, workers: Workers) -> None:
+    Parameters
+    ----------
+    layout, workers
+        What is summed, and by which threads.
+    compact
+        Keep W in single precision. Each chunk's part of it is formed in double precision in a scratch, which is there
+        for ``after_chunk`` of :meth:`linearize`; only what is read later, for back-substitution, is rounded.
+    """
+
+    def __init__(self, layout: Layout, workers: Workers, compact: bool = False) -> None:
         self.layout = layout
         self.workers = workers
+        self.compact = compact
         self._noise = [Noise(factor) for factor in layout.factors]
         self._sizes = [0] * len(layout.factors)
         for chunk in layout.chunks:
@@ -131,6 +144,7 @@ class NormalEquations:
                 self._sizes[f] = max(self._sizes[f], end - begin)
         self.shares = _shares(layout.chunks, workers.count)
         self._scratch: list[dict[int, FloatArray]] = [{} for _ in self.shares]
+        self._references = [tuple(ref for _, ref in factor.factor.references()) for factor in layout.factors]
         self._free = {}
         for name, group in layout.problem.variables.items():
             free = group.free_coordinates()
@@ -140,8 +154,14 @@ class NormalEquations:
         self.V = [np.zeros(e.count * e.dof * e.dof) for e in layout.eliminated]
         self.g_landmarks = [np.zeros(e.count * e.dof) for e in layout.eliminated]
         self.W = [
-            {c: np.zeros(len(i.block) * e.dof * layout.kept[c].width) for c, i in e.incidences.items()}
+            {
+                c: np.zeros(len(i.block) * e.dof * layout.kept[c].width, np.float32 if compact else np.float64)
+                for c, i in e.incidences.items()
+            }
             for e in layout.eliminated
+        ]
+        self._chunk_W: list[list[dict[int, Any]]] = [
+            self._room_for_chunks() if compact else self.W for _ in self.shares
         ]
         self._sole = [
             {c: _has_sole_contributions(layout, number, c) for c in e.incidences}
@@ -152,35 +172,49 @@ class NormalEquations:
             for _ in self.shares
         ]
         self._g = [[np.zeros(c.count * c.width) for c in layout.kept] for _ in self.shares]
+        self._sums = [[self._sums_of(share, f) for f in layout.factors] for share in range(len(self.shares))]
         self.num_degenerate = [0] * len(layout.factors)
         self.costs = [0.0] * len(layout.factors)
-        self.num_hidden = 0
+        self.hidden = [0] * len(layout.factors)
 
     # ------------------------------------------------------------------------------------------------ evaluation
+
+    @property
+    def num_hidden(self) -> int:
+        """Degenerate factors in the last evaluation of the cost."""
+        return sum(self.hidden)
 
     def prepare(self, states: States) -> list[tuple]:
         """Evaluate what each factor group reads of the states."""
         ambients = {name: self.layout.problem.variables[name].manifold.ambient(state) for name, state in states.items()}
         return [
-            layout.factor.prepare(tuple(ambients[ref.group] for _, ref in layout.factor.references()))
-            for layout in self.layout.factors
+            layout.factor.prepare(tuple(ambients[ref.group] for ref in references))
+            for layout, references in zip(self.layout.factors, self._references, strict=True)
         ]
 
-    def cost(self, inputs: list[tuple], landmark_costs: list[FloatArray] | None = None) -> float:
-        """Return the total cost; also store ``costs`` by factor group, and ``num_hidden``, the degenerate factors.
+    def cost(
+        self,
+        inputs: list[tuple],
+        landmark_costs: list[FloatArray] | None = None,
+        wanted: Callable[[Chunk], bool] | None = None,
+    ) -> float:
+        """Return the total cost; also store ``costs`` and ``hidden``, the degenerate factors, both by factor group.
 
         With ``landmark_costs`` (one array of zeros per eliminated group) the cost of each landmark is added there.
+        Chunks that are not ``wanted`` are left out.
         """
 
-        def work(share: int) -> tuple[list[float], int]:
-            sums, hidden = [0.0] * len(self.layout.factors), 0
+        def work(share: int) -> tuple[list[float], list[int]]:
+            sums, hidden = [0.0] * len(self.layout.factors), [0] * len(self.layout.factors)
             for chunk in self.shares[share]:
+                if wanted is not None and not wanted(chunk):
+                    continue
                 for f, begin, end in chunk.factors:
                     if begin == end:
                         continue
                     value, rho, degenerate = self._chunk_cost(share, f, inputs[f], begin, end)
                     sums[f] += value
-                    hidden += degenerate
+                    hidden[f] += degenerate
                     if landmark_costs is not None and chunk.eliminated is not None:
                         landmark = self.layout.factors[f].landmark[begin:end] - chunk.begin
                         landmark_costs[chunk.eliminated][chunk.begin : chunk.end] += 0.5 * np.bincount(
@@ -190,7 +224,7 @@ class NormalEquations:
 
         parts = self.workers.map(work, len(self.shares))
         self.costs = [0.5 * sum(part[0][f] for part in parts) for f in range(len(self.layout.factors))]
-        self.num_hidden = sum(part[1] for part in parts)
+        self.hidden = [sum(part[1][f] for part in parts) for f in range(len(self.layout.factors))]
         return float(sum(self.costs))
 
     def _chunk_cost(self, share: int, f: int, inputs: tuple, begin: int, end: int) -> tuple[float, FloatArray, int]:
@@ -214,16 +248,22 @@ class NormalEquations:
             scratch[f] = np.zeros(size)
         return scratch[f]
 
-    def linearize(self, states: States, inputs: list[tuple], after_chunk=None) -> float:
+    def linearize(
+        self,
+        states: States,
+        inputs: list[tuple],
+        after_chunk: Callable[[int, Chunk], None] | None = None,
+        wanted: Callable[[Chunk], bool] | None = None,
+    ) -> float:
         """Form all sums at the given states and return the cost.
 
         ``after_chunk(share, chunk)`` is called as soon as the sums of a chunk's landmarks are complete, while they
-        are still in cache.
+        are still in cache. Chunks that are not ``wanted`` are left out; the sums of their landmarks stay as they were.
         """
         bases = {}
-        for layout in self.layout.factors:
+        for f, layout in enumerate(self.layout.factors):
             for chain in layout.chains:
-                name = layout.factor.references()[chain.reference][1].group
+                name = self._references[f][chain.reference].group
                 if name not in bases:
                     bases[name] = self.layout.problem.variables[name].manifold.basis(states[name])
 
@@ -234,24 +274,28 @@ class NormalEquations:
             for g in self._g[share]:
                 g[:] = 0.0
             for chunk in self.shares[share]:
-                self._clear(chunk)
+                if wanted is not None and not wanted(chunk):
+                    continue
+                self._clear(share, chunk)
                 for f, begin, end in chunk.factors:
                     if begin < end:
-                        cost, count = self._linearize_chunk(share, f, inputs[f], bases, begin, end)
+                        cost, count = self._linearize_chunk(share, chunk, f, inputs[f], bases, begin, end)
                         costs[f] += cost
                         degenerate[f] += count
                 if after_chunk is not None and chunk.eliminated is not None:
                     after_chunk(share, chunk)
+                if self.compact and chunk.eliminated is not None:
+                    self._round(share, chunk)
             return costs, degenerate
 
         parts = self.workers.map(work, len(self.shares))
         self.costs = [0.5 * sum(part[0][f] for part in parts) for f in range(len(self.layout.factors))]
         self.num_degenerate = [sum(part[1][f] for part in parts) for f in range(len(self.layout.factors))]
-        self.H = {pair: sum_of([H[pair] for H in self._H]) for pair in self.layout.num_direct}
-        self.g_kept = [sum_of([g[c] for g in self._g]) for c in range(len(self.layout.kept))]
+        self.H = {pair: sum_of([H[pair] for H in self._H], self.workers) for pair in self.layout.num_direct}
+        self.g_kept = [sum_of([g[c] for g in self._g], self.workers) for c in range(len(self.layout.kept))]
         return float(sum(self.costs))
 
-    def _clear(self, chunk: Chunk) -> None:
+    def _clear(self, share: int, chunk: Chunk) -> None:
         if chunk.eliminated is None:
             return
         e = self.layout.eliminated[chunk.eliminated]
@@ -261,11 +305,43 @@ class NormalEquations:
             if self._sole[chunk.eliminated][c]:
                 continue
             size = e.dof * self.layout.kept[c].width
-            first, last = incidences.pointer[chunk.begin], incidences.pointer[chunk.end]
-            self.W[chunk.eliminated][c][first * size : last * size] = 0.0
+            begin, end = incidences.pointer[chunk.begin], incidences.pointer[chunk.end]
+            W, first = self.blocks_of_chunk(share, chunk, c)
+            W[(begin - first) * size : (end - first) * size] = 0.0
+
+    def _room_for_chunks(self) -> list[dict[int, Any]]:
+        """Room for the part of W of any one chunk."""
+        room = []
+        for e, group in enumerate(self.layout.eliminated):
+            most = {
+                c: max(
+                    i.pointer[chunk.end] - i.pointer[chunk.begin]
+                    for chunk in self.layout.chunks
+                    if chunk.eliminated == e
+                )
+                for c, i in group.incidences.items()
+            }
+            room.append({c: np.zeros(n * group.dof * self.layout.kept[c].width) for c, n in most.items()})
+        return room
+
+    def blocks_of_chunk(self, share: int, chunk: Chunk, kept_class: int) -> tuple[FloatArray, int]:
+        """Return an array with the blocks W of a chunk, in double precision, and the incidence it begins with."""
+        e = chunk.eliminated
+        assert e is not None
+        first = self.layout.eliminated[e].incidences[kept_class].pointer[chunk.begin] if self.compact else 0
+        return self._chunk_W[share][e][kept_class], int(first)
+
+    def _round(self, share: int, chunk: Chunk) -> None:
+        """Keep the blocks W of a chunk in single precision."""
+        assert chunk.eliminated is not None
+        e, kept, rounded = self.layout.eliminated[chunk.eliminated], self._chunk_W[share], self.W[chunk.eliminated]
+        for c, incidences in e.incidences.items():
+            size = e.dof * self.layout.kept[c].width
+            begin, end = incidences.pointer[chunk.begin] * size, incidences.pointer[chunk.end] * size
+            rounded[c][begin:end] = kept[chunk.eliminated][c][: end - begin]
 
     def _linearize_chunk(
-        self, share: int, f: int, inputs: tuple, bases: dict, begin: int, end: int
+        self, share: int, chunk: Chunk, f: int, inputs: tuple, bases: dict, begin: int, end: int
     ) -> tuple[float, int]:
         """Write, weigh, chain and sum the records of one factor group in one chunk."""
         layout, noise = self.layout.factors[f], self._noise[f]
@@ -279,57 +355,59 @@ class NormalEquations:
         if noise.matrices is not None:
             whiten(record, begin, noise.matrices)
         cost = weigh(record, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, norms)
-        references = layout.factor.references()
+        references = self._references[f]
         for chain in layout.chains:
-            ref = references[chain.reference][1]
+            ref = references[chain.reference]
             chain_rule(
                 record, begin, chain.raw_column, chain.column, ref.index, bases[ref.group],
                 width(chain.raw_size), width(chain.dof), _ONE,
             )  # fmt: skip
         for reference, column, _ in layout.masked:
-            ref = references[reference][1]
+            ref = references[reference]
             mask(record, begin, column, ref.index, self._free[ref.group])
-        self._sum(share, layout, record, begin)
+        for add, kept_class, arguments in self._sums[share][f]:
+            if kept_class is None:
+                add(record, begin, *arguments)
+            else:
+                add(record, begin, self.blocks_of_chunk(share, chunk, kept_class)[1], *arguments)
         return cost, degenerate
 
-    def _sum(self, share: int, layout: FactorLayout, record: FloatArray, begin: int) -> None:
+    def _sums_of(self, share: int, layout: FactorLayout) -> list[tuple[Callable, int | None, tuple]]:
+        """Return the loops that sum the records of a factor group, the class of W they add to, and arguments."""
         rows = width(layout.factor.residual_size)
         H, g = self._H[share], self._g[share]
+        sums: list[tuple[Callable, int | None, tuple]] = []
         rest = layout.kept
         if layout.eliminated is not None:
             e = layout.eliminated
             l_width = width(self.layout.eliminated[e].dof)
+            landmarks = (self.V[e], self.g_landmarks[e])
             if not layout.kept:
-                _add_block(
-                    record, begin, layout.landmark, layout.landmark_column, self.V[e], self.g_landmarks[e],
-                    rows, l_width, _ONE,
-                )  # fmt: skip
-                return
+                return [(_add_block, None, (layout.landmark, layout.landmark_column, *landmarks, rows, l_width, _ONE))]
             first, rest = layout.kept[0], layout.kept[1:]
             c = first.kept_class
-            _add_primary(
-                record, begin, layout.landmark, layout.landmark_column, first.incidence, first.block, first.column,
-                self.V[e], self.g_landmarks[e], self.W[e][c], H[c, c], g[c], self._sole[e][c],
-                rows, l_width, width(self.layout.kept[c].width), _ONE,
-            )  # fmt: skip
+            indices = (layout.landmark, layout.landmark_column, first.incidence, first.block, first.column)
+            targets = (*landmarks, self._chunk_W[share][e][c], H[c, c], g[c], self._sole[e][c])
+            widths = (rows, l_width, width(self.layout.kept[c].width), _ONE)
+            sums.append((_add_primary, c, (*indices, *targets, *widths)))
             for entry in rest:
                 c = entry.kept_class
-                _add_incidence(
-                    record, begin, layout.landmark_column, entry.incidence, entry.column, self.W[e][c],
-                    rows, l_width, width(self.layout.kept[c].width),
-                )  # fmt: skip
+                indices = (layout.landmark_column, entry.incidence, entry.column)
+                widths = (rows, l_width, width(self.layout.kept[c].width))
+                sums.append((_add_incidence, c, (*indices, self._chunk_W[share][e][c], *widths)))
         for entry in rest:
             c = entry.kept_class
-            _add_block(
-                record, begin, entry.block, entry.column, H[c, c], g[c], rows, width(self.layout.kept[c].width), _ONE
+            targets = (H[c, c], g[c])
+            sums.append(
+                (_add_block, None, (entry.block, entry.column, *targets, rows, width(self.layout.kept[c].width), _ONE))
             )
         for i, j, slot in layout.crosses:
             a, b = layout.kept[i], layout.kept[j]
             pair = (a.kept_class, b.kept_class)
-            _add_cross(
-                record, begin, a.block, a.column, b.block, b.column, slot, pair[0] == pair[1], H[pair],
-                rows, width(self.layout.kept[pair[0]].width), width(self.layout.kept[pair[1]].width),
-            )  # fmt: skip
+            widths = [width(self.layout.kept[c].width) for c in pair]
+            blocks = (a.block, a.column, b.block, b.column, slot)
+            sums.append((_add_cross, None, (*blocks, pair[0] == pair[1], H[pair], rows, *widths)))
+        return sums
 
 
 def _has_sole_contributions(layout: Layout, eliminated: int, kept_class: int) -> bool:
@@ -356,9 +434,23 @@ def _shares(chunks: tuple[Chunk, ...], count: int) -> list[list[Chunk]]:
     return [list(chunks[cuts[i] : cuts[i + 1]]) for i in range(count)]
 
 
-def sum_of(parts: list[FloatArray]) -> FloatArray:
-    """Sum of equal arrays; a single one is passed on as it is."""
-    return parts[0] if len(parts) == 1 else np.sum(parts, axis=0)
+#: Sums of arrays shorter than this are not worth a thread.
+_SUM_IN_THREADS = 200_000
+
+
+def sum_of(parts: list[FloatArray], workers: Workers) -> FloatArray:
+    """Add the other arrays to the first one, and return that."""
+    total = parts[0]
+    tasks = workers.count if total.size > _SUM_IN_THREADS else 1
+    cuts = [total.size * i // tasks for i in range(tasks + 1)]
+
+    def add(task: int) -> None:
+        for part in parts[1:]:
+            total[cuts[task] : cuts[task + 1]] += part[cuts[task] : cuts[task + 1]]
+
+    if len(parts) > 1:
+        workers.map(add, tasks)
+    return total
 
 
 def to_original_order(layout: Layout, states: States) -> dict[str, FloatArray]:
@@ -375,5 +467,5 @@ def to_solver_order(layout: Layout) -> dict[str, FloatArray]:
     """States of the problem's variables, landmarks in the order of the layout."""
     states = {name: group.state for name, group in layout.problem.variables.items()}
     for e in layout.eliminated:
-        states[e.group] = np.ascontiguousarray(states[e.group][e.order])
+        states[e.group] = states[e.group].take(e.order, axis=0)
     return states

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma.problem.linearization import NormalEquations
-from groma.solver.levenberg_marquardt import linearize_and_eliminate
+from groma.solver.levenberg_marquardt import eliminate_again, linearize_and_eliminate
 from groma.solver.linear import LinearSolver
 from groma.solver.report import Stopwatch
 from groma.solver.schur import ReducedSystem
@@ -39,13 +39,14 @@ class Dogleg:
 
     def linearize(self, states: States, inputs: list[tuple]) -> None:
         """Form the normal equations, and the two corners of the dogleg."""
+        self._linear.follow(states)
         linearize_and_eliminate(self._equations, self._system, states, inputs, GAUSS_NEWTON_DAMPING, self._watch)
         damping = GAUSS_NEWTON_DAMPING
         kept = None
         while kept is None and damping < 1.0:
+            if damping > GAUSS_NEWTON_DAMPING:
+                eliminate_again(self._equations, self._system, states, inputs, damping, self._watch)
             with self._watch("schur"):
-                if damping > GAUSS_NEWTON_DAMPING:
-                    self._system.eliminate(damping)
                 self._system.assemble(damping)
             with self._watch("solve"):
                 kept = self._linear.solve(self._system.S, self._system.rhs)

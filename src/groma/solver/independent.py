@@ -2,7 +2,8 @@
 """Many small problems at once: variables that share no factor with another free variable.
 
 A camera against fixed landmarks (motion only) and landmarks seen by fixed cameras (structure only) are of this kind.
-Every variable has a damping of its own, and its step is kept only if it lowers that variable's cost.
+Every variable has a damping of its own, its step is kept only if it lowers that variable's cost, and it is left alone
+once it has converged: what it becomes does not depend on the others, and a few that creep do not keep all of them busy.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ import numpy as np
 from groma._simd import width
 from groma._typing import FloatArray
 from groma.problem._parallel import Workers
-from groma.problem.layout import Layout
+from groma.problem.layout import Chunk, Layout
 from groma.problem.linearization import NormalEquations
 from groma.solver.schur import MIN_DIAGONAL, invert_blocks
-from groma.solver.steps import States, gradient, largest
+from groma.solver.steps import States
 
 #: A variable whose damping exceeds this has reached its minimum to machine precision.
 MAX_DAMPING = 1e12
@@ -49,37 +50,51 @@ class IndependentBlocks:
         self._N = [np.zeros_like(V) for V in self.equations.V]
         self._h = [np.zeros_like(g) for g in self.equations.g_landmarks]
         self._initial_damping = initial_damping
-        self.num_singular = 0
+        self._singular: dict[tuple[int, int], int] = {}
         self.reset()
 
+    @property
+    def num_singular(self) -> int:
+        """Variables with a direction that the data do not determine."""
+        return sum(self._singular.values())
+
     def reset(self) -> None:
-        """Forget the dampings of earlier steps."""
+        """Forget the dampings of earlier steps, and that variables have converged."""
+        self._open = [np.ones(e.count, bool) for e in self.layout.eliminated]
+        self._begun = False
         self.damping = [np.full(e.count, self._initial_damping) for e in self.layout.eliminated]
         self._growth = [np.full(e.count, 2.0) for e in self.layout.eliminated]
 
-    def costs(self, states: States, inputs: list[tuple] | None = None) -> list[FloatArray]:
-        """Return the cost of each variable of each group."""
+    def _wanted(self, chunk: Chunk) -> bool:
+        """Whether some variable of a chunk has not converged."""
+        return chunk.eliminated is not None and bool(self._open[chunk.eliminated][chunk.begin : chunk.end].any())
+
+    def costs(self, states: States, known: list[FloatArray] | None = None) -> list[FloatArray]:
+        """Return the cost of each variable of each group; where it has converged, that of ``known`` if given."""
         costs = [np.zeros(e.count) for e in self.layout.eliminated]
-        self.equations.cost(self.equations.prepare(states) if inputs is None else inputs, costs)
+        self.equations.cost(self.equations.prepare(states), costs, None if known is None else self._wanted)
+        if known is not None:
+            costs = [np.where(mine, new, old) for mine, new, old in zip(self._open, costs, known, strict=True)]
         return costs
 
     def step(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
         """Try one step of every variable; return the new states, their costs, and how far the variables have come."""
         equations = self.equations
-        equations.linearize(states, equations.prepare(states))
-        self.num_singular = 0
-        moved, deltas, promised = dict(states), [], []
+        equations.linearize(states, equations.prepare(states), self._invert, self._wanted if self._begun else None)
+        self._begun = True
+        moved, deltas, promised, slope = dict(states), [], [], 0.0
         for e, group in enumerate(self.layout.eliminated):
-            V, g, N, h = equations.V[e], equations.g_landmarks[e], self._N[e], self._h[e]
-            self.num_singular += invert_blocks(V, g, self.damping[e], 1, 0, group.count, N, h, width(group.dof))
-            delta = h.reshape(group.count, group.dof)
-            diagonal = np.maximum(V.reshape(group.count, -1)[:, :: group.dof + 1], MIN_DIAGONAL)
-            pull = -np.einsum("ni,ni->n", g.reshape(group.count, group.dof), delta)
+            V, g, mine = equations.V[e].reshape(group.count, -1), equations.g_landmarks[e], self._open[e]
+            g = g.reshape(group.count, group.dof)
+            delta = np.where(mine[:, None], self._h[e].reshape(group.count, group.dof), 0.0)
+            diagonal = np.maximum(V[:, :: group.dof + 1], MIN_DIAGONAL)
+            pull = -np.einsum("ni,ni->n", g, delta)
             promised.append(0.5 * (pull + self.damping[e] * np.einsum("ni,ni,ni->n", delta, diagonal, delta)))
             deltas.append(delta)
+            slope = max(slope, float(np.abs(g).max(initial=0.0)))
             manifold = self.layout.problem.variables[group.group].manifold
             moved[group.group] = manifold.retract(states[group.group], delta)
-        new_costs = self.costs(moved)
+        new_costs = self.costs(moved, costs)
         self._stretch(states, costs, moved, new_costs, deltas, promised)
         unfinished, squared_length = 0, 0.0
         for e, group in enumerate(self.layout.eliminated):
@@ -87,13 +102,24 @@ class IndependentBlocks:
             moved[group.group] = np.where(better[:, None], moved[group.group], states[group.group])
             decrease = np.where(better, costs[e] - new_costs[e], promised[e])
             open_ended = better | (self.damping[e] < MAX_DAMPING)
-            unfinished += int((open_ended & (decrease > self._tolerance * costs[e])).sum())
+            self._open[e] &= open_ended & (decrease > self._tolerance * costs[e])
+            unfinished += int(self._open[e].sum())
             squared_length += float((np.where(better[:, None], deltas[e], 0.0) ** 2).sum())
             new_costs[e] = np.where(better, new_costs[e], costs[e])
             raised = np.minimum(self.damping[e] * self._growth[e], MAX_DAMPING)
             self.damping[e] = np.where(better, np.maximum(self.damping[e] / 5.0, MIN_DAMPING), raised)
             self._growth[e] = np.where(better, 2.0, np.minimum(2.0 * self._growth[e], 1e6))
-        return moved, new_costs, BlockProgress(unfinished, float(np.sqrt(squared_length)), largest(gradient(equations)))
+        return moved, new_costs, BlockProgress(unfinished, float(np.sqrt(squared_length)), slope)
+
+    def _invert(self, share: int, chunk: Chunk) -> None:
+        """Find the steps of the variables of one chunk."""
+        e = chunk.eliminated
+        if e is not None:
+            V, g = self.equations.V[e], self.equations.g_landmarks[e]
+            dof = width(self.layout.eliminated[e].dof)
+            self._singular[e, chunk.begin] = invert_blocks(
+                V, g, self.damping[e], 1, chunk.begin, chunk.end, self._N[e], self._h[e], dof
+            )
 
     def _stretch(self, states: States, costs, moved: States, new_costs, deltas, promised) -> None:
         """Lengthen the steps whose cost fell faster than promised; ``moved``, its costs and steps are updated.
@@ -110,7 +136,7 @@ class IndependentBlocks:
         for e, group in enumerate(self.layout.eliminated):
             manifold = self.layout.problem.variables[group.group].manifold
             longer[group.group] = manifold.retract(states[group.group], factors[e][:, None] * deltas[e])
-        longer_costs = self.costs(longer)
+        longer_costs = self.costs(longer, costs)
         for e, group in enumerate(self.layout.eliminated):
             better = longer_costs[e] < new_costs[e]
             moved[group.group] = np.where(better[:, None], longer[group.group], moved[group.group])

@@ -10,11 +10,13 @@ H. B. Nielsen, *Damping parameter in Marquardt's method*, IMM-REP-1999-05, 1999.
 
 from __future__ import annotations
 
+import numpy as np
+
 from groma.problem.linearization import NormalEquations
 from groma.solver.linear import ConjugateGradients, LinearSolver
 from groma.solver.report import Stopwatch
-from groma.solver.schur import ReducedSystem
-from groma.solver.steps import States, Step, diagonal, gradient
+from groma.solver.schur import MIN_DIAGONAL, ReducedSystem
+from groma.solver.steps import States, Step
 
 MAX_DAMPING = 1e16
 #: A scene that is free to move has a singular system; this much damping keeps its factorisation stable.
@@ -30,9 +32,12 @@ class LevenbergMarquardt:
         self._equations, self._system, self._linear, self._watch = equations, system, linear, watch
         self.damping = damping
         self._growth = 2.0
+        self._at: tuple[States, list[tuple]] = ({}, [])
 
     def linearize(self, states: States, inputs: list[tuple]) -> None:
         """Form the normal equations and eliminate each chunk's landmarks while they are in cache."""
+        self._at = (states, inputs)
+        self._linear.follow(states)
         linearize_and_eliminate(self._equations, self._system, states, inputs, self.damping, self._watch)
 
     def propose(self) -> tuple[Step, float] | None:
@@ -50,12 +55,10 @@ class LevenbergMarquardt:
             return None
         with self._watch("backsubstitute"):
             step = Step(kept, self._system.landmark_steps(kept))
-            scaled = [
-                d * delta
-                for d, delta in zip(diagonal(self._equations, self._system).parts(), step.parts(), strict=True)
-            ]
-            total = self.damping * sum(float(a @ b) for a, b in zip(scaled, step.parts(), strict=True))
-            total -= gradient(self._equations).dot(step)
+            total = self.damping * self._system.landmark_squares - self._system.landmark_slope
+            for c, delta in enumerate(kept):
+                diagonal = np.maximum(self._system.diagonal(c).reshape(-1), MIN_DIAGONAL)
+                total += self.damping * float((diagonal * delta) @ delta) - float(self._equations.g_kept[c] @ delta)
             if isinstance(self._linear, ConjugateGradients):
                 total += sum(float(r @ d) for r, d in zip(self._linear.residual, kept, strict=True))
         return step, 0.5 * total
@@ -70,8 +73,7 @@ class LevenbergMarquardt:
         self.damping, self._growth = self.damping * self._growth, self._growth * 2.0
         if self.damping > MAX_DAMPING:
             return False
-        with self._watch("schur"):
-            self._system.eliminate(self.damping)
+        eliminate_again(self._equations, self._system, *self._at, self.damping, self._watch)
         return True
 
 
@@ -96,3 +98,19 @@ def linearize_and_eliminate(
         system.clear()
         equations.linearize(states, inputs, eliminate)
     watch.move("linearize", "schur", spent[0])
+
+
+def eliminate_again(
+    equations: NormalEquations,
+    system: ReducedSystem,
+    states: States,
+    inputs: list[tuple],
+    damping: float,
+    watch: Stopwatch,
+) -> None:
+    """Eliminate the landmarks for another damping; compact equations are formed anew for that."""
+    if equations.compact:
+        linearize_and_eliminate(equations, system, states, inputs, damping, watch)
+        return
+    with watch("schur"):
+        system.eliminate(damping)

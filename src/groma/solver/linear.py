@@ -6,8 +6,9 @@
 ``sparse``
     Direct factorisation with a fill-reducing symmetric ordering (SuperLU). Best when cameras see few others.
 ``pcg``
-    Conjugate gradients, preconditioned with the inverses of the diagonal blocks, stopped early: a Newton step needs few
-    digits. Best for large systems.
+    Conjugate gradients, preconditioned with the inverses of the diagonal blocks and, in large systems, with the motions
+    of clusters of cameras (:mod:`groma.solver._coarse`). Stopped early: a Newton step needs few digits. Best for large
+    systems.
 
 Each solver is made once per layout and called once per step. It returns None when S is not positive definite; the
 caller then raises the damping.
@@ -15,6 +16,7 @@ caller then raises the damping.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
@@ -26,6 +28,7 @@ from groma._numba import loop
 from groma._simd import add_matvec, add_product, width
 from groma._typing import FloatArray
 from groma.problem.layout import Layout
+from groma.solver._coarse import coarse_space
 
 Blocks = dict[tuple[int, int], FloatArray]
 
@@ -63,6 +66,14 @@ def _multiply(blocks, rows, columns, same_class, x_row, x_column, y_row, y_colum
             add_product(y_column, c * b, x_row, r * a, 1, flat, i * a * b, b, a_width, one, b_width)
 
 
+@loop
+def _apply_blocks(blocks, x, y, block_width):
+    """Add the product of diagonal blocks with x to y."""
+    w = len(block_width)
+    for i in range(x.shape[0] // w):
+        add_matvec(y, i * w, blocks, i * w * w, x, i * w, block_width, block_width)
+
+
 # ----------------------------------------------------------------------------------------------------------- Public
 
 
@@ -70,6 +81,10 @@ class LinearSolver(Protocol):
     """Solves S x = b for the blocks of one layout."""
 
     name: str
+
+    def follow(self, states: Mapping[str, FloatArray]) -> None:
+        """Take notice of the states at which the next systems are formed."""
+        ...
 
     def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:
         """Return x by class, flat, or None when S is not positive definite."""
@@ -108,7 +123,14 @@ def _split(layout: Layout, x: FloatArray) -> list[FloatArray]:
     return [np.ascontiguousarray(x[c.start : c.start + c.count * c.width]) for c in layout.kept]
 
 
-class Dense:
+class _Stateless:
+    """A solver that needs to know nothing but the system."""
+
+    def follow(self, states: Mapping[str, FloatArray]) -> None:
+        pass
+
+
+class Dense(_Stateless):
     """Cholesky factorisation of the full matrix."""
 
     name = "dense"
@@ -137,7 +159,7 @@ class Dense:
             _scatter(S, rows, columns, layout.kept[a].start, layout.kept[b].start, M)
 
 
-class Sparse:
+class Sparse(_Stateless):
     """Factorisation of the scalar sparse matrix."""
 
     name = "sparse"
@@ -194,9 +216,14 @@ class ConjugateGradients:
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
+        self._coarse = coarse_space(layout)
         self.num_iterations = 0
         #: b - S x of the last solve, by class.
         self.residual: list[FloatArray] = []
+
+    def follow(self, states: Mapping[str, FloatArray]) -> None:  # noqa: D102
+        if self._coarse is not None:
+            self._coarse.follow(states)
 
     def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
         inverses = []
@@ -206,9 +233,17 @@ class ConjugateGradients:
             except np.linalg.LinAlgError:
                 return None
 
+        coarse = self._coarse
+        if coarse is not None:
+            coarse.factorize(blocks[coarse.kept_class, coarse.kept_class])
+
         def precondition(r: list[FloatArray]) -> list[FloatArray]:
-            parts = zip(r, inverses, self._layout.kept, strict=True)
-            return [np.einsum("nij,nj->ni", inv, v.reshape(-1, kept.width)).reshape(-1) for v, inv, kept in parts]
+            z = [np.zeros_like(part) for part in r]
+            for part, out, inverse, kept in zip(r, z, inverses, self._layout.kept, strict=True):
+                _apply_blocks(inverse.reshape(-1), part, out, width(kept.width))
+            if coarse is not None:
+                coarse.correct(r[coarse.kept_class], z[coarse.kept_class])
+            return z
 
         x = [np.zeros_like(b) for b in rhs]
         r = [b.copy() for b in rhs]

@@ -97,33 +97,36 @@ def invert_blocks(V, g, damping, step, begin, end, N, h, dof):
 
 
 @loop
-def _eliminate(pointer, block, W, N, h, begin, end, slots, pair_pointer, Y, S, g, dof, c_width, one):
-    """S += W^T N W and g += W^T h for one class of kept blocks."""
+def _eliminate(pointer, block, W, incidence, N, h, begin, end, slots, pair_pointer, Y, S, g, dof, c_width, one):
+    """S += W^T N W and g += W^T h for one class of kept blocks; W begins with the block of ``incidence``."""
     dl, dc = len(dof), len(c_width)
     w_size, s_size = dl * dc, dc * dc
     for p in range(begin, end):
         s = pair_pointer[p]
         first, last = pointer[p], pointer[p + 1]
         for k in range(first, last):
-            c = np.int64(block[k])
-            set_product(Y, 0, N, p * (dl * dl), dl, W, k * w_size, dc, dof, dof, c_width)
-            add_product(g, c * dc, h, p * dl, 1, W, k * w_size, dc, dof, one, c_width)
+            c, at = np.int64(block[k]), (k - incidence) * w_size
+            set_product(Y, 0, N, p * (dl * dl), dl, W, at, dc, dof, dof, c_width)
+            add_product(g, c * dc, h, p * dl, 1, W, at, dc, dof, one, c_width)
             for m in range(k, last):
-                add_product(S, np.int64(slots[s]) * s_size, Y, 0, dc, W, m * w_size, dc, dof, c_width, c_width)
+                add_product(
+                    S, np.int64(slots[s]) * s_size, Y, 0, dc, W, (m - incidence) * w_size, dc, dof, c_width, c_width
+                )
                 s += 1
 
 
 @loop
-def _eliminate_cross(pointer_a, W_a, pointer_b, W_b, N, begin, end, slots, pair_pointer, Y, S, dof, a_width, b_width):
+def _eliminate_cross(pointer_a, W_a, first_a, pointer_b, W_b, first_b, N, begin, end, slots, pair_pointer, Y, S,
+                     dof, a_width, b_width):  # fmt: skip
     """S_ab += W_a^T N W_b for two classes of kept blocks."""
     dl, da, db = len(dof), len(a_width), len(b_width)
     for p in range(begin, end):
         s = pair_pointer[p]
         for k in range(pointer_b[p], pointer_b[p + 1]):
-            set_product(Y, 0, N, p * (dl * dl), dl, W_b, k * (dl * db), db, dof, dof, b_width)
+            set_product(Y, 0, N, p * (dl * dl), dl, W_b, (k - first_b) * (dl * db), db, dof, dof, b_width)
             for m in range(pointer_a[p], pointer_a[p + 1]):
                 target = np.int64(slots[s]) * (da * db)
-                add_product(S, target, W_a, m * (dl * da), da, Y, 0, db, dof, a_width, b_width)
+                add_product(S, target, W_a, (m - first_a) * (dl * da), da, Y, 0, db, dof, a_width, b_width)
                 s += 1
 
 
@@ -137,15 +140,19 @@ def _add_incident_steps(pointer, block, W, delta_c, begin, end, t, dof, c_width)
 
 
 @loop
-def _landmark_steps(N, t, begin, end, delta, dof):
-    """Delta = N t for landmarks begin..end."""
+def _landmark_steps(N, t, V, g, begin, end, delta, dof):
+    """Delta = N t for landmarks begin..end; return delta D delta and g delta."""
     n = len(dof)
+    squares, slope = 0.0, 0.0
     for p in range(begin, end):
         for i in range(n):
             total = 0.0
             for j in range(n):
                 total += N[p * n * n + i * n + j] * t[p * n + j]
             delta[p * n + i] = total
+            squares += max(V[p * n * n + i * n + i], MIN_DIAGONAL) * total * total
+            slope += g[p * n + i] * total
+    return squares, slope
 
 
 # ----------------------------------------------------------------------------------------------------------- Public
@@ -161,8 +168,8 @@ class ReducedSystem:
         self.layout: Layout = equations.layout
         layout = self.layout
         shares = len(equations.shares)
-        self.N = [np.zeros_like(V) for V in equations.V]
-        self.h = [np.zeros_like(g) for g in equations.g_landmarks]
+        self.N = [np.empty_like(V) for V in equations.V]
+        self.h = [np.empty_like(g) for g in equations.g_landmarks]
         self._S = [
             {
                 pair: np.zeros(len(rows) * layout.kept[pair[0]].width * layout.kept[pair[1]].width)
@@ -176,6 +183,8 @@ class ReducedSystem:
         self._Y = [np.zeros(widest * tallest) for _ in range(shares)]
         self._singular = [0] * shares
         self.num_singular_landmarks = 0
+        #: Of the last steps of the landmarks: the sums of delta D delta and of g delta.
+        self.landmark_squares = self.landmark_slope = 0.0
 
     def clear(self) -> None:
         """Set all sums to zero."""
@@ -188,7 +197,10 @@ class ReducedSystem:
         self._singular = [0] * len(self._S)
 
     def eliminate_chunk(self, share: int, chunk: Chunk, damping: float) -> None:
-        """Eliminate the landmarks of one chunk into the share's copy of S."""
+        """Eliminate the landmarks of one chunk into the share's copy of S.
+
+        Where the equations are compact, this must follow the linearisation of the chunk: its W is there only then.
+        """
         e = chunk.eliminated
         if e is None:
             return
@@ -199,19 +211,20 @@ class ReducedSystem:
         )
         for c, incidences in eliminated.incidences.items():
             _eliminate(
-                incidences.pointer, incidences.block, equations.W[e][c], N, h, chunk.begin, chunk.end,
-                incidences.pair_slots, incidences.pair_pointer, self._Y[share], self._S[share][c, c],
-                self._g[share][c], dof, width(self.layout.kept[c].width), _ONE,
+                incidences.pointer, incidences.block, *equations.blocks_of_chunk(share, chunk, c), N, h,
+                chunk.begin, chunk.end, incidences.pair_slots, incidences.pair_pointer, self._Y[share],
+                self._S[share][c, c], self._g[share][c], dof, width(self.layout.kept[c].width), _ONE,
             )  # fmt: skip
         for (a, b), (slots, pointer) in eliminated.cross.items():
             _eliminate_cross(
-                eliminated.incidences[a].pointer, equations.W[e][a], eliminated.incidences[b].pointer,
-                equations.W[e][b], N, chunk.begin, chunk.end, slots, pointer, self._Y[share], self._S[share][a, b],
+                eliminated.incidences[a].pointer, *equations.blocks_of_chunk(share, chunk, a),
+                eliminated.incidences[b].pointer, *equations.blocks_of_chunk(share, chunk, b),
+                N, chunk.begin, chunk.end, slots, pointer, self._Y[share], self._S[share][a, b],
                 dof, width(self.layout.kept[a].width), width(self.layout.kept[b].width),
             )  # fmt: skip
 
     def eliminate(self, damping: float) -> None:
-        """Eliminate all landmarks again, for another damping at the same linearisation."""
+        """Eliminate all landmarks again, for another damping at the same linearisation; not where that is compact."""
         self.clear()
 
         def work(share: int) -> None:
@@ -227,7 +240,7 @@ class ReducedSystem:
         self.S: dict[tuple[int, int], FloatArray] = {}
         for pair in layout.blocks:
             a, b = layout.kept[pair[0]].width, layout.kept[pair[1]].width
-            S = sum_of([parts[pair] for parts in self._S])
+            S = sum_of([parts[pair] for parts in self._S], self.equations.workers)
             direct = layout.num_direct[pair] * a * b
             S[:direct] += self.equations.H[pair]
             S = S.reshape(-1, a, b)
@@ -240,7 +253,8 @@ class ReducedSystem:
                 if held.any():
                     blocks[:, steps, steps] += held
             self.S[pair] = S
-        self.rhs = [-(g + sum_of([parts[c] for parts in self._g])) for c, g in enumerate(self.equations.g_kept)]
+        reduced = [sum_of([parts[c] for parts in self._g], self.equations.workers) for c in range(len(layout.kept))]
+        self.rhs = [-(a + b) for a, b in zip(self.equations.g_kept, reduced, strict=True)]
 
     def diagonal(self, c: int) -> FloatArray:
         """Return the diagonal of H for one class, (count, width)."""
@@ -264,7 +278,8 @@ class ReducedSystem:
         deltas = [np.empty_like(g) for g in self.equations.g_landmarks]
         sums = [g.copy() for g in self.equations.g_landmarks]
 
-        def work(share: int) -> None:
+        def work(share: int) -> tuple[float, float]:
+            squares, slope = 0.0, 0.0
             for chunk in self.equations.shares[share]:
                 e = chunk.eliminated
                 if e is None:
@@ -276,7 +291,13 @@ class ReducedSystem:
                         incidences.pointer, incidences.block, self.equations.W[e][c], delta_kept[c],
                         chunk.begin, chunk.end, sums[e], dof, width(self.layout.kept[c].width),
                     )  # fmt: skip
-                _landmark_steps(self.N[e], sums[e], chunk.begin, chunk.end, deltas[e], dof)
+                more = _landmark_steps(
+                    self.N[e], sums[e], self.equations.V[e], self.equations.g_landmarks[e],
+                    chunk.begin, chunk.end, deltas[e], dof,
+                )  # fmt: skip
+                squares, slope = squares + more[0], slope + more[1]
+            return squares, slope
 
-        self.equations.workers.map(work, len(self.equations.shares))
+        parts = self.equations.workers.map(work, len(self.equations.shares))
+        self.landmark_squares, self.landmark_slope = (sum(part[i] for part in parts) for i in range(2))
         return deltas

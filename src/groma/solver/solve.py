@@ -39,6 +39,8 @@ from groma.solver.termination import Termination
 
 #: From this many factors on, all cores are used unless the caller says otherwise.
 FACTORS_FOR_THREADS = 50_000
+#: Where the blocks between landmarks and kept blocks would take more bytes than this, single precision keeps them.
+COMPACT_FROM = 2**28
 
 #: Called after every step tried; returning False stops the solve.
 Progress = Callable[[Iteration], bool | None]
@@ -105,7 +107,7 @@ def _solve_jointly(
     layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
 ) -> States:
     with watch("setup"):
-        equations = NormalEquations(layout, workers)
+        equations = NormalEquations(layout, workers, compact=_bytes_of_blocks(layout) > COMPACT_FROM)
         system = ReducedSystem(equations)
         linear = choose(layout, options.linear_solver)
         refiner = _landmark_refiner(layout, workers, options)
@@ -117,6 +119,7 @@ def _solve_jointly(
     with watch("cost"):
         inputs = equations.prepare(states)
         cost = equations.cost(inputs)
+    costs = equations.costs
     _start(report, layout, equations, cost)
     if not np.isfinite(cost):
         report.termination = Termination.NOT_FINITE
@@ -152,8 +155,8 @@ def _solve_jointly(
                 with watch("backsubstitute"):
                     trial = refiner.refine(equations, trial)
         if trial is not None and accepted:
-            decrease, old_cost = cost - trial.cost, cost
-            states, cost, inputs, hidden = trial.states, trial.cost, trial.inputs, equations.num_hidden
+            decrease, old_cost, costs = cost - trial.cost, cost, trial.costs
+            states, cost, inputs, hidden = trial.states, trial.cost, trial.inputs, trial.hidden
             strategy.accept(trial.gain_ratio)
             if decrease <= options.function_tolerance * old_cost:
                 termination = Termination.COST_CONVERGED
@@ -178,8 +181,7 @@ def _solve_jointly(
         if accepted and termination is None and report.iterations < options.max_iterations:
             strategy.linearize(states, inputs)
     report.termination = termination
-    with watch("cost"):
-        report.final_cost = equations.cost(inputs)
+    report.final_cost, equations.costs = cost, costs
     _finish(report, layout, equations, system.num_singular_landmarks)
     return states
 
@@ -199,6 +201,8 @@ class _Trial:
     hidden: int
     #: The decrease of the quadratic model.
     promised: float
+    #: Costs by factor group.
+    costs: list[float]
 
 
 def _try_step(
@@ -220,7 +224,8 @@ def _try_step(
         inputs = equations.prepare(moved)
         new_cost = equations.cost(inputs)
     ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
-    return _Trial(step, moved, inputs, new_cost, float(ratio), step.norm(), equations.num_hidden, predicted)
+    found = (float(ratio), step.norm(), equations.num_hidden, predicted, equations.costs)
+    return _Trial(step, moved, inputs, new_cost, *found)
 
 
 def _stretched(layout: Layout, equations: NormalEquations, states: States, trial: _Trial) -> _Trial:
@@ -233,7 +238,8 @@ def _stretched(layout: Layout, equations: NormalEquations, states: States, trial
     moved = retract(layout, states, trial.step.blend(factor, trial.step, 0.0))
     inputs = equations.prepare(moved)
     cost = equations.cost(inputs)
-    return replace(trial, states=moved, inputs=inputs, cost=cost) if cost < trial.cost else trial
+    better = {"states": moved, "inputs": inputs, "cost": cost, "costs": equations.costs}
+    return replace(trial, **better, hidden=equations.num_hidden) if cost < trial.cost else trial
 
 
 # ------------------------------------------------------------------------------------------- landmarks on their own
@@ -281,7 +287,8 @@ class _LandmarkRefiner:
         cost = equations.cost(inputs)
         if cost >= trial.cost:
             return trial
-        return replace(trial, states=refined, inputs=inputs, cost=cost, hidden=equations.num_hidden)
+        better = {"states": refined, "inputs": inputs, "cost": cost, "costs": equations.costs}
+        return replace(trial, **better, hidden=equations.num_hidden)
 
 
 def _landmark_refiner(layout: Layout, workers: Workers, options: SolverOptions) -> _LandmarkRefiner | None:
@@ -291,6 +298,15 @@ def _landmark_refiner(layout: Layout, workers: Workers, options: SolverOptions) 
     if options.landmark_steps == 0 or not groups:
         return None
     return _LandmarkRefiner(layout, workers, groups, options.landmark_steps)
+
+
+def _bytes_of_blocks(layout: Layout) -> int:
+    """Memory of the blocks W in double precision."""
+    return sum(
+        8 * len(incidences.block) * e.dof * layout.kept[c].width
+        for e in layout.eliminated
+        for c, incidences in e.incidences.items()
+    )
 
 
 def _initial_damping(layout: Layout, options: SolverOptions) -> float:
@@ -347,6 +363,7 @@ def _solve_independently(
             break
     with watch("cost"):
         report.final_cost = blocks.equations.cost(blocks.equations.prepare(states))
+        blocks.equations.num_degenerate = blocks.equations.hidden
     _finish(report, layout, blocks.equations, blocks.num_singular)
     return states
 
