@@ -14,7 +14,6 @@ from groma.tracking.camera import TrackCamera, back, into, planes_back, planes_i
 from groma.tracking.depth import depth_at, segment_inverse_depths
 from groma.tracking.features import SEGMENT_NOISE
 from groma.tracking.frame_planes import frame_planes
-from groma.tracking.keyframes import triangulate
 from groma.tracking.landmarks import ALIVE, DEAD, LineTable, PlaneTable, PointTable
 from groma.tracking.lines import assign, carried, line_ends
 from groma.tracking.motion import MapView, estimate_pose
@@ -24,6 +23,7 @@ from groma.tracking.prediction import MotionModel
 from groma.tracking.relocalise import pose_from_matches
 from groma.tracking.sparse_depth import fill_sparse
 from groma.tracking.stereo import dense_disparities, match_columns
+from groma.tracking.triangulation import triangulate
 
 CAMERA = TrackCamera(500.0, 510.0, 320.0, 240.0, 640, 480, 0.2)
 IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])

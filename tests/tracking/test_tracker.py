@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError, ShapeError
+from groma.geometry import se3
 from groma.io.sequences import SequenceCamera
 from groma.tracking import Tracker, TrackOptions
 
@@ -158,10 +159,83 @@ def test_finds_its_place_again(rgbd, truth):
     assert {tracker.process(frame).status for frame in elsewhere} == {"lost"}
     found = tracker.process(back[0])
     assert found.status == "found"
+    assert found.pose is not None
     expected = truth[5]
     assert np.abs(found.pose[4:] - expected[4:]).max() < 0.02
     assert tracker.process(back[1]).status == "tracked"
     tracker.finish()
+
+
+def _turned(degrees: float, sideways: float = 0.0) -> np.ndarray:
+    """cam_from_world of a camera turned to the side in the middle of the room."""
+    twist = np.zeros((1, 6))
+    twist[0, 4] = np.radians(degrees)
+    world = se3.exp(twist)
+    world[0, 4] = sideways
+    return se3.inverse(world)[0]
+
+
+def test_a_fast_turn_about_all_axes():
+    """Up to 8 degrees from frame to frame, swinging back and forth: constant velocity predicts it wrongly each time."""
+    time = np.arange(30)
+    twist = np.zeros((30, 6))
+    twist[:, 0] = 0.01 * time
+    swing = np.clip((time - 4) / 6, 0, 1)
+    twist[:, 4] = np.radians(10.0) * swing * np.sin(2 * np.pi * time / 8)
+    twist[:, 3] = np.radians(4.0) * swing * np.sin(2 * np.pi * time / 11)
+    twist[:, 5] = np.radians(4.0) * swing * np.sin(2 * np.pi * time / 13)
+    poses = se3.inverse(se3.exp(twist))
+    rows, result = _run(_room.frames("rgbd", poses))
+    assert {row.status for row in rows} == {"tracked"}
+    assert _room.position_error(result.trajectory, poses) < 0.01
+
+
+def test_a_stereo_pair_turns():
+    """A quarter turn at 5 degrees a frame while driving on: nothing of the first view is left at its end."""
+    angle = np.concatenate([np.zeros(5), np.arange(0, 90, 5.0), np.full(5, 90.0)])
+    poses = np.array([_turned(a, 0.02 * k) for k, a in enumerate(angle)])
+    rows, result = _run(_room.frames("stereo", poses), _room.camera(_room.BASELINE))
+    assert {row.status for row in rows} == {"tracked"}
+    assert _room.position_error(result.trajectory, poses) < 0.03
+
+
+def _to_the_opposite_wall() -> tuple[np.ndarray, np.ndarray]:
+    """Poses that jump to a wall never seen, stay there until a new map is begun, and a way of turning back."""
+    there = np.array(
+        [_turned(1.5 * k, 0.02 * k) for k in range(10)] + [_turned(180, 0.1 + 0.01 * k) for k in range(24)]
+    )
+    back = np.array([_turned(180 - 4 * k, 0.3) for k in range(1, 44)] + [_turned(4 - 0.5 * k, 0.3) for k in range(8)])
+    return there, back
+
+
+def test_a_new_map_after_a_long_loss_is_joined_when_the_place_is_seen_again():
+    poses = np.concatenate(_to_the_opposite_wall())
+    rows, result = _run(_room.frames("rgbd", poses))
+    statuses = [row.status for row in rows]
+    lost = statuses.count("lost")
+    # Half a second at thirty frames a second.
+    assert 10 <= lost <= 18
+    assert rows[9].part == 0
+    assert rows[-1].part == 1
+    assert result.parts == ()
+    assert len(result.trajectory) == len(poses) - lost
+    assert _room.position_error(result.trajectory, poses) < 0.01
+    assert any("lost" in sentence for sentence in result.warnings)
+    assert any("joined" in sentence for sentence in result.warnings)
+    assert len(result.scene.images.names) == len(set(result.scene.images.names))
+
+
+def test_maps_that_never_meet_stay_apart():
+    poses = _to_the_opposite_wall()[0]
+    rows, result = _run(_room.frames("rgbd", poses))
+    lengths = sorted([len(result.trajectory), *(len(part.trajectory) for part in result.parts)])
+    assert len(lengths) == 2
+    assert len(result.trajectory) == lengths[-1]
+    assert sum(lengths) == sum(row.pose is not None for row in rows)
+    for part in (result, *result.parts):
+        assert _room.position_error(part.trajectory, poses) < 0.01
+        assert part.scene.num_images == len(part.keyframes) >= 1
+    assert "could not be joined" in result.warnings[-1]
 
 
 def test_visiting_again_makes_few_keyframes(rgbd):

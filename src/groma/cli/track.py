@@ -54,7 +54,8 @@ def track(
 
     OUT then holds trajectory.txt (TUM format), the keyframes as a COLMAP model with lines and planes beside it
     (structures/), scene.npz, summary.json and report.html. While it runs, OUT.work holds the keyframes that are
-    finished; Ctrl-C ends the track early and writes what there is.
+    finished (groma view --live OUT shows them); Ctrl-C ends the track early and writes what there is. Where the track
+    was lost for long and no place was recognised later, further maps are in OUT/part_2, part_3, ...
     """
     from groma.cli import _output
     from groma.cli._console import Console
@@ -94,6 +95,9 @@ def track(
         )
     numbers = {"kind": frames.kind, "interrupted": interrupted, **result.statistics, "sequence": str(sequence)}
     numbers["warnings"] = [*frames.warnings, *result.warnings]
+    if result.parts:
+        folders = ", ".join(f"part_{number}" for number in range(2, len(result.parts) + 2))
+        numbers["warnings"].append(f"Only the longest part is in trajectory.txt and the report; see also {folders}.")
     compared, scores = _scores(result, frames)
     if scores:
         numbers["reference"] = scores
@@ -125,6 +129,7 @@ def _run(tracker: "Tracker", frames: "Sequence", work: Path, console: "Console",
             for frame in frames:
                 tracked = tracker.process(frame)
                 rows.append(tracked)
+                journal.frame(tracked)
                 done += 1
                 progress("tracking frame", done, total)
                 if tracked.status in ("lost", "skipped") or tracked.weak:
@@ -145,6 +150,11 @@ def _write(result: "TrackResult", draft: Path) -> None:
     write_scene(result.scene, draft, format="colmap")
     write_scene(result.scene, draft / "scene.npz")
     write_tum(result.trajectory, draft / "trajectory.txt")
+    for number, part in enumerate(result.parts, start=2):
+        folder = draft / f"part_{number}"
+        folder.mkdir()
+        write_scene(part.scene, folder / "scene.npz")
+        write_tum(part.trajectory, folder / "trajectory.txt")
 
 
 def _scores(result: "TrackResult", frames: "Sequence") -> "tuple[TrajectoryScores | None, dict[str, Any]]":

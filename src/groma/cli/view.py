@@ -2,15 +2,18 @@
 """``groma view``: a scene in the browser."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from groma.cli import _options
 
+if TYPE_CHECKING:
+    from groma.cli._console import Console
+
 
 def view(
-    source: _options.Input,
+    source: Annotated[Path, typer.Argument(metavar="INPUT", help="Model to look at; with --live the OUT of a track.")],
     images: Annotated[
         Path | None,
         typer.Option("--images", metavar="DIR", help="Folder of the photographs, shown in the cameras."),
@@ -18,6 +21,7 @@ def view(
     port: Annotated[
         int, typer.Option("--port", "-p", min=0, max=65535, metavar="N", help="Port, or the next free one; 0: any.")
     ] = 8080,
+    live: Annotated[bool, typer.Option("--live", help="Follow groma track while it runs: INPUT is its OUT.")] = False,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
     force: _options.Force = False,
     threads: _options.Threads = None,
@@ -28,7 +32,7 @@ def view(
     """Look at a scene in the browser: cameras, points, lines, planes. Click a line for its observations.
 
     The page is served from this machine, to this machine only, until Ctrl-C. --json writes the address and the counts
-    as soon as the page is ready.
+    as soon as the page is ready. With --live the page shows a running track as it grows, and its result at the end.
     """
     import contextlib
 
@@ -37,6 +41,10 @@ def view(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
+
+    if live:
+        _follow(source, port, browser, console, json_target, force)
+        return
 
     from groma.cli._counts import counts_of, sentence_of
     from groma.io import read_scene
@@ -54,6 +62,35 @@ def view(
         if browser:
             _open_browser(address)
         wait_for_interrupt()
+    console.say("\nClosed.")
+
+
+def _follow(output: Path, port: int, browser: bool, console: "Console", json_target: str | None, force: bool) -> None:
+    """Serve a running track until Ctrl-C."""
+    import contextlib
+    import time
+
+    from groma.cli import _output
+    from groma.errors import InputError
+    from groma.viz.live import EVERY, following
+
+    if output.is_file():
+        raise InputError(f"{output} is a file. With --live, pass the folder that groma track -o was given.")
+    with following(output, port) as shown, contextlib.suppress(KeyboardInterrupt):
+        shown.refresh()
+        address = f"http://localhost:{shown.server.get_port()}"
+        console.say(f"Open {address} in a browser. Ctrl-C ends.")
+        console.say(f"The track of {output} is {shown.state}.")
+        _output.write_json(json_target, {"address": address, "state": shown.state}, force)
+        if browser:
+            _open_browser(address)
+        before = shown.state
+        while True:
+            time.sleep(EVERY)
+            shown.refresh()
+            if shown.state != before:
+                before = shown.state
+                console.say(f"The track of {output} is {before}.")
     console.say("\nClosed.")
 
 

@@ -35,8 +35,8 @@ Blocks = dict[tuple[int, int], FloatArray]
 #: Rates that choose between dense and pcg, measured on one core: flops of a dense factorisation, bytes of a product.
 DENSE_FLOPS_PER_SECOND = 2.5e10
 BYTES_PER_SECOND = 6e9
-#: Iterations of conjugate gradients in a step of a problem of unknown difficulty.
-TYPICAL_ITERATIONS = 60
+#: Iterations of conjugate gradients in a step where poses alone are kept, and otherwise (calibration, planes).
+POSE_ITERATIONS, OTHER_ITERATIONS = 15, 60
 #: Up to this many unknowns a dense factorisation costs next to nothing, and is exact.
 DENSE_UNKNOWNS = 1000
 
@@ -98,8 +98,12 @@ def choose(layout: Layout, name: str) -> LinearSolver:
         stored = sum(
             layout.kept[a].width * layout.kept[b].width * len(rows) for (a, b), (rows, _) in layout.blocks.items()
         )
+        variables = layout.problem.variables
+        members = [member for kept in layout.kept for member in kept.members]
+        poses_alone = all(variables[member.group].manifold.kind == "pose" for member in members)
+        iterations = POSE_ITERATIONS if poses_alone else OTHER_ITERATIONS
         dense_seconds = unknowns**3 / 3 / DENSE_FLOPS_PER_SECOND
-        pcg_seconds = TYPICAL_ITERATIONS * 8 * stored / BYTES_PER_SECOND
+        pcg_seconds = iterations * 8 * stored / BYTES_PER_SECOND
         name = "dense" if unknowns <= DENSE_UNKNOWNS or dense_seconds < pcg_seconds else "pcg"
     return {"dense": Dense, "sparse": Sparse, "pcg": ConjugateGradients}[name](layout)
 

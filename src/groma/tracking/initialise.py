@@ -16,12 +16,13 @@ from groma.frontend.point_tracks import follow
 from groma.geometry import quaternion, se3
 from groma.tracking.camera import TrackCamera
 from groma.tracking.features import FrameFeatures
-from groma.tracking.keyframes import Followed, add_keyframe, triangulate
+from groma.tracking.keyframes import Followed, add_keyframe
 from groma.tracking.landmarks import ALIVE
 from groma.tracking.lines import FollowedSegments
 from groma.tracking.options import TrackOptions
 from groma.tracking.points import PointTracks
 from groma.tracking.track_map import TrackMap
+from groma.tracking.triangulation import triangulate
 
 #: Landmarks with depth that a first frame must have.
 LEAST_KNOWN = 15

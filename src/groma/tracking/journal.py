@@ -20,7 +20,10 @@ EVERY, SHARE = 2.0, 0.03
 
 
 class Journal:
-    """A folder with ``keyframes.txt`` (TUM, as each keyframe was made), ``trajectory.txt`` and ``scene.npz``."""
+    """A folder with ``frames.txt`` and ``keyframes.txt`` (as they were tracked), ``trajectory.txt`` and ``scene.npz``.
+
+    Rows are those of TUM: time, place, quaternion; in ``frames.txt`` the number of the map follows.
+    """
 
     def __init__(self, folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
@@ -28,12 +31,21 @@ class Journal:
         self._folder = folder
         self._next = 0.0
 
-    def keyframe(self, tracker: Tracker, frame: TrackedFrame) -> None:
-        """Note a keyframe that was just made."""
+    def frame(self, frame: TrackedFrame) -> None:
+        """Note a frame that has a pose."""
+        if frame.pose is not None:
+            self._append("frames.txt", frame, str(frame.part))
+
+    def _append(self, name: str, frame: TrackedFrame, *more: str) -> None:
         assert frame.pose is not None
         world = se3.inverse(frame.pose[None])[0]
-        with (self._folder / "keyframes.txt").open("a", encoding="utf-8") as file:
-            file.write(" ".join(map(repr, [frame.timestamp, *world[4:].tolist(), *world[:4].tolist()])) + "\n")
+        row = [*map(repr, [frame.timestamp, *world[4:].tolist(), *world[:4].tolist()]), *more]
+        with (self._folder / name).open("a", encoding="utf-8") as file:
+            file.write(" ".join(row) + "\n")
+
+    def keyframe(self, tracker: Tracker, frame: TrackedFrame) -> None:
+        """Note a keyframe that was just made."""
+        self._append("keyframes.txt", frame)
         began = time.monotonic()
         if began < self._next:
             return

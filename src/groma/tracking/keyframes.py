@@ -14,6 +14,7 @@ from groma.frontend.point_tracks import corners, spread
 from groma.geometry import se3
 from groma.scene.landmarks import Lines
 from groma.tracking.camera import TrackCamera, back, into
+from groma.tracking.feature_points import place_by_motion
 from groma.tracking.features import FrameFeatures
 from groma.tracking.landmarks import ALIVE, PENDING
 from groma.tracking.lines import FollowedSegments, assign, expected_segments, line_ends
@@ -22,9 +23,12 @@ from groma.tracking.options import TrackOptions
 from groma.tracking.planes import add_planes, assign_planes, grow
 from groma.tracking.points import PointTracks
 from groma.tracking.track_map import Keyframe, TrackMap
+from groma.tracking.triangulation import triangulate
 
 #: A feature within this distance of a followed point is that point, pixels.
 SAME_FEATURE = 2.0
+#: Below this share of the wanted points, one camera alone places described features by motion.
+FEW = 0.33
 #: A new line must be longer than this share of its depth, and its direction known to this angle.
 LEAST_LENGTH, LINE_ANGLE = 0.04, 0.15
 #: A keyframe within this share of the motion that makes a new one stands for it.
@@ -145,6 +149,11 @@ def _add_points(track_map, camera, data, pose, tracks: PointTracks, index: int, 
             rows = np.flatnonzero(np.isfinite(distance))
             free = features.point[nearest[rows]] < 0
             features.point[nearest[rows[free]]] = tracks.index[rows[free]]
+        depthless = data.frame.depth is None and data.frame.right is None
+        if depthless and track_map.keyframes and points.alive[tracks.index].sum() < FEW * options.num_points:
+            # After a wide step hardly any point was followed, but many features are seen again.
+            before = track_map.near
+            tracks = tracks.joined(place_by_motion(track_map, camera, before, data, pose, tracks.index))
         # New points: described features first, then corners where there are none.
         room = max(options.num_points - len(tracks), 0)
         cell = max(12, int(math.sqrt(data.gray.size / options.num_points)))
@@ -198,41 +207,6 @@ def _poses_of(track_map: TrackMap, keyframes: IntArray) -> FloatArray:
     """Poses (n, 7) of keyframes, each looked up once."""
     unique, which = np.unique(keyframes, return_inverse=True)
     return np.array([track_map.pose_of(int(k)) for k in unique])[which]
-
-
-def triangulate(
-    camera: TrackCamera,
-    first: FloatArray,
-    first_pixel: FloatArray,
-    second: FloatArray,
-    second_pixel: FloatArray,
-    least_parallax: float = 0.015,
-    max_error: float = 2.5,
-) -> tuple[FloatArray, np.ndarray]:
-    """Intersect rays from many first poses (N, 7) with rays from one second pose (7,): middle of the shortest link.
-
-    Returns (N, 3) places in the world, and which of them are in front of both cameras, with enough parallax (radians)
-    and reprojected within ``max_error`` pixels.
-    """
-    origin = se3.inverse(first)[:, 4:]
-    tips = se3.transform_points(se3.inverse(first), camera.bearings(first_pixel))
-    ray1 = tips - origin
-    ray1 /= np.linalg.norm(ray1, axis=1, keepdims=True)
-    center = back(second, np.zeros((1, 3)))[0]
-    ray2 = back(second, camera.bearings(second_pixel)) - center
-    ray2 /= np.linalg.norm(ray2, axis=1, keepdims=True)
-    cosine = (ray1 * ray2).sum(axis=1)
-    sine2 = np.maximum(1.0 - cosine**2, 1e-12)
-    link = center - origin
-    share1 = ((link * ray1).sum(axis=1) - cosine * (link * ray2).sum(axis=1)) / sine2
-    share2 = (cosine * (link * ray1).sum(axis=1) - (link * ray2).sum(axis=1)) / sine2
-    places = 0.5 * (origin + share1[:, None] * ray1 + center + share2[:, None] * ray2)
-    good = (np.sqrt(sine2) > least_parallax) & (share1 > 0) & (share2 > 0)
-    with np.errstate(invalid="ignore"):
-        error1 = np.linalg.norm(camera.project(se3.transform_points(first, places)) - first_pixel, axis=1)
-        error2 = np.linalg.norm(camera.project(into(second, places)) - second_pixel, axis=1)
-        good &= (error1 < max_error) & (error2 < max_error)
-    return places, good
 
 
 # ----------------------------------------------------------------------------------------------------------- lines
@@ -378,4 +352,4 @@ def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> P
     return PlaneMeasurements(index, seen.plane[rows], seen.sqrt_information[rows])
 
 
-__all__ = ["Followed", "add_keyframe", "measure_points", "triangulate", "wants_keyframe"]
+__all__ = ["Followed", "add_keyframe", "measure_points", "wants_keyframe"]

@@ -23,8 +23,9 @@ from groma.scene.landmarks import Lines
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.camera import TrackCamera, back, into, planes_back, planes_into
+from groma.tracking.feature_points import match_features
 from groma.tracking.landmarks import DEAD
-from groma.tracking.relocalise import feature_places, match_features, pose_from_matches
+from groma.tracking.relocalise import feature_places, pose_from_matches
 from groma.tracking.track_map import Keyframe, TrackMap
 
 #: Keyframes between a new one and those it may close a loop with.
@@ -83,20 +84,34 @@ def close_loop(
     for keyframe, first, second in pairs:
         if not (keyframe.alive and newest.alive):
             continue
-        places = feature_places(track_map, camera, keyframe, first)
-        known = np.isfinite(places[:, 0])
-        first, second, places = first[known], second[known], places[known]
-        found = pose_from_matches(camera, places, newest.features.pixel[second], LEAST_INLIERS)
-        if found is not None and (best is None or found[1].sum() > best[3].sum()):
-            best = (keyframe, first, second, found[1], found[0])
+        found = agreeing_pose(track_map, camera, keyframe, newest, first, second, LEAST_INLIERS)
+        if found is not None and (best is None or len(found[1]) > len(best[2])):
+            best = (keyframe, *found)
     if best is None:
         return False
-    keyframe, first, second, agree, pose = best
+    keyframe, pose, first, second = best
     measured = se3.compose(keyframe.pose[None], se3.inverse(pose[None]))[0]
     track_map.loops.append((keyframe.index, newest.index, measured))
     _spread_error(track_map)
-    _join_points(track_map, keyframe, newest, first[agree], second[agree])
+    join_points(track_map, keyframe, newest, first, second)
     return True
+
+
+def agreeing_pose(
+    track_map: TrackMap,
+    camera: TrackCamera,
+    keyframe: Keyframe,
+    newest: Keyframe,
+    first: IntArray,
+    second: IntArray,
+    least: int,
+) -> tuple[FloatArray, IntArray, IntArray] | None:
+    """Pose (7,) of a keyframe by matches to features of another in a map, and the matches that agree; None without."""
+    places = feature_places(track_map, camera, keyframe, first)
+    known = np.isfinite(places[:, 0])
+    first, second, places = first[known], second[known], places[known]
+    found = pose_from_matches(camera, places, newest.features.pixel[second], least)
+    return None if found is None else (found[0], first[found[1]], second[found[1]])
 
 
 def _spread_error(track_map: TrackMap) -> None:
@@ -150,7 +165,7 @@ def _move(track_map: TrackMap, living: list[Keyframe], poses: FloatArray) -> Non
         keyframe.pose = new.copy()
 
 
-def _join_points(track_map: TrackMap, old: Keyframe, new: Keyframe, first: IntArray, second: IntArray) -> None:
+def join_points(track_map: TrackMap, old: Keyframe, new: Keyframe, first: IntArray, second: IntArray) -> None:
     """Points of both keyframes at matched features become one: the older one stays."""
     keep, drop = old.features.point[first], new.features.point[second]
     both = (keep >= 0) & (drop >= 0) & (keep != drop)
@@ -172,4 +187,4 @@ def _join_points(track_map: TrackMap, old: Keyframe, new: Keyframe, first: IntAr
     track_map.points.state[drop] = DEAD
 
 
-__all__ = ["close_loop"]
+__all__ = ["LoopSearch", "agreeing_pose", "close_loop", "join_points", "search_for_loop"]

@@ -19,10 +19,11 @@ from groma.tracking.local_adjustment import AdjustmentJob, job_of, window_job
 from groma.tracking.loop_closure import LoopSearch, close_loop, search_for_loop
 from groma.tracking.options import TrackOptions
 from groma.tracking.outcome import Stopwatch
+from groma.tracking.parts import Joint, find_joint, join_maps, search_older_maps
 from groma.tracking.planes import merge_planes
 from groma.tracking.stereo_calibration import correct_offset, estimate_offset
 from groma.tracking.structure import find_lines_on_planes
-from groma.tracking.track_map import Keyframe, TrackMap
+from groma.tracking.track_map import TrackMap
 from groma.tracking.upkeep import drop_repeating_keyframes, drop_unseen
 
 #: A chosen frame becomes a keyframe, and the result of a window's adjustment is taken up, after this many frames.
@@ -66,7 +67,11 @@ class Mapper:
     """Makes keyframes of chosen frames and keeps the map adjusted."""
 
     def __init__(self, camera: TrackCamera, options: TrackOptions) -> None:
-        self.map, self.camera, self.options = TrackMap(), camera, options
+        #: Maps begun so far; more than one after the track was lost for long.
+        self.maps, self.current = [TrackMap()], 0
+        #: How maps join older ones, by the number of the newer.
+        self.joints: dict[int, Joint] = {}
+        self.camera, self.options = camera, options
         self.metric = True
         self.loops = 0
         #: A frame that is to become a keyframe; its features are being found meanwhile.
@@ -75,6 +80,23 @@ class Mapper:
         self._workers = ThreadPoolExecutor(2, thread_name_prefix="groma-detect") if options.threaded else None
         self._pending: _Pending | None = None
         self._search: tuple[LoopSearch, Future] | None = None
+
+    @property
+    def map(self) -> TrackMap:
+        """The map that is followed now."""
+        return self.maps[self.current]
+
+    def begin_anew(self, present: Present) -> None:
+        """Leave the present map, and begin another."""
+        self.leave(present)
+        if self.maps[-1].keyframes:
+            self.maps.append(TrackMap())
+        self.current = len(self.maps) - 1
+
+    def leave(self, present: Present) -> None:
+        """Finish what was begun on the present map."""
+        self.due = None
+        self.take_up(present, now=True)
 
     @property
     def threaded(self) -> bool:
@@ -138,7 +160,7 @@ class Mapper:
                 else:
                     self._pending = _Pending(job, self._pool.submit(job.solve), DELAY)
         with watch("loop"):
-            search = search_for_loop(self.map, self.metric) if self.options.close_loops else None
+            search = self._what_to_search() if self.options.close_loops else None
             if search is not None:
                 if self._pool is None:
                     self._close_loop(present, search, search.run())
@@ -164,7 +186,23 @@ class Mapper:
             (search, future), self._search = self._search, None
             self._close_loop(present, search, future.result())
 
+    def _what_to_search(self) -> LoopSearch | None:
+        """Search the older maps until this one is joined to one of them, then this map for loops."""
+        newest = len(self.maps) - 1
+        if 0 < newest == self.current and newest not in self.joints and self.metric:
+            return search_older_maps(self.maps, self.map.last)
+        return search_for_loop(self.map, self.metric)
+
     def _close_loop(self, present: Present, search: LoopSearch, pairs: list) -> None:
+        if search.newest is not self.map.keyframes[search.newest.index]:
+            return
+        if pairs and not any(pair[0] in self.map.living() for pair in pairs):
+            joint = find_joint(self.maps, self.camera, search.newest, pairs)
+            if joint is not None:
+                self.joints[self.current] = joint
+                self.map.pinned.add(joint.newest.index)
+                self.maps[joint.older].pinned.add(joint.keyframe.index)
+            return
         last = self.map.last
         before = last.pose.copy()
         if close_loop(self.map, self.camera, search.newest, pairs):
@@ -175,9 +213,11 @@ class Mapper:
         """Take up the result of an adjustment."""
         _follow_world(present, job.apply(self.map))
 
-    def _adjust_all(self, living: list[Keyframe]) -> SolveReport | None:
-        """Adjust all keyframes together, twice: outliers are left out in between."""
-        report = None
+    def _adjust_all(self) -> SolveReport | None:
+        """Adjust all keyframes of the map together, twice: outliers are left out in between."""
+        report, living = None, self.map.living()
+        if len(living) < 2:
+            return None
         held = np.zeros(len(living), dtype=bool)
         held[0] = True
         for _ in range(2):
@@ -188,8 +228,8 @@ class Mapper:
                 report = job.report
         return report
 
-    def finish(self, present: Present) -> tuple[SolveReport | None, float]:
-        """Adjust all keyframes together; return the report and the offset of the right images, pixels."""
+    def end(self, present: Present) -> dict[int, tuple[int, int]]:
+        """End the threads and join the maps; see :func:`~groma.tracking.parts.join_maps` for what is returned."""
         if self.due is not None:
             self.make_keyframe(present, Stopwatch())
         self.take_up(present, now=True)
@@ -197,14 +237,18 @@ class Mapper:
             if pool is not None:
                 pool.shutdown(wait=True)
         self._pool = self._workers = None
-        living = self.map.living()
-        if not self.options.adjust_at_end or len(living) < 2:
+        return join_maps(self.maps, self.joints)
+
+    def adjust_at_end(self, part: int) -> tuple[SolveReport | None, float]:
+        """Adjust all keyframes of a map together; return the report and the offset of the right images, pixels."""
+        self.current = part
+        if not self.options.adjust_at_end or len(self.map.living()) < 2:
             return None, 0.0
-        report = self._adjust_all(living)
+        report = self._adjust_all()
         offset = estimate_offset(self.map, self.camera)
         if offset:
             correct_offset(self.map, self.camera, offset)
-            report = self._adjust_all(living)
+            report = self._adjust_all()
         return report, offset
 
 

@@ -9,6 +9,7 @@ a *virtual camera* displaced by b across the segment, where an end at inverse de
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 from typing import Self
 
@@ -34,7 +35,7 @@ VIRTUAL = np.array([[0, 0, 0, 1, -VIRTUAL_BASELINE, 0, 0], [0, 0, 0, 1, 0, -VIRT
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _Rows(ABC):
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
@@ -50,9 +51,9 @@ class _Rows:
         return cls(**{item.name: np.concatenate([getattr(t, item.name) for t in tables]) for item in fields(cls)})
 
     @classmethod
+    @abstractmethod
     def empty(cls) -> Self:
         """Return a table without rows."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from groma._typing import FloatArray
 from groma.geometry import se3
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
+from groma.tracking.parts import Part
 from groma.tracking.track_map import TrackMap
 
 #: What a frame can be.
@@ -37,13 +38,15 @@ class TrackedFrame:
     #: Why a frame was skipped.
     reason: str = ""
     keyframe: bool = False
+    #: The map that the pose refers to: 0, or more after the track was lost for long and a new map was begun.
+    part: int = 0
 
 
 @dataclass(frozen=True)
 class TrackResult:
     """Outcome of a track."""
 
-    #: Poses of all frames that have one, world_from_cam.
+    #: Poses of all frames that have one, world_from_cam; of the longest part, if parts could not be joined.
     trajectory: Trajectory
     #: Keyframes with points, lines and planes.
     scene: Scene
@@ -51,6 +54,8 @@ class TrackResult:
     keyframes: FloatArray
     statistics: dict
     warnings: tuple[str, ...] = ()
+    #: The other parts.
+    parts: tuple[Part, ...] = ()
 
 
 @dataclass
@@ -60,6 +65,8 @@ class Entry:
     timestamp: float
     keyframe: int
     cam_from_keyframe: FloatArray
+    #: The map of the keyframe.
+    part: int = 0
 
 
 @dataclass
@@ -76,20 +83,27 @@ class History:
         for stage, value in (seconds or {}).items():
             self.seconds.setdefault(stage, []).append(value)
 
-    def note_pose(self, track_map: TrackMap, timestamp: float, pose: FloatArray) -> None:
+    def note_pose(self, track_map: TrackMap, timestamp: float, pose: FloatArray, part: int = 0) -> None:
         """Keep a pose in terms of the keyframe that is followed."""
         keyframe = track_map.near
         relative = se3.compose(pose[None], se3.inverse(keyframe.pose[None]))[0]
-        self.entries.append(Entry(timestamp, keyframe.index, relative))
+        self.entries.append(Entry(timestamp, keyframe.index, relative, part))
 
-    def trajectory(self, track_map: TrackMap) -> Trajectory:
-        """Return the poses as the keyframes stand now."""
-        if not self.entries:
+    def joined(self, where: dict[int, tuple[int, int]]) -> None:
+        """Take note of maps that were put into others."""
+        for entry in self.entries:
+            entry.part, shift = where[entry.part]
+            entry.keyframe += shift
+
+    def trajectory(self, track_map: TrackMap, part: int = 0) -> Trajectory:
+        """Return the poses in one map as its keyframes stand now."""
+        entries = [entry for entry in self.entries if entry.part == part]
+        if not entries:
             return Trajectory()
-        poses = np.array([track_map.pose_of(entry.keyframe) for entry in self.entries])
-        relative = np.array([entry.cam_from_keyframe for entry in self.entries]).reshape(-1, 7)
+        poses = np.array([track_map.pose_of(entry.keyframe) for entry in entries])
+        relative = np.array([entry.cam_from_keyframe for entry in entries]).reshape(-1, 7)
         world = se3.inverse(se3.compose(relative, poses))
-        times = np.array([entry.timestamp for entry in self.entries])
+        times = np.array([entry.timestamp for entry in entries])
         order = np.argsort(times, kind="stable")
         return Trajectory(times[order], world[order])
 

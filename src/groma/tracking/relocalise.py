@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Find the pose of a frame without a good prediction: by described features, then by points, lines and planes.
 
-Used when following fails between two frames, and to find the place again after the track was lost. Each keyframe
-proposes a pose (perspective from points, with RANSAC); the proposals, and the prediction, are then judged together by
-all that agrees with them.
+Used when following fails between two frames, and to find the place again after the track was lost. Where a guess of
+the pose exists, features are matched near where it says they are; otherwise each keyframe proposes a pose from all
+matches (perspective from points, with RANSAC). Guesses and proposals are judged by the features and planes that agree
+with them, and the best are estimated from all that agrees: points, lines and planes.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.geometry import quaternion
+from groma.geometry import quaternion, se3
 from groma.tracking.camera import TrackCamera, back, into
-from groma.tracking.features import Features, FrameFeatures
+from groma.tracking.feature_points import match_features, points_of_features
+from groma.tracking.features import Descriptors, Features, FrameFeatures
 from groma.tracking.landmarks import ALIVE
 from groma.tracking.lines import FollowedSegments, assign, expected_segments
 from groma.tracking.motion import PoseEstimate, estimate_pose
@@ -28,39 +31,67 @@ from groma.tracking.track_map import Keyframe, TrackMap
 
 #: A feature agrees with a pose within this distance, pixels (features of coarse scales are not precise).
 NEAR = 6.0
-#: Hamming distance beyond which descriptors do not match.
-FARTHEST = 64
+#: Hamming distance beyond which descriptors do not match near where a feature is expected.
+FARTHEST_NEAR = 75
+#: Features are looked for within this share of the image's width around where a guess says.
+SEARCH = 0.07
+#: A pose with this score needs no further proposals.
+STRONG = 70.0
+#: Poses refined at most; one that starts near an earlier result (share of its median depth, radians) is left out.
+MOST_REFINED, SAME_SHARE, SAME_TURN = 4, 0.01, 0.006
 #: Agreements that a line and a plane count for, in points.
 LINE_WEIGHT, PLANE_WEIGHT = 2.0, 6.0
 
 
 @dataclass(frozen=True)
-class FeatureMatches:
-    """Features of a keyframe, with places in the world, matched to features of a frame."""
+class KnownFeatures:
+    """Features of some keyframes whose place in the world is known."""
 
-    keyframe: Keyframe
-    #: (n,) rows of the keyframe's features, and of the frame's.
-    first: IntArray
-    second: IntArray
-    #: (n, 3) places in the world.
+    keyframes: list[Keyframe]
+    #: (n,) which of the keyframes, and which of its features.
+    of: IntArray
+    row: IntArray
+    #: (n, 3) places in the world, (n, 32) descriptors.
     places: FloatArray
+    descriptor: Descriptors
 
 
-def match_features(first: Features, second: Features) -> tuple[IntArray, IntArray]:
-    """Pair features whose descriptors are nearest to each other, both ways."""
-    if not len(first.pixel) or not len(second.pixel):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(first.descriptor, second.descriptor)
-    pairs = [pair for pair in pairs if pair.distance <= FARTHEST]
-    return np.array([p.queryIdx for p in pairs], np.int64), np.array([p.trainIdx for p in pairs], np.int64)
+def known_features(track_map: TrackMap, camera: TrackCamera, keyframes: list[Keyframe]) -> KnownFeatures:
+    """Collect the features of keyframes whose place is known."""
+    of, row, places, descriptor = [], [], [], []
+    for k, keyframe in enumerate(keyframes):
+        every = np.arange(len(keyframe.features.pixel))
+        place = feature_places(track_map, camera, keyframe, every)
+        known = np.flatnonzero(np.isfinite(place[:, 0]))
+        of.append(np.full(len(known), k))
+        row.append(known)
+        places.append(place[known])
+        descriptor.append(keyframe.features.descriptor[known])
+    return KnownFeatures(
+        keyframes, np.concatenate(of), np.concatenate(row), np.concatenate(places), np.concatenate(descriptor)
+    )
 
 
-def match_keyframe(track_map: TrackMap, camera: TrackCamera, keyframe: Keyframe, features: Features) -> FeatureMatches:
-    """Match a frame's features to those of a keyframe whose place is known."""
-    first, second = match_features(keyframe.features, features)
-    places = feature_places(track_map, camera, keyframe, first)
-    known = np.isfinite(places[:, 0])
-    return FeatureMatches(keyframe, first[known], second[known], places[known])
+def match_near(
+    camera: TrackCamera, known: KnownFeatures, features: Features, tree: KDTree, pose: FloatArray, radius: float
+) -> IntArray:
+    """Pair known features with features of a frame (n, 2): near where a pose says, and most alike for both."""
+    expected = camera.project(into(pose, known.places))
+    rows = np.flatnonzero(camera.inside(expected, -radius))
+    if not len(rows) or not len(features.pixel):
+        return np.zeros((0, 2), np.int64)
+    near = KDTree(expected[rows]).sparse_distance_matrix(tree, radius, output_type="ndarray")
+    first, second = rows[near["i"]], near["j"]
+    bits = np.bitwise_count(known.descriptor[first] ^ features.descriptor[second]).sum(axis=1, dtype=np.int64)
+    alike = np.flatnonzero(bits <= FARTHEST_NEAR)
+    # Nearest in the image among equals.
+    alike = alike[np.lexsort((near["v"][alike], bits[alike]))]
+    first, second = first[alike], second[alike]
+    best_of_first, best_of_second = np.full(len(known.of), -1), np.full(len(features.pixel), -1)
+    best_of_first[first[::-1]] = np.arange(len(first))[::-1]
+    best_of_second[second[::-1]] = np.arange(len(first))[::-1]
+    mutual = np.flatnonzero(best_of_first[first] == best_of_second[second])
+    return np.column_stack([first[mutual], second[mutual]])
 
 
 def feature_places(track_map: TrackMap, camera: TrackCamera, keyframe: Keyframe, rows: IntArray) -> FloatArray:
@@ -80,10 +111,13 @@ def pose_from_matches(
     """Pose (7,) from places in the world and their pixels, by P3P with RANSAC, and which agree; None without one."""
     if len(places) < max(min_inliers, 6):
         return None
-    found, turn, shift, inliers = cv2.solvePnPRansac(
-        np.ascontiguousarray(places), np.ascontiguousarray(pixel - 0.5), camera.matrix_opencv, np.zeros(0),
-        iterationsCount=300, reprojectionError=error, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
-    )  # fmt: skip
+    try:
+        found, turn, shift, inliers = cv2.solvePnPRansac(
+            np.ascontiguousarray(places), np.ascontiguousarray(pixel - 0.5), camera.matrix_opencv, np.zeros(0),
+            iterationsCount=500, reprojectionError=error, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+    except cv2.error:  # places that coincide are refused so
+        return None
     if not found or inliers is None or len(inliers) < min_inliers or not np.isfinite(shift).all():
         return None
     turned = quaternion.from_matrix(np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64))
@@ -98,9 +132,13 @@ class Found:
     """A pose, what agrees with it, and what can be followed from there."""
 
     estimate: PoseEstimate
-    points: PointTracks
+    known: KnownFeatures
+    #: (n, 2) known features and features of the frame that agree; :func:`promote` makes followed points of them.
+    pairs: IntArray
     lines: FollowedSegments
     score: float
+    #: Share of the known features in view that agree: some do so by chance.
+    share: float
 
 
 def find_pose(
@@ -113,72 +151,97 @@ def find_pose(
     prior_sigma: FloatArray,
 ) -> Found | None:
     """Find the pose of a frame near some keyframes; ``guesses`` are poses to be tried as well."""
-    matches = [match_keyframe(track_map, camera, keyframe, data.features) for keyframe in keyframes]
-    starts = list(guesses)
-    for match in matches:
-        proposal = pose_from_matches(camera, match.places, data.features.pixel[match.second])
-        if proposal is not None:
-            starts.append(proposal[0])
-    if not starts:
-        return None
-    judged = []
-    for start in starts:
-        agreeing = sum(int(_agreeing(camera, match, data.features, start, 3 * NEAR).sum()) for match in matches)
-        planes = len(assign_planes(track_map.planes, data.planes, start, 0.15, 0.12)[0]) if data.planes else 0
-        judged.append(agreeing + PLANE_WEIGHT * planes)
-    best: Found | None = None
-    order = np.argsort(-np.array(judged), kind="stable")
-    for k in order[:4]:
-        found = _refine(track_map, camera, data, matches, starts[k], predicted, prior_sigma)
-        if found is not None and (best is None or found.score > best.score):
-            best = found
-    return best
+    search = _Search(track_map, camera, data, known_features(track_map, camera, keyframes), predicted, prior_sigma)
+    if guesses:
+        near = [search.proposal_near(guess) for guess in guesses]
+        best = search.best_of([*guesses, *(pose for pose in near if pose is not None)])
+        if best is not None and best.score >= STRONG:
+            return best
+    return search.best_of([pose for pose in map(search.proposal, keyframes) if pose is not None])
 
 
-def _refine(track_map, camera, data, matches, start, predicted, prior_sigma) -> Found | None:
-    """Estimate the pose from all that agrees with a start, with narrowing gates."""
-    pose, estimate, lines = start, None, FollowedSegments.empty()
-    pairs = np.zeros((0, 2), np.int64)
-    for gate in (3.0, 1.0):
-        pairs = _pairs(camera, matches, data.features, pose, gate * NEAR)
-        # Features that are no point of the map yet become one when the frame becomes a keyframe: here by place alone.
-        temporary, table = _temporary_points(track_map, matches, pairs, data)
-        lines, line_table = match_lines(track_map, camera, data, pose, 8.0 * gate, 0.08 + 0.06 * gate)
-        planes = match_planes(track_map, data, pose, 0.1 + 0.06 * gate, 0.06 + 0.04 * gate)
-        if len(pairs) + len(line_table) + len(planes) < 3:
-            return None
-        view = replace(track_map.view, points=temporary)
-        estimate = estimate_pose(camera, view, Measurements(table, line_table, planes), predicted, prior_sigma, pose)
-        pose = estimate.pose
-    assert estimate is not None
-    good = estimate.points
-    if data.options.points:
-        promoted = _promote(track_map, camera, matches, pairs[good], data)
-    else:
-        promoted = PointTracks.empty()
-    lines = lines.take(estimate.lines)
-    counts = estimate.counts
-    score = counts["points"] + LINE_WEIGHT * counts["lines"] + PLANE_WEIGHT * counts["planes"]
-    return Found(estimate, promoted, lines, score)
+class _Search:
+    """One frame, the features it is compared with, and the best pose so far."""
 
+    def __init__(self, track_map, camera, data, known, predicted, prior_sigma) -> None:
+        self.track_map, self.camera, self.data, self.known = track_map, camera, data, known
+        self.predicted, self.prior_sigma = predicted, prior_sigma
+        self._tree = KDTree(data.features.pixel if len(data.features.pixel) else np.zeros((1, 2)))
+        self._best: Found | None = None
+        self._tried: list[FloatArray] = []
 
-def _agreeing(
-    camera: TrackCamera, match: FeatureMatches, features: Features, pose: FloatArray, gate: float
-) -> BoolArray:
-    with np.errstate(invalid="ignore"):
-        away = np.linalg.norm(camera.project(into(pose, match.places)) - features.pixel[match.second], axis=1)
-        return away < gate
+    def near(self, pose: FloatArray, radius: float) -> IntArray:
+        """Pairs (n, 2) of known features and features of the frame, near where a pose says."""
+        return match_near(self.camera, self.known, self.data.features, self._tree, pose, radius)
 
+    def proposal_near(self, guess: FloatArray) -> FloatArray | None:
+        """Pose from features matched in wide surroundings of where a guess says."""
+        pairs = self.near(guess, SEARCH * self.camera.width)
+        return self._from_pairs(self.known.places[pairs[:, 0]], pairs[:, 1])
 
-def _pairs(camera, matches, features, pose, gate) -> IntArray:
-    """Rows (n, 2): which match, which of its pairs; each feature of the frame once, newest keyframes first."""
-    taken = np.zeros(len(features.pixel), dtype=bool)
-    out = []
-    for k, match in enumerate(matches):
-        rows = np.flatnonzero(_agreeing(camera, match, features, pose, gate) & ~taken[match.second])
-        taken[match.second[rows]] = True
-        out.append(np.column_stack([np.full(len(rows), k), rows]))
-    return np.concatenate(out) if out else np.zeros((0, 2), np.int64)
+    def proposal(self, keyframe: Keyframe) -> FloatArray | None:
+        """Pose from all features that match those of one keyframe."""
+        first, second = match_features(keyframe.features, self.data.features)
+        places = feature_places(self.track_map, self.camera, keyframe, first)
+        known = np.isfinite(places[:, 0])
+        return self._from_pairs(places[known], second[known])
+
+    def _from_pairs(self, places: FloatArray, second: IntArray) -> FloatArray | None:
+        found = pose_from_matches(self.camera, places, self.data.features.pixel[second])
+        return found[0] if found is not None else None
+
+    def best_of(self, starts: list[FloatArray]) -> Found | None:
+        """Refine the starts that most agrees with; return the best pose so far."""
+        planes, seen = self.track_map.planes, self.data.planes
+        judged = [
+            len(self.near(start, 3 * NEAR))
+            + PLANE_WEIGHT * (len(assign_planes(planes, seen, start, 0.15, 0.12)[0]) if seen else 0)
+            for start in starts
+        ]
+        for k in np.argsort(-np.array(judged), kind="stable")[:MOST_REFINED]:
+            if self._is_known(starts[k]):
+                continue
+            found = self._refine(starts[k])
+            self._tried.append(starts[k])
+            if found is not None:
+                self._tried.append(found.estimate.pose)
+                if self._best is None or found.score > self._best.score:
+                    self._best = found
+        return self._best
+
+    def _is_known(self, start: FloatArray) -> bool:
+        """Whether a start is as good as at a pose that was tried."""
+        if not self._tried:
+            return False
+        tried = np.array(self._tried)
+        apart = np.abs(se3.log(se3.compose(np.tile(start, (len(tried), 1)), se3.inverse(tried))))
+        depth = self.track_map.near.depth
+        return bool(((apart[:, :3].max(axis=1) < SAME_SHARE * depth) & (apart[:, 3:].max(axis=1) < SAME_TURN)).any())
+
+    def _refine(self, start: FloatArray) -> Found | None:
+        """Estimate the pose from all that agrees with a start, with narrowing gates."""
+        track_map, camera, data = self.track_map, self.camera, self.data
+        pose, estimate, lines = start, None, FollowedSegments.empty()
+        pairs = np.zeros((0, 2), np.int64)
+        for gate in (3.0, 1.0):
+            pairs = self.near(pose, gate * NEAR)
+            # Features that are no point of the map yet take part by their place alone.
+            temporary, table = _temporary_points(self.known, pairs, data)
+            lines, line_table = match_lines(track_map, camera, data, pose, 8.0 * gate, 0.08 + 0.06 * gate)
+            planes = match_planes(track_map, data, pose, 0.1 + 0.06 * gate, 0.06 + 0.04 * gate)
+            if len(pairs) + len(line_table) + len(planes) < 3:
+                return None
+            view = replace(track_map.view, points=temporary)
+            measured = Measurements(table, line_table, planes)
+            estimate = estimate_pose(camera, view, measured, self.predicted, self.prior_sigma, pose)
+            pose = estimate.pose
+        assert estimate is not None
+        agree = pairs[estimate.points] if data.options.points else pairs[:0]
+        counts = estimate.counts
+        score = counts["points"] + LINE_WEIGHT * counts["lines"] + PLANE_WEIGHT * counts["planes"]
+        in_view = int(camera.inside(camera.project(into(pose, self.known.places))).sum())
+        share = len(agree) / max(in_view, 1)
+        return Found(estimate, self.known, agree, lines.take(estimate.lines), score, share)
 
 
 class _Places:
@@ -188,47 +251,35 @@ class _Places:
         self.xyz = xyz
 
 
-def _temporary_points(track_map, matches, pairs, data):
-    xyz = np.array([matches[k].places[row] for k, row in pairs]).reshape(-1, 3)
-    rows = np.array([matches[k].second[row] for k, row in pairs], np.int64)
-    features = data.features
+def _temporary_points(known: KnownFeatures, pairs: IntArray, data: FrameFeatures):
+    rows = pairs[:, 1] if data.options.points else pairs[:0, 1]
     count = len(rows)
-    depth = features.depth[rows]
-    unknown = np.full(count, np.nan)
+    depth = data.features.depth[rows]
     sigma = np.full(count, 1.5 * data.options.point_sigma_px)
     depth_sigma = 1.5 * data.depth_sigma(depth)
-    if not data.options.points:
-        count, rows = 0, rows[:0]
-    table = PointMeasurements(np.arange(count), features.pixel[rows], sigma, depth, depth_sigma, unknown)
-    return _Places(xyz), table.take(np.arange(count))
+    unknown = np.full(count, np.nan)
+    table = PointMeasurements(np.arange(count), data.features.pixel[rows], sigma, depth, depth_sigma, unknown)
+    return _Places(known.places[pairs[:, 0]]), table
 
 
-def _promote(track_map: TrackMap, camera: TrackCamera, matches, pairs: IntArray, data: FrameFeatures) -> PointTracks:
+def promote(track_map: TrackMap, found: Found, data: FrameFeatures) -> PointTracks:
     """Make points of the map of features that agree, where they are none yet; return them as followed points."""
-    points, features = track_map.points, data.features
+    points, features, known = track_map.points, data.features, found.known
     tracks = PointTracks.empty()
-    for k, match in enumerate(matches):
-        rows = pairs[pairs[:, 0] == k, 1]
-        if not len(rows):
+    for k, keyframe in enumerate(known.keyframes):
+        pairs = found.pairs[known.of[found.pairs[:, 0]] == k]
+        if not len(pairs):
             continue
-        keyframe, own, here = match.keyframe, match.first[rows], match.second[rows]
+        own, here = known.row[pairs[:, 0]], pairs[:, 1]
         index = keyframe.features.point[own]
         usable = index >= 0
         usable[usable] = points.state[index[usable]] == ALIVE
         fresh = np.flatnonzero(~usable & np.isfinite(keyframe.features.depth[own]))
         if len(fresh):
-            new = points.extend(len(fresh))
-            pixel, depth = keyframe.features.pixel[own[fresh]], keyframe.features.depth[own[fresh]]
-            points.xyz[new], points.state[new] = match.places[rows[fresh]], ALIVE
-            points.keyframe[new] = points.first_keyframe[new] = keyframe.index
-            points.pixel[new] = points.first_pixel[new] = pixel
-            keyframe.features.point[own[fresh]] = new
+            sigma = data.depth_sigma(keyframe.features.depth[own[fresh]])
+            places = known.places[pairs[fresh, 0]]
+            new = points_of_features(track_map, keyframe, own[fresh], places, sigma, 1.5 * data.options.point_sigma_px)
             index[fresh], usable[fresh] = new, True
-            sigma = np.full(len(new), 1.5 * data.options.point_sigma_px)
-            unknown = np.full(len(new), np.nan)
-            table = PointMeasurements(new, pixel, sigma, depth, data.depth_sigma(depth), unknown)
-            joined = PointMeasurements.stack([keyframe.measured.points, table])
-            keyframe.measured = replace(keyframe.measured, points=joined)
         rows = np.flatnonzero(usable)
         features.point[here[rows]] = index[rows]
         tracks = tracks.joined(PointTracks(index[rows], features.pixel[here[rows]]))
@@ -272,13 +323,13 @@ FRAME_GATES = (math.radians(12.0), 0.12)
 
 __all__ = [
     "FRAME_GATES",
-    "FeatureMatches",
     "Found",
+    "KnownFeatures",
     "feature_places",
     "find_pose",
-    "match_features",
-    "match_keyframe",
     "match_lines",
+    "match_near",
     "match_planes",
     "pose_from_matches",
+    "promote",
 ]

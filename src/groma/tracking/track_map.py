@@ -55,6 +55,8 @@ class TrackMap:
     loops: list[tuple[int, int, FloatArray]] = field(default_factory=list)
     #: The keyframe whose patches are followed: the newest, or an older one that was visited again.
     reference: int = -1
+    #: Keyframes that must not be dropped: they join maps.
+    pinned: set[int] = field(default_factory=set)
 
     @property
     def view(self) -> MapView:

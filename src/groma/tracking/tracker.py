@@ -24,6 +24,7 @@ from groma.scene import Scene
 from groma.solver.report import SolveReport
 from groma.tracking.camera import TrackCamera
 from groma.tracking.checks import FrameChecks
+from groma.tracking.coarse_alignment import TURN_SIGMA, turned_prediction
 from groma.tracking.features import FrameFeatures
 from groma.tracking.following import follow_frame
 from groma.tracking.initialise import Initialiser
@@ -44,9 +45,10 @@ from groma.tracking.outcome import (
     TrackedFrame,
     TrackResult,
 )
+from groma.tracking.parts import Part, about_parts
 from groma.tracking.points import find_again
 from groma.tracking.prediction import MotionModel
-from groma.tracking.relocalise import Found, find_pose
+from groma.tracking.relocalise import Found, find_pose, promote
 from groma.tracking.result import map_to_scene
 from groma.tracking.track_map import TrackMap
 
@@ -56,6 +58,12 @@ NEAREST, MOST = 3, 30
 LEAST_SCORE, LEAST_SHARE = 18.0, 0.35
 #: Least number of agreeing points and lines (counted twice), where either is followed at all.
 LEAST_EVIDENCE = 16.0
+#: After this many lost frames and seconds a new map is begun.
+RESTART_FRAMES, RESTART_SECONDS = 5, 0.5
+#: A pose found by features needs this score, or this share of the features in view.
+CERTAIN, LEAST_AGREEING = 40.0, 0.03
+#: A pose found without a prediction needs this score; less where no points are followed.
+ANYWHERE_SCORE = 36.0
 #: Below this score most of the planes must agree, where the frame sees any of the map.
 DOUBTFUL_SCORE = 80.0
 
@@ -87,7 +95,9 @@ class Tracker:
         self._present = Present()
         self._history = History()
         self._least_evidence = LEAST_EVIDENCE if self.options.points or self.options.lines else 0.0
-        self._lost_for = 0
+        self._lost_for, self._lost_since = 0, 0.0
+        #: What happened to the track between its maps, for the reader.
+        self._breaks: list[tuple[float, float]] = []
         self._finished = False
 
     @property
@@ -128,6 +138,8 @@ class Tracker:
         status, followed = TRACKED, Followed.nothing()
         assert present.data is not None
         if self._lost_for == 0:
+            with watch("turn"):
+                predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
             estimate, followed = follow_frame(
                 self.map, self.camera, self.options, present.data, data, present.followed, present.pose, predicted,
                 prior_sigma, watch,
@@ -141,13 +153,12 @@ class Tracker:
                     mapper.make_keyframe(present, watch)
                 mapper.choose(present, present.data)
                 mapper.make_keyframe(present, watch)
-                predicted, prior_sigma = self._motion.predict(present.pose, frame.timestamp)
             with watch("find"):
                 found = self._find(data, predicted, prior_sigma, doubtful)
             if found is None:
                 return self._lose(data, began, watch)
             estimate, status = found.estimate, FOUND if self._lost_for else TRACKED
-            followed = Followed(found.points, found.lines)
+            followed = Followed(promote(self.map, found, data), found.lines)
         pose = estimate.pose
         with watch("again"):
             followed = self._find_again(data, pose, followed)
@@ -171,6 +182,19 @@ class Tracker:
                 # What was found by features alone cannot be followed; the next frame needs this one's landmarks.
                 mapper.make_keyframe(present, watch)
         return self._report(frame, status, estimate, is_keyframe, began, watch)
+
+    def _with_turn(self, data: FrameFeatures, predicted: FloatArray, prior_sigma: FloatArray):
+        """Put a turn that the whole image shows in place of a prediction that the image denies."""
+        present, points = self._present, self.map.points
+        assert present.data is not None
+        tracks = present.followed.points
+        tracks = tracks.take(points.alive[tracks.index])
+        turned = turned_prediction(
+            self.camera, present.data.gray, data.gray, tracks.pixel, points.xyz[tracks.index], present.pose, predicted
+        )
+        if turned is None:
+            return predicted, prior_sigma
+        return turned, np.maximum(prior_sigma, [0.0] * 3 + [TURN_SIGMA] * 3)
 
     def _trustworthy(self, estimate: PoseEstimate | None, followed: Followed) -> bool:
         """Whether enough agrees with a pose, and enough of what was followed."""
@@ -200,6 +224,7 @@ class Tracker:
             if (
                 found is not None
                 and found.score >= LEAST_SCORE
+                and (found.score >= CERTAIN or found.share >= LEAST_AGREEING or not self.options.points)
                 and _evidence(found.estimate.counts) >= 0.75 * self._least_evidence
                 and len(found.estimate.weak) <= 2
             ):
@@ -215,9 +240,14 @@ class Tracker:
                 best = found
             if best is not None and best.score > 120:
                 break
-        if best is not None and best.score >= 1.5 * LEAST_SCORE and not best.estimate.weak:
-            return best
-        return None
+        least = ANYWHERE_SCORE if self.options.points else 0.75 * ANYWHERE_SCORE
+        if best is None or best.score < least or best.estimate.weak:
+            return None
+        # Two places may have like features; planes that are seen and are not there tell them apart.
+        seen = 0 if data.planes is None else len(data.planes)
+        if seen >= 2 and not best.estimate.planes.any() and best.score < DOUBTFUL_SCORE:
+            return None
+        return best
 
     def _find_again(self, data: FrameFeatures, pose: FloatArray, followed: Followed) -> Followed:
         """Look for points of the map that are in view but not followed."""
@@ -252,17 +282,28 @@ class Tracker:
         with watch("start"):
             poses = self._initialiser.try_start(data)
             if poses is None:
-                return self._report(data.frame, STARTING, None, False, began, watch)
+                status = STARTING if len(self._mapper.maps) == 1 else LOST
+                return self._report(data.frame, status, None, False, began, watch)
             self._mapper.metric = self._initialiser.metric
             self._present.followed, self._present.pose = self._initialiser.make_map(self.map)
         self._present.data = data
         self._initialiser = None
-        self._motion.update(None, self._present.pose, data.frame.timestamp)
+        if len(self._mapper.maps) > 1:
+            self._breaks.append((self._lost_since, data.frame.timestamp))
+        self._lost_for = 0
+        if len(self.map.keyframes) > 1:
+            first = self.map.keyframes[0]
+            self._motion.update(None, first.pose, first.timestamp)
+            self._motion.update(first.pose, self._present.pose, data.frame.timestamp)
+        else:
+            self._motion.update(None, self._present.pose, data.frame.timestamp)
         self._present.frames_since_keyframe = 0
         if len(self.map.keyframes) > 1:
             self._mapper.adjust_start(self._present)
         for keyframe in self.map.keyframes[:-1]:
-            self._history.entries.append(Entry(keyframe.timestamp, keyframe.index, se3.identity()))
+            self._history.entries.append(
+                Entry(keyframe.timestamp, keyframe.index, se3.identity(), self._mapper.current)
+            )
         return self._report(data.frame, TRACKED, None, True, began, watch)
 
     # ----------------------------------------------------------------------------------------------------- outcomes
@@ -274,46 +315,67 @@ class Tracker:
         )  # fmt: skip
 
     def _lose(self, data: FrameFeatures, began: float, watch: Stopwatch) -> TrackedFrame:
+        now = data.frame.timestamp
+        if self._lost_for == 0:
+            self._lost_since = now
         self._lost_for += 1
+        if self._lost_for > RESTART_FRAMES and now - self._lost_since > RESTART_SECONDS:
+            self._mapper.begin_anew(self._present)
+            self._present, self._motion = Present(), MotionModel()
+            return self._start(data, began, watch)
         return self._report(data.frame, LOST, None, False, began, watch)
 
     def _report(self, frame, status, estimate, is_keyframe, began, watch) -> TrackedFrame:
         self.status = status
         has_pose = status in (TRACKED, FOUND, WEAK)
         if has_pose:
-            self._history.note_pose(self.map, frame.timestamp, self._present.pose)
+            self._history.note_pose(self.map, frame.timestamp, self._present.pose, self._mapper.current)
         timings = {**watch.seconds, "total": time.perf_counter() - began}
         self._history.note(status, timings)
         return TrackedFrame(
             frame.timestamp, self._present.pose.copy() if has_pose else None, status,
             estimate.counts if estimate is not None else {}, timings,
-            estimate.weak if estimate is not None else (), keyframe=is_keyframe,
+            estimate.weak if estimate is not None else (), keyframe=is_keyframe, part=self._mapper.current,
         )  # fmt: skip
 
     # ------------------------------------------------------------------------------------------------------ results
 
     def trajectory(self) -> Trajectory:
-        """Return the poses of all tracked frames so far, as the keyframes stand now."""
+        """Return the poses so far in the map that is followed now, as its keyframes stand."""
         self._mapper.take_up(self._present, now=True)
-        return self._history.trajectory(self.map)
+        return self._history.trajectory(self.map, self._mapper.current)
 
     def scene(self) -> Scene:
-        """Return the keyframes with points, lines and planes as they stand now."""
+        """Return the keyframes with points, lines and planes of the map that is followed now."""
         self._mapper.take_up(self._present, now=True)
         return map_to_scene(self.map, self.camera)
 
     def finish(self) -> TrackResult:
-        """End the track: adjust all keyframes together and return the result."""
-        report, offset = self._mapper.finish(self._present)
-        living = self.map.living()
+        """End the track: join its maps where that is possible, adjust all keyframes together and return the result."""
+        mapper, history = self._mapper, self._history
+        where = mapper.end(self._present)
+        history.joined(where)
         self._finished = True
+        roots = sorted({root for root, _ in where.values() if mapper.maps[root].keyframes})
+        count = {root: sum(entry.part == root for entry in history.entries) for root in roots}
+        main = max(roots, key=lambda root: count[root], default=0)
+        reports = {root: mapper.adjust_at_end(root) for root in roots if root != main}
+        reports[main] = mapper.adjust_at_end(main)
+        parts = {root: self._part(root) for root in (roots or [main])}
         warnings = list(self._checks.warnings)
-        if not living:
+        if not roots:
             warnings.append("No map was made: no frame could be used, or the camera did not move enough to start.")
+        warnings += about_parts(self._breaks, where, [count[root] for root in roots if root != main])
+        whole = parts.pop(main)
         return TrackResult(
-            self.trajectory(), map_to_scene(self.map, self.camera),
-            np.array([keyframe.timestamp for keyframe in living]), self.statistics(report, offset), tuple(warnings),
+            whole.trajectory, whole.scene, whole.keyframes, self.statistics(*reports[main]), tuple(warnings),
+            tuple(parts.values()),
         )  # fmt: skip
+
+    def _part(self, root: int) -> Part:
+        track_map = self._mapper.maps[root]
+        stamps = np.array([keyframe.timestamp for keyframe in track_map.living()])
+        return Part(self._history.trajectory(track_map, root), map_to_scene(track_map, self.camera), stamps)
 
     def statistics(self, report: SolveReport | None = None, right_offset_px: float = 0.0) -> dict:
         """Return counts and times so far as plain numbers."""
@@ -324,6 +386,8 @@ class Tracker:
             "lines": int(self.map.lines.alive.sum()),
             "planes": int(self.map.planes.alive.sum()),
             "loops": self._mapper.loops,
+            "maps": max(sum(bool(part.keyframes) for part in self._mapper.maps), 1),
+            "maps_joined": len(self._mapper.joints),
             "metric": self._mapper.metric,
             "milliseconds": self._history.milliseconds(),
         }

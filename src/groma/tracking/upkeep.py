@@ -40,6 +40,7 @@ def drop_repeating_keyframes(track_map: TrackMap, busy: list[Keyframe]) -> None:
         if (
             keyframe.index == track_map.reference
             or keyframe.index in used
+            or keyframe.index in track_map.pinned
             or any(keyframe.index in loop[:2] for loop in track_map.loops)
         ):
             continue
