@@ -103,6 +103,15 @@ def test_runs_repeat_exactly(rgbd, tracked):
     assert np.array_equal(again.trajectory.world_from_cam, tracked[1].trajectory.world_from_cam)
 
 
+def test_looking_at_a_running_track_changes_nothing(rgbd, tracked):
+    tracker = Tracker(_room.camera(), TrackOptions(num_points=250, num_features=500))
+    for frame in rgbd:
+        tracker.process(frame)
+        assert len(tracker.trajectory()) <= len(rgbd)
+        assert tracker.scene().num_images <= len(rgbd)
+    np.testing.assert_array_equal(tracker.finish().trajectory.world_from_cam, tracked[1].trajectory.world_from_cam)
+
+
 def test_a_thread_changes_little(rgbd, truth):
     result = _run(rgbd[:12], threaded=False)[1]
     assert _room.position_error(result.trajectory, truth) < 0.01

@@ -341,13 +341,11 @@ class Tracker:
     # ------------------------------------------------------------------------------------------------------ results
 
     def trajectory(self) -> Trajectory:
-        """Return the poses so far in the map that is followed now, as its keyframes stand."""
-        self._mapper.take_up(self._present, now=True)
+        """Return the poses so far in the map that is followed now, as its keyframes stand; changes nothing."""
         return self._history.trajectory(self.map, self._mapper.current)
 
     def scene(self) -> Scene:
-        """Return the keyframes with points, lines and planes of the map that is followed now."""
-        self._mapper.take_up(self._present, now=True)
+        """Return the keyframes with points, lines and planes of the map that is followed now; changes nothing."""
         return map_to_scene(self.map, self.camera)
 
     def finish(self) -> TrackResult:

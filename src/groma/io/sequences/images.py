@@ -30,7 +30,7 @@ VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 RATE = 30.0
 
 _NO_CAMERA = (
-    "no camera is known for {path}. Pass one, such as camera='fx fy cx cy' or the name of a file with a line of "
+    "no camera is known for {path}. Pass one (--camera), such as 'fx fy cx cy', or the name of a file with a line of "
     "COLMAP's cameras.txt, or put it into cameras.txt beside the images."
 )
 

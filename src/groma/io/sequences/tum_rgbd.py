@@ -75,7 +75,7 @@ def _freiburg(folder: Path) -> Calibration:
     if found is None:
         raise InputError(
             f"{folder} holds no camera, and its name does not say which of the three of the benchmark it is. Pass "
-            "one, such as camera='525 525 319.5 239.5', or put it into camera.txt."
+            "one (--camera), such as '525 525 319.5 239.5', or put it into camera.txt."
         )
     return from_opencv(FREIBURG[found[1]], (640, 480))
 
