@@ -59,7 +59,7 @@ def test_bad_input_is_refused_in_one_sentence(tmp_path, model):
     with pytest.raises(InputError, match="holds no images"):
         map_images(tmp_path / "empty", tmp_path / "work", model)
     cv2.imwrite(str(tmp_path / "empty" / "a.png"), np.zeros((10, 10), np.uint8))
-    with pytest.raises(InputError, match="None of the .* images of the model is in"):
+    with pytest.raises(InputError, match=r"None of the .* images of the model is in"):
         map_images(tmp_path / "empty", tmp_path / "work", model)
     with pytest.raises(InputError, match="holds 1 image; a map needs at least 3"):
         map_images(tmp_path / "empty", tmp_path / "work")
