@@ -319,10 +319,10 @@ def _combined(reports: list[SolveReport], start: Problem, stages: list[Loss]) ->
     last = reports[-1]
     if len(reports) == 1:
         return last
-    first = solve(
-        Problem(start.variables, [_with_loss(factor, stages[len(reports) - 1]) for factor in start.factors]),
-        SolverOptions(max_iterations=0),
-    ).report
+    loss, first = stages[len(reports) - 1], reports[0]
+    if loss != stages[0]:
+        under_last = [_with_loss(factor, loss) for factor in start.factors]
+        first = solve(Problem(start.variables, under_last), SolverOptions(max_iterations=0)).report
     history: list[Iteration] = []
     for report in reports:
         steps, seconds = len(history), history[-1].seconds if history else 0.0

@@ -122,15 +122,14 @@ def _coordinate_motion(
     kind: str, ambient: FloatArray, a: FloatArray, rotation: FloatArray, scale: float, mounted: bool
 ) -> FloatArray:
     """Change (count, factor_columns) of the factor coordinates; formulas at the top of this module."""
-    # x @ turning is the cross product of the rotation with every row x
-    turning = np.cross(rotation, np.eye(3))
+    turning = _turning(rotation)
     if kind == "point":
         return a + ambient @ turning + scale * ambient
     if kind == "direction":
         return ambient @ turning
     if kind == "line":
         m, d = ambient[:, :3], ambient[:, 3:]
-        return np.hstack([scale * m + m @ turning + d @ np.cross(a, np.eye(3)), d @ turning])
+        return np.hstack([scale * m + m @ turning + d @ _turning(a), d @ turning])
     if kind == "plane":
         n, w = ambient[:, :3], ambient[:, 3:]
         return np.hstack([n @ turning, scale * w - (n @ a)[:, None]])
@@ -140,6 +139,11 @@ def _coordinate_motion(
         return np.hstack([scale * t, np.zeros_like(t)])
     turn = R @ rotation
     return np.hstack([scale * t - R @ a + np.cross(turn, t), -turn])
+
+
+def _turning(v: FloatArray) -> FloatArray:
+    """Return the matrix M of the cross product with every row: x @ M is v x x."""
+    return np.array([[0.0, v[2], -v[1]], [-v[2], 0.0, v[0]], [v[1], -v[0], 0.0]])
 
 
 def _increments(manifold: Manifold, state: FloatArray, ambient: FloatArray, moved: FloatArray) -> FloatArray:
