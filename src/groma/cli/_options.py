@@ -15,6 +15,19 @@ Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")]
 Threads = Annotated[int | None, typer.Option("--threads", min=1, metavar="N", help="Use at most N threads.")]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the random numbers.")]
 Force = Annotated[bool, typer.Option("--force", "-f", help="Replace what is there.")]
+Contributions = Annotated[
+    bool,
+    typer.Option(
+        "--contributions",
+        help="Also adjust by points alone, with lines, with planes, and say what each of them changes.",
+    ),
+]
+Truth = Annotated[
+    Path | None,
+    typer.Option(
+        "--truth", metavar="SCENE", help="With --contributions: a scene to compare the camera poses with, by name."
+    ),
+]
 Input = Annotated[
     Path,
     typer.Argument(metavar="INPUT", help="COLMAP model folder, BAL file (.txt, .bz2, .gz) or groma archive (.npz)."),

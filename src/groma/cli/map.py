@@ -50,19 +50,8 @@ def map_(
             "--diagnosis/--no-diagnosis", help="Say what the data do not determine. Default: yes up to 300 images."
         ),
     ] = None,
-    contributions: Annotated[
-        bool,
-        typer.Option(
-            "--contributions",
-            help="Also adjust by points alone, with lines, with planes, and say what each of them changes.",
-        ),
-    ] = False,
-    truth: Annotated[
-        Path | None,
-        typer.Option(
-            "--truth", metavar="SCENE", help="With --contributions: a scene to compare the camera poses with, by name."
-        ),
-    ] = None,
+    contributions: _options.Contributions = False,
+    truth: _options.Truth = None,
     force: _options.Force = False,
     threads: _options.Threads = None,
     seed: _options.Seed = 0,

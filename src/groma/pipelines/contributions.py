@@ -145,7 +145,7 @@ def _center_sigma(result: AdjustResult) -> float | None:
         return None
     try:
         found = uncertainty(result.scene, gauge="held", problem=result.problem)
-    except (InputError, ProblemError):
+    except (InputError, ProblemError):  # poses are held, or the data leave a line or a plane open
         return None
     sigma = position_sigma(found.centers)
     known = sigma[np.isfinite(sigma) & (sigma > 0)]
