@@ -109,6 +109,10 @@ def _triangulated(folder: Path) -> Scene:
 SCENES: dict[str, Callable[[Path], LineScene]] = {
     "boxes": lambda data: boxes("boxes", BoxSettings(seed=3)),
     "boxes-textured": lambda data: boxes("boxes-textured", BoxSettings(seed=11, texture=8.0)),
+    "boxes-fine": lambda data: boxes("boxes-fine", BoxSettings(seed=35, texture=10.0, blotches=256)),
+    "boxes-rough": lambda data: boxes(
+        "boxes-rough", BoxSettings(seed=34, texture=15.0, width=640, height=480, focal=560.0)
+    ),
     "boxes-small": lambda data: boxes("boxes-small", BoxSettings(seed=5, width=640, height=480, focal=560.0)),
     "pavilion": lambda data: pavilion("pavilion", data / "pavilion_chair"),
     "fountain": lambda data: strecha("fountain", data / "strecha_fountain_p11"),

@@ -22,8 +22,6 @@ FLOOR = 3.0
 BACKGROUND = 30.0
 #: Rays per pixel, in either direction.
 SAMPLES = 3
-#: Size of a pattern of blotches.
-BLOTCHES = 64
 
 
 @dataclass(frozen=True)
@@ -38,6 +36,8 @@ class BoxSettings:
     num_boxes: int = 8
     #: Standard deviation of the blotches on the faces, grey values.
     texture: float = 0.0
+    #: Samples along a face's side of the pattern of blotches: more make them smaller.
+    blotches: int = 64
     #: Standard deviation of the noise of a pixel, grey values.
     noise: float = 2.0
     #: Standard deviation of the blur, pixels.
@@ -67,7 +67,7 @@ def render_boxes(settings: BoxSettings) -> RenderedScene:
     world = _boxes(settings, rng)
     poses = _ring(settings, rng)
     camera = np.array([settings.focal, settings.focal, settings.width / 2, settings.height / 2])
-    blotches = [_blotches(rng) for _ in world.polygons] if settings.texture else None
+    blotches = [_blotches(rng, settings.blotches) for _ in world.polygons] if settings.texture else None
     images = [_picture(world, pose, camera, settings, blotches, rng) for pose in poses]
     points, observations = _points(world, poses, camera, settings, rng)
     scene = Scene.from_images(
@@ -120,9 +120,9 @@ def _ring(settings: BoxSettings, rng: np.random.Generator) -> np.ndarray:
     return np.array(poses)
 
 
-def _blotches(rng: np.random.Generator) -> np.ndarray:
+def _blotches(rng: np.random.Generator, size: int) -> np.ndarray:
     """A smooth random pattern of unit deviation, without edges."""
-    pattern = cv2.GaussianBlur(rng.normal(size=(BLOTCHES, BLOTCHES)), (0, 0), 3.0)
+    pattern = cv2.GaussianBlur(rng.normal(size=(size, size)), (0, 0), 3.0)
     return ((pattern - pattern.mean()) / pattern.std()).astype(np.float32)
 
 
@@ -168,7 +168,7 @@ def _picture(world, pose, camera, settings, blotches, rng) -> np.ndarray:
         value = np.float32(shade)
         if blotches is not None and hit.any():
             # Place in the polygon along its two sides at the first corner, which are perpendicular.
-            scaled = [(BLOTCHES - 1) * v / (v @ v) for v in (local[1] - local[0], local[-1] - local[0])]
+            scaled = [(settings.blotches - 1) * v / (v @ v) for v in (local[1] - local[0], local[-1] - local[0])]
             s, t = (over(v) / np.where(hit, inverse, 1) - np.float32(v @ local[0]) for v in scaled)
             value = value + np.float32(settings.texture) * cv2.remap(blotches[k], s, t, cv2.INTER_LINEAR)
         nearest[rows, columns] = np.where(hit, inverse, nearest[rows, columns])

@@ -25,6 +25,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import _workshop
 import numpy as np
 from _workshop import CACHE, CONTESTANTS, RESULTS, machine, run_program
 
@@ -300,6 +301,7 @@ def main() -> int:
     parser.add_argument("--images", type=int, nargs="+", default=[100, 200])
     parser.add_argument("--views", nargs="+", choices=("random", "near"), default=["random"])
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--timeout", type=int, default=_workshop.TIMEOUT, help="longest a run may take, seconds")
     parser.add_argument("--programs", nargs="+", choices=("groma", "limap"), default=["groma", "limap"])
     parser.add_argument("--accuracy", action="store_true", help="ten scenes of 100 images; the table as published")
     parser.add_argument("--weights", action="store_true", help="only the table of weights of metric relations")
@@ -311,6 +313,7 @@ def main() -> int:
         (RESULTS / "holistic_weights.md").write_text(text)
         print(text)
         return 0
+    _workshop.TIMEOUT = arguments.timeout
     pythons = {"groma": sys.executable}
     if arguments.python_limap:
         pythons["limap"] = str(Path(arguments.python_limap))

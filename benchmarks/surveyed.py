@@ -2,6 +2,7 @@
 """Camera poses against a survey, and what points, lines and planes bring.
 
     python benchmarks/surveyed.py SCENE ...
+    python benchmarks/surveyed.py SCENE ... --scales 1 3 5 7
 
 SCENE is a folder with ``images/``, a start ``sparse_inc/`` and the survey ``sparse_gt/``, both COLMAP models. Each
 scene is mapped once with the defaults of ``groma map``; its last adjustment is then repeated from the same start with
@@ -13,10 +14,14 @@ fit the photographs than the adjusted ones do: twice the difference of the robus
 of freedom of the poses. Perfect poses would give about one. Where it is hundreds, survey and photographs, with this
 calibration, contradict each other, and no adjustment of these photographs could come as near to the survey as its own
 noise would allow.
+
+With ``--scales`` the last adjustment, of everything, is repeated with these scales of the first loss, in standard
+deviations of the noise, instead.
 """
 
 import argparse
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +29,7 @@ import numpy as np
 import groma
 from groma.evaluation import evaluate_poses
 from groma.evaluation.alignment import align_points
-from groma.pipelines.map import LOSS_SIGMAS, MapOptions, map_images
+from groma.pipelines.map import MapOptions, MapResult, map_images
 from groma.pipelines.uncertainty import position_sigma, uncertainty
 from groma.scene import Scene
 
@@ -58,25 +63,44 @@ def misfit(scene: Scene, survey: Scene, sigma_px: float) -> tuple[float, float]:
     return survey_from_scene.scale * float(np.sqrt(np.mean(predicted**2))), excess
 
 
+def tell_kinds(folder: Path, start: Scene, survey: Scene, result: MapResult) -> None:
+    """Print a row: the start, plain least squares, and what each kind of landmark brings."""
+    squares = groma.adjust(start, groma.AdjustOptions(loss="none", lines=False, planes=False)).scene
+    cells = [scores(start, survey), scores(squares, survey)]
+    for kinds in KINDS.values():
+        options = replace(result.adjusted_with, **kinds)
+        cells.append(scores(groma.adjust(result.before, options).scene, survey))
+    predicted, excess = misfit(result.before, survey, result.sigma_px["points"])
+    print(f"| {folder.name} | " + " | ".join(cells) + f" | {1e3 * predicted:.2f} | {excess:.0f} |", flush=True)
+
+
+def tell_scales(folder: Path, survey: Scene, result: MapResult, scales: list[float]) -> None:
+    """Print a row: the centres' error for each scale of the first loss."""
+    cells = []
+    for scale in scales:
+        found = groma.adjust(result.before, replace(result.adjusted_with, loss_scale=scale))
+        cells.append(f"{1e3 * evaluate_poses(found.scene, survey).center_rmse:.2f}")
+    print(f"| {folder.name} | " + " | ".join(cells) + " |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", type=Path)
+    parser.add_argument("--scales", nargs="+", type=float, metavar="S", help="scales of the first loss to compare")
     arguments = parser.parse_args()
     print("centres: rms / largest, thousandths of the survey's unit; rotations: mean, degrees\n")
-    print("| scene | start | squares | " + " | ".join(KINDS) + " | predicted | misfit |")
-    print("|---|" + "---|" * (2 + len(KINDS)) + "--:|--:|")
+    columns = ["start", "squares", *KINDS, "predicted", "misfit"]
+    if arguments.scales:
+        columns = [f"{scale:g}" for scale in arguments.scales]
+    print("| scene | " + " | ".join(columns) + " |\n|---|" + "--:|" * len(columns))
     for folder in arguments.scenes:
         start, survey = groma.read_scene(folder / "sparse_inc"), groma.read_scene(folder / "sparse_gt")
-        squares = groma.adjust(start, groma.AdjustOptions(loss="none", lines=False, planes=False)).scene
         with tempfile.TemporaryDirectory() as work:
             result = map_images(folder / "images", work, start, MapOptions())
-        noise = {"point_sigma_px": result.sigma_px["points"], "line_sigma_px": result.sigma_px["lines"]}
-        cells = [scores(start, survey), scores(squares, survey)]
-        for kinds in KINDS.values():
-            options = groma.AdjustOptions(loss_scale=LOSS_SIGMAS, **noise, **kinds)
-            cells.append(scores(groma.adjust(result.before, options).scene, survey))
-        predicted, excess = misfit(result.before, survey, noise["point_sigma_px"])
-        print(f"| {folder.name} | " + " | ".join(cells) + f" | {1e3 * predicted:.2f} | {excess:.0f} |", flush=True)
+        if arguments.scales:
+            tell_scales(folder, survey, result, arguments.scales)
+        else:
+            tell_kinds(folder, start, survey, result)
 
 
 if __name__ == "__main__":

@@ -36,6 +36,8 @@ autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_preserve_defaults = True
+# Signatures say FloatArray and not what that is made of.
+autodoc_type_aliases = {name: name for name in ("BoolArray", "FloatArray", "IntArray")}
 # Words in the prose of a parameter's type ("name", "kind") are looked up as if they were types; more than one class has
 # an attribute of that name, and none is meant.
 suppress_warnings = ["ref.python"]

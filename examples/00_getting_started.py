@@ -5,7 +5,8 @@
 import groma
 from groma.scene import synthetic
 
-# 20 cameras on a sphere look at 200 points, 20 lines and 4 planes; the start is perturbed, the truth is known.
+# 20 cameras on a sphere look at 200 points, 20 lines and 4 planes.
+# The start is perturbed, the truth is known.
 scene = synthetic.holistic(20, noise_px=1.0, seed=0)
 
 result = groma.adjust(scene.start, groma.AdjustOptions(loss="none"))

@@ -5,7 +5,7 @@ import numpy as np
 
 import groma
 from groma.factors.losses import Cauchy
-from groma.geometry._manifold import Euclidean
+from groma.geometry import Euclidean
 
 
 # The residual: predicted minus measured distance. Derivatives are taken by groma, and everything is compiled.

@@ -7,7 +7,9 @@ Compiled functions are loaded by small solves first, those that only large probl
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 from _common import Clock, peak_memory_mib, report
 
@@ -15,6 +17,7 @@ import groma.solver.solve as solve_module
 from groma.io import read_scene
 from groma.pipelines._assemble import AssemblyOptions, assemble
 from groma.scene import Scene, synthetic
+from groma.solver import report as solver_report
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
@@ -26,6 +29,8 @@ def problem_of(scene: Scene):
 
 def main() -> None:
     path, steps, threads = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+    if threads == 1:  # the stages of a report are then timed by CPU time, so that other work does not count
+        solver_report.time = SimpleNamespace(perf_counter=time.process_time)
     small = problem_of(synthetic.corridor(120).start.points_only())
     threshold = solve_module.COMPACT_FROM
     for bytes_ in (threshold, 0):
@@ -41,7 +46,7 @@ def main() -> None:
     problem = problem_of(scene)
     made = making.read()
     after_making = peak_memory_mib()
-    rule = {"function_tolerance": 0.0, "gradient_tolerance": 0.0, "step_tolerance": 0.0}
+    rule: dict = {"function_tolerance": 0.0, "gradient_tolerance": 0.0, "step_tolerance": 0.0}
     clock = Clock()
     solved = solve(problem, SolverOptions(max_iterations=steps, threads=threads, **rule)).report
     times = clock.read()
@@ -59,7 +64,7 @@ def main() -> None:
         initial_cost=solved.initial_cost,
         final_cost=solved.final_cost,
         linear_iterations=sum(step.linear_iterations for step in solved.history),
-        # of the share of each stage in the wall time
+        # share of each stage in the whole time
         stages={name: seconds / solved.seconds["total"] for name, seconds in solved.seconds.items()},
         process_mib=before,
         before_solve_mib=after_making,

@@ -10,12 +10,16 @@ import zlib as _zlib  # noqa: F401  (before pycolmap, whose library hides Python
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from groma._version import __version__ as __version__
+
 if TYPE_CHECKING:
     from groma import (
         cameras,
         errors,
+        estimators,
         evaluation,
         factors,
+        frontend,
         geometry,
         io,
         pipelines,
@@ -52,8 +56,6 @@ if TYPE_CHECKING:
     from groma.solver.termination import Termination
     from groma.tracking import Tracker, TrackOptions
     from groma.viz.report import write_report
-
-__version__ = "0.1.0"
 
 #: Where each public name lives, and after a colon its name there if that is another; with ``__all__`` and the imports
 #: above the only place to touch when one is added.
@@ -100,8 +102,10 @@ _HOME = {
 _SUBPACKAGES = (
     "cameras",
     "errors",
+    "estimators",
     "evaluation",
     "factors",
+    "frontend",
     "geometry",
     "io",
     "pipelines",
@@ -145,9 +149,11 @@ __all__ = [
     "cameras",
     "diagnose",
     "errors",
+    "estimators",
     "evaluation",
     "factor",
     "factors",
+    "frontend",
     "geometry",
     "io",
     "loss",

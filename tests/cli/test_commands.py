@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import groma
+from groma.cli._counts import counted
 from groma.cli.main import run
 from groma.errors import ProblemError
 from groma.io import read_scene, write_scene
@@ -131,13 +132,14 @@ def test_a_map_is_diagnosed_at_its_own_noise(scenes):
     from types import SimpleNamespace
 
     from groma.cli._mapping import _diagnosis
-    from groma.pipelines.map import MapOptions
+    from groma.pipelines.adjust import AdjustOptions
 
     scene = read_scene(scenes / "truth.npz").replace(relations=Relations())  # these have a noise of their own
     weakness = []
     for sigma in (20.0, 10.0):
-        result: Any = SimpleNamespace(scene=scene, sigma_px={"points": sigma, "lines": sigma})
-        weakness.append(_diagnosis(result, MapOptions()).weakness["points"])
+        told = AdjustOptions(point_sigma_px=sigma, line_sigma_px=sigma)
+        result: Any = SimpleNamespace(scene=scene, adjusted_with=told)
+        weakness.append(_diagnosis(result).weakness["points"])
     # The loss, which is twelve times as wide as the noise, takes hardly anything off residuals of half a pixel.
     np.testing.assert_allclose(weakness[0], 2 * weakness[1], rtol=1e-3)
 
@@ -226,6 +228,7 @@ def test_standard_deviations_in_a_file(scenes, here):
         ["adjust", "GOOD", "--loss", "magic"],
         ["adjust", "GOOD", "--loss", "huber", "--loss-scale", "-1"],
         ["adjust", "GOOD", "--line-chart", "magic"],
+        ["adjust", "POINTS", "--line-chart", "magic"],
         ["adjust", "GOOD", "--gauge", "magic"],
         ["adjust", "GOOD", "--no-points", "--no-lines"],
         ["adjust", "GOOD", "--covariance", "taken.npz"],
@@ -235,6 +238,10 @@ def test_standard_deviations_in_a_file(scenes, here):
         ["convert", "missing", "out.npz"],
         ["report", "missing", "-o", "out.html"],
         ["evaluate", "poses", "GOOD", "missing"],
+        ["evaluate", "planes", "GOOD", "GOOD", "--threshold", "1"],
+        ["evaluate", "trajectory", "noise.npz", "noise.npz"],
+        ["map", "walk.MP4", "-o", "out"],
+        ["map", "folder", "-o", "out"],
         ["synth", "-o", "taken.npz"],
         ["selfcheck", "--golden", "missing"],
     ],
@@ -245,12 +252,25 @@ def test_bad_input_is_one_line(scenes, here, arguments, capsys):
     (here / "noise.npz").write_bytes(np.random.default_rng(0).bytes(500))
     (here / "taken.npz").write_text("precious")
     (here / "folder").mkdir()
+    (here / "walk.MP4").touch()
     before = sorted(os.listdir(here))
-    assert run([str(scenes / "start.npz") if word == "GOOD" else word for word in arguments]) == 1
+    files = {"GOOD": str(scenes / "start.npz"), "POINTS": str(scenes / "points.npz")}
+    assert run([files.get(word, word) for word in arguments]) == 1
     said = capsys.readouterr().err
     assert said.startswith("groma: ") and said.count("\n") == 1, said
     assert sorted(os.listdir(here)) == before
     assert (here / "taken.npz").read_text() == "precious"
+
+
+def test_counts_are_words():
+    assert [counted(count, "images") for count in (0, 1, 22106)] == ["0 images", "1 image", "22,106 images"]
+
+
+def test_poses_of_one_image_are_no_comparison(scenes, here, capsys):
+    write_scene(read_scene(scenes / "truth.npz").subset([0]), here / "one.npz")
+    assert run(["evaluate", "poses", "one.npz", str(scenes / "truth.npz")]) == 0
+    told = capsys.readouterr()
+    assert "1 image in both" in told.out and "whatever their poses" in told.err
 
 
 def test_force_replaces(scenes, here):

@@ -68,6 +68,17 @@ def test_text_model_refuses_names_with_spaces(tmp_path):
         write_colmap(scene, tmp_path / "text", form="text")
 
 
+def test_names_with_spaces_are_read_whole_from_text_models_of_others(tmp_path):
+    import pycolmap
+
+    names = ("set 1/a  b.png", "c.png", "d e", "é f", "g")
+    scene = rig_scene()
+    write_colmap(scene.replace(images=scene.images.replace(names=names)), tmp_path / "binary")
+    (tmp_path / "text").mkdir()
+    pycolmap.Reconstruction(str(tmp_path / "binary")).write_text(str(tmp_path / "text"))
+    assert read_colmap(tmp_path / "text").images.names == names
+
+
 def test_colmap_poses_are_those_of_pycolmap(tmp_path):
     import pycolmap
 
@@ -279,11 +290,14 @@ def test_read_scene_says_what_it_wants(tmp_path):
     (tmp_path / "picture.jpg").write_bytes(b"\xff\xd8\xff\xe0 no scene")
     (tmp_path / "empty.npz").write_bytes(b"")
     (tmp_path / "folder").mkdir()
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "a.JPG").touch()
     for name, error, message in [
         ("nothing", InputError, "Cannot read"),
         ("picture.jpg", FileFormatError, "is not a scene"),
         ("empty.npz", FileFormatError, "groma archive"),
-        ("folder", FileFormatError, "No COLMAP model"),
+        ("folder", FileFormatError, "holds no COLMAP model: .* Check the path"),
+        ("pictures", FileFormatError, "holds no COLMAP model: .* groma map"),
         ("bad\0name", InputError, "Cannot read"),
     ]:
         with pytest.raises(error, match=message):

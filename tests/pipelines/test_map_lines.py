@@ -466,3 +466,17 @@ def test_ends_are_where_most_images_see_them():
     half = 0.5 * np.linalg.norm(true[:, 1] - true[:, 0], axis=1)
     beyond = np.concatenate([at[:, 1] - half, -at[:, 0] - half]) * 700.0 / 4.0
     assert abs(np.median(beyond)) < 0.8  # pixels; the outermost but one of twelve lies 1.1 out
+
+
+def test_lines_of_texture():
+    rng = np.random.default_rng(21)
+    world = wireframe(arc(6), random_lines(30, rng), rng, num_clutter=80)
+    weak = [np.where((truth >= 0) & (truth < 22), 20.0, 4.0) for truth in world.truth]
+    segments = [Segments(s.ends, s.sigma, w) for s, w in zip(world.segments, weak, strict=True)]
+    found = map_lines(world.scene, segments)
+    every = map_lines(world.scene, segments, options=MapLinesOptions(min_repeatability=0.0))
+    assert found.fate_counts()[Fate.TEXTURE] > 0
+    assert every.fate_counts()[Fate.TEXTURE] == 0
+    strong = {n for n in true_lines(world, every) if 0 <= n < 22}
+    assert {n for n in true_lines(world, found) if n >= 0} == strong
+    assert any(n >= 22 for n in true_lines(world, every))

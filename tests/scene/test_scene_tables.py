@@ -18,8 +18,9 @@ from groma.scene import (
     Scene,
     Similarity,
 )
+from groma.scene._synthetic import project_pinhole
 from groma.scene.compare import equal, near
-from groma.scene.synthetic import holistic, project_pinhole
+from groma.scene.synthetic import holistic
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +130,41 @@ def test_subset_keeps_what_is_seen(made):
     whole = equal(made.truth.subset(np.ones(12, bool)), made.truth)
     assert whole, whole.reason
     assert made.truth.subset([0], min_observations=0).num_points == 120
+
+
+def test_keep_takes_relations_and_observations_along(made):
+    """By identifiers: what lay on what before still does, and nothing else does."""
+    scene = made.truth
+    planes = scene.num_planes - 1 - np.arange(scene.num_planes - 1)  # all but the first, backwards
+    points = scene.points.ids % 3 != 0
+    part = scene.keep(points=points, planes=planes)
+    np.testing.assert_array_equal(part.planes.ids, scene.planes.ids[planes])
+    np.testing.assert_array_equal(part.points.ids, scene.points.ids[points])
+    assert part.lines is scene.lines and part.line_observations is scene.line_observations
+
+    def named(table, first, second):
+        return set(zip(first.ids[table[:, 0]].tolist(), second.ids[table[:, 1]].tolist(), strict=True))
+
+    left = {number for number in scene.points.ids.tolist() if number % 3}
+    stay = set(part.planes.ids.tolist())
+    before = named(scene.relations.point_on_plane, scene.points, scene.planes)
+    after = named(part.relations.point_on_plane, part.points, part.planes)
+    assert after == {(point, plane) for point, plane in before if point in left and plane in stay} and after
+    on_lines = named(part.relations.point_on_line, part.points, part.lines)
+    assert {point for point, _ in on_lines} <= left
+    seen = part.point_observations
+    assert len(seen) == points[scene.point_observations.point_idx].sum()
+    np.testing.assert_array_equal(
+        seen.pixel, scene.point_observations.pixel[points[scene.point_observations.point_idx]]
+    )
+    with pytest.raises(InputError, match="points"):
+        scene.keep(points=[scene.num_points])
+
+
+def test_observations_are_numbered_within_their_image():
+    made = PointObservations.numbered([1, 0, 1, 1, 0], [0, 1, 2, 3, 4], np.zeros((5, 2)))
+    np.testing.assert_array_equal(made.keypoint_idx, [0, 0, 1, 2, 1])
+    assert len(PointObservations.numbered([], [], [])) == 0
 
 
 def test_lines_carry_their_end_points_along():

@@ -4,14 +4,16 @@ import dataclasses
 
 import numpy as np
 import pytest
-from problems import dense_normal_equations, scene_problem
+from problems import INTRINSICS, dense_normal_equations, pixels_of, scene_problem
 
+import groma.solver.schur as schur_module
 import groma.solver.solve as solve_module
 from groma.errors import ProblemError
-from groma.factors import PointOnLine, VectorPrior
+from groma.factors import PointOnLine, PointReprojection, VectorPrior
 from groma.factors._factor import Ref
 from groma.factors.losses import Cauchy, Truncated
 from groma.geometry._manifold import Euclidean
+from groma.geometry.pose_charts import POSE_CHARTS
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.options import SolverOptions
@@ -50,6 +52,43 @@ def test_line_charts_reach_the_same_minimum(chart):
     problem = scene_problem(num_points=20, num_lines=30, line_chart=chart)
     solution = solve(problem, SolverOptions(function_tolerance=1e-12, max_iterations=100))
     np.testing.assert_allclose(solution.report.final_cost, reference.report.final_cost, rtol=1e-6)
+
+
+def test_far_points_reach_their_depth_in_few_steps(monkeypatch):
+    """Rays at small angles say little about depth; the damping that suits the cameras must not hold the points back."""
+    rng = np.random.default_rng(0)
+    poses = np.tile([0.0, 0, 0, 1, 0, 0, 0], (6, 1))
+    poses[:, 4] = -np.linspace(0, 1, 6)
+    points = np.hstack([rng.uniform(-0.4, 0.4, (80, 2)), np.ones((80, 1))]) * rng.choice([5.0, 150.0], (80, 1))
+    camera, point = np.repeat(np.arange(6), 80), np.tile(np.arange(80), 6)
+    seen = PointReprojection(
+        pose=Ref("poses", camera),
+        point=Ref("points", point),
+        intrinsics=Ref("intrinsics", np.zeros(480, int)),
+        camera_model="PINHOLE",
+        pixels=pixels_of(poses[camera], points[point]) + rng.normal(0, 0.2, (480, 2)),
+    )
+    held = np.zeros((6, 6), dtype=bool)
+    held[0] = held[5, 0] = True
+    variables = {
+        "poses": Variables(POSE_CHARTS["left"], poses, held),
+        "intrinsics": Variables(Euclidean(4, "intrinsics"), INTRINSICS[None], True),
+        "points": Variables(Euclidean(3, "point"), points * rng.uniform(0.9, 1.1, (80, 1))),
+    }
+    problem, options = Problem(variables, [seen]), SolverOptions(function_tolerance=1e-8)
+    shared = solve(problem, options).report
+    monkeypatch.setattr(schur_module, "LANDMARK_DAMPING", {})
+    same = solve(problem, options).report
+    np.testing.assert_allclose(shared.final_cost, same.final_cost, rtol=1e-5)
+    assert shared.iterations < same.iterations
+
+
+def test_start_alone_is_evaluated():
+    problem = scene_problem(num_lines=5)
+    report, full = solve(problem, SolverOptions(max_iterations=0)).report, solve(problem).report
+    assert report.termination is Termination.MAX_ITERATIONS
+    assert report.initial_cost == report.final_cost == pytest.approx(full.initial_cost, rel=1e-12)
+    assert report.final_costs == pytest.approx(full.initial_costs, rel=1e-12)
 
 
 def test_robust_loss_ignores_an_outlier():

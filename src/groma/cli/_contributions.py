@@ -14,6 +14,8 @@ def describe_contributions(entries: Sequence[Mapping[str, Any]]) -> list[str]:
             parts.append(f"cameras moved {entry['moved']:.3g}")
         if entry["center_sigma"] is not None:
             parts.append(f"centres known to {entry['center_sigma']:.3g}")
+        elif number == 0 or not entries[number - 1]["center_sigma_missing"]:
+            parts.append(f"centres not predicted: {entry['center_sigma_missing'].rstrip('.')}")
         if entry["center_error"] is not None:
             parts.append(f"error {entry['center_error']:.4g}, {entry['rotation_error_deg']:.4f}°")
         if entry["num_relations"]:

@@ -75,6 +75,7 @@ def map_and_write(
     from groma.cli._interrupt import interruptible
     from groma.io import write_geometry, write_scene
     from groma.pipelines._stages import has_stages, remove_stages, system_reason
+    from groma.pipelines.contributions import contributions as find_contributions
     from groma.pipelines.map import map_images
     from groma.viz._page_tables import contributions_card
     from groma.viz.report import write_report
@@ -94,10 +95,11 @@ def map_and_write(
         )
         raise typer.Exit(INTERRUPTED) from None
     scene = result.scene
-    diagnosis = diagnosis_of(scene, lambda: _diagnosis(result, options), console, diagnose)
+    diagnosis = diagnosis_of(scene, lambda: _diagnosis(result), console, diagnose)
     numbers: dict[str, Any] = _numbers(result) | {"diagnosis": diagnosis} | (judge(result) if judge is not None else {})
     if contributions:
-        numbers["contributions"] = _contributions(result, options, truth)
+        entries = find_contributions(result.before, result.adjusted_with, truth)
+        numbers["contributions"] = [entry.to_dict() for entry in entries]
     try:
         with _output.atomic_output(output, force, work) as draft:
             write_scene(scene, draft, format="colmap")
@@ -151,53 +153,32 @@ def _numbers(result: MapResult) -> dict[str, Any]:
     }
 
 
-def _diagnosis(result: MapResult, options: MapOptions) -> Diagnosis:
+def _diagnosis(result: MapResult) -> Diagnosis:
     """Diagnose a map at the noise and with the kind of loss of its last adjustment."""
     from groma.factors.losses import GemanMcClure
     from groma.pipelines._assemble import AssemblyOptions
     from groma.pipelines.adjust import LAST_SCALE_SIGMAS
     from groma.pipelines.diagnosis import diagnose_scene
 
-    known = {kind: sigma for kind, sigma in result.sigma_px.items() if sigma > 0}
+    told = result.adjusted_with
     assembly = AssemblyOptions(
-        point_sigma_px=known.get("points", 1.0),
-        line_sigma_px=known.get("lines", 1.0),
-        structure_sigma_px=options.structure.surface_sigma_px,
-        refine_poses=options.refine_poses,
-        refine_intrinsics=options.refine_intrinsics,
+        point_sigma_px=told.point_sigma_px,
+        line_sigma_px=told.line_sigma_px,
+        structure_sigma_px=told.structure_sigma_px,
+        refine_poses=told.refine_poses,
+        refine_intrinsics=bool(told.refine_intrinsics),
         loss=GemanMcClure(LAST_SCALE_SIGMAS),
     )
     return diagnose_scene(result.scene, assembly)
 
 
-def _contributions(result: MapResult, options: MapOptions, truth: Scene | None) -> list[dict[str, Any]]:
-    """Repeat the last adjustment of a map, with its noise, by points alone and with more and more."""
-    from groma.pipelines.adjust import AdjustOptions
-    from groma.pipelines.contributions import contributions
-    from groma.pipelines.map import LOSS_SIGMAS
-
-    known = {kind: sigma for kind, sigma in result.sigma_px.items() if sigma > 0}
-    weighted = AdjustOptions(
-        point_sigma_px=known.get("points", 1.0),
-        line_sigma_px=known.get("lines", 1.0),
-        structure_sigma_px=options.structure.surface_sigma_px,
-        loss_scale=LOSS_SIGMAS,
-        refine_poses=options.refine_poses,
-        refine_intrinsics=options.refine_intrinsics,
-        threads=options.threads,
-    )
-    return [entry.to_dict() for entry in contributions(result.before, weighted, truth)]
-
-
 def _sentences(result: MapResult, verbose: bool = False) -> list[str]:
+    from groma.cli._counts import counted
     from groma.cli._numbers import describe_relations
 
     scene = result.scene
-    counts = (
-        f"{scene.num_images} images, {scene.num_points:,} points, {scene.num_lines:,} lines, "
-        f"{scene.num_planes} planes, {scene.num_directions} directions"
-    )
-    lines = [counts]
+    kinds = ("images", "points", "lines", "planes", "directions")
+    lines = [", ".join(counted(getattr(scene, f"num_{kind}"), kind) for kind in kinds)]
     for kind, rmse in result.report.rmse_px.items():
         lines.append(f"  {kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms, outliers included)")
     if any(rmse["after"] > rmse["before"] for rmse in result.report.rmse_px.values()):

@@ -4,7 +4,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-_KINDS = (("images", "num_images"), ("points", "num_points"), ("lines", "num_lines"), ("planes", "num_planes"))
+from groma.cli._counts import counted
 
 _SIGMAS = (
     ("centres", "center", ""),
@@ -30,8 +30,8 @@ def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, f
     fresh : bool
         Say that the time includes compilation.
     """
-    counts = ", ".join(f"{numbers[key]:,} {name}" for name, key in _KINDS if numbers.get(key))
-    lines = [f"{counts}, {numbers['num_observations']:,} observations"]
+    kinds = ("images", "points", "lines", "planes", "observations")
+    lines = [", ".join(counted(numbers[f"num_{kind}"], kind) for kind in kinds if numbers.get(f"num_{kind}"))]
     for kind, rmse in numbers.get("rmse_px", {}).items():
         if rmse.get("before") is not None and rmse.get("after") is not None:
             lines.append(f"  {kind + ' error':<16}{rmse['before']:>10.3f} px  ->{rmse['after']:>9.3f} px   (rms)")

@@ -2,12 +2,19 @@
 """``groma evaluate``: a result against a reference, in the scores of the field."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from groma.cli import _options, _output
 from groma.cli._console import Console
+from groma.cli._counts import counted
+from groma.errors import InputError
+
+# As groma.io.trajectories and groma.evaluation.trajectory have them; not imported, because they load NumPy.
+_Format = Literal["auto", "tum", "kitti", "euroc"]
+_Alignment = Literal["se3", "sim3", "none"]
+_StepUnit = Literal["frames", "metres", "seconds"]
 
 
 def poses(
@@ -27,9 +34,14 @@ def poses(
     from groma.io import read_scene
 
     scores = evaluate_poses(read_scene(estimate), read_scene(reference))
-    console.say(f"{scores.num_images} images in both, after similarity alignment")
+    console.say(f"{counted(scores.num_images, 'images')} in both, after similarity alignment")
     if scores.num_missing:
-        console.warn(f"{scores.num_missing} images of the reference are missing in the estimate.")
+        missing = counted(scores.num_missing, "images")
+        console.warn(
+            f"{missing} of the reference {'is' if scores.num_missing == 1 else 'are'} missing in the estimate."
+        )
+    if scores.num_images < 3:
+        console.warn("The alignment takes the centres of one or two images onto each other, whatever their poses.")
     console.say(f"  camera centres   {scores.center_rmse:.6g} rms, in units of the reference")
     console.say(f"  rotations        {scores.rotation_deg_mean:.4g} deg mean, {scores.rotation_deg_max:.4g} max")
     areas = ", ".join(f"{value:.3f} at {degrees:g} deg" for degrees, value in scores.auc.items())
@@ -78,13 +90,14 @@ def lines(
         scores = evaluate_lines(read_scene(estimate), read_scene(reference), threshold, align=True)
     else:
         scores = score_lines(read_reference(estimate).segments, read_reference(reference), threshold)
-    console.say(f"{scores.num_lines} lines, {scores.length:.6g} long; reference {scores.reference_length:.6g} long")
+    lines_there = counted(scores.num_lines, "lines")
+    console.say(f"{lines_there}, {scores.length:.6g} long; reference {scores.reference_length:.6g} long")
     if scores.num_lines == 0:
         console.warn(f"{estimate} holds no lines.")
     console.say("  threshold  recall of length  precision: lines  lines 90 %   length   length found")
     for tau, recall in scores.recall_length.items():
         shares = [recall, scores.precision_count[tau], scores.precision_strict[tau], scores.precision_length[tau]]
-        row = "  ".join(f"{100 * share:{width}.1f} %" for share, width in zip(shares, (14, 14, 8, 6), strict=True))
+        row = "  ".join(_percent(share, width) for share, width in zip(shares, (14, 14, 8, 6), strict=True))
         console.say(f"  {tau:9.4g}  {row}  {scores.inlier_length[tau]:13.6g}")
     _output.write_json(json_target, scores.to_dict(), force)
 
@@ -121,9 +134,12 @@ def planes(
     if scene.num_planes == 0:
         console.warn(f"{estimate} holds no planes.")
     if holds_scene(reference):
+        if threshold is not None:
+            raise InputError("--threshold is for a reference of points. For planes pass --max-angle and --max-offset.")
         found = evaluate_planes(scene, read_scene(reference), max_angle, max_offset)
-        console.say(f"{len(found.matches)} of {found.num_planes} planes match {found.num_reference} of the reference")
-        console.say(f"  precision   {100 * found.precision:.1f} %, recall {100 * found.recall:.1f} %")
+        planes_there = counted(found.num_planes, "planes")
+        console.say(f"{len(found.matches)} of {planes_there} match {found.num_reference} of the reference")
+        console.say(f"  precision   {_percent(found.precision)}, recall {_percent(found.recall)}")
         console.say(f"  normals     {found.normal_deg_mean:.4g} deg mean, {found.normal_deg_max:.4g} max")
         console.say(
             f"  offsets     {found.offset_mean:.4g} mean, {found.offset_max:.4g} max, in units of the reference"
@@ -131,7 +147,7 @@ def planes(
         _output.write_json(json_target, found.to_dict(), force)
         return
     shares = score_planes_by_points(scene.planes.hesse, read_reference(reference).surface_points(), threshold)
-    console.say(f"{shares.num_planes} planes, {shares.num_points} points")
+    console.say(f"{counted(shares.num_planes, 'planes')}, {counted(shares.num_points, 'points')}")
     for tau, share in shares.inlier_share.items():
         console.say(f"  {tau:9.4g}  {100 * share:5.1f} % of the points, {shares.inlier_rmse[tau]:.4g} rms")
     _output.write_json(json_target, shares.to_dict(), force)
@@ -140,19 +156,13 @@ def planes(
 def trajectory(
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory to judge.")],
     reference: Annotated[Path, typer.Argument(metavar="REF", help="Trajectory taken for true.")],
-    format: Annotated[
-        str, typer.Option("--format", metavar="auto|tum|kitti|euroc", help="Format of both files; .gz is unpacked.")
-    ] = "auto",
-    align: Annotated[
-        str, typer.Option("--align", metavar="se3|sim3|none", help="Alignment of EST to REF; sim3 for monocular.")
-    ] = "se3",
+    format: Annotated[_Format, typer.Option("--format", help="Format of both files; .gz is unpacked.")] = "auto",
+    align: Annotated[_Alignment, typer.Option("--align", help="Alignment of EST to REF; sim3 for monocular.")] = "se3",
     max_time_difference: Annotated[
         float, typer.Option("--max-time-difference", metavar="S", help="Largest difference of associated times, s.")
     ] = 0.01,
     rpe_delta: Annotated[float, typer.Option("--rpe-delta", metavar="D", help="Step of the relative errors.")] = 1.0,
-    rpe_unit: Annotated[
-        str, typer.Option("--rpe-unit", metavar="frames|metres|seconds", help="Unit of the step.")
-    ] = "frames",
+    rpe_unit: Annotated[_StepUnit, typer.Option("--rpe-unit", help="Unit of the step.")] = "frames",
     force: _options.Force = False,
     threads: _options.Threads = None,
     json_target: _options.Json = None,
@@ -173,12 +183,12 @@ def trajectory(
         )
 
     scores = score_trajectory(
-        read_trajectory(estimate, format),  # type: ignore[arg-type]  # unknown words are refused there
-        read_trajectory(reference, format),  # type: ignore[arg-type]
-        align,  # type: ignore[arg-type]
+        read_trajectory(estimate, format),
+        read_trajectory(reference, format),
+        align,
         max_time_difference,
         rpe_delta,
-        rpe_unit,  # type: ignore[arg-type]
+        rpe_unit,
     )
     applied = {"se3": "rotation and translation", "sim3": f"similarity of scale {scores.similarity.scale:.6g}"}
     console.say(
@@ -198,3 +208,8 @@ def trajectory(
             f"mean over segments of {scores.segment_lengths[0]:.4g} to {scores.segment_lengths[-1]:.4g} m"
         )
     _output.write_json(json_target, scores.to_dict(), force)
+
+
+def _percent(share: float, width: int = 0) -> str:
+    """A share in percent; a dash where there is nothing to have a share of."""
+    return f"{100 * share:{width}.1f} %" if share == share else f"{'–':>{width}} %"

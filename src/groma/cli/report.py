@@ -49,8 +49,8 @@ def report(
         raise InputError(f"{images} is not a folder of images. Check --images.")
     scene = read_scene(source)
     earlier = read_scene(before) if before is not None else None
-    if images is not None and not any(image_file(images, name) for name in scene.images.names):
-        console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[:1]}.")
+    if images is not None and scene.num_images and not any(image_file(images, name) for name in scene.images.names):
+        console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[0]!r}.")
     saved = saved_report(source) if source.is_dir() else None
     with _output.atomic_output(output, force) as draft:
         write_report(

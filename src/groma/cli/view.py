@@ -72,15 +72,21 @@ def _follow(output: Path, port: int, browser: bool, console: "Console", json_tar
 
     from groma.cli import _output
     from groma.errors import InputError
-    from groma.viz.live import EVERY, following
+    from groma.viz.live import EVERY, WAITING, following
 
     if output.is_file():
         raise InputError(f"{output} is a file. With --live, pass the folder that groma track -o was given.")
+
+    def sentence(state: str) -> str:
+        if state == WAITING:
+            return f"There is nothing in {output} yet; waiting for groma track SEQUENCE -o {output}."
+        return f"The track of {output} is {state}."
+
     with following(output, port) as shown, contextlib.suppress(KeyboardInterrupt):
         shown.refresh()
         address = f"http://localhost:{shown.server.get_port()}"
         console.say(f"Open {address} in a browser. Ctrl-C ends.")
-        console.say(f"The track of {output} is {shown.state}.")
+        console.say(sentence(shown.state))
         _output.write_json(json_target, {"address": address, "state": shown.state}, force)
         if browser:
             _open_browser(address)
@@ -90,7 +96,7 @@ def _follow(output: Path, port: int, browser: bool, console: "Console", json_tar
             shown.refresh()
             if shown.state != before:
                 before = shown.state
-                console.say(f"The track of {output} is {before}.")
+                console.say(sentence(before))
     console.say("\nClosed.")
 
 

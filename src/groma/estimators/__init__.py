@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Closed forms and robust estimates: triangulation, trimming, plane fits, directions, alignment."""
+"""Closed forms and robust estimates: lines from segments and where they end, planes, directions, what lies on what."""

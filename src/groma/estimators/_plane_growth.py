@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import stats
@@ -21,12 +20,10 @@ from groma.estimators._plane_loops import (
     near_loop,
     nearest_rows_loop,
 )
+from groma.estimators._plane_options import PlaneOptions
 from groma.estimators.association import inlier_probability
 from groma.estimators.plane_fit import PlaneFit, fit_plane, tilt_sigma
 from groma.geometry._algebra import norm, perpendicular
-
-if TYPE_CHECKING:
-    from groma.estimators.plane_search import PlaneOptions
 
 #: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
 BAND = 8.0

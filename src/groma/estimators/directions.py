@@ -46,14 +46,15 @@ class DirectionOptions:
     parallel_sigma: float = 8.7e-4
     #: A feature agrees when the chi-square test of its residual passes at this level.
     level: float = 0.95
-    #: Least number of features that agree.
-    min_support: int = 5
+    #: Least number of features that agree beyond those that determine a direction, one line or two segments: four
+    #: parallel lines are enough, if they are long enough not to be parallel by chance.
+    min_coincidences: int = 3
     #: Least number of groups (images, for segments) among them.
     min_groups: int = 1
     #: Expected number of directions found where there are none.
     max_false_alarms: float = 1e-4
     #: Most directions.
-    max_directions: int = 12
+    max_directions: int = 24
     #: Directions whose standard deviation is larger are dropped, radians. 2 degrees.
     max_sigma: float = 0.035
     #: Where the random choice of candidates begins.
@@ -297,7 +298,8 @@ def _search(
     found: list[FloatArray] = []
     covariances: list[FloatArray] = []
     alarms: list[float] = []
-    while len(found) < options.max_directions and len(remaining) >= max(options.min_support, 2):
+    least = options.min_coincidences + 3 - features.freedom
+    while len(found) < options.max_directions and len(remaining) >= max(least, 2):
         pool = features.take(remaining)
         guesses = candidates if candidates is not None else _crossings(pool, rng)
         if len(guesses) == 0:
@@ -315,7 +317,7 @@ def _search(
             tail = float(stats.poisson.logsf(count - 1, expected)) / np.log(10) + np.log10(tried)
             spread = count if groups is None else len(np.unique(groups[remaining[inside]]))
             certain = float(np.linalg.eigvalsh(covariance)[-1]) < options.max_sigma**2
-            strong = tail < np.log10(options.max_false_alarms) and count >= options.min_support
+            strong = tail < np.log10(options.max_false_alarms) and count >= least
             new = all(abs(float(direction @ other)) < np.cos(3 * options.parallel_sigma) for other in found)
             if strong and certain and new and spread >= options.min_groups:
                 accepted = direction, covariance, tail

@@ -27,6 +27,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.estimators._plane_candidates import Features, from_neighbours, from_segments, squares
 from groma.estimators._plane_growth import BAND, RANK, Grower, Grown, connected_to
+from groma.estimators._plane_options import PlaneOptions
 from groma.geometry._algebra import norm, vectors
 
 #: Neighbours that make a candidate, and that improve it.
@@ -39,26 +40,6 @@ _SAME = 2.0
 _LEAST_SCORE = 1e-3
 #: Failures one after the other, of ever weaker candidates, after which the search ends.
 _PATIENCE = 100
-
-
-@dataclass(frozen=True)
-class PlaneOptions:
-    """What counts as a plane."""
-
-    #: A point lies on a plane when the chi-square test of its distance passes at this level.
-    level: float = 0.95
-    #: Least number of points; a segment counts as two.
-    min_support: int = 10
-    #: Largest standard deviation of the normal, radians. Half a degree.
-    max_tilt: float = 0.0087
-    #: Least part of the features in the layer around a plane that lie on it.
-    min_share: float = 0.2
-    #: Expected number of planes found where there are none.
-    max_false_alarms: float = 1e-4
-    #: Most planes.
-    max_planes: int = 100
-    #: Where the random choice of candidates begins.
-    seed: int = 0
 
 
 @dataclass(frozen=True)

@@ -65,17 +65,19 @@ def evaluate_poses(estimate: Scene, reference: Scene, with_scale: bool = True) -
     Raises
     ------
     InputError
-        If no image is in both, or a name occurs twice in one scene.
+        If a scene has no image, no image is in both, or a name occurs twice in one scene.
     """
     rows = []
     for name, scene in (("estimate", estimate), ("reference", reference)):
         index = {image: row for row, image in enumerate(scene.images.names)}
         if len(index) != scene.num_images:
             raise InputError(f"Image names of the {name} are not unique; images are matched by name. Rename them.")
+        if not index:
+            raise InputError(f"The {name} holds no images, so there are no poses to compare. Pass a scene with images.")
         rows.append(index)
     common = [name for name in reference.images.names if name in rows[0]]
     if not common:
-        examples = [next(iter(index), "none") for index in rows]
+        examples = [next(iter(index)) for index in rows]
         raise InputError(
             f"No image is in both scenes; names are for example {examples[0]!r} and {examples[1]!r}. "
             "Images are matched by name: rename those of one scene."

@@ -115,7 +115,7 @@ class Loss:
         if not (math.isfinite(scale) and scale > 0.0):
             raise InputError(
                 f"The scale of the loss {self.name!r} must be a positive number (standard deviations); got {scale}. "
-                "Use Trivial() for plain least squares."
+                "Use the loss 'none' for plain least squares."
             )
 
     @property
@@ -236,6 +236,10 @@ def loss(name: str, scale: float = 1.0, *, alpha: float | None = None) -> Loss:
     alpha : float, optional
         Shape, at most 2, for ``barron`` only (1 if not given).
 
+    Returns
+    -------
+    Loss
+
     Raises
     ------
     InputError
@@ -244,7 +248,8 @@ def loss(name: str, scale: float = 1.0, *, alpha: float | None = None) -> Loss:
     key = name.lower().replace("-", "_")
     key = "trivial" if key == "none" else key
     if key not in LOSSES:
-        raise InputError(f"There is no loss named {name!r}; choose one of {', '.join(sorted(LOSSES))}.")
+        known = ["none", *sorted(set(LOSSES) - {"trivial"})]
+        raise InputError(f"There is no loss named {name!r}; choose one of {', '.join(known)}.")
     if alpha is not None and key != "barron":
         raise InputError(f"Only the loss 'barron' has a shape alpha; got alpha={alpha} for {name!r}. Leave it out.")
     if key == "trivial":

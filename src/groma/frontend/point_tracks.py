@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Follow points from image to image by OpenCV's pyramidal Lucas-Kanade, and find new ones worth following.
 
+Where there is nothing but noise, Lucas-Kanade stays near where it was told to begin, and such a point would confirm
+whatever was predicted. So patches must be alike, and corners must stand out from the noise of the image.
+
 Pixels count from the corner of the image (first pixel's centre at 0.5, 0.5).
 """
 
@@ -13,6 +16,12 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.frontend.images import GrayImage
 
 _HALF = np.float32(0.5)
+#: Least correlation of a patch with the one it was followed from: more signal than noise.
+LEAST_ALIKE = 0.5
+#: Width of the blocks in which corners are rated, pixels; the mean eigenvalue in them that noise of one grey level
+#: makes (OpenCV's units: 12 times 25 samples, by 4, 5 and 255), and how often that a corner must have. Noise alone
+#: reaches three times in an image of 640 x 480.
+BLOCK, NOISE_EIGENVALUE, ABOVE_NOISE = 5, 12.0 * 25.0 / (4.0 * 5.0 * 255.0) ** 2, 4.0
 
 
 def follow(
@@ -44,7 +53,7 @@ def follow(
     Returns
     -------
     (N, 2) float64, (N,) bool
-        Pixels, and which points were found inside the image.
+        Pixels, and which points were found inside the image, with a patch like the one they had.
     """
     if not len(pixels):
         return np.zeros((0, 2)), np.zeros(0, dtype=bool)
@@ -63,6 +72,9 @@ def follow(
     height, width = image_2.shape
     with np.errstate(invalid="ignore"):
         good &= ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
+    if good.any():
+        rows = np.flatnonzero(good)
+        good[rows] = _alike(image_1, image_2, start[rows], there[rows], window) > LEAST_ALIKE
     if round_trip is not None and good.any():
         settings["maxLevel"] = min(1, levels)
         rows = np.flatnonzero(good)
@@ -71,6 +83,23 @@ def follow(
         )
         good[rows] = (returned.ravel() == 1) & (np.linalg.norm(home - start[rows], axis=1) <= round_trip)
     return there.astype(np.float64) + 0.5, good
+
+
+def _alike(image_1: GrayImage, image_2: GrayImage, first, second, window: int) -> FloatArray:
+    """Correlation (N,) of the patches around points (N, 2) of two images, in OpenCV's pixels."""
+    reach = np.arange(window, dtype=np.float32) - window // 2
+    offset = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2)
+    patches = []
+    for image, places in ((image_1, first), (image_2, second)):
+        at = places[:, None] + offset
+        values = cv2.remap(
+            image, np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1]), cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        ).astype(np.float32)  # fmt: skip
+        patches.append(values - values.mean(axis=1, keepdims=True))
+    a, b = patches
+    size = np.sqrt(np.einsum("nk,nk->n", a, a) * np.einsum("nk,nk->n", b, b))
+    return np.einsum("nk,nk->n", a, b) / np.maximum(size, 1e-6)
 
 
 def spread(
@@ -112,9 +141,20 @@ def spread(
 
 
 def corners(image: GrayImage, count: int, distance: float, mask: GrayImage | None = None) -> FloatArray:
-    """Corners by the smaller eigenvalue (Shi and Tomasi), (N, 2) pixels, strongest first."""
-    found = cv2.goodFeaturesToTrack(image, count, 0.005, distance, mask=mask, blockSize=5)
-    return np.zeros((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64) + 0.5
+    """Corners (Shi and Tomasi) that noise does not explain, (N, 2) pixels, strongest first."""
+    found = cv2.goodFeaturesToTrack(image, count, 0.005, distance, mask=mask, blockSize=BLOCK)
+    if found is None:
+        return np.zeros((0, 2))
+    at = found.reshape(-1, 2)
+    column, row = at.astype(np.int64).T
+    strength = cv2.cornerMinEigenVal(image, BLOCK)[row, column]
+    return at[strength > ABOVE_NOISE * NOISE_EIGENVALUE * image_noise(image) ** 2].astype(np.float64) + 0.5
 
 
-__all__ = ["corners", "follow", "spread"]
+def image_noise(image: GrayImage) -> float:
+    """Standard deviation of the noise of an image, grey levels, from differences that planes of grey do not make."""
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    return 1.4826 / 6.0 * float(np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, kernel)[::2, ::2])))
+
+
+__all__ = ["corners", "follow", "image_noise", "spread"]

@@ -31,6 +31,11 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     path : path
         A folder (with the model in it, in ``sparse`` or in ``sparse/0``) or a file.
 
+    Returns
+    -------
+    Scene
+        What the files hold; LIMAP's structures beside a COLMAP model too.
+
     Raises
     ------
     InputError

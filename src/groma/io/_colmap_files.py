@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from groma.errors import FileFormatError
+from groma.io._endings import IMAGES
 from groma.io._reading import existing
 
 _FILES = ("cameras", "images", "points3D")
@@ -33,14 +34,15 @@ def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "t
         If none of them holds a complete model.
     """
     root = existing(path)
-    places = [root, root / "sparse", root / "sparse" / "0"]
-    for place in places:
+    for place in (root, root / "sparse", root / "sparse" / "0"):
         for suffix, form in ((".bin", "binary"), (".txt", "text")):
             if all((place / f"{name}{suffix}").is_file() for name in _FILES):
                 return place, form  # type: ignore[return-value]
+    pictures = any(entry.suffix.lower() in IMAGES for entry in root.iterdir()) if root.is_dir() else False
+    remedy = "It holds images: groma map makes a model of them." if pictures else "Check the path."
     raise FileFormatError(
-        f"No COLMAP model in {', '.join(map(str, places))}: expected cameras, images and points3D, "
-        "all .bin or all .txt."
+        f"{root} holds no COLMAP model: expected cameras, images and points3D, all .bin or all .txt, there, in sparse "
+        f"or in sparse/0. {remedy}"
     )
 
 

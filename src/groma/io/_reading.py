@@ -29,9 +29,14 @@ def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
         raise InputError(f"Cannot read {path}: {error.strerror or error}. Check the path.") from error
     except MemoryError as error:
         raise FileFormatError(f"{path} is too large for the memory of this machine, or damaged.") from error
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path} is not a usable {kind}: it is not a text file. Check the path.") from error
     except Exception as error:
         reason = str(error).strip() or type(error).__name__
-        raise FileFormatError(f"{path} is not a usable {kind}; it may be damaged or incomplete: {reason}") from error
+        raise FileFormatError(
+            f"{path} is not a usable {kind}; it may be damaged or incomplete ({reason.rstrip('.')}). Fetch or write it "
+            "again."
+        ) from error
 
 
 def existing(path: str | os.PathLike[str]) -> Path:

@@ -64,7 +64,10 @@ def read_archive(path: str | os.PathLike[str]) -> Scene:
         if (total := sum(info.file_size for info in members.values())) > limit:
             raise FileFormatError(f"{place} would unpack to {total} bytes, far more than an archive of its size holds.")
         if "format.npy" not in members or str(_read_array(file, members["format.npy"], ())) != FORMAT:
-            raise FileFormatError(f"{place} is not a groma archive: it does not say format '{FORMAT}'.")
+            raise FileFormatError(
+                f"{place} is not a groma archive: its format is not '{FORMAT}'. It is an .npz file of another program; "
+                "pass a scene."
+            )
         version = int(_read_array(file, members["version.npy"], ())) if "version.npy" in members else 0
         if not 1 <= version <= VERSION:
             raise FileFormatError(f"{place} has version {version}; this groma reads up to {VERSION}. Update groma.")

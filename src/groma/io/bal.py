@@ -209,18 +209,13 @@ def _scene(image_idx: IntArray, point_idx: IntArray, pixel: FloatArray, camera: 
         width=np.zeros(count, int),
         height=np.zeros(count, int),
     )
-    # The number of a 2D point within its image: the running count per image, in the order of the file.
-    order = np.argsort(image_idx, kind="stable")
-    first = np.searchsorted(image_idx[order], np.arange(count))
-    keypoint_idx = np.empty(len(order), np.int64)
-    keypoint_idx[order] = np.arange(len(order)) - first[image_idx[order]]
     return Scene.from_images(
         cameras,
         [f"{index:05d}" for index in range(count)],
         np.arange(count),
         np.hstack([turned, camera[:, 3:6] * _FLIP]),
         points=Points.at(xyz),
-        point_observations=PointObservations(image_idx, point_idx, pixel * [1, -1], keypoint_idx),
+        point_observations=PointObservations.numbered(image_idx, point_idx, pixel * [1, -1]),
     )
 
 

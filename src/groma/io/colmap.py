@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 import zlib  # noqa: F401 - must be loaded before pycolmap, whose wheel (4.2) otherwise breaks it: heap corruption
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -66,7 +67,26 @@ def read_colmap(path: str | os.PathLike[str]) -> Scene:
         else:
             reconstruction.read_text(str(folder))
         scene = from_pycolmap(reconstruction)
+        if form == "text":
+            whole = _spaced_names(folder / "images.txt")
+            pairs = zip(scene.images.ids.tolist(), scene.images.names, strict=True)
+            names = tuple(whole.get(number, name) for number, name in pairs)
+            scene = scene.replace(images=scene.images.replace(names=names))
     return read_beside(scene, folder)
+
+
+def _spaced_names(path: Path) -> dict[int, str]:
+    """Return the image names with white space in a text file, by image; COLMAP writes them, and reads one word."""
+    found = {}
+    with path.open(encoding="utf-8", errors="surrogateescape") as file:
+        for line in file:
+            words = line.split(maxsplit=9)
+            if not words or words[0].startswith("#"):
+                continue
+            next(file, None)  # the observations
+            if len(words) == 10 and len(words[9].split()) > 1:
+                found[int(words[0])] = words[9].strip()
+    return found
 
 
 def from_pycolmap(reconstruction: pycolmap.Reconstruction) -> Scene:

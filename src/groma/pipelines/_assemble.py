@@ -42,19 +42,29 @@ FAR_FROM_CAMERAS = 2.0
 class AssemblyOptions:
     """What of a scene takes part, and how it is weighted."""
 
+    #: Points and what was observed of them.
     points: bool = True
+    #: Lines and what was observed of them.
     lines: bool = True
+    #: Planes and directions; landmarks lie on lines without them too.
     planes: bool = True
+    #: Move the cameras; otherwise they are held.
     refine_poses: bool = True
+    #: Estimate focal lengths and distortion.
     refine_intrinsics: bool = False
+    #: With the intrinsics: principal points too.
     refine_principal_point: bool = False
     #: Estimate where cameras sit on their rig.
     refine_rigs: bool = False
+    #: A name of :data:`groma.geometry.line_charts.LINE_CHARTS`.
     line_chart: str = "cartesian"
+    #: A name of :data:`groma.geometry.plane_charts.PLANE_CHARTS`.
     plane_chart: str = "normal_offset"
+    #: A name of :data:`groma.geometry.pose_charts.POSE_CHARTS`.
     pose_chart: str = "left"
-    #: Standard deviation of points and of segment end points, pixels.
+    #: Standard deviation of the usual coordinate of a point, pixels; those of single observations are relative to it.
     point_sigma_px: float = 1.0
+    #: The same of an end point of a segment, across it.
     line_sigma_px: float = 1.0
     #: How well points and lines keep to their planes and lines, as a length in the images, pixels.
     structure_sigma_px: float = SURFACE_SIGMA_PX
@@ -70,6 +80,18 @@ class AssemblyOptions:
     #: of free scale, or at the ends of segments, which stay where they are when the scene moves; else ``free``.
     gauge: str = "auto"
 
+    def __post_init__(self) -> None:
+        # Here, so that a wrong name is refused whether the scene has such landmarks or not.
+        for name, known in (
+            ("line_chart", LINE_CHARTS),
+            ("plane_chart", PLANE_CHARTS),
+            ("pose_chart", POSE_CHARTS),
+            ("structure_form", ("metric", "pixels")),
+            ("gauge", ("auto", "first_camera", "free")),
+        ):
+            if getattr(self, name) not in known:
+                raise InputError(f"{name} must be one of {', '.join(sorted(known))}; got {getattr(self, name)!r}.")
+
 
 @dataclass(frozen=True)
 class Assembly:
@@ -83,7 +105,11 @@ class Assembly:
 
 
 def assemble(scene: Scene, options: AssemblyOptions) -> Assembly:
-    """Turn a scene into a problem."""
+    """Turn a scene into a problem.
+
+    Its groups of variables are ``frames`` (poses), ``sensors`` (where there are rigs), ``intrinsics/MODEL``,
+    ``points``, ``lines``, ``planes`` and ``directions``, those that a factor reads.
+    """
     notes: list[str] = []
     if options.gauge == "auto":
         wireframe = options.points and options.lines and len(scene.relations.point_on_line) > 0
@@ -97,14 +123,14 @@ def assemble(scene: Scene, options: AssemblyOptions) -> Assembly:
         variables["points"] = _point_variables(scene)
         factors += _point_factors(scene, options, notes)
     if options.lines and scene.num_line_observations:
-        chart = _chart(LINE_CHARTS, options.line_chart, "line_chart")
+        chart = LINE_CHARTS[options.line_chart]
         variables["lines"] = Variables(chart, chart.from_ambient(scene.lines.plucker))
         for factor, focal in _line_factors(scene, options, notes):
             if focal is not None:
                 pixels_of_residual[len(factors)] = focal
             factors.append(factor)
     if options.planes and scene.num_planes:
-        chart = _chart(PLANE_CHARTS, options.plane_chart, "plane_chart")
+        chart = PLANE_CHARTS[options.plane_chart]
         variables["planes"] = Variables(chart, chart.from_ambient(scene.planes.hesse))
     if options.planes and scene.num_directions:
         chart = next(iter(DIRECTION_CHARTS.values()))
@@ -112,12 +138,10 @@ def assemble(scene: Scene, options: AssemblyOptions) -> Assembly:
     sigma_px = (options.point_sigma_px, options.line_sigma_px)
     if options.structure_form == "pixels":
         factors += structure_pixel_factors(scene, sigma_px, options.loss, variables, _camera_refs, _by_model)
-    elif options.structure_form == "metric":
+    else:
         factors += structure_factors(scene, options.structure_sigma_px, options.loss, variables)
         if {"points", "lines"} <= set(variables) and scene.num_lines > MAX_COUPLED_LINES:
             factors += wireframe_factors(scene, sigma_px, options.loss, _camera_refs, _by_model)
-    else:
-        raise InputError(f"structure_form must be 'metric' or 'pixels'; got {options.structure_form!r}.")
     used = {ref.group for factor in factors for _, ref in factor.references()}
     problem = Problem({k: v for k, v in variables.items() if k in used}, factors)
     return Assembly(problem, tuple(notes), pixels_of_residual)
@@ -148,24 +172,16 @@ def disassemble(scene: Scene, problem: Problem) -> Scene:
 # --------------------------------------------------------------------------------------------------------- cameras
 
 
-def _chart(charts: dict, name: str, option: str):
-    if name not in charts:
-        raise InputError(f"{option} must be one of {', '.join(sorted(charts))}; got {name!r}.")
-    return charts[name]
-
-
 def _cameras_by_model(scene: Scene) -> dict[str, IntArray]:
     models = np.array(scene.cameras.models, dtype=object)
     return {str(name): np.flatnonzero(models == name) for name in dict.fromkeys(models)}
 
 
 def _camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variables]:
-    chart = _chart(POSE_CHARTS, options.pose_chart, "pose_chart")
+    chart = POSE_CHARTS[options.pose_chart]
     held: bool | BoolArray = not options.refine_poses
     if options.refine_poses and options.gauge == "first_camera":
         held = first_camera_gauge(scene)
-    elif options.gauge not in ("free", "first_camera"):
-        raise InputError(f"gauge must be 'auto', 'free' or 'first_camera'; got {options.gauge!r}.")
     variables = {"frames": Variables(chart, scene.frames.rig_from_world, held)}
     if not scene.has_trivial_rigs:
         constant = (scene.sensors.is_reference == 1) | (not options.refine_rigs)
@@ -182,16 +198,25 @@ def _camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Varia
 
 
 def first_camera_gauge(scene: Scene) -> BoolArray:
-    """Hold frame 0, and of the frame farthest from it the translation along the line between the two."""
+    """Hold the first frame, and of the frame farthest from it the translation along the line between the two.
+
+    Frames with less than half of the usual number of observations are not taken for either: a camera that hardly
+    anything holds would leave the scale to relations measured in lengths, which shrink the scene.
+    """
     poses = scene.frames.rig_from_world
     held = np.zeros((len(poses), 6), dtype=bool)
     if len(poses) == 0:
         return held
-    held[0] = True
+    frame_of = scene.images.frame_idx
+    seen = [table.image_idx for table in (scene.point_observations, scene.line_observations)]
+    count = np.bincount(frame_of[np.concatenate(seen)], minlength=len(poses))
+    fit = np.flatnonzero(count >= 0.5 * np.median(count))
+    first = int(fit[0])
+    held[first] = True
     centers = se3.inverse(poses)[:, 4:]
-    away = centers - centers[0]
-    far = int(np.argmax(np.linalg.norm(away, axis=1)))
-    if far != 0:
+    away = centers - centers[first]
+    far = int(fit[np.argmax(np.linalg.norm(away[fit], axis=1))])
+    if far != first:
         in_camera = quaternion.rotate(poses[far, :4], away[far])
         held[far, int(np.argmax(np.abs(in_camera)))] = True
     return held

@@ -14,9 +14,10 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.pipelines._structure_factors import lengths_per_pixel
 from groma.scene import Scene
+from groma.scene._synthetic import project_pinhole
 from groma.scene.landmarks import Directions, Lines
 from groma.scene.observations import Relations
-from groma.scene.synthetic import NEAR, holistic, project_pinhole
+from groma.scene.synthetic import NEAR, holistic
 
 #: How well landmarks keep to what they lie on, as a length in the images, pixels.
 STRUCTURE_SIGMA_PX = 0.1

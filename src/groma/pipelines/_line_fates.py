@@ -39,6 +39,8 @@ class Fate(IntEnum):
     UNCERTAIN = 11
     #: No segment of its line is as long as ``min_longest``.
     SHORT_LINE = 12
+    #: Its line is made of segments of a kind that is seldom found again: ``min_repeatability``.
+    TEXTURE = 13
 
 
 #: Not a fate: what a segment has before its stage.
@@ -59,6 +61,7 @@ _WORDS = {
     Fate.FEW_IMAGES: "lay on lines that too few images see",
     Fate.UNCERTAIN: "lay on lines too uncertain for their distance",
     Fate.SHORT_LINE: "lay on lines that only short segments show",
+    Fate.TEXTURE: "lay on lines of short, weak segments, of which few are found again: texture, most likely",
 }
 
 #: What would help.
@@ -74,6 +77,7 @@ _REMEDIES = {
     Fate.FEW_IMAGES: "more photographs of the same parts",
     Fate.UNCERTAIN: "photographs from further apart",
     Fate.SHORT_LINE: "a smaller MapLinesOptions.min_longest, or larger images",
+    Fate.TEXTURE: "MapLinesOptions.min_repeatability = 0, if lines of texture are wanted",
 }
 
 

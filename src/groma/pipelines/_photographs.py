@@ -16,9 +16,8 @@ import numpy as np
 
 from groma.errors import GromaError, InputError
 from groma.frontend.images import GrayImage, to_gray
+from groma.io._endings import IMAGES, VIDEOS
 from groma.scene import Scene
-
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
 
@@ -27,16 +26,18 @@ def image_files(folder: Path) -> list[Path]:
     """Return the images in a folder and its sub-folders, sorted; hidden files are not looked at."""
     if not folder.is_dir():
         what = "is a file, not a folder of images" if folder.exists() else "is not a folder of images"
-        raise InputError(f"{folder} {what}. Check the path.")
+        video = folder.suffix.lower() in VIDEOS
+        remedy = "Take pictures out of it, or follow it with groma track." if video else "Check the path."
+        raise InputError(f"{folder} {what}. {remedy}")
     files = sorted(
         path
         for path in folder.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES
+        if path.suffix.lower() in IMAGES
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)
         and path.is_file()
     )
     if not files:
-        raise InputError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)}). Check the path.")
+        raise InputError(f"{folder} holds no images ({', '.join(IMAGES)}). Check the path.")
     return files
 
 
@@ -143,4 +144,4 @@ def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
     return {name: of_camera[camera] for name, camera in zip(model.images.names, model.images.camera_idx, strict=True)}
 
 
-__all__ = ["IMAGE_SUFFIXES", "check_images", "check_names", "image_files", "read_gray"]
+__all__ = ["check_images", "check_names", "image_files", "read_gray"]

@@ -31,7 +31,23 @@ MAX_COUPLED_LINES = 4000
 
 
 def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
-    """For each landmark the length that a pixel of its images spans at its distance, scene units; the median image."""
+    r"""Return the length that a pixel spans at the distance of each landmark, the mean over its images, scene units.
+
+    .. math:: \frac{1}{n} \sum_i |X - C_i| / f_i
+
+    Landmarks that no image sees get the median over all observations.
+
+    Parameters
+    ----------
+    scene : Scene
+        Cameras and landmarks.
+    kind : "point" or "line"
+        Of which landmarks; lines count at the middle of their segments.
+
+    Returns
+    -------
+    (P,) or (L,) float64
+    """
     if kind == "point":
         image_idx, index, places = (
             scene.point_observations.image_idx, scene.point_observations.point_idx, scene.points.xyz,

@@ -3,13 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import fields
-
 import numpy as np
 
-from groma._typing import IntArray
-from groma.scene import Relations, Scene
+from groma.scene import Scene
 
 #: Points, a line counting twice, that fix a plane; lines that make a direction a common one.
 _FEWEST_ON_PLANE, _FEWEST_ALONG = 3, 2
@@ -32,31 +28,15 @@ def without_unused(scene: Scene, *others: Scene) -> tuple[Scene, ...]:
     on_plane = np.bincount(on["point_on_plane"], minlength=scene.num_planes)
     on_plane += 2 * np.bincount(on["line_on_plane"], minlength=scene.num_planes)
     along = np.bincount(on["line_along_direction"], minlength=scene.num_directions)
-    kept = seen | {"plane": on_plane >= _FEWEST_ON_PLANE, "direction": along >= _FEWEST_ALONG}
-    rows = {name: np.flatnonzero(mask) for name, mask in kept.items()}
-    new = {name: np.where(mask, np.cumsum(mask) - 1, -1) for name, mask in kept.items()}
+    kept = {
+        "points": seen["point"],
+        "lines": seen["line"],
+        "planes": on_plane >= _FEWEST_ON_PLANE,
+        "directions": along >= _FEWEST_ALONG,
+    }
     if all(mask.all() for mask in kept.values()):
         return scene, *others
-    return tuple(_kept(one, rows, new) for one in (scene, *others))
-
-
-def _kept(scene: Scene, rows: Mapping[str, IntArray], new: Mapping[str, IntArray]) -> Scene:
-    relations = {}
-    for item in fields(scene.relations):
-        first, second = item.name.replace("_along_", "_on_").split("_on_")
-        pairs = getattr(scene.relations, item.name)
-        pairs = np.column_stack([new[first][pairs[:, 0]], new[second][pairs[:, 1]]])
-        relations[item.name] = pairs[(pairs >= 0).all(axis=1)]
-    points, lines = scene.point_observations, scene.line_observations
-    return scene.replace(
-        points=scene.points.take(rows["point"]),
-        point_observations=points.replace(point_idx=new["point"][points.point_idx]),
-        lines=scene.lines.take(rows["line"]),
-        line_observations=lines.replace(line_idx=new["line"][lines.line_idx]),
-        planes=scene.planes.take(rows["plane"]),
-        directions=scene.directions.take(rows["direction"]),
-        relations=Relations(**relations),
-    )
+    return tuple(one.keep(**kept) for one in (scene, *others))
 
 
 __all__ = ["without_unused"]

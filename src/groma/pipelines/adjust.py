@@ -302,8 +302,8 @@ def _landmark_steps(options: AdjustOptions, loss: Loss, problem: Problem) -> int
 def _with_loss(factor: Factor, loss: Loss) -> Factor:
     """Return the factors under a loss; relations between landmarks have a noise of their own, and the plain scale."""
     if factor.type_name in RELATION_FACTORS and loss.name in RELATION_SCALES:
-        return replace(factor, loss=make_loss(loss.name, RELATION_SCALES[loss.name]))
-    return replace(factor, loss=loss)
+        loss = make_loss(loss.name, RELATION_SCALES[loss.name])
+    return factor if factor.loss == loss else replace(factor, loss=loss)
 
 
 def _stage_entries(stages: list[Loss], reports: list[SolveReport]) -> tuple[dict[str, Any], ...]:

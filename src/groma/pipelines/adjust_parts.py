@@ -22,7 +22,7 @@ from groma.io.archive import read_archive, write_archive
 from groma.pipelines._assemble import AssemblyOptions, assemble, disassemble
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
-from groma.scene import Scene
+from groma.scene import Relations, Scene
 from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
 from groma.solver.shards import Shard, solve_shards
@@ -49,16 +49,34 @@ def write_parts(
 
     Landmarks are taken in the order of the first image that sees them, so that a part concerns few images.
 
+    Parameters
+    ----------
+    scene : Scene
+        What to cut; its relations between landmarks are left out.
+    folder : path
+        Where; made where it is missing.
+    observations : int
+        About so many in each part.
+    force : bool
+        Replace archives that exist in ``folder``.
+
     Returns
     -------
     tuple of Path
         ``part-00000.npz`` and so on, in ``folder``.
+
+    Raises
+    ------
+    InputError
+        If ``observations`` is not positive.
+    OutputError
+        If an archive exists already, or cannot be written.
     """
     if observations < 1:
         raise InputError(f"A part needs at least one observation; got {observations}. The default is {PART_SIZE}.")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    scene = scene.replace(relations=type(scene.relations)())
+    scene = scene.replace(relations=Relations())
     seen_points = np.bincount(scene.point_observations.point_idx, minlength=scene.num_points)
     seen_lines = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
     seen = np.concatenate([seen_points, seen_lines])
@@ -72,7 +90,8 @@ def write_parts(
     for number in np.unique(part):
         own = part == number
         paths.append(folder / f"part-{number:05d}.npz")
-        write_archive(_landmarks(scene, own[: scene.num_points], own[scene.num_points :]), paths[-1], force)
+        cut = scene.keep(points=own[: scene.num_points], lines=own[scene.num_points :])
+        write_archive(cut, paths[-1], force)
     return tuple(paths)
 
 
@@ -169,21 +188,6 @@ class _Reader:
 
 def _joined(groups: list[Variables]) -> Variables:
     return Variables(groups[0].manifold, np.concatenate([group.state for group in groups]))
-
-
-def _landmarks(scene: Scene, points: np.ndarray, lines: np.ndarray) -> Scene:
-    """Return a scene with some of its landmarks, and all images."""
-    point_table, line_table = scene.point_observations, scene.line_observations
-    new_point, new_line = np.cumsum(points) - 1, np.cumsum(lines) - 1
-    point_rows = np.flatnonzero(points[point_table.point_idx])
-    line_rows = np.flatnonzero(lines[line_table.line_idx])
-    seen_points, seen_lines = point_table.take(point_rows), line_table.take(line_rows)
-    return scene.replace(
-        points=scene.points.take(np.flatnonzero(points)),
-        lines=scene.lines.take(np.flatnonzero(lines)),
-        point_observations=seen_points.replace(point_idx=new_point[seen_points.point_idx]),
-        line_observations=seen_lines.replace(line_idx=new_line[seen_lines.line_idx]),
-    )
 
 
 __all__ = ["PART_SIZE", "PartsResult", "adjust_parts", "write_parts"]

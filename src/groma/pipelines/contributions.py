@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from groma._typing import FloatArray
 from groma.errors import InputError, ProblemError
-from groma.evaluation.alignment import align_poses
+from groma.evaluation.alignment import align_poses, camera_centers
 from groma.evaluation.poses import evaluate_poses
-from groma.geometry import se3
 from groma.pipelines.adjust import AdjustOptions, AdjustResult, adjust
 from groma.pipelines.uncertainty import position_sigma, uncertainty
 from groma.scene import Relations, Scene
@@ -21,11 +21,16 @@ from groma.scene import Relations, Scene
 KINDS = ("points", "lines", "planes and directions", "points on lines")
 #: With more images than this the standard deviations are left out.
 MOST_IMAGES = 300
+#: Where a distribution over the images is told: so many of a hundred are below.
+PERCENTILES = (5, 25, 50, 75, 95)
 
 
 @dataclass(frozen=True)
 class Contribution:
-    """An adjustment of everything up to one kind of landmark; lengths in scene units, residuals in pixels."""
+    """An adjustment of everything up to one kind of landmark; residuals in pixels.
+
+    Lengths are in scene units, or in those of the reference where there is one.
+    """
 
     #: The kind that was added last.
     added: str
@@ -35,13 +40,21 @@ class Contribution:
     num_dropped: int
     #: Root mean square residual by kind, without the loss.
     rmse_px: dict[str, float]
-    #: Median distance of the camera centres from those of points alone, after a similarity alignment.
+    #: Median distance of the camera centres from those of points alone, after a similarity alignment, and its
+    #: percentiles over the images (:data:`PERCENTILES`).
     moved: float
+    moved_percentiles: tuple[float, ...]
     #: Median predicted standard deviation of the camera centres, with the first camera and the scale held, because
     #: relations in lengths leave no free scale; None where it is not known.
     center_sigma: float | None
-    #: Against a reference, if there is one: rms error of the camera centres, and mean error of the rotations.
+    #: Why it is not known; empty if it is.
+    center_sigma_missing: str
+    #: How many landmarks the data leave open, by kind, where that is known; they are no harm to the others.
+    num_undetermined: dict[str, int]
+    #: Against a reference, if there is one: rms error of the camera centres, its percentiles over the images, and mean
+    #: error of the rotations.
     center_error: float | None
+    center_error_percentiles: tuple[float, ...] | None
     rotation_error_deg: float | None
     iterations: int
     seconds: float
@@ -121,32 +134,58 @@ def _variants(scene: Scene, options: AdjustOptions) -> list[tuple[str, Scene, Ad
 
 def _contribution(kind: str, result: AdjustResult, alone: Scene, reference: Scene | None) -> Contribution:
     report, scene = result.report, result.scene
-    moved = align_poses(scene.cam_from_world, alone.cam_from_world).poses(scene.cam_from_world)
-    away = se3.inverse(moved)[:, 4:] - alone.cam_centers_in_world
     scores = None if reference is None else evaluate_poses(scene, reference)
+    unit = 1.0 if scores is None else scores.alignment.scale
+    moved = unit * _distances(scene.cam_from_world, alone.cam_from_world)
     outcomes = report.relations.values()
+    sigma, missing, num_open = _center_sigma(result)
     return Contribution(
         added=kind,
         num_landmarks=report.num_points + report.num_lines + report.num_planes,
         num_relations=sum(outcome["held"] + outcome["dropped"] for outcome in outcomes),
         num_dropped=sum(outcome["dropped"] for outcome in outcomes),
         rmse_px={name: values["after"] for name, values in report.rmse_px.items()},
-        moved=0.0 if scene is alone else float(np.median(np.linalg.norm(away, axis=1))),
-        center_sigma=_center_sigma(result),
+        moved=0.0 if scene is alone else float(np.median(moved)),
+        moved_percentiles=_percentiles(0.0 * moved if scene is alone else moved),
+        center_sigma=None if sigma is None else unit * sigma,
+        center_sigma_missing=missing,
+        num_undetermined=num_open,
         center_error=None if scores is None else scores.center_rmse,
+        center_error_percentiles=None if reference is None else _percentiles(_errors(scene, reference)),
         rotation_error_deg=None if scores is None else scores.rotation_deg_mean,
         iterations=report.solve.iterations,
         seconds=report.solve.seconds["total"],
     )
 
 
-def _center_sigma(result: AdjustResult) -> float | None:
+def _distances(poses: FloatArray, others: FloatArray) -> FloatArray:
+    """Distances (N,) between the camera centres of poses (N, 7), the first aligned to the others by a similarity."""
+    aligned = align_poses(poses, others).poses(poses)
+    return np.linalg.norm(camera_centers(aligned) - camera_centers(others), axis=1)
+
+
+def _errors(scene: Scene, reference: Scene) -> FloatArray:
+    row = {name: k for k, name in enumerate(scene.images.names)}
+    pairs = [(row[name], k) for k, name in enumerate(reference.images.names) if name in row]
+    mine, true = np.array(pairs).T
+    return _distances(scene.cam_from_world[mine], reference.cam_from_world[true])
+
+
+def _percentiles(values: FloatArray) -> tuple[float, ...]:
+    return tuple(float(value) for value in np.percentile(values, PERCENTILES))
+
+
+def _center_sigma(result: AdjustResult) -> tuple[float | None, str, dict[str, int]]:
+    """Return the median standard deviation of the camera centres, why there is none, and how much is open by kind."""
     if result.scene.num_images > MOST_IMAGES:
-        return None
+        return None, f"more than {MOST_IMAGES} images", {}
     try:
         found = uncertainty(result.scene, gauge="held", problem=result.problem)
-    except (InputError, ProblemError):  # poses are held, or the data leave a line or a plane open
-        return None
+    except (InputError, ProblemError) as error:
+        return None, str(error), {}
+    num_open = {name: len(ids) for name, ids in found.undetermined.items() if len(ids)}
     sigma = position_sigma(found.centers)
     known = sigma[np.isfinite(sigma) & (sigma > 0)]
-    return float(np.median(known)) if len(known) else None
+    if not len(known):
+        return None, "the poses are held" if (sigma == 0).any() else "no pose is determined", num_open
+    return float(np.median(known)), "", num_open

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from groma import __version__
+from groma._version import __version__
 from groma.errors import InputError
 from groma.frontend.external import ExternalMatches
 from groma.frontend.lsd import LsdDetector
@@ -81,8 +81,9 @@ class MapResult:
     start: Scene
     #: The map before its last joint adjustment, with the same landmarks as ``scene``.
     before: Scene
-    #: Report of the last joint adjustment.
+    #: Report of the last joint adjustment, and what it was told: noise, losses, what is estimated.
     report: AdjustReport
+    adjusted_with: AdjustOptions
     #: Estimated standard deviations, pixels: of points, and of segment end points.
     sigma_px: dict[str, float]
     #: What became of the segments, in words.
@@ -210,6 +211,7 @@ def _mapped(
         start=start,
         before=before,
         report=result.report,
+        adjusted_with=weighted,
         sigma_px=sigma,
         explanation=explain(line_map),
         fates={fate.name.lower(): count for fate, count in line_map.fate_counts().items()},

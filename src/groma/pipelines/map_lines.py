@@ -7,7 +7,8 @@ Stages, each on all images before the next begins:
 2. for every segment, proposals of its place from every neighbour, and the one that most neighbours agree on
    (:mod:`groma.pipelines._line_places`), one image at a time;
 3. tracks: link, refine, recover, merge, trim (:mod:`groma.pipelines._line_tracks`), and join what was mapped more than
-   once (:mod:`groma.pipelines._line_merge`).
+   once (:mod:`groma.pipelines._line_merge`). Lines of segments of a kind that is seldom found again, as texture gives
+   them, are dropped (:mod:`groma.pipelines._line_kinds`).
 
 Every segment ends with a :class:`Fate` (:mod:`groma.pipelines._line_fates`), so that the question why a line is missing
 has an answer.
@@ -27,6 +28,7 @@ from groma.errors import InputError
 from groma.pipelines._distinct import num_distinct
 from groma.pipelines._line_directions import depth_ratios
 from groma.pipelines._line_fates import UNKNOWN, Fate, explain
+from groma.pipelines._line_kinds import found_again
 from groma.pipelines._line_matches import MatchProvider, external_matches, flow_matches, wide_baseline_matches
 from groma.pipelines._line_merge import merge_agreeing
 from groma.pipelines._line_places import choose_places
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
 
 #: Segments whose deviation is that many times the usual one make no line by themselves.
 MAX_BLUR = 2.8
+#: Segments that no image or geometry lets become part of a line say nothing about others of their kind.
+_IMPOSSIBLE = (Fate.TOO_SHORT, Fate.NO_NEIGHBOR, Fate.NO_MATCH, Fate.DEGENERATE)
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,9 @@ class MapLinesOptions:
     max_unchecked: float = 0.04
     #: A place is ambiguous if another one has more than this share of its support.
     max_rival: float = 0.95
+    #: Least share of the segments of a line's kind that are part of a line: see :mod:`groma.pipelines._line_kinds`.
+    #: Where less of the whole scene is found again, more is asked. 0 keeps the lines of texture.
+    min_repeatability: float = 0.4
     #: Use lines through known points as further proposals.
     use_points: bool = True
     #: Use vanishing directions, alone and with known points.
@@ -206,13 +213,15 @@ def map_lines(
     places = choose_places(scene, views, ratios, neighbors, matches, options, fate, report)
     fate[~views.usable] = Fate.TOO_SHORT
     lap("proposals")
-    tracks = _build_tracks(views, neighbors, places, options, fate, report)
+    strength = np.concatenate([np.zeros(0), *(one.strength for one in segments)])
+    tracks = _build_tracks(views, strength, neighbors, places, options, fate, report)
     lap("tracks")
     return _result(tracks, neighbors, places, fate, seconds)
 
 
 def _build_tracks(
     views: LineViews,
+    strength: FloatArray,
     neighbors: list[IntArray],
     places: Choice,
     options: MapLinesOptions,
@@ -262,6 +271,9 @@ def _build_tracks(
     sure |= _is_sure(tracks, options)
     sure &= _num_sharp(tracks, sharp) >= min(3, options.min_images)
     fate[tracks.keep(sure)] = Fate.UNCERTAIN
+    possible = views.usable & ~np.isin(fate, _IMPOSSIBLE)
+    repeated = found_again(views.length, strength, tracks.line_of, possible, len(tracks.X), options.min_repeatability)
+    fate[tracks.keep(repeated)] = Fate.TEXTURE
     longest = np.zeros(len(tracks.X))
     rows = np.flatnonzero(tracks.line_of >= 0)
     np.maximum.at(longest, tracks.line_of[rows], views.length[rows])

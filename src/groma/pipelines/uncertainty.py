@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.pipelines._assemble import AssemblyOptions, assemble, first_camera_gauge
 from groma.problem.problem import Problem
@@ -39,6 +39,9 @@ class SceneUncertainty:
     planes: FloatArray
     #: (D, 3, 3) of the directions.
     directions: FloatArray
+    #: Identifiers of what the data leave open, by kind: ``points``, ``lines``, ``planes``, ``directions``, and the rows
+    #: of ``frames``. Their covariances are NaN, and all others are not affected.
+    undetermined: dict[str, IntArray]
     #: For joint covariances and derived quantities: groups are ``frames``, ``points``, ``lines``, ``planes``.
     covariances: Covariances
 
@@ -63,6 +66,7 @@ class SceneUncertainty:
             "segment_end": summary(position_sigma(self.segment_ends.reshape(-1, 3, 3))),
             "line_direction_deg": summary(np.rad2deg(position_sigma(self.lines[:, 3:, 3:]))),
             "plane_normal_deg": summary(np.rad2deg(position_sigma(self.planes[:, :3, :3]))),
+            "undetermined": {kind: ids.tolist() for kind, ids in self.undetermined.items()},
         }
 
 
@@ -106,7 +110,8 @@ def uncertainty(
     InputError
         If the gauge is not known.
     ProblemError
-        If too much is not determined; :func:`groma.pipelines.diagnosis.diagnose_scene` says what.
+        If the poses are not determined; :func:`groma.pipelines.diagnosis.diagnose_scene` says what. Landmarks may be
+        open.
     """
     if gauge not in ("auto", "inner", "held"):
         raise InputError(f"gauge must be 'auto', 'inner' or 'held'; got {gauge!r}.")
@@ -151,8 +156,21 @@ def uncertainty(
         segment_ends=_ends(scene, lines),
         planes=planes,
         directions=coordinates("directions", 3, scene.num_directions),
+        undetermined=_undetermined(covariances, scene),
         covariances=covariances,
     )
+
+
+def _undetermined(covariances: Covariances, scene: Scene) -> dict[str, IntArray]:
+    ids = {
+        "frames": np.arange(scene.num_frames),
+        "points": scene.points.ids,
+        "lines": scene.lines.ids,
+        "planes": scene.planes.ids,
+        "directions": scene.directions.ids,
+    }
+    present = covariances.problem.variables
+    return {name: numbers[covariances.undetermined(name)] for name, numbers in ids.items() if name in present}
 
 
 def _in_gauge(problem: Problem, scene: Scene, gauge: str) -> Problem:

@@ -8,6 +8,11 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.problem.layout import Chunk
+
 T = TypeVar("T")
 
 
@@ -44,3 +49,32 @@ def available_cores() -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:
         return os.cpu_count() or 1
+
+
+def shares_of(chunks: tuple[Chunk, ...], count: int) -> list[list[Chunk]]:
+    """Divide consecutive chunks among ``count`` threads, about equal in the number of factors."""
+    if count == 1 or len(chunks) < 2 * count:
+        return [list(chunks)]
+    done = np.concatenate([[0], np.cumsum([max(chunk.size, 1) for chunk in chunks])])
+    cuts = np.searchsorted(done, done[-1] * np.arange(count + 1) / count)
+    cuts[0], cuts[-1] = 0, len(chunks)
+    return [list(chunks[cuts[i] : cuts[i + 1]]) for i in range(count)]
+
+
+#: Sums of arrays shorter than this are not worth a thread.
+_SUM_IN_THREADS = 200_000
+
+
+def sum_of(parts: list[FloatArray], workers: Workers) -> FloatArray:
+    """Add the other arrays to the first one, and return that."""
+    total = parts[0]
+    tasks = workers.count if total.size > _SUM_IN_THREADS else 1
+    cuts = [total.size * i // tasks for i in range(tasks + 1)]
+
+    def add(task: int) -> None:
+        for part in parts[1:]:
+            total[cuts[task] : cuts[task + 1]] += part[cuts[task] : cuts[task + 1]]
+
+    if len(parts) > 1:
+        workers.map(add, tasks)
+    return total

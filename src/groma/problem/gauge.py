@@ -95,6 +95,9 @@ def gauge_directions(
         return directions
     ambient = manifold.ambient(state)
     center = np.zeros(3) if center is None else center
+    if manifold.kind == "pose":
+        moved = _pose_motions(ambient, center, length, mounted)
+        return _increments(manifold, state, ambient, moved).transpose(2, 0, 1)
     moved = np.empty((len(state), manifold.factor_columns, 7))
     for k in range(7):
         a, rotation, scale = np.zeros(3), np.zeros(3), float(k == 6)
@@ -103,7 +106,7 @@ def gauge_directions(
         elif k < 6:
             rotation[k - 3] = 1.0
         a = a - np.cross(rotation, center) - scale * center
-        moved[:, :, k] = _coordinate_motion(manifold.kind, ambient, a, rotation, scale, mounted)
+        moved[:, :, k] = _coordinate_motion(manifold.kind, ambient, a, rotation, scale)
     return _increments(manifold, state, ambient, moved).transpose(2, 0, 1)
 
 
@@ -118,10 +121,8 @@ def world_motions(problem: Problem, center: FloatArray | None = None, length: fl
     }
 
 
-def _coordinate_motion(
-    kind: str, ambient: FloatArray, a: FloatArray, rotation: FloatArray, scale: float, mounted: bool
-) -> FloatArray:
-    """Change (count, factor_columns) of the factor coordinates; formulas at the top of this module."""
+def _coordinate_motion(kind: str, ambient: FloatArray, a: FloatArray, rotation: FloatArray, scale: float) -> FloatArray:
+    """Change (count, factor_columns) of the factor coordinates but of poses; formulas at the top of this module."""
     turning = _turning(rotation)
     if kind == "point":
         return a + ambient @ turning + scale * ambient
@@ -130,15 +131,31 @@ def _coordinate_motion(
     if kind == "line":
         m, d = ambient[:, :3], ambient[:, 3:]
         return np.hstack([scale * m + m @ turning + d @ _turning(a), d @ turning])
-    if kind == "plane":
-        n, w = ambient[:, :3], ambient[:, 3:]
-        return np.hstack([n @ turning, scale * w - (n @ a)[:, None]])
+    n, w = ambient[:, :3], ambient[:, 3:]
+    return np.hstack([n @ turning, scale * w - (n @ a)[:, None]])
+
+
+def _pose_motions(ambient: FloatArray, center: FloatArray, length: float, mounted: bool) -> FloatArray:
+    r"""Left twists (count, 6, 7) of poses under the seven motions about ``center``, which lies at c in the cameras.
+
+    With :math:`a = -\varphi\times o` of a rotation about o, :math:`-R a + (R\varphi)\times t` is
+    :math:`(R\varphi)\times c`.
+    """
     T = ambient.reshape(-1, 3, 4)
     R, t = T[:, :, :3], T[:, :, 3]
+    moved = np.zeros((len(T), 6, 7))
     if mounted:
-        return np.hstack([scale * t, np.zeros_like(t)])
-    turn = R @ rotation
-    return np.hstack([scale * t - R @ a + np.cross(turn, t), -turn])
+        moved[:, :3, 6] = t
+        return moved
+    c = R @ center + t
+    x, y, z = c[:, 0, None], c[:, 1, None], c[:, 2, None]
+    moved[:, :3, :3] = -length * R
+    moved[:, 0, 3:6] = R[:, 1] * z - R[:, 2] * y
+    moved[:, 1, 3:6] = R[:, 2] * x - R[:, 0] * z
+    moved[:, 2, 3:6] = R[:, 0] * y - R[:, 1] * x
+    moved[:, 3:, 3:6] = -R
+    moved[:, :3, 6] = c
+    return moved
 
 
 def _turning(v: FloatArray) -> FloatArray:

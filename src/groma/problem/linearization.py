@@ -16,88 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from groma._numba import loop
-from groma._simd import add_product, set_product, width
+from groma._simd import width
 from groma._typing import FloatArray
-from groma.problem._parallel import Workers
+from groma.problem._parallel import Workers, shares_of, sum_of
 from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
+from groma.problem._sums import add_block, add_cross, add_incidence, add_primary
 from groma.problem.layout import Chunk, FactorLayout, Layout
 
 States = Mapping[str, FloatArray]
-
-# ---------------------------------------------------------------------------------------------------------- Kernels
-
-
-@loop
-def _add_primary(
-    record, begin, first, landmark, l_column, incidence, block, c_column, V, g_l, W, H, g_c, sole,
-    rows, l_width, c_width, one,
-):  # fmt: skip
-    """Sum the landmark, its incidence and its kept block, for factors with a landmark and a first kept block.
-
-    Incidences with a ``sole`` contribution are written instead of added to. W begins with the incidence ``first``.
-    """
-    n, m, columns = record.shape
-    flat = record.reshape(record.size)
-    dl, dc = len(l_width), len(c_width)
-    for i in range(n):
-        base = i * m * columns
-        at_l, at_c, at_r = base + l_column, base + c_column, base + columns - 1
-        p, q, c = np.int64(landmark[begin + i]), incidence[begin + i] - first, np.int64(block[begin + i])
-        add_product(V, p * (dl * dl), flat, at_l, columns, flat, at_l, columns, rows, l_width, l_width)
-        add_product(g_l, p * dl, flat, at_r, columns, flat, at_l, columns, rows, one, l_width)
-        if sole:
-            set_product(W, q * (dl * dc), flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
-        else:
-            add_product(W, q * (dl * dc), flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
-        add_product(H, c * (dc * dc), flat, at_c, columns, flat, at_c, columns, rows, c_width, c_width)
-        add_product(g_c, c * dc, flat, at_r, columns, flat, at_c, columns, rows, one, c_width)
-
-
-@loop
-def _add_incidence(record, begin, first, l_column, incidence, c_column, W, rows, l_width, c_width):
-    n, m, columns = record.shape
-    flat = record.reshape(record.size)
-    size = len(l_width) * len(c_width)
-    for i in range(n):
-        base = i * m * columns
-        at_l, at_c = base + l_column, base + c_column
-        q = incidence[begin + i] - first
-        add_product(W, q * size, flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
-
-
-@loop
-def _add_block(record, begin, block, column, H, g, rows, block_width, one):
-    """Sum the square and the gradient of one block; serves landmarks alone and kept blocks alone."""
-    n, m, columns = record.shape
-    flat = record.reshape(record.size)
-    size = len(block_width)
-    for i in range(n):
-        base = i * m * columns
-        at_c, at_r = base + column, base + columns - 1
-        c = np.int64(block[begin + i])
-        add_product(H, c * (size * size), flat, at_c, columns, flat, at_c, columns, rows, block_width, block_width)
-        add_product(g, c * size, flat, at_r, columns, flat, at_c, columns, rows, one, block_width)
-
-
-@loop
-def _add_cross(record, begin, block_a, column_a, block_b, column_b, slot, same_class, H, rows, a_width, b_width):
-    """Sum the product of two kept blocks; within one class the smaller block is the row."""
-    n, m, columns = record.shape
-    flat = record.reshape(record.size)
-    size = len(a_width) * len(b_width)
-    for i in range(n):
-        base = i * m * columns
-        at_a, at_b = base + column_a, base + column_b
-        target = np.int64(slot[begin + i]) * size
-        a, b = block_a[begin + i], block_b[begin + i]
-        if not same_class or a <= b:
-            add_product(H, target, flat, at_a, columns, flat, at_b, columns, rows, a_width, b_width)
-        if same_class and a >= b:
-            add_product(H, target, flat, at_b, columns, flat, at_a, columns, rows, b_width, a_width)
-
-
-# ----------------------------------------------------------------------------------------------------------- Public
 
 _ONE = width(1)
 
@@ -142,7 +68,7 @@ class NormalEquations:
         for chunk in layout.chunks:
             for f, begin, end in chunk.factors:
                 self._sizes[f] = max(self._sizes[f], end - begin)
-        self.shares = _shares(layout.chunks, workers.count)
+        self.shares = shares_of(layout.chunks, workers.count)
         self._scratch: list[dict[int, FloatArray]] = [{} for _ in self.shares]
         self._references = [tuple(ref for _, ref in factor.factor.references()) for factor in layout.factors]
         self._free = {}
@@ -225,6 +151,17 @@ class NormalEquations:
         parts = self.workers.map(work, len(self.shares))
         self.costs = [0.5 * sum(part[0][f] for part in parts) for f in range(len(self.layout.factors))]
         self.hidden = [sum(part[1][f] for part in parts) for f in range(len(self.layout.factors))]
+        return float(sum(self.costs))
+
+    def cost_of(self, inputs: list[tuple], eliminated: set[int], costs: list[float], hidden: list[int]) -> float:
+        """Return the total cost where only factors of some groups of landmarks have moved; see :meth:`cost`.
+
+        ``costs`` and ``hidden`` are those of an earlier evaluation; of all other factors they are taken over.
+        """
+        self.cost(inputs, wanted=lambda chunk: chunk.eliminated in eliminated)
+        for f, layout in enumerate(self.layout.factors):
+            if layout.eliminated not in eliminated:
+                self.costs[f], self.hidden[f] = costs[f], hidden[f]
         return float(sum(self.costs))
 
     def _chunk_cost(self, share: int, f: int, inputs: tuple, begin: int, end: int) -> tuple[float, FloatArray, int]:
@@ -383,30 +320,30 @@ class NormalEquations:
             l_width = width(self.layout.eliminated[e].dof)
             landmarks = (self.V[e], self.g_landmarks[e])
             if not layout.kept:
-                return [(_add_block, None, (layout.landmark, layout.landmark_column, *landmarks, rows, l_width, _ONE))]
+                return [(add_block, None, (layout.landmark, layout.landmark_column, *landmarks, rows, l_width, _ONE))]
             first, rest = layout.kept[0], layout.kept[1:]
             c = first.kept_class
             indices = (layout.landmark, layout.landmark_column, first.incidence, first.block, first.column)
             targets = (*landmarks, self._chunk_W[share][e][c], H[c, c], g[c], self._sole[e][c])
             widths = (rows, l_width, width(self.layout.kept[c].width), _ONE)
-            sums.append((_add_primary, c, (*indices, *targets, *widths)))
+            sums.append((add_primary, c, (*indices, *targets, *widths)))
             for entry in rest:
                 c = entry.kept_class
                 indices = (layout.landmark_column, entry.incidence, entry.column)
                 widths = (rows, l_width, width(self.layout.kept[c].width))
-                sums.append((_add_incidence, c, (*indices, self._chunk_W[share][e][c], *widths)))
+                sums.append((add_incidence, c, (*indices, self._chunk_W[share][e][c], *widths)))
         for entry in rest:
             c = entry.kept_class
             targets = (H[c, c], g[c])
             sums.append(
-                (_add_block, None, (entry.block, entry.column, *targets, rows, width(self.layout.kept[c].width), _ONE))
+                (add_block, None, (entry.block, entry.column, *targets, rows, width(self.layout.kept[c].width), _ONE))
             )
         for i, j, slot in layout.crosses:
             a, b = layout.kept[i], layout.kept[j]
             pair = (a.kept_class, b.kept_class)
             widths = [width(self.layout.kept[c].width) for c in pair]
             blocks = (a.block, a.column, b.block, b.column, slot)
-            sums.append((_add_cross, None, (*blocks, pair[0] == pair[1], H[pair], rows, *widths)))
+            sums.append((add_cross, None, (*blocks, pair[0] == pair[1], H[pair], rows, *widths)))
         return sums
 
 
@@ -422,35 +359,6 @@ def _has_sole_contributions(layout: Layout, eliminated: int, kept_class: int) ->
                     return False
                 total += len(entry.incidence)
     return total == len(layout.eliminated[eliminated].incidences[kept_class].block)
-
-
-def _shares(chunks: tuple[Chunk, ...], count: int) -> list[list[Chunk]]:
-    """Divide consecutive chunks among ``count`` threads, about equal in the number of factors."""
-    if count == 1 or len(chunks) < 2 * count:
-        return [list(chunks)]
-    done = np.concatenate([[0], np.cumsum([max(chunk.size, 1) for chunk in chunks])])
-    cuts = np.searchsorted(done, done[-1] * np.arange(count + 1) / count)
-    cuts[0], cuts[-1] = 0, len(chunks)
-    return [list(chunks[cuts[i] : cuts[i + 1]]) for i in range(count)]
-
-
-#: Sums of arrays shorter than this are not worth a thread.
-_SUM_IN_THREADS = 200_000
-
-
-def sum_of(parts: list[FloatArray], workers: Workers) -> FloatArray:
-    """Add the other arrays to the first one, and return that."""
-    total = parts[0]
-    tasks = workers.count if total.size > _SUM_IN_THREADS else 1
-    cuts = [total.size * i // tasks for i in range(tasks + 1)]
-
-    def add(task: int) -> None:
-        for part in parts[1:]:
-            total[cuts[task] : cuts[task + 1]] += part[cuts[task] : cuts[task + 1]]
-
-    if len(parts) > 1:
-        workers.map(add, tasks)
-    return total
 
 
 def to_original_order(layout: Layout, states: States) -> dict[str, FloatArray]:

@@ -6,7 +6,7 @@ The cost is :math:`\\tfrac12 \\sum_i \\rho_i(\\lVert \\Sigma_i^{-1/2} r_i \\rVer
 
 from __future__ import annotations
 
-import dataclasses
+import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -66,7 +66,11 @@ class Problem:
         variables = {
             name: group.with_state(states[name]) if name in states else group for name, group in self.variables.items()
         }
-        return dataclasses.replace(self, variables=variables, factors=self.factors)
+        if any(len(group) != len(self.variables[name]) for name, group in variables.items()):
+            return Problem(variables, self.factors)
+        moved = copy.copy(self)  # what was checked once holds for other states, too
+        object.__setattr__(moved, "variables", variables)
+        return moved
 
     @property
     def num_residuals(self) -> int:

@@ -8,16 +8,17 @@ revisit. Walls do not hide what lies behind them; depth does: nothing is seen be
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.geometry import quaternion
+from groma.scene._synthetic import SyntheticScene, assemble, project_pinhole, rotated
 from groma.scene.camera import Cameras
 from groma.scene.landmarks import Lines
 from groma.scene.observations import Relations
-from groma.scene.synthetic import SyntheticScene, assemble, project_pinhole, rotated
 
 WIDTH, HEIGHT, FOCAL = 1280, 960, 800.0
 #: Half width and height of the corridor, range of depths that are seen.
@@ -56,7 +57,9 @@ class _Loop:
         return np.column_stack([position + side[:, None] * _left(heading), height]), leg
 
 
-def make(size: int | str, seed: int, noise_px: float) -> SyntheticScene:
+def corridor(
+    size: int | Literal["tiny", "small", "medium", "large"] = "small", seed: int = 0, noise_px: float = 0.5
+) -> SyntheticScene:
     """Make a walk round a square corridor.
 
     Parameters
@@ -72,6 +75,11 @@ def make(size: int | str, seed: int, noise_px: float) -> SyntheticScene:
     -------
     SyntheticScene
         Truth and start. Every point is seen at least twice, every line three times, planes by what lies on them.
+
+    Raises
+    ------
+    InputError
+        If ``size`` is neither a number of at least 2 nor one of the names.
     """
     if isinstance(size, str):
         if size not in SIZES:
@@ -229,4 +237,4 @@ def _thin(rng: np.random.Generator, owner: IntArray, count: int, mean: int, leas
     return kept[alive[owner[kept]]], alive
 
 
-__all__ = ["make"]
+__all__ = ["corridor"]

@@ -5,9 +5,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.scene._table import Table, check_sigma, column, convert
@@ -31,6 +32,23 @@ class PointObservations(Table):
 
     def _check(self) -> None:
         check_sigma("PointObservations.sigma", self.sigma)
+
+    @classmethod
+    def numbered(cls, image_idx: npt.ArrayLike, point_idx: npt.ArrayLike, pixel: npt.ArrayLike) -> Self:
+        """Return observations whose 2D points are numbered 0, 1, 2, ... within each image, in the order given.
+
+        Parameters
+        ----------
+        image_idx, point_idx : (N,) int
+            The image and the point of each.
+        pixel : (N, 2) float
+            Measured places, pixels.
+        """
+        image = np.asarray(image_idx)
+        order = np.argsort(image, kind="stable")
+        number = np.empty(len(order), np.int64)
+        number[order] = np.arange(len(order)) - np.searchsorted(image[order], image[order])
+        return cls(image, point_idx, pixel, number)  # type: ignore[arg-type]  # columns are converted
 
 
 @dataclass(frozen=True, eq=False)

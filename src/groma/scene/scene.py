@@ -317,52 +317,58 @@ class Scene:
         check_index("image_idx", chosen, self.num_images, "images")
         new_image = _new_index(chosen, self.num_images)
         kept_frames, frame_idx = np.unique(self.images.frame_idx[chosen], return_inverse=True)
-        points_seen, new_point = _still_seen(
-            new_image,
-            self.point_observations.image_idx,
-            self.point_observations.point_idx,
-            self.num_points,
-            min_observations,
+        seen = self.replace(
+            frames=self.frames.take(kept_frames),
+            images=self.images.take(chosen).replace(frame_idx=frame_idx),
+            point_observations=_renumbered(self.point_observations, image_idx=new_image),
+            keypoints=_renumbered(self.keypoints, image_idx=new_image),
+            line_observations=_renumbered(self.line_observations, image_idx=new_image),
         )
-        lines_seen, new_line = _still_seen(
-            new_image,
-            self.line_observations.image_idx,
-            self.line_observations.line_idx,
-            self.num_lines,
-            min_observations,
-        )
-        new = {"point": new_point, "line": new_line}
-        new |= {"plane": np.arange(self.num_planes), "direction": np.arange(self.num_directions)}
+        points = np.bincount(seen.point_observations.point_idx, minlength=self.num_points)
+        lines = np.bincount(seen.line_observations.line_idx, minlength=self.num_lines)
+        return seen.keep(points=points >= min_observations, lines=lines >= min_observations)
+
+    def keep(
+        self,
+        *,
+        points: npt.ArrayLike | None = None,
+        lines: npt.ArrayLike | None = None,
+        planes: npt.ArrayLike | None = None,
+        directions: npt.ArrayLike | None = None,
+    ) -> Self:
+        """Return the scene with some of its landmarks, what was observed of them, and the relations among them.
+
+        Parameters
+        ----------
+        points, lines, planes, directions : (n,) int or (P,), (L,), (K,), (D,) bool, optional
+            Which to keep, integers in their new order; all of a kind that is left out.
+        """
+        chosen = {"point": points, "line": lines, "plane": planes, "direction": directions}
+        new, tables = {}, {}
+        for kind, rows in chosen.items():
+            table = getattr(self, f"{kind}s")
+            new[kind] = np.arange(len(table))
+            if rows is not None:
+                kept = np.asarray(rows)
+                kept = np.flatnonzero(kept) if kept.dtype == bool else kept.astype(np.int64)
+                check_index(f"{kind}s", kept, len(table), f"{kind}s")
+                new[kind], tables[f"{kind}s"] = _new_index(kept, len(table)), table.take(kept)
+        for kind in {"point", "line"} & {name.removesuffix("s") for name in tables}:
+            seen = getattr(self, f"{kind}_observations")
+            tables[f"{kind}_observations"] = _renumbered(seen, **{f"{kind}_idx": new[kind]})
         relations = {}
         for item in fields(self.relations):
             first, second = item.name.replace("_along_", "_on_").split("_on_")
             pairs = getattr(self.relations, item.name)
             pairs = np.column_stack([new[first][pairs[:, 0]], new[second][pairs[:, 1]]])
-            relations[item.name] = pairs[(pairs >= 0).all(1)]
-        return self.replace(
-            frames=self.frames.take(kept_frames),
-            images=self.images.take(chosen).replace(frame_idx=frame_idx),
-            points=self.points.take(points_seen),
-            point_observations=_renumbered(self.point_observations, image_idx=new_image, point_idx=new_point),
-            keypoints=_renumbered(self.keypoints, image_idx=new_image),
-            lines=self.lines.take(lines_seen),
-            line_observations=_renumbered(self.line_observations, image_idx=new_image, line_idx=new_line),
-            relations=Relations(**relations),
-        )
+            relations[item.name] = pairs[(pairs >= 0).all(axis=1)]
+        return self.replace(**tables, relations=Relations(**relations))
 
 
 def _new_index(kept: IntArray, size: int) -> IntArray:
     index = np.full(size, -1, np.int64)
     index[kept] = np.arange(len(kept))
     return index
-
-
-def _still_seen(
-    new_image: IntArray, image_idx: IntArray, landmark_idx: IntArray, size: int, least: int
-) -> tuple[IntArray, IntArray]:
-    seen = np.bincount(landmark_idx[new_image[image_idx] >= 0], minlength=size)
-    kept = np.flatnonzero(seen >= least)
-    return kept, _new_index(kept, size)
 
 
 def _renumbered(table: Any, **new_index: IntArray) -> Any:

@@ -8,7 +8,6 @@ corridor. Both give the truth and a perturbed start; the measurements, with thei
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -16,10 +15,11 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.geometry import quaternion
+from groma.scene._corridor import corridor
+from groma.scene._synthetic import SyntheticScene, assemble, rotated
 from groma.scene.camera import Cameras
-from groma.scene.landmarks import Lines, Planes, Points
-from groma.scene.observations import LineObservations, PointObservations, Relations
-from groma.scene.scene import Scene
+from groma.scene.landmarks import Lines
+from groma.scene.observations import Relations
 
 WIDTH, HEIGHT, FOCAL = 1024, 768, 800.0
 #: Half extent of the cube, radius of the camera sphere, least depth of anything observed.
@@ -32,18 +32,6 @@ LINES_PER_PLANE, POINTS_PER_PLANE, POINTS_PER_LINE = 2, 10, 3
 _CANDIDATES = 96
 #: Numbers held at once while visibility is tested.
 _CHUNK = 2_000_000
-
-
-@dataclass(frozen=True, eq=False)
-class SyntheticScene:
-    """A scene whose truth is known."""
-
-    #: Exact cameras and landmarks, noisy measurements.
-    truth: Scene
-    #: The same scene with perturbed cameras and landmarks.
-    start: Scene
-    #: Standard deviation of the measurements in each coordinate, pixels.
-    noise_px: float
 
 
 def holistic(
@@ -139,87 +127,6 @@ def holistic(
         lines=Lines.through(segments + rng.normal(0, structure, segments.shape)),
     )
     return SyntheticScene(truth, start.with_poses(turned).with_planes(moved), noise_px)
-
-
-def assemble(
-    rng: np.random.Generator,
-    camera: Cameras,
-    poses: FloatArray,
-    xyz: FloatArray,
-    point_obs: IntArray,
-    segments: FloatArray,
-    line_obs: IntArray,
-    trims: FloatArray | None,
-    planes: FloatArray,
-    relations: Relations,
-    noise_px: float,
-) -> Scene:
-    """Return the true scene with noisy measurements.
-
-    Parameters
-    ----------
-    rng : Generator
-        Source of the noise.
-    camera : Cameras
-        One PINHOLE camera.
-    poses : (N, 7) float
-        True cam_from_world.
-    xyz, segments, planes : (P, 3), (L, 2, 3), (K, 4) float
-        True landmarks.
-    point_obs, line_obs : (M, 2) int
-        Pairs (landmark, image).
-    trims : (M, 2) float or None
-        Where each observed segment begins and ends on the line's segment, 0 to 1; all of it by default.
-    relations : Relations
-        Which landmarks belong together.
-    noise_px : float
-        Standard deviation of pixel coordinates.
-    """
-    point_obs = point_obs[np.lexsort((point_obs[:, 1], point_obs[:, 0]))]
-    order = np.lexsort((line_obs[:, 1], line_obs[:, 0]))
-    line_obs = line_obs[order]
-    params = camera.params[0]
-    pixel = project_pinhole(params, poses[point_obs[:, 1]], xyz[point_obs[:, 0]])[0]
-    share = np.tile([0.0, 1.0], (len(line_obs), 1)) if trims is None else trims[order]
-    start, end = segments[line_obs[:, 0], 0], segments[line_obs[:, 0], 1]
-    ends = [project_pinhole(params, poses[line_obs[:, 1]], start + s[:, None] * (end - start))[0] for s in share.T]
-    seen = np.hstack(ends)
-    count = len(poses)
-    by_image = np.argsort(point_obs[:, 1], kind="stable")
-    first = np.searchsorted(point_obs[by_image, 1], np.arange(count))
-    keypoint_idx = np.empty(len(point_obs), np.int64)
-    keypoint_idx[by_image] = np.arange(len(point_obs)) - first[point_obs[by_image, 1]]
-    return Scene.from_images(
-        camera,
-        [f"{row + 1:05d}.png" for row in range(count)],
-        np.zeros(count, int),
-        poses,
-        points=Points.at(xyz),
-        point_observations=PointObservations(
-            point_obs[:, 1], point_obs[:, 0], pixel + rng.normal(0, noise_px, pixel.shape), keypoint_idx
-        ),
-        lines=Lines.through(segments),
-        line_observations=LineObservations(line_obs[:, 1], line_obs[:, 0], seen + rng.normal(0, noise_px, seen.shape)),
-        planes=Planes(np.arange(len(planes)) + 1, planes),
-        relations=relations,
-    )
-
-
-def project_pinhole(params: FloatArray, cam_from_world: FloatArray, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return pixels (..., 2) and depths (...) of points (..., 3) seen from poses (..., 7) by one PINHOLE camera."""
-    in_cam = quaternion.rotate(cam_from_world[..., :4], xyz) + cam_from_world[..., 4:]
-    depth = in_cam[..., 2]
-    safe = np.where(depth > 1e-9, depth, 1e-9)[..., None]
-    return params[:2] * in_cam[..., :2] / safe + params[2:], depth
-
-
-def rotated(rng: np.random.Generator, poses: FloatArray, sigma_deg: float) -> FloatArray:
-    """Return poses turned in their camera frames; the translation of cam_from_world stays."""
-    turned = poses.copy()
-    turn = quaternion.exp(rng.normal(0, np.deg2rad(sigma_deg), (len(poses), 3)))
-    turned[:, :4] = quaternion.multiply(turn, poses[:, :4])
-    turned[:, :4] /= np.linalg.norm(turned[:, :4], axis=1, keepdims=True)
-    return turned
 
 
 def _sphere_of_cameras(rng: np.random.Generator, count: int) -> FloatArray:
@@ -358,15 +265,6 @@ def _draw_segments(rng: np.random.Generator, on_plane: IntArray, planes: FloatAr
 def _pairs(owner: IntArray) -> IntArray:
     rows = np.flatnonzero(owner >= 0)
     return np.column_stack([rows, owner[rows]])
-
-
-def corridor(
-    size: int | Literal["tiny", "small", "medium", "large"] = "small", seed: int = 0, noise_px: float = 0.5
-) -> SyntheticScene:
-    """Make a walk round a square corridor; see :func:`groma.scene._corridor.make`."""
-    from groma.scene._corridor import make
-
-    return make(size, seed, noise_px)
 
 
 __all__ = ["SyntheticScene", "corridor", "holistic"]

@@ -25,6 +25,7 @@ from scipy.linalg import get_lapack_funcs
 from groma._numba import loop
 from groma._simd import add_matvec, add_product, set_product, width
 from groma._typing import FloatArray, IntArray
+from groma.problem._sorting import argsort_by
 from groma.problem.gauge import gauge_directions
 from groma.problem.layout import Layout
 
@@ -180,7 +181,7 @@ def coarse_space(layout: Layout) -> CoarseSpace | None:
 def _clusters(rows: IntArray, columns: IntArray, count: int) -> IntArray:
     """Cluster of each block."""
     ends = np.concatenate([rows, columns])
-    order = np.argsort(ends, kind="stable")
+    order = argsort_by(((ends, count),), len(ends))
     neighbor = np.concatenate([columns, rows])[order]
     pointer = np.concatenate([[0], np.cumsum(np.bincount(ends, minlength=count))])
     cluster = np.full(count, -1, np.int32)

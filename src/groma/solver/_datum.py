@@ -27,6 +27,7 @@ from groma._typing import BoolArray, FloatArray
 from groma.problem.gauge import world_motions
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
+from groma.problem.problem import Problem
 from groma.solver.linear import Blocks, multiply
 from groma.solver.schur import ReducedSystem
 from groma.solver.steps import Step
@@ -75,7 +76,7 @@ def held_coordinates(layout: Layout) -> tuple[list[BoolArray], list[BoolArray]]:
 
 def free_motions(layout: Layout, equations: NormalEquations, system: ReducedSystem) -> FreeMotions:
     """Find the combinations of the seven world motions that move no held coordinate and cost nothing."""
-    center, length = _place_and_size(layout)
+    center, length = middle_and_extent(layout.problem)
     motions = world_motions(layout.problem, center, length)
     kept, landmarks = _by_layout(layout, motions)
     held_kept, held_landmarks = held_coordinates(layout)
@@ -83,7 +84,7 @@ def free_motions(layout: Layout, equations: NormalEquations, system: ReducedSyst
     held = [part[mask] for part, mask in zip(kept + landmarks, held_kept + held_landmarks, strict=True)]
     stuck = np.concatenate([np.zeros((0, 7)), *held])
     if len(stuck):
-        combinations = _null_space(stuck.T @ stuck)
+        combinations = unmoved(stuck)
     combinations = combinations[:, _not_still(kept + landmarks, combinations)]
     if combinations.shape[1]:
         gram, size = _costs(layout, equations, system, kept, landmarks)
@@ -132,20 +133,24 @@ def constrained(layout: Layout, S: Blocks, G: FloatArray) -> Blocks:
     return S
 
 
-def _place_and_size(layout: Layout) -> tuple[FloatArray, float]:
-    """Middle and extent of the points and cameras of a problem, to which motions are referred."""
+def middle_and_extent(problem: Problem, most_points: int | None = None) -> tuple[FloatArray, float]:
+    """Middle (3,) and extent of the points and cameras of a problem, to which motions are referred.
+
+    Of each group at most so many points are looked at, evenly spread; all if None.
+    """
     places = [np.zeros((0, 3))]
-    for group in layout.problem.variables.values():
+    for group in problem.variables.values():
         if group.manifold.kind == "point" and len(group):
-            places.append(group.ambient())
+            every = 1 if most_points is None else -(-len(group) // most_points)
+            places.append(group.manifold.ambient(group.state[::every]))
         if group.manifold.kind == "pose" and len(group):
             T = group.ambient().reshape(-1, 3, 4)
             places.append(-np.einsum("nij,ni->nj", T[:, :, :3], T[:, :, 3]))
-    every = np.concatenate(places)
-    if len(every) == 0:
+    place = np.concatenate(places)
+    if len(place) == 0:
         return np.zeros(3), 1.0
-    center = np.median(every, axis=0)
-    length = float(np.median(np.linalg.norm(every - center, axis=1)))
+    center = np.median(place, axis=0)
+    length = float(np.median(np.linalg.norm(place - center, axis=1)))
     return center, length if length > 0 else 1.0
 
 
@@ -162,9 +167,14 @@ def _by_layout(layout: Layout, motions: dict[str, FloatArray]) -> tuple[list[Flo
     return kept, landmarks
 
 
-def _null_space(gram: FloatArray) -> FloatArray:
-    values, vectors = np.linalg.eigh(gram)
-    return vectors[:, values <= RANK_TOLERANCE**2 * max(values.max(initial=0.0), 1e-300)]
+def unmoved(motions: FloatArray) -> FloatArray:
+    """Return the combinations (7, k) of motions (unknowns, 7) that leave all these unknowns where they are.
+
+    By singular values: their squares, the eigenvalues of the product, are lost in rounding below 1e-16.
+    """
+    _, values, vectors = np.linalg.svd(np.linalg.qr(motions, mode="r"))
+    size = np.append(values, np.zeros(len(vectors) - len(values)))
+    return vectors[size <= RANK_TOLERANCE * max(float(size.max(initial=0.0)), 1e-300)].T
 
 
 def _not_still(parts: list[FloatArray], combinations: FloatArray) -> BoolArray:
@@ -207,4 +217,12 @@ def _costs(
     return gram, size
 
 
-__all__ = ["FREE_TOLERANCE", "FreeMotions", "constrained", "free_motions", "held_coordinates"]
+__all__ = [
+    "FREE_TOLERANCE",
+    "FreeMotions",
+    "constrained",
+    "free_motions",
+    "held_coordinates",
+    "middle_and_extent",
+    "unmoved",
+]

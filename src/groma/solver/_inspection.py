@@ -20,7 +20,7 @@ from groma.problem.gauge import gauge_directions
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 from groma.problem.problem import Problem
-from groma.solver._datum import FREE_TOLERANCE, free_motions, held_coordinates
+from groma.solver._datum import FREE_TOLERANCE, free_motions, held_coordinates, middle_and_extent, unmoved
 from groma.solver._observability import camera_centers, motion
 from groma.solver._words import Names
 from groma.solver.linear import multiply
@@ -63,16 +63,7 @@ class Inspection:
     @cached_property
     def place_and_size(self) -> tuple[FloatArray, float]:
         """Middle and extent of points and cameras."""
-        places = [self.all_centers]
-        for group in self.problem.variables.values():
-            if group.manifold.kind == "point" and len(group):
-                places.append(group.manifold.ambient(group.state[:: -(-len(group) // SAMPLE)]))
-        every = np.concatenate(places)
-        if len(every) == 0:
-            return np.zeros(3), 1.0
-        center = np.median(every, axis=0)
-        length = float(np.median(np.linalg.norm(every - center, axis=1)))
-        return center, length if length > 0 else 1.0
+        return middle_and_extent(self.problem, SAMPLE)
 
     @cached_property
     def free_motions(self) -> tuple[FloatArray, FloatArray]:
@@ -80,8 +71,7 @@ class Inspection:
         G, held = self._world_motions(), np.concatenate(self.held[0])
         combinations = np.eye(7)
         if held.any():
-            values, vectors = np.linalg.eigh(G[held].T @ G[held])
-            combinations = vectors[:, values <= 1e-18 * max(float(values.max()), 1e-300)]
+            combinations = unmoved(G[held])
         still = np.abs(G @ combinations).max(axis=0, initial=0.0) <= 1e-9
         combinations = combinations[:, ~still]
         if combinations.shape[1]:

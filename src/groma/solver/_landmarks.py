@@ -17,11 +17,9 @@ from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
+from groma.solver._elimination import LANDMARK_TOLERANCE, eliminate, scaled_blocks
 from groma.solver.linear import Blocks
 from groma.solver.schur import ReducedSystem
-
-#: A landmark whose scaled normal matrix has a smaller eigenvalue than this has an undetermined direction.
-LANDMARK_TOLERANCE = 1e-12
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 
@@ -95,11 +93,12 @@ class Landmarks:
     Parameters
     ----------
     layout, equations, system
-        Of a problem that is linearised, with its landmarks eliminated and without damping.
+        Of a problem that is linearised; its landmarks are eliminated here, without damping.
     """
 
     def __init__(self, layout: Layout, equations: NormalEquations, system: ReducedSystem) -> None:
         self._layout, self._equations, self._system = layout, equations, system
+        self._roots = eliminate(system)
         self._B: dict[tuple[int, int], FloatArray] = {}
 
     def inverses(self, e: int) -> FloatArray:
@@ -116,6 +115,10 @@ class Landmarks:
             _multiply_incidences(
                 incidences.pointer, self._system.N[e], self._equations.W[e][c], eliminated.dof, width, B
             )
+            roots = self._roots[e]
+            rows, owner = roots.incidences[c]
+            W: FloatArray = np.asarray(self._equations.W[e][c].reshape(-1, eliminated.dof, width)[rows], np.float64)
+            B[rows] = -(roots.A[owner] @ roots.times(W, c))
             self._B[e, c] = B
         return self._B[e, c]
 
@@ -152,10 +155,8 @@ class Landmarks:
         V = self._equations.V[e].reshape(-1, dof, dof).copy()
         steps = np.arange(dof)
         V[:, steps, steps] += held.reshape(-1, dof)
-        size = np.sqrt(V[:, steps, steps])
-        empty = (size == 0.0).any(axis=1)
-        size[size == 0.0] = 1.0
-        return empty | (np.linalg.eigvalsh(V / size[:, :, None] / size[:, None, :])[:, 0] < LANDMARK_TOLERANCE)
+        empty = (V[:, steps, steps] == 0.0).any(axis=1)
+        return empty | (np.linalg.eigvalsh(scaled_blocks(V)[0])[:, 0] < LANDMARK_TOLERANCE)
 
     def moved(self, e: int, X: FloatArray, threshold: float) -> BoolArray:
         """Return which landmarks follow the columns of X by more than a threshold, in units that make diag V one."""
@@ -164,4 +165,4 @@ class Landmarks:
         return (np.abs(self.followed(e, X)) * size[:, :, None] > threshold).any(axis=(1, 2))
 
 
-__all__ = ["LANDMARK_TOLERANCE", "Landmarks"]
+__all__ = ["Landmarks"]

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
-from groma.errors import InputError, ProblemError
+from groma.errors import InputError
 from groma.geometry._manifold import Manifold
 from groma.geometry.conversions import conversion_jacobian
 from groma.problem._parallel import Workers
@@ -38,15 +38,14 @@ from groma.solver._blas import one_blas_thread
 from groma.solver._datum import constrained, free_motions, held_coordinates
 from groma.solver._fronts import Fronts
 from groma.solver._landmarks import Landmarks
-from groma.solver._modes import MODES, divided, scaled, smallest
+from groma.solver._modes import divided, scaled, smallest
+from groma.solver._open_variables import LOOSE, deficiency, hold_open_blocks, loses_the_cameras, zero_modes
 from groma.solver._transformation import Transformation, datum_weights, transformation
 from groma.solver.linear import Blocks
 from groma.solver.schur import ReducedSystem
 
 #: A scaled variance above this means a direction that the data do not determine.
 LARGEST_VARIANCE = 1e11
-#: A variable that moves by more than this in a scaled mode of zero cost is loose; so many may be, of all unknowns.
-LOOSE, MAX_LOOSE = 1e-6, 0.2
 #: Relative step of the central differences of functions of variables.
 STEP = 1e-6
 
@@ -115,9 +114,8 @@ class Covariances:
         states = to_solver_order(layout)
         self._equations = equations = NormalEquations(layout, Workers(1))
         self._system = ReducedSystem(equations)
-        self._landmarks = Landmarks(layout, equations, self._system)
         equations.linearize(states, equations.prepare(states))
-        self._system.eliminate(0.0)
+        self._landmarks = Landmarks(layout, equations, self._system)
         self._position = {e.group: np.argsort(e.order) for e in layout.eliminated}
         self._held, self._held_landmarks = held_coordinates(layout)
         self._open = [self._landmarks.undetermined(e, held) for e, held in enumerate(self._held_landmarks)]
@@ -145,10 +143,10 @@ class Covariances:
             S = constrained(layout, S, G * self._size[:, None])
         inverse = self._inverse(S)
         if inverse is None:
-            S = self._without_loose_ends(S, gauge)
+            S = self._without_open_variables(S, G, gauge)
             inverse = self._inverse(S)
             if inverse is None:
-                raise self._deficient(S, gauge)
+                raise deficiency(layout, smallest(layout, self._fronts, S), 0)
         self._sigma = divided(layout, inverse, self._size)
         if motions is not None and motions.count:
             weights = datum_weights(layout, datum, self._open)
@@ -163,29 +161,24 @@ class Covariances:
         variances = [np.einsum("nii->ni", inverse[c, c][: k.count]) for c, k in enumerate(self._layout.kept)]
         return inverse if all((part < LARGEST_VARIANCE).all() for part in variances) else None
 
-    def _without_loose_ends(self, S: Blocks, gauge: str) -> Blocks:
-        """Hold the few variables that the data leave open, and note them and the landmarks they move."""
-        modes = smallest(self._layout, self._fronts, S)
+    def _without_open_variables(self, S: Blocks, G: FloatArray, gauge: str) -> Blocks:
+        """Hold the variables that the data leave open, and note them and the landmarks they move."""
+        layout = self._layout
+        known = [held | unseen for held, unseen in zip(self._held, self._unseen, strict=True)]
+        S, is_open = hold_open_blocks(self._equations, S, self._size, known, G)
+        modes = zero_modes(layout, self._fronts, S)
         null = modes.vectors[:, : modes.num_null]
-        loose = (np.abs(null) > LOOSE).any(axis=1)
-        free = gauge == "held" and free_motions(self._layout, self._equations, self._system).count
-        if free or not 0 < modes.num_null < MODES or loose.mean() > MAX_LOOSE:
-            raise self._deficient(S, gauge, modes.num_null)
-        for c, kept in enumerate(self._layout.kept):
-            self._unseen[c] |= np.asarray(loose)[kept.start : kept.start + kept.count * kept.width]
+        if modes.num_null or not len(modes.values):
+            free = free_motions(layout, self._equations, self._system).count if gauge == "held" else 0
+            if free or loses_the_cameras(layout, modes):
+                raise deficiency(layout, modes, free)
+            S = constrained(layout, S, null)
+        loose = np.any(np.abs(null) > LOOSE, axis=1)
+        for c, kept in enumerate(layout.kept):
+            self._unseen[c] |= is_open[c] | loose[kept.start : kept.start + kept.count * kept.width]
         for e in range(len(self._open)):
             self._open[e] |= self._landmarks.moved(e, null / self._size[:, None], LOOSE)
-        return constrained(self._layout, S, null)
-
-    def _deficient(self, S: Blocks, gauge: str, count: int | None = None) -> ProblemError:
-        count = smallest(self._layout, self._fronts, S).num_null if count is None else count
-        number = f"at least {count}" if count == MODES else str(max(count, 1))
-        free = free_motions(self._layout, self._equations, self._system).count if gauge == "held" else 0
-        what = f"; {free} of them are motions of the whole scene" if free else ""
-        remedy = "Hold variables constant, pass gauge='inner', or add priors."
-        if not free:
-            remedy = "groma.solver.diagnosis.diagnose(problem) names what is not determined; drop it, or add priors."
-        return ProblemError(f"The normal equations are rank deficient by {number}{what}. {remedy}")
+        return S
 
     def _solve(self, rhs: FloatArray) -> FloatArray:
         """Return S^-1 times the columns of ``rhs``, S with the constraints of the gauge."""

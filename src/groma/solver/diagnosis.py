@@ -30,6 +30,7 @@ from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.problem import Problem
 from groma.solver._blas import one_blas_thread
 from groma.solver._camera_findings import camera_findings
+from groma.solver._elimination import eliminate as eliminate_landmarks
 from groma.solver._findings import Finding
 from groma.solver._inspection import UNDETERMINED, WEAK, Inspection
 from groma.solver._landmark_findings import landmark_findings
@@ -110,7 +111,7 @@ def diagnose(
         equations = NormalEquations(layout, workers)
         system = ReducedSystem(equations)
         equations.linearize(states, equations.prepare(states))
-        system.eliminate(0.0)
+        eliminate_landmarks(system)
         system.assemble(0.0)
         with one_blas_thread():
             return _diagnosis(Inspection(problem, layout, equations, system, names or _plain_name), begin)

@@ -13,11 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma.problem.linearization import NormalEquations
-from groma.solver.levenberg_marquardt import eliminate_again, linearize_and_eliminate
-from groma.solver.linear import LinearSolver
-from groma.solver.report import Stopwatch
-from groma.solver.schur import ReducedSystem
+from groma.solver._reduction import Reduction
 from groma.solver.steps import States, Step, curvature, diagonal, gradient
 
 #: Damping of the Gauss-Newton step, relative to the diagonal.
@@ -28,43 +24,40 @@ MIN_RADIUS = 1e-14
 class Dogleg:
     """Proposes steps inside a trust region and adapts its radius."""
 
-    def __init__(
-        self, equations: NormalEquations, system: ReducedSystem, linear: LinearSolver, watch: Stopwatch, damping: float
-    ) -> None:
-        self._equations, self._system, self._linear, self._watch = equations, system, linear, watch
+    def __init__(self, reduction: Reduction, damping: float) -> None:
+        self._reduction = reduction
         #: Reported in place of a damping: the inverse of the radius.
         self.damping = damping
         self._radius = 0.0
         self._newton: Step | None = None
 
-    def linearize(self, states: States, inputs: list[tuple]) -> None:
-        """Form the normal equations, and the two corners of the dogleg."""
-        self._linear.follow(states)
-        linearize_and_eliminate(self._equations, self._system, states, inputs, GAUSS_NEWTON_DAMPING, self._watch)
+    def linearize(self, states: States, inputs: list[tuple]) -> float:
+        """Form the normal equations, and the two corners of the dogleg; return the cost of the states."""
+        equations, system = self._reduction.equations, self._reduction.system
         damping = GAUSS_NEWTON_DAMPING
-        kept = None
-        while kept is None and damping < 1.0:
-            if damping > GAUSS_NEWTON_DAMPING:
-                eliminate_again(self._equations, self._system, states, inputs, damping, self._watch)
-            with self._watch("schur"):
-                self._system.assemble(damping)
-            with self._watch("solve"):
-                kept = self._linear.solve(self._system.S, self._system.rhs)
+        cost = self._reduction.linearize(states, inputs, damping)
+        if not np.isfinite(cost):
+            return cost
+        kept = self._reduction.solve(damping)
+        while kept is None and damping < 0.01:
             damping *= 100.0
-        with self._watch("backsubstitute"):
-            D = diagonal(self._equations, self._system)
-            g = gradient(self._equations)
+            self._reduction.damp(damping)
+            kept = self._reduction.solve(damping)
+        with self._reduction.watch("backsubstitute"):
+            D = diagonal(equations, system)
+            g = gradient(equations)
             self._root = Step([np.sqrt(d) for d in D.kept], [np.sqrt(d) for d in D.landmarks])
             descent = Step(
                 [-a / d for a, d in zip(g.kept, D.kept, strict=True)],
                 [-a / d for a, d in zip(g.landmarks, D.landmarks, strict=True)],
             )
-            bend = curvature(self._equations, self._system, descent)
+            bend = curvature(equations, system, descent)
             length = -g.dot(descent) / bend if bend > 0 else 0.0
             self._cauchy = descent.blend(length, descent, 0.0)
-            self._newton = Step(kept, self._system.landmark_steps(kept)) if kept is not None else None
+            self._newton = Step(kept, system.landmark_steps(kept)) if kept is not None else None
             if self._radius == 0.0:
                 self._radius = max(self._length(self._newton or self._cauchy), 1e-12)
+        return cost
 
     def _length(self, step: Step) -> float:
         return float(
@@ -73,10 +66,11 @@ class Dogleg:
 
     def propose(self) -> tuple[Step, float] | None:
         """Return the dogleg step for the present radius and the decrease of the quadratic model."""
-        with self._watch("backsubstitute"):
+        with self._reduction.watch("backsubstitute"):
             step = self._point()
             self._proposed = self._length(step)
-            decrease = -gradient(self._equations).dot(step) - 0.5 * curvature(self._equations, self._system, step)
+            equations, system = self._reduction.equations, self._reduction.system
+            decrease = -gradient(equations).dot(step) - 0.5 * curvature(equations, system, step)
         return step, decrease
 
     def _point(self) -> Step:

@@ -16,9 +16,12 @@ from groma._simd import width
 from groma._typing import FloatArray
 from groma.problem._parallel import Workers
 from groma.problem.layout import Chunk, Layout
-from groma.problem.linearization import NormalEquations
+from groma.problem.linearization import NormalEquations, to_solver_order
+from groma.solver.options import SolverOptions, first_damping
+from groma.solver.report import Iteration, SolveReport, Stopwatch, note_end, note_start
 from groma.solver.schur import MIN_DIAGONAL, invert_blocks
 from groma.solver.steps import States
+from groma.solver.termination import Termination
 
 #: A variable whose damping exceeds this has reached its minimum to machine precision.
 MAX_DAMPING = 1e12
@@ -142,3 +145,54 @@ class IndependentBlocks:
             moved[group.group] = np.where(better[:, None], longer[group.group], moved[group.group])
             deltas[e] = np.where(better[:, None], factors[e][:, None] * deltas[e], deltas[e])
             new_costs[e] = np.where(better, longer_costs[e], new_costs[e])
+
+
+def solve_independently(
+    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
+) -> States:
+    """Solve a layout without kept blocks; return the states in its order."""
+    with watch("setup"):
+        blocks = IndependentBlocks(layout, workers, first_damping(layout, options), options.function_tolerance)
+        states = to_solver_order(layout)
+    report.linear_solver = "blocks"
+    with watch("cost"):
+        costs = blocks.costs(states)
+    cost = float(sum(blocks.equations.costs))
+    outside = cost - float(sum(part.sum() for part in costs))
+    note_start(report, layout, blocks.equations, cost)
+    if not np.isfinite(cost):
+        report.termination = Termination.NOT_FINITE
+        return states
+    report.termination = Termination.MAX_ITERATIONS
+    while report.iterations < options.max_iterations:
+        report.iterations += 1
+        with watch("linearize"):
+            states, costs, moved = blocks.step(states, costs)
+        new_cost = float(sum(part.sum() for part in costs)) + outside
+        damping = max((float(d.max()) for d in blocks.damping if d.size), default=0.0)
+        record = Iteration(
+            iteration=report.iterations,
+            cost=new_cost,
+            accepted=new_cost < cost,
+            damping=damping,
+            gain_ratio=0.0,
+            step_norm=moved.length,
+            gradient_max=moved.gradient,
+            linear_iterations=0,
+            seconds=watch.elapsed(),
+        )
+        report.history.append(record)
+        cost = new_cost
+        if moved.gradient <= options.gradient_tolerance:
+            report.termination = Termination.GRADIENT_CONVERGED
+        elif moved.unfinished == 0:
+            report.termination = Termination.COST_CONVERGED
+        if progress is not None and progress(record) is False:
+            report.termination = Termination.STOPPED_BY_CALLER
+        if report.termination is not Termination.MAX_ITERATIONS:
+            break
+    with watch("cost"):
+        report.final_cost = blocks.equations.cost(blocks.equations.prepare(states))
+        blocks.equations.num_degenerate = blocks.equations.hidden
+    note_end(report, layout, blocks.equations, blocks.num_singular)
+    return states

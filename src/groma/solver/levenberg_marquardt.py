@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma.problem.linearization import NormalEquations
-from groma.solver.linear import ConjugateGradients, LinearSolver
-from groma.solver.report import Stopwatch
-from groma.solver.schur import MIN_DIAGONAL, ReducedSystem
+from groma.solver._reduction import Reduction
+from groma.solver.linear import ConjugateGradients
+from groma.solver.schur import MIN_DIAGONAL
 from groma.solver.steps import States, Step
 
 MAX_DAMPING = 1e16
@@ -26,19 +25,14 @@ MIN_DAMPING = 1e-10
 class LevenbergMarquardt:
     """Proposes damped steps and adapts the damping."""
 
-    def __init__(
-        self, equations: NormalEquations, system: ReducedSystem, linear: LinearSolver, watch: Stopwatch, damping: float
-    ) -> None:
-        self._equations, self._system, self._linear, self._watch = equations, system, linear, watch
+    def __init__(self, reduction: Reduction, damping: float) -> None:
+        self._reduction = reduction
         self.damping = damping
         self._growth = 2.0
-        self._at: tuple[States, list[tuple]] = ({}, [])
 
-    def linearize(self, states: States, inputs: list[tuple]) -> None:
-        """Form the normal equations and eliminate each chunk's landmarks while they are in cache."""
-        self._at = (states, inputs)
-        self._linear.follow(states)
-        linearize_and_eliminate(self._equations, self._system, states, inputs, self.damping, self._watch)
+    def linearize(self, states: States, inputs: list[tuple]) -> float:
+        """Form the reduced system at new states; return their cost."""
+        return self._reduction.linearize(states, inputs, self.damping)
 
     def propose(self) -> tuple[Step, float] | None:
         r"""Return a step and the decrease of the quadratic model.
@@ -47,20 +41,18 @@ class LevenbergMarquardt:
         :math:`(J^\top J + \lambda D)\,\delta = -g - e`, with e the residual that an iterative solver leaves, it is
         :math:`\tfrac12(-g^\top\delta + \lambda\,\delta^\top D\,\delta + e^\top\delta)`.
         """
-        with self._watch("schur"):
-            self._system.assemble(self.damping)
-        with self._watch("solve"):
-            kept = self._linear.solve(self._system.S, self._system.rhs)
+        system, linear = self._reduction.system, self._reduction.linear
+        kept = self._reduction.solve(self.damping)
         if kept is None:
             return None
-        with self._watch("backsubstitute"):
-            step = Step(kept, self._system.landmark_steps(kept))
-            total = self.damping * self._system.landmark_squares - self._system.landmark_slope
+        with self._reduction.watch("backsubstitute"):
+            step = Step(kept, system.landmark_steps(kept))
+            total = self.damping * system.landmark_squares - system.landmark_slope
             for c, delta in enumerate(kept):
-                diagonal = np.maximum(self._system.diagonal(c).reshape(-1), MIN_DIAGONAL)
-                total += self.damping * float((diagonal * delta) @ delta) - float(self._equations.g_kept[c] @ delta)
-            if isinstance(self._linear, ConjugateGradients):
-                total += sum(float(r @ d) for r, d in zip(self._linear.residual, kept, strict=True))
+                diagonal = np.maximum(system.diagonal(c).reshape(-1), MIN_DIAGONAL)
+                total += self.damping * float((diagonal * delta) @ delta) - float(system.equations.g_kept[c] @ delta)
+            if isinstance(linear, ConjugateGradients):
+                total += sum(float(r @ d) for r, d in zip(linear.residual, kept, strict=True))
         return step, 0.5 * total
 
     def accept(self, gain_ratio: float) -> None:
@@ -73,44 +65,5 @@ class LevenbergMarquardt:
         self.damping, self._growth = self.damping * self._growth, self._growth * 2.0
         if self.damping > MAX_DAMPING:
             return False
-        eliminate_again(self._equations, self._system, *self._at, self.damping, self._watch)
+        self._reduction.damp(self.damping)
         return True
-
-
-def linearize_and_eliminate(
-    equations: NormalEquations,
-    system: ReducedSystem,
-    states: States,
-    inputs: list[tuple],
-    damping: float,
-    watch: Stopwatch,
-) -> None:
-    """Form the normal equations; eliminate each chunk's landmarks right after, while they are in cache."""
-    spent = [0.0]
-
-    def eliminate(share: int, chunk) -> None:
-        begin = watch.elapsed()
-        system.eliminate_chunk(share, chunk, damping)
-        if share == 0:
-            spent[0] += watch.elapsed() - begin
-
-    with watch("linearize"):
-        system.clear()
-        equations.linearize(states, inputs, eliminate)
-    watch.move("linearize", "schur", spent[0])
-
-
-def eliminate_again(
-    equations: NormalEquations,
-    system: ReducedSystem,
-    states: States,
-    inputs: list[tuple],
-    damping: float,
-    watch: Stopwatch,
-) -> None:
-    """Eliminate the landmarks for another damping; compact equations are formed anew for that."""
-    if equations.compact:
-        linearize_and_eliminate(equations, system, states, inputs, damping, watch)
-        return
-    with watch("schur"):
-        system.eliminate(damping)

@@ -37,8 +37,8 @@ DENSE_FLOPS_PER_SECOND = 2.5e10
 BYTES_PER_SECOND = 6e9
 #: Iterations of conjugate gradients in a step where poses alone are kept, and otherwise (calibration, planes).
 POSE_ITERATIONS, OTHER_ITERATIONS = 15, 60
-#: Up to this many unknowns a dense factorisation costs next to nothing, and is exact.
-DENSE_UNKNOWNS = 1000
+#: Up to this many unknowns a dense factorisation costs little, and is exact: where poses alone are kept, and otherwise.
+DENSE_POSE_UNKNOWNS, DENSE_OTHER_UNKNOWNS = 360, 1000
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 
@@ -102,9 +102,10 @@ def choose(layout: Layout, name: str) -> LinearSolver:
         members = [member for kept in layout.kept for member in kept.members]
         poses_alone = all(variables[member.group].manifold.kind == "pose" for member in members)
         iterations = POSE_ITERATIONS if poses_alone else OTHER_ITERATIONS
+        small = unknowns <= (DENSE_POSE_UNKNOWNS if poses_alone else DENSE_OTHER_UNKNOWNS)
         dense_seconds = unknowns**3 / 3 / DENSE_FLOPS_PER_SECOND
         pcg_seconds = iterations * 8 * stored / BYTES_PER_SECOND
-        name = "dense" if unknowns <= DENSE_UNKNOWNS or dense_seconds < pcg_seconds else "pcg"
+        name = "dense" if small or dense_seconds < pcg_seconds else "pcg"
     return {"dense": Dense, "sparse": Sparse, "pcg": ConjugateGradients}[name](layout)
 
 
@@ -114,17 +115,24 @@ def multiply(layout: Layout, blocks: Blocks, x: list[FloatArray]) -> list[FloatA
     A class pair may hold fewer blocks than the layout lists; they are then the first ones.
     """
     y = [np.zeros_like(part) for part in x]
-    for (a, b), S in blocks.items():
-        rows, columns = (index[: len(S)] for index in layout.blocks[a, b])
-        _multiply(
-            S, rows, columns, a == b, x[a], x[b], y[a], y[b],
-            width(layout.kept[a].width), width(layout.kept[b].width), width(1),
-        )  # fmt: skip
+    for product in _products(layout, blocks, x, y):
+        _multiply(*product)
     return y
 
 
+def _products(layout: Layout, blocks: Blocks, x: list[FloatArray], y: list[FloatArray]) -> list[tuple]:
+    """Return the arguments of :func:`_multiply` that add the product of the blocks with x to y."""
+    products = []
+    for (a, b), S in blocks.items():
+        rows, columns = (index[: len(S)] for index in layout.blocks[a, b])
+        widths = width(layout.kept[a].width), width(layout.kept[b].width), width(1)
+        products.append((S, rows, columns, a == b, x[a], x[b], y[a], y[b], *widths))
+    return products
+
+
 def _split(layout: Layout, x: FloatArray) -> list[FloatArray]:
-    return [np.ascontiguousarray(x[c.start : c.start + c.count * c.width]) for c in layout.kept]
+    """Return the parts of a flat vector by class, without a copy."""
+    return [x[c.start : c.start + c.count * c.width] for c in layout.kept]
 
 
 class _Stateless:
@@ -230,62 +238,62 @@ class ConjugateGradients:
             self._coarse.follow(states)
 
     def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
+        layout, coarse = self._layout, self._coarse
+        b = np.concatenate(rhs)
+        x, r = np.zeros_like(b), b.copy()
+        p, z, Sp = np.empty_like(b), np.empty_like(b), np.empty_like(b)
+        r_parts, z_parts = _split(layout, r), _split(layout, z)
         inverses = []
-        for c, kept in enumerate(self._layout.kept):
+        for c, kept in enumerate(layout.kept):
             try:
-                inverses.append(np.linalg.inv(blocks[c, c][: kept.count]))
+                inverse = np.linalg.inv(blocks[c, c][: kept.count]).reshape(-1)
             except np.linalg.LinAlgError:
                 return None
-
-        coarse = self._coarse
+            inverses.append((inverse, r_parts[c], z_parts[c], width(kept.width)))
         if coarse is not None:
             coarse.factorize(blocks[coarse.kept_class, coarse.kept_class])
+        products = _products(layout, blocks, _split(layout, p), _split(layout, Sp))
 
-        def precondition(r: list[FloatArray]) -> list[FloatArray]:
-            z = [np.zeros_like(part) for part in r]
-            for part, out, inverse, kept in zip(r, z, inverses, self._layout.kept, strict=True):
-                _apply_blocks(inverse.reshape(-1), part, out, width(kept.width))
+        def precondition() -> float:
+            """Write the preconditioned residual to z and return their product."""
+            z[:] = 0.0
+            for arguments in inverses:
+                _apply_blocks(*arguments)
             if coarse is not None:
-                coarse.correct(r[coarse.kept_class], z[coarse.kept_class])
-            return z
+                coarse.correct(r_parts[coarse.kept_class], z_parts[coarse.kept_class])
+            return float(r @ z)
 
-        x = [np.zeros_like(b) for b in rhs]
-        r = [b.copy() for b in rhs]
-        z = precondition(r)
-        p = [v.copy() for v in z]
-        rz = rz_begin = _dot(r, z)
+        rz = rz_begin = precondition()
+        p[:] = z
         model = 0.0
-        mixed = len(x) > 1
+        mixed = len(layout.kept) > 1
         for k in range(1, self.max_iterations + 1):
             if rz <= 0.0:
                 break
-            Sp = multiply(self._layout, blocks, p)
-            curvature = _dot(p, Sp)
+            Sp[:] = 0.0
+            for arguments in products:
+                _multiply(*arguments)
+            curvature = float(p @ Sp)
             if not curvature > 0.0:
                 if k == 1:
                     return None
                 break
             alpha = rz / curvature
-            for i in range(len(x)):
-                x[i] += alpha * p[i]
-                r[i] -= alpha * Sp[i]
+            x += alpha * p
+            r -= alpha * Sp
             # value of the quadratic model, as in Nash and Sofer, "Assessing a search direction within a
             # truncated-Newton method", 1990
-            value = -0.5 * (_dot(x, rhs) + _dot(x, r))
+            value = -0.5 * float(x @ b + x @ r)
             self.num_iterations = k
             slow = k * (value - model) / value < self.model_tolerance
             if slow and not mixed:
                 break
             model = value
-            z = precondition(r)
-            rz_next = _dot(r, z)
+            rz_next = precondition()
             if slow and rz_next < self.mixed_tolerance**2 * rz_begin:
                 break
-            p = [a + (rz_next / rz) * b for a, b in zip(z, p, strict=True)]
+            p *= rz_next / rz
+            p += z
             rz = rz_next
-        self.residual = r
-        return x if all(np.isfinite(part).all() for part in x) else None
-
-
-def _dot(x: list[FloatArray], y: list[FloatArray]) -> float:
-    return float(sum(a @ b for a, b in zip(x, y, strict=True)))
+        self.residual = r_parts
+        return _split(layout, x) if np.isfinite(x).all() else None

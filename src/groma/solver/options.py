@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from groma.errors import InputError
+from groma.problem.layout import Layout
 
 
 @dataclass(frozen=True)
@@ -51,3 +52,12 @@ class SolverOptions:
                 raise InputError(f"{name} must be a number that is not negative; got {getattr(self, name)}.")
         if self.threads is not None and self.threads < 1:
             raise InputError(f"threads must be at least 1, or None; got {self.threads}.")
+
+
+def first_damping(layout: Layout, options: SolverOptions) -> float:
+    """Lines are more bent than points, and long first steps throw some into minima of their own."""
+    if options.initial_damping is not None:
+        return options.initial_damping
+    variables = layout.problem.variables.values()
+    moving_lines = any(group.manifold.kind == "line" and not group.is_constant for group in variables)
+    return 1e-4 if moving_lines else 1e-5

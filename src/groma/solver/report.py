@@ -8,6 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from groma.problem.layout import Layout
+from groma.problem.linearization import NormalEquations
+from groma.problem.problem import Problem
 from groma.solver.termination import Termination
 
 STAGES = ("setup", "linearize", "schur", "solve", "backsubstitute", "cost")
@@ -114,3 +117,52 @@ class Stopwatch:
     def elapsed(self) -> float:
         """Seconds since the stopwatch was made."""
         return time.perf_counter() - self._start
+
+
+def count_unknowns(problem: Problem) -> int:
+    """Return how many coordinates of variables that some factor touches may move."""
+    total = 0
+    used = {ref.group for factor in problem.factors if len(factor) for _, ref in factor.references()}
+    for name in used:
+        group = problem.variables[name]
+        free = group.free_coordinates()
+        total += len(group) * group.manifold.dof if free is None else int(free.sum())
+    return total
+
+
+def _by_type(layout: Layout, values: list) -> dict:
+    totals: dict = {}
+    for factor, value in zip(layout.factors, values, strict=True):
+        totals[factor.factor.type_name] = totals.get(factor.factor.type_name, 0) + value
+    return totals
+
+
+def note_start(report: SolveReport, layout: Layout, equations: NormalEquations, cost: float) -> None:
+    """Write the costs at the start into the report."""
+    report.initial_cost = report.final_cost = cost
+    report.initial_costs = report.final_costs = _by_type(layout, equations.costs)
+
+
+def note_end(report: SolveReport, layout: Layout, equations: NormalEquations, singular: int) -> None:
+    """Write the costs at the end into the report, and what could not be evaluated or determined."""
+    report.final_costs = _by_type(layout, equations.costs)
+    report.num_degenerate = {name: n for name, n in _by_type(layout, equations.num_degenerate).items() if n}
+    report.num_underdetermined_landmarks = singular
+
+
+def warn_of_oddities(report: SolveReport) -> None:
+    """Put into words what may be wrong."""
+    for name, count in report.num_degenerate.items():
+        report.warnings.append(
+            f"{count} factor(s) of type {name!r} could not be evaluated (degenerate geometry) and were left out."
+        )
+    if report.num_underdetermined_landmarks:
+        report.warnings.append(
+            f"{report.num_underdetermined_landmarks} landmark(s) have a direction that the observations do not "
+            "determine; it was left where it was."
+        )
+    if report.num_residuals < report.num_unknowns:
+        report.warnings.append(
+            f"There are fewer residuals ({report.num_residuals}) than unknowns ({report.num_unknowns}): the result is "
+            "one of many. Hold variables constant, add priors or add observations."
+        )

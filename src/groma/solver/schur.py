@@ -7,7 +7,8 @@ The damped normal equations
           \begin{bmatrix} \delta_c \\ \delta_l \end{bmatrix} = -\begin{bmatrix} g_c \\ g_l \end{bmatrix},
           \qquad D = \mathrm{diag}(J^\top J)
 
-are reduced to the kept blocks. With :math:`N = -(V + \lambda D_l)^{-1}`, block by block,
+are reduced to the kept blocks; some landmarks take a share of the damping, see :data:`LANDMARK_DAMPING`. With
+:math:`N = -(V + \lambda D_l)^{-1}`, block by block,
 
 .. math:: S = H + \lambda D_c + W^\top N W, \qquad S\,\delta_c = -(g_c + W^\top N g_l), \qquad
           \delta_l = N (g_l + W \delta_c).
@@ -24,11 +25,16 @@ import numpy as np
 from groma._numba import loop
 from groma._simd import add_matvec, add_product, set_product, width
 from groma._typing import FloatArray
+from groma.problem._parallel import sum_of
 from groma.problem.layout import Chunk, Layout
-from groma.problem.linearization import NormalEquations, sum_of
+from groma.problem.linearization import NormalEquations
 
 #: Diagonal entries are damped as if they were at least this large.
 MIN_DIAGONAL = 1e-6
+#: Damping of landmarks by kind, relative to that of all other variables; 1 where a kind is not named. The damping is
+#: measured by the diagonal, which says little about the depth of a far point: along its rays the cost is flatter by the
+#: square of the angle between them, and a damping that suits the cameras holds the point back for many steps.
+LANDMARK_DAMPING = {"point": 0.03}
 #: A pivot below this fraction of its diagonal entry means a direction the data do not determine.
 PIVOT_TOLERANCE = 1e-13
 
@@ -181,9 +187,11 @@ class ReducedSystem:
         widest = max([c.width for c in layout.kept], default=0)
         tallest = max([e.dof for e in layout.eliminated], default=0)
         self._Y = [np.zeros(widest * tallest) for _ in range(shares)]
+        kinds = [layout.problem.variables[e.group].manifold.kind for e in layout.eliminated]
+        self._landmark_damping = [LANDMARK_DAMPING.get(kind, 1.0) for kind in kinds]
         self._singular = [0] * shares
         self.num_singular_landmarks = 0
-        #: Of the last steps of the landmarks: the sums of delta D delta and of g delta.
+        #: Of the last steps of the landmarks: the sums of delta D delta, with D as their damping takes it, and g delta.
         self.landmark_squares = self.landmark_slope = 0.0
 
     def clear(self) -> None:
@@ -206,8 +214,9 @@ class ReducedSystem:
             return
         eliminated, equations = self.layout.eliminated[e], self.equations
         dof, N, h = width(eliminated.dof), self.N[e], self.h[e]
+        own = np.array([damping * self._landmark_damping[e]])
         self._singular[share] += invert_blocks(
-            equations.V[e], equations.g_landmarks[e], np.array([damping]), 0, chunk.begin, chunk.end, N, h, dof
+            equations.V[e], equations.g_landmarks[e], own, 0, chunk.begin, chunk.end, N, h, dof
         )
         for c, incidences in eliminated.incidences.items():
             _eliminate(
@@ -295,7 +304,7 @@ class ReducedSystem:
                     self.N[e], sums[e], self.equations.V[e], self.equations.g_landmarks[e],
                     chunk.begin, chunk.end, deltas[e], dof,
                 )  # fmt: skip
-                squares, slope = squares + more[0], slope + more[1]
+                squares, slope = squares + self._landmark_damping[e] * more[0], slope + more[1]
             return squares, slope
 
         parts = self.equations.workers.map(work, len(self.equations.shares))

@@ -24,6 +24,8 @@ STEPS = 12
 LEAST_OVERLAP = 0.25
 #: Correlation of the surroundings of the points above which a prediction needs no help, and what a turn must gain.
 AGREES, GAIN = 0.8, 0.04
+#: Places that a judgement needs.
+LEAST_PLACES = 8
 #: Noise of a turn found so, radians.
 TURN_SIGMA = 0.03
 _SmallImage = npt.NDArray[np.float32]
@@ -115,16 +117,21 @@ def _align(K: FloatArray, before: _SmallImage, now: _SmallImage, start: FloatArr
 
 def surroundings_agree(
     before: _SmallImage, now: _SmallImage, shape: tuple[int, int], pixels: FloatArray, guesses: FloatArray
-) -> float:
-    """Median correlation of the surroundings of points in the first image with those of guesses in the second.
+) -> tuple[float, float]:
+    """Correlation of the surroundings of places in the first image with those of guesses in the second.
 
-    Guesses outside the image count as -1: what leaves it cannot be followed.
+    Returns the median over the places, and the correlation of all surroundings together, in which edges weigh most.
+    Places that leave the image do not count; -1 if fewer than a quarter remain.
     """
     height, width = before.shape
+    with np.errstate(invalid="ignore"):
+        inside = ((guesses >= 0) & (guesses <= (shape[1], shape[0]))).all(axis=1)
+    if 4 * inside.sum() < len(pixels):
+        return -1.0, -1.0
     offset = np.stack(np.meshgrid([-2, -1, 0, 1, 2], [-2, -1, 0, 1, 2]), axis=-1).reshape(1, -1, 2).astype(np.float32)
     scale = np.array([width / shape[1], height / shape[0]])
     patches = []
-    for image, places in ((before, pixels), (now, guesses)):
+    for image, places in ((before, pixels[inside]), (now, guesses[inside])):
         at = (places * scale - 0.5)[:, None].astype(np.float32) + offset
         values = cv2.remap(
             image, np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1]), cv2.INTER_LINEAR,
@@ -132,18 +139,30 @@ def surroundings_agree(
         )  # fmt: skip
         patches.append(np.asarray(values, np.float64))
     a, b = (patch - patch.mean(axis=1, keepdims=True) for patch in patches)
-    score = (a * b).sum(axis=1) / np.sqrt(((a * a).sum(axis=1) + 4.0) * ((b * b).sum(axis=1) + 4.0))
-    with np.errstate(invalid="ignore"):
-        outside = ~((guesses >= 0) & (guesses <= (shape[1], shape[0]))).all(axis=1)
-    return float(np.median(np.where(outside, -1.0, score)))
+    aa, bb, ab = (a * a).sum(axis=1), (b * b).sum(axis=1), (a * b).sum(axis=1)
+    each = ab / np.sqrt((aa + 4.0) * (bb + 4.0))
+    return float(np.median(each)), float(ab.sum() / np.sqrt((aa.sum() + 4.0) * (bb.sum() + 4.0)))
+
+
+def turned(
+    camera: TrackCamera, before: npt.NDArray[np.uint8], now: npt.NDArray[np.uint8], pose: FloatArray
+) -> FloatArray:
+    """Return the pose (7,) of a frame whose predecessor had one, from the turn between their images alone."""
+    return _after(turn_between(camera, small_image(before), small_image(now), [np.eye(3)]), pose)
+
+
+def _after(turn: FloatArray, pose: FloatArray) -> FloatArray:
+    """Turn a camera where it is: pose (7,) after a rotation (3, 3) now_from_before."""
+    by_turn = np.concatenate([quaternion.from_matrix(turn), np.zeros(3)])
+    return se3.compose(by_turn[None], pose[None])[0]
 
 
 def turned_prediction(
     camera: TrackCamera,
     before: npt.NDArray[np.uint8],
     now: npt.NDArray[np.uint8],
-    pixels: FloatArray,
-    places: FloatArray,
+    followed: tuple[FloatArray, FloatArray],
+    spread: tuple[FloatArray, FloatArray],
     previous: FloatArray,
     predicted: FloatArray,
 ) -> FloatArray | None:
@@ -155,34 +174,34 @@ def turned_prediction(
         The camera.
     before, now : (H, W) uint8
         The frame before, whose pose is known, and the present one.
-    pixels, places : (n, 2), (n, 3)
-        Points in the frame before, and where they are in the world.
+    followed : (n, 2), (n, 3)
+        Pixels of followed points in the frame before, and where they are in the world: these ask for a turn.
+    spread : (m, 2), (m, 3)
+        The same spread over the image where depth is known there: these judge it, with the others.
     previous, predicted : (7,)
         Pose of the frame before, and the prediction for this one.
     """
-    if len(pixels) < 8:
-        return None
     small = small_image(before), small_image(now)
-    start = camera.project(into(previous, places))
 
-    def agree(pose: FloatArray) -> float:
-        moved = pixels + camera.project(into(pose, places)) - start
+    def agree(pose: FloatArray, pixels: FloatArray, places: FloatArray) -> tuple[float, float]:
+        moved = pixels + camera.project(into(pose, places)) - camera.project(into(previous, places))
         return surroundings_agree(*small, now.shape, pixels, np.where(np.isfinite(moved), moved, -1e6))
 
-    expected = agree(predicted)
-    if expected > AGREES:
+    if len(followed[0]) >= LEAST_PLACES and agree(predicted, *followed)[0] > AGREES:
         return None
+    every = np.concatenate([followed[0], spread[0]]), np.concatenate([followed[1], spread[1]])
+    if len(every[0]) < LEAST_PLACES:
+        return None
+    expected = agree(predicted, *every)[1]
     turns = [rotation(predicted) @ rotation(previous).T, np.eye(3)]
-    turn = turn_between(camera, *small, turns)
-    by_turn = np.concatenate([quaternion.from_matrix(turn), np.zeros(3)])
     # The same turn, with the way that was predicted or without any.
     center = se3.inverse(predicted[None])[0, 4:]
-    stayed = se3.compose(by_turn[None], previous[None])[0]
+    stayed = _after(turn_between(camera, *small, turns), previous)
     went = stayed.copy()
     went[4:] = -rotation(stayed) @ center
-    scores = [agree(stayed), agree(went)]
+    scores = [agree(pose, *every)[1] for pose in (stayed, went)]
     k = int(np.argmax(scores))
     return (stayed, went)[k] if scores[k] > expected + GAIN else None
 
 
-__all__ = ["small_image", "surroundings_agree", "turn_between", "turned_prediction"]
+__all__ = ["small_image", "surroundings_agree", "turn_between", "turned", "turned_prediction"]

@@ -46,7 +46,7 @@ def points_of_features(
     depth_sigma : (n,)
         Standard deviation of their depths, where known.
     sigma : float
-        Standard deviation of their pixels.
+        Standard deviation of their pixels, at the finest scale.
     """
     points, features = track_map.points, keyframe.features
     new = points.extend(len(rows))
@@ -56,7 +56,7 @@ def points_of_features(
     points.pixel[new] = points.first_pixel[new] = pixel
     features.point[rows] = new
     unknown = np.full(len(new), np.nan)
-    table = PointMeasurements(new, pixel, np.full(len(new), sigma), features.depth[rows], depth_sigma, unknown)
+    table = PointMeasurements(new, pixel, sigma * features.scale[rows], features.depth[rows], depth_sigma, unknown)
     keyframe.measured = replace(keyframe.measured, points=PointMeasurements.stack([keyframe.measured.points, table]))
     return new
 
@@ -95,7 +95,7 @@ def place_by_motion(
     points.xyz[index[begun]], points.state[index[begun]] = places[begun], ALIVE
     fresh = ~begun
     unknown = np.full(int(fresh.sum()), np.nan)
-    sigma = 1.5 * data.options.point_sigma_px
+    sigma = data.options.point_sigma_px
     index[fresh] = points_of_features(track_map, keyframe, first[fresh], places[fresh], unknown, sigma)
     features.point[second] = index
     tracks = PointTracks(index, features.pixel[second])

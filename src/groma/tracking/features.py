@@ -35,6 +35,8 @@ from groma.tracking.stereo import DISPARITY_SIGMA, Disparities, dense_disparitie
 FAR_SHARE = 0.06
 #: Errors of depth beside a segment: so many neighbours err alike.
 SEGMENT_NOISE = DepthNoise(DEPTH_FLOOR, INVERSE_DEPTH_SIGMA, 0.0, correlation=6.0, tilt=0.0, shift=0.0)
+#: Pixels from one place of the grid of depths to the next.
+GRID = 20
 Descriptors = npt.NDArray[np.uint8]
 
 
@@ -42,9 +44,10 @@ Descriptors = npt.NDArray[np.uint8]
 class Features:
     """Described features (ORB) of a frame."""
 
-    #: (N, 2) pixels, (N,) response.
+    #: (N, 2) pixels, (N,) response, (N,) size of a pixel of the image in the pyramid where each was found, pixels.
     pixel: FloatArray
     response: FloatArray
+    scale: FloatArray
     #: (N, 32) descriptors.
     descriptor: Descriptors
     #: (N,) depth; NaN where unknown.
@@ -142,6 +145,11 @@ class FrameFeatures:
             return match_columns(self.gray, right, pixels, np.full(len(pixels), np.nan), self.disparities)
         return match_columns(self.gray, right, pixels, expected, None)
 
+    @cached_property
+    def depth_grid(self) -> FloatArray:
+        """Depths at :func:`grid_pixels`; NaN where unknown."""
+        return self.depths(grid_pixels(self.camera))
+
     def depth_sigma(self, depth: FloatArray) -> FloatArray:
         """Standard deviations of depths from :meth:`depths`."""
         if self.frame.right is not None and self.frame.depth is None:
@@ -164,16 +172,30 @@ class FrameFeatures:
         return unknown, unknown.copy()
 
 
+def grid_pixels(camera: TrackCamera) -> FloatArray:
+    """Pixels (N, 2) of an even grid over the image, row by row: the middles of cells."""
+    rows, columns = grid_shape(camera)
+    v, u = np.mgrid[0:rows, 0:columns].reshape(2, -1)
+    return (np.column_stack([u, v]) + 0.5) * (camera.width / columns, camera.height / rows)
+
+
+def grid_shape(camera: TrackCamera) -> tuple[int, int]:
+    """Rows and columns of :func:`grid_pixels`."""
+    return max(camera.height // GRID, 2), max(camera.width // GRID, 2)
+
+
 def describe(gray: npt.NDArray[np.uint8], count: int, depths: Callable[[FloatArray], FloatArray]) -> Features:
     """Find and describe ORB features."""
     orb = cv2.ORB.create(nfeatures=count, fastThreshold=7)
     keypoints, descriptor = orb.detectAndCompute(gray, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
     if not keypoints:
         none = np.zeros(0)
-        return Features(np.zeros((0, 2)), none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
+        return Features(np.zeros((0, 2)), none, none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
     pixel = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64) + 0.5
     response = np.array([keypoint.response for keypoint in keypoints])
-    return Features(pixel, response, np.asarray(descriptor, np.uint8), depths(pixel), np.full(len(pixel), -1))
+    scale = orb.getScaleFactor() ** np.array([keypoint.octave for keypoint in keypoints], np.float64)
+    none = np.full(len(pixel), -1)
+    return Features(pixel, response, scale, np.asarray(descriptor, np.uint8), depths(pixel), none)
 
 
-__all__ = ["Descriptors", "DetectedSegments", "Features", "FrameFeatures"]
+__all__ = ["Descriptors", "DetectedSegments", "Features", "FrameFeatures", "grid_pixels", "grid_shape"]

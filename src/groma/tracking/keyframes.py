@@ -100,7 +100,8 @@ def add_keyframe(
         segments, lines = _add_lines(track_map, camera, data, pose, followed.lines, index, options)
     planes = _add_planes(track_map, data, pose) if data.planes is not None else PlaneMeasurements.empty()
     measured = Measurements(measure_points(data, tracks, options, track_map, pose, camera), lines, planes)
-    keyframe = Keyframe(index, data.frame.timestamp, data.frame.name, pose.copy(), data.gray, measured, data.features)
+    name, time = data.frame.name, data.frame.timestamp
+    keyframe = Keyframe(index, time, name, pose.copy(), data.gray, measured, data.features, data.depth_grid)
     alive = measured.points.index[track_map.points.alive[measured.points.index]]
     if len(alive):
         keyframe.depth = max(float(np.median(into(pose, track_map.points.xyz[alive])[:, 2])), 1e-6)

@@ -23,6 +23,7 @@ from groma.scene.landmarks import Lines
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.camera import TrackCamera, back, into, planes_back, planes_into
+from groma.tracking.depth_check import DENIES, depth_agreement
 from groma.tracking.feature_points import match_features
 from groma.tracking.landmarks import DEAD
 from groma.tracking.relocalise import feature_places, pose_from_matches
@@ -111,7 +112,9 @@ def agreeing_pose(
     known = np.isfinite(places[:, 0])
     first, second, places = first[known], second[known], places[known]
     found = pose_from_matches(camera, places, newest.features.pixel[second], least)
-    return None if found is None else (found[0], first[found[1]], second[found[1]])
+    if found is None or depth_agreement(camera, [keyframe], newest.depth_grid, found[0])[1] > DENIES:
+        return None
+    return found[0], first[found[1]], second[found[1]]
 
 
 def _spread_error(track_map: TrackMap) -> None:

@@ -255,7 +255,7 @@ def _temporary_points(known: KnownFeatures, pairs: IntArray, data: FrameFeatures
     rows = pairs[:, 1] if data.options.points else pairs[:0, 1]
     count = len(rows)
     depth = data.features.depth[rows]
-    sigma = np.full(count, 1.5 * data.options.point_sigma_px)
+    sigma = data.features.scale[rows] * data.options.point_sigma_px
     depth_sigma = 1.5 * data.depth_sigma(depth)
     unknown = np.full(count, np.nan)
     table = PointMeasurements(np.arange(count), data.features.pixel[rows], sigma, depth, depth_sigma, unknown)
@@ -278,7 +278,7 @@ def promote(track_map: TrackMap, found: Found, data: FrameFeatures) -> PointTrac
         if len(fresh):
             sigma = data.depth_sigma(keyframe.features.depth[own[fresh]])
             places = known.places[pairs[fresh, 0]]
-            new = points_of_features(track_map, keyframe, own[fresh], places, sigma, 1.5 * data.options.point_sigma_px)
+            new = points_of_features(track_map, keyframe, own[fresh], places, sigma, data.options.point_sigma_px)
             index[fresh], usable[fresh] = new, True
         rows = np.flatnonzero(usable)
         features.point[here[rows]] = index[rows]

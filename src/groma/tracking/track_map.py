@@ -28,6 +28,8 @@ class Keyframe:
     gray: npt.NDArray[np.uint8] | None
     measured: Measurements
     features: Features
+    #: Depths on a grid of pixels; NaN where unknown.
+    depth_grid: FloatArray
     #: Median depth of its points, scene units.
     depth: float = 1.0
     #: False once it was found to repeat what others see; its pose is then told by another's.
@@ -40,7 +42,8 @@ class Keyframe:
         self.gray = None
         self.measured = Measurements.empty()
         none = np.zeros(0)
-        self.features = Features(np.zeros((0, 2)), none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
+        self.features = Features(np.zeros((0, 2)), none, none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
+        self.depth_grid = np.full(len(self.depth_grid), np.nan)
 
 
 @dataclass

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,10 +23,11 @@ from groma.io.sequences.frame import Frame, SequenceCamera
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
 from groma.solver.report import SolveReport
-from groma.tracking.camera import TrackCamera
+from groma.tracking.belief import Belief, is_near
+from groma.tracking.camera import TrackCamera, back
 from groma.tracking.checks import FrameChecks
-from groma.tracking.coarse_alignment import TURN_SIGMA, turned_prediction
-from groma.tracking.features import FrameFeatures
+from groma.tracking.coarse_alignment import TURN_SIGMA, turned, turned_prediction
+from groma.tracking.features import FrameFeatures, grid_pixels
 from groma.tracking.following import follow_frame
 from groma.tracking.initialise import Initialiser
 from groma.tracking.keyframes import Followed, keyframe_nearby, wants_keyframe
@@ -48,29 +50,14 @@ from groma.tracking.outcome import (
 from groma.tracking.parts import Part, about_parts
 from groma.tracking.points import find_again
 from groma.tracking.prediction import MotionModel
-from groma.tracking.relocalise import Found, find_pose, promote
+from groma.tracking.relocalise import Found, promote
 from groma.tracking.result import map_to_scene
 from groma.tracking.track_map import TrackMap
 
-#: Keyframes that are tried first, and at most, to find a lost frame.
-NEAREST, MOST = 3, 30
-#: Least number of agreeing measurements (a line counts twice, a plane six times), and least share.
-LEAST_SCORE, LEAST_SHARE = 18.0, 0.35
-#: Least number of agreeing points and lines (counted twice), where either is followed at all.
-LEAST_EVIDENCE = 16.0
 #: After this many lost frames and seconds a new map is begun.
 RESTART_FRAMES, RESTART_SECONDS = 5, 0.5
-#: A pose found by features needs this score, or this share of the features in view.
-CERTAIN, LEAST_AGREEING = 40.0, 0.03
-#: A pose found without a prediction needs this score; less where no points are followed.
-ANYWHERE_SCORE = 36.0
-#: Below this score most of the planes must agree, where the frame sees any of the map.
-DOUBTFUL_SCORE = 80.0
-
-
-def _evidence(counts: dict[str, int]) -> float:
-    """Weight of points and lines alone: planes slide along each other, so a pose should not hang on them."""
-    return counts["points"] + 2.0 * counts["lines"]
+#: After this many lost frames, the frame is no longer looked for near where the camera was.
+NEAR_FRAMES = 5
 
 
 class Tracker:
@@ -94,8 +81,10 @@ class Tracker:
         self._mapper = Mapper(self.camera, self.options)
         self._present = Present()
         self._history = History()
-        self._least_evidence = LEAST_EVIDENCE if self.options.points or self.options.lines else 0.0
+        self._belief = Belief(self.camera, self.options)
         self._lost_for, self._lost_since = 0, 0.0
+        #: The frame before, if it was lost, and where it may have been taken.
+        self._guess = np.zeros((0, 0), np.uint8), self._present.pose
         #: What happened to the track between its maps, for the reader.
         self._breaks: list[tuple[float, float]] = []
         self._finished = False
@@ -135,18 +124,19 @@ class Tracker:
             return self._start(data, began, watch)
         predicted, prior_sigma = self._motion.predict(present.pose, frame.timestamp)
         estimate, doubtful, found = None, None, None
-        status, followed = TRACKED, Followed.nothing()
+        followed = Followed.nothing()
         assert present.data is not None
-        if self._lost_for == 0:
+        if self._lost_for <= NEAR_FRAMES:
             with watch("turn"):
                 predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
             estimate, followed = follow_frame(
                 self.map, self.camera, self.options, present.data, data, present.followed, present.pose, predicted,
                 prior_sigma, watch,
             )  # fmt: skip
-            if not self._trustworthy(estimate, followed):
+            if estimate is not None and not self._belief.trusts(self.map, estimate):
                 doubtful, estimate = estimate, None
         if estimate is None:
+            before = present.pose
             if self._lost_for == 0 and present.frames_since_keyframe > 0:
                 # The frame before is the nearest there is to look for.
                 if mapper.due is not None:
@@ -155,11 +145,15 @@ class Tracker:
                 mapper.make_keyframe(present, watch)
             with watch("find"):
                 found = self._find(data, predicted, prior_sigma, doubtful)
-            if found is None:
-                return self._lose(data, began, watch)
-            estimate, status = found.estimate, FOUND if self._lost_for else TRACKED
-            followed = Followed(promote(self.map, found, data), found.lines)
-        pose = estimate.pose
+            if found is not None:
+                estimate, followed = found.estimate, Followed(promote(self.map, found, data), found.lines)
+            elif doubtful is not None and self._belief.confirms(self.map, data, doubtful):
+                # The new keyframe may have moved the map.
+                moved = se3.compose(se3.inverse(before[None]), present.pose[None])
+                estimate = replace(doubtful, pose=se3.compose(doubtful.pose[None], moved)[0])
+            else:
+                return self._lose(data, predicted, began, watch)
+        pose, status = estimate.pose, FOUND if self._lost_for else TRACKED
         with watch("again"):
             followed = self._find_again(data, pose, followed)
         self._motion.update(present.pose if self._lost_for == 0 else None, pose, frame.timestamp)
@@ -184,70 +178,45 @@ class Tracker:
         return self._report(frame, status, estimate, is_keyframe, began, watch)
 
     def _with_turn(self, data: FrameFeatures, predicted: FloatArray, prior_sigma: FloatArray):
-        """Put a turn that the whole image shows in place of a prediction that the image denies."""
+        """Put a turn that the whole image shows in place of a prediction that the image denies.
+
+        While the frame before has no pose, turns from frame to frame tell roughly where the camera looks.
+        """
         present, points = self._present, self.map.points
         assert present.data is not None
+        if self._lost_for:
+            gray, pose = self._guess
+            pose = turned(self.camera, gray, data.gray, pose)
+            return pose, np.maximum(prior_sigma, TURN_SIGMA * (1.0 + self._lost_for))
         tracks = present.followed.points
         tracks = tracks.take(points.alive[tracks.index])
-        turned = turned_prediction(
-            self.camera, present.data.gray, data.gray, tracks.pixel, points.xyz[tracks.index], present.pose, predicted
-        )
-        if turned is None:
+        better = turned_prediction(
+            self.camera, present.data.gray, data.gray, (tracks.pixel, points.xyz[tracks.index]),
+            self._spread(present.data, present.pose), present.pose, predicted,
+        )  # fmt: skip
+        if better is None:
             return predicted, prior_sigma
-        return turned, np.maximum(prior_sigma, [0.0] * 3 + [TURN_SIGMA] * 3)
+        return better, np.maximum(prior_sigma, [0.0] * 3 + [TURN_SIGMA] * 3)
 
-    def _trustworthy(self, estimate: PoseEstimate | None, followed: Followed) -> bool:
-        """Whether enough agrees with a pose, and enough of what was followed."""
-        if estimate is None:
-            return False
-        counts = estimate.counts
-        score = counts["points"] + 2.0 * counts["lines"] + 6.0 * counts["planes"]
-        looked_at = len(estimate.points) + len(estimate.lines)
-        share = (counts["points"] + counts["lines"]) / looked_at if looked_at else 1.0
-        last = self.map.near.measured
-        before = len(last.points) + len(last.lines)
-        kept = (counts["points"] + counts["lines"]) / max(before, 1)
-        if len(estimate.planes) >= 2 and 2 * counts["planes"] < len(estimate.planes) and score < DOUBTFUL_SCORE:
-            return False
-        enough = score >= LEAST_SCORE and _evidence(counts) >= self._least_evidence
-        return enough and share >= LEAST_SHARE and kept >= 0.12 and len(estimate.weak) < 6
+    def _spread(self, data: FrameFeatures, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels spread over a frame and their places, where it has a depth image."""
+        if data.depth is None:
+            return np.zeros((0, 2)), np.zeros((0, 3))
+        known = np.isfinite(data.depth_grid)
+        pixel = grid_pixels(self.camera)[known]
+        return pixel, back(pose, self.camera.bearings(pixel) * data.depth_grid[known, None])
 
-    def _find(
-        self, data: FrameFeatures, predicted: FloatArray, prior_sigma: FloatArray, doubtful: PoseEstimate | None
-    ) -> Found | None:
+    def _find(self, data, predicted, prior_sigma, doubtful: PoseEstimate | None) -> Found | None:
         """Find a pose by described features: near the last keyframes first, then anywhere."""
-        living = self.map.living()
-        if self._lost_for == 0:
-            nearest = living[::-1][:NEAREST]
+        if self._lost_for <= NEAR_FRAMES:
             guesses = [predicted, self._present.pose] + ([doubtful.pose] if doubtful is not None else [])
-            found = find_pose(self.map, self.camera, data, nearest, guesses, predicted, 3.0 * prior_sigma)
-            if (
-                found is not None
-                and found.score >= LEAST_SCORE
-                and (found.score >= CERTAIN or found.share >= LEAST_AGREEING or not self.options.points)
-                and _evidence(found.estimate.counts) >= 0.75 * self._least_evidence
-                and len(found.estimate.weak) <= 2
-            ):
+            found = self._belief.find_near(self.map, data, guesses, predicted, prior_sigma)
+            if found is not None:
                 return found
-        # Anywhere: recent keyframes and an even choice of the others.
-        step = max(1, len(living) // MOST)
-        anywhere = living[::-1][::step][:MOST]
-        wide = np.array([1e3] * 3 + [10.0] * 3)
-        best = None
-        for keyframe in anywhere:
-            found = find_pose(self.map, self.camera, data, [keyframe], [], keyframe.pose, wide)
-            if found is not None and (best is None or found.score > best.score):
-                best = found
-            if best is not None and best.score > 120:
-                break
-        least = ANYWHERE_SCORE if self.options.points else 0.75 * ANYWHERE_SCORE
-        if best is None or best.score < least or best.estimate.weak:
-            return None
-        # Two places may have like features; planes that are seen and are not there tell them apart.
-        seen = 0 if data.planes is None else len(data.planes)
-        if seen >= 2 and not best.estimate.planes.any() and best.score < DOUBTFUL_SCORE:
-            return None
-        return best
+        found = self._belief.find_anywhere(self.map, data)
+        if found is None or self._lost_for > NEAR_FRAMES:
+            return found
+        return found if is_near(found.estimate.pose, predicted, prior_sigma) else None
 
     def _find_again(self, data: FrameFeatures, pose: FloatArray, followed: Followed) -> Followed:
         """Look for points of the map that are in view but not followed."""
@@ -314,11 +283,12 @@ class Tracker:
             frame.timestamp, None, SKIPPED, {}, {"total": time.perf_counter() - began}, reason=reason
         )  # fmt: skip
 
-    def _lose(self, data: FrameFeatures, began: float, watch: Stopwatch) -> TrackedFrame:
+    def _lose(self, data: FrameFeatures, guess: FloatArray, began: float, watch: Stopwatch) -> TrackedFrame:
         now = data.frame.timestamp
         if self._lost_for == 0:
             self._lost_since = now
         self._lost_for += 1
+        self._guess = data.gray, guess
         if self._lost_for > RESTART_FRAMES and now - self._lost_since > RESTART_SECONDS:
             self._mapper.begin_anew(self._present)
             self._present, self._motion = Present(), MotionModel()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Small charts as inline SVG: histogram, convergence curve, bars. Colours come from the page's style sheet."""
+"""Small charts as inline SVG: histogram, convergence curve, bars, spreads. Colours come from the page's style sheet."""
 
 from __future__ import annotations
 
@@ -230,6 +230,53 @@ def tracks(lengths: Mapping[str, IntArray]) -> str:
     body.append(_text((_LEFT + WIDTH) / 2, HEIGHT - 5, "images that observe it"))
     body.append(_text(_LEFT - 8, _TOP + 10, f"{100 * top:.2g} %", "end") + _text(_LEFT - 8, bottom, "0", "end"))
     return _svg(body)
+
+
+def spreads(rows: Sequence[tuple[str, Sequence[float], float | None]], axis: str) -> str:
+    """Return distributions one below the other: from the 5th to the 95th percentile, the middle half, the median.
+
+    Parameters
+    ----------
+    rows : sequence of (words, percentiles, mark)
+        Five percentiles (5, 25, 50, 75, 95) in the unit of the axis, and a value to mark with a ring, or None.
+    axis : str
+        What the axis shows.
+    """
+    left, step, top = 172, 40, 8
+    height = top + step * len(rows) + _BOTTOM
+    bottom = top + step * len(rows)
+    most = max([max(*values, mark or 0.0) for _, values, mark in rows], default=0.0) or 1.0
+    ticks = _even_ticks(most)
+
+    def x(value: float) -> float:
+        return left + value / ticks[-1] * (WIDTH - _RIGHT - 14 - left)
+
+    body = []
+    for value in ticks:
+        body.append(_line(x(value), top, x(value), bottom, "grid") + _text(x(value), bottom + 16, _number(value)))
+    for number, (words, values, mark) in enumerate(rows):
+        y = top + step * (number + 0.5)
+        low, first, middle, third, high = (x(value) for value in values)
+        told = f"{words}: half of them below {_number(values[2])}, 95 % below {_number(values[4])}"
+        told += "" if mark is None else f"; predicted {_number(mark)}"
+        ring = "" if mark is None else f'<circle class="rejected" cx="{x(mark):.1f}" cy="{y:.1f}" r="5"/>'
+        body.append(
+            f"<g><title>{html.escape(told)}</title>{_text(left - 12, y + 4, words, 'end')}"
+            f"{_line(low, y, high, y, 'axis')}"
+            f'<rect class="after" x="{first:.1f}" y="{y - 9:.1f}" width="{max(third - first, 1.0):.1f}" height="18" '
+            f'rx="3" opacity="0.62"/>'
+            f'<rect class="after" x="{middle - 1.5:.1f}" y="{y - 12:.1f}" width="3" height="24"/>{ring}</g>'
+        )
+    body.append(_line(left, bottom, WIDTH - _RIGHT, bottom, "axis"))
+    body.append(_text((left + WIDTH) / 2, height - 5, axis))
+    return _svg(body, height)
+
+
+def _even_ticks(most: float) -> list[float]:
+    """Return three to six round values from zero up to at least ``most``."""
+    unit = 10.0 ** math.floor(math.log10(most))
+    step = next(step * unit for step in (0.2, 0.25, 0.5, 1.0, 2.0) if most <= 5 * step * unit)
+    return [step * k for k in range(math.ceil(most / step - 1e-9) + 1)]
 
 
 def shares(parts: Sequence[tuple[str, int, str]]) -> str:

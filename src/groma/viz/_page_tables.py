@@ -72,7 +72,7 @@ def tiles(scene: Scene, before: Drawable | None, after: Drawable, numbers: Mappi
     if numbers is not None:
         cells += [
             (change(numbers["initial_cost"], numbers["final_cost"], ""), "robust cost"),
-            (f"{numbers['iterations']} <i>in</i> {numbers['seconds']['total']:.2f} s", "steps"),
+            (f"{numbers['iterations']}", "steps"),
         ]
     cells += [(f"{count:,}", name) for name, count in counts_of(scene, after) if count][: 5 - len(cells)]
     return "".join(f'<div class="tile"><b>{value}</b><span>{label}</span></div>' for value, label in cells)
@@ -167,38 +167,51 @@ def diagnosis_card(diagnosis: Mapping[str, Any] | None) -> str:
 
 
 def contributions_card(entries: Sequence[Mapping[str, Any]] | None) -> str:
-    """Return adjustments with more and more kinds of landmarks, as a table."""
+    """Return adjustments with more and more kinds of landmarks: how far the camera centres are, and a table."""
     if not entries:
         return ""
     pixels = list(dict.fromkeys(name for entry in entries for name in entry["rmse_px"]))
-    columns: list[tuple[str, Callable[[Mapping[str, Any]], Any]]] = [
+    measures: list[tuple[str, Callable[[Mapping[str, Any]], Any]]] = [
         ("landmarks", lambda entry: f"{entry['num_landmarks']:,}"),
         ("relations", lambda entry: f"{entry['num_relations']:,}"),
         ("given up", lambda entry: f"{entry['num_dropped']:,}"),
         *((f"{name}, px", lambda entry, name=name: entry["rmse_px"].get(name)) for name in pixels),
-        ("cameras moved", lambda entry: entry["moved"]),
-        ("centre, predicted", lambda entry: entry["center_sigma"]),
-        ("centre error", lambda entry: entry["center_error"]),
-        ("rotation error, °", lambda entry: entry["rotation_error_deg"]),
+        ("moved", lambda entry: entry["moved"] if entry["moved"] else None),
+        ("predicted", lambda entry: entry["center_sigma"]),
+        ("error", lambda entry: entry["center_error"]),
+        ("rotation, °", lambda entry: entry["rotation_error_deg"]),
         ("steps", lambda entry: f"{entry['iterations']}"),
     ]
-    columns = [(name, value) for name, value in columns if any(value(entry) is not None for entry in entries)]
     rows = [
-        [
-            ("and " if number else "") + entry["added"],
-            *(
-                "–" if cell is None else cell if isinstance(cell, str) else _digits(cell)
-                for cell in (value(entry) for _, value in columns)
-            ),
-        ]
-        for number, entry in enumerate(entries)
+        [name, *("–" if cell is None else cell if isinstance(cell, str) else _digits(cell) for cell in cells)]
+        for name, cells in ((name, [value(entry) for entry in entries]) for name, value in measures)
+        if any(cell is not None for cell in cells)
     ]
+    head = [("+ " if number else "") + entry["added"] for number, entry in enumerate(entries)]
+    against = [entry for entry in entries if entry["center_error_percentiles"]]
+    shown = against or entries[1:]
+    chart, key = "", ""
+    if shown:
+        field = "center_error_percentiles" if against else "moved_percentiles"
+        whence = "the reference, in its units" if against else "where points alone put them, scene units"
+        chart = _charts.spreads(
+            [(head[entries.index(entry)], entry[field], entry["center_sigma"] if against else None) for entry in shown],
+            f"distance of the camera centres from {whence}",
+        )
+        key = " Box: the middle half of the cameras, line: from 5 to 95 of 100."
+        if against and any(entry["center_sigma"] is not None for entry in shown):
+            key = key.removesuffix(".") + ", ring: predicted."
     caption = (
-        "The same scene adjusted by points alone, then by more and more. Residuals: rms, wrong matches in full. "
-        "Cameras moved: median distance from where points alone put them; predicted: median standard deviation of the "
-        "camera centres, seen from the first; both in scene units."
+        "The same scene adjusted by points alone, then by more and more. Residuals: rms, wrong matches in full. Moved: "
+        "median distance of the camera centres from where points alone put them; predicted: their median standard "
+        "deviation, seen from the first camera"
+        + ("; error: rms; all in units of the reference." if against else "; in scene units.")
+        + key
     )
-    return table("With and without", caption, ["adjusted", *(name for name, _ in columns)], rows)
+    missing = sorted({entry["center_sigma_missing"] for entry in entries if entry["center_sigma_missing"]})
+    if missing:
+        caption += " Not predicted: " + "; ".join(missing).rstrip(".") + "."
+    return card("With and without", html.escape(caption), chart + _table([" ", *head], rows))
 
 
 def card(name: str, caption: str, content: str) -> str:
@@ -223,6 +236,8 @@ def _residual_table(before: Drawable | None, after: Drawable) -> str:
     if any(unseen):
         rows.append(["not visible from their camera", *(f"{count:,}" for count in unseen)])
     caption = "Residuals of all observations. The rms counts wrong matches in full; the median does not notice them."
+    if before is not None:
+        caption += " Kinds that are adjusted together share what is left: one may grow while the robust cost falls."
     return table("Numbers", caption, ["", *columns], rows) if rows else ""
 
 
@@ -283,13 +298,17 @@ def _direction_table(scene: Scene) -> str:
 
 def table(name: str, caption: str, head: list[str], rows: list[list[str]], marks: Sequence[str] = ()) -> str:
     """Return a card with a table; everything is text, and ``marks`` are colours before the rows."""
+    return card(name, html.escape(caption), _table(head, rows, marks))
+
+
+def _table(head: list[str], rows: list[list[str]], marks: Sequence[str] = ()) -> str:
     top = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
     body = ""
     for number, row in enumerate(rows):
         mark = f'<i class="mark" style="background:{marks[number]}"></i>' if marks else ""
         cells = "".join(f"<td>{mark if not place else ''}{html.escape(cell)}</td>" for place, cell in enumerate(row))
         body += f"<tr>{cells}</tr>"
-    return card(name, html.escape(caption), f'<div class="wide"><table><tr>{top}</tr>{body}</table></div>')
+    return f'<div class="wide"><table><tr>{top}</tr>{body}</table></div>'
 
 
 # ------------------------------------------------------------------------------------------------------- Statistics

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from groma._version import __version__
 from groma.errors import InputError, OutputError
 from groma.viz import _page_tables
 from groma.viz._drawable import Drawable, drawable
@@ -162,6 +163,4 @@ def _stages(numbers: Mapping[str, Any] | None) -> list[dict[str, Any]]:
 
 
 def _footer() -> str:
-    from groma import __version__
-
     return f"Written by groma {__version__}. Pixels: the centre of the first pixel is (0.5, 0.5)."

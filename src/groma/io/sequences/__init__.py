@@ -6,12 +6,13 @@ from __future__ import annotations
 import os
 
 from groma.errors import InputError
+from groma.io._endings import VIDEOS
 from groma.io._reading import existing
 from groma.io.sequences._calibration import CameraLike, calibration_of
 from groma.io.sequences._reader import Selection
 from groma.io.sequences.euroc import euroc_root, open_euroc
 from groma.io.sequences.frame import Frame, Kind, Sequence, SequenceCamera
-from groma.io.sequences.images import VIDEOS, image_files, open_images, open_video
+from groma.io.sequences.images import image_files, open_images, open_video
 from groma.io.sequences.kitti import is_kitti, open_kitti
 from groma.io.sequences.seven_scenes import open_seven_scenes, seven_scenes_root
 from groma.io.sequences.tum_rgbd import is_tum_rgbd, open_tum_rgbd
@@ -79,7 +80,7 @@ def open_sequence(
         return open_images(place, calibration, selection)
     raise InputError(
         f"{place} is no sequence that groma knows: expected rgb.txt or associations.txt (TUM), mav0/cam0 (EuRoC), "
-        "image_0 (KITTI), frame-000000.color.png (7-Scenes), or images."
+        "image_0 (KITTI), frame-000000.color.png (7-Scenes), or images. Check the path."
     )
 
 

@@ -17,15 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from groma.errors import FileFormatError, InputError
+from groma.io._endings import IMAGES
 from groma.io._reading import reading
 from groma.io.sequences._calibration import Calibration, find_calibration, rectification
 from groma.io.sequences._reader import Entry, FileSequence, Selection, read_ahead, simple_sequence
 from groma.io.sequences.frame import Frame, Kind, SequenceCamera
 from groma.io.trajectories import Trajectory, read_trajectory
 
-#: Endings of names, in lower case.
-IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 #: Frames a second where nothing says it.
 RATE = 30.0
 

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Lines of segments of a kind that is found again, and lines of segments of a kind that is not.
+
+The border of a blotch, a vein of marble and a blade of grass give segments like the edge of a box does, and some of
+them agree in three images. What tells them apart is the others of their kind: an edge is found in most images that see
+it, while of the segments that texture gives few are ever found again. How often is learned from the images themselves.
+Of a segment with length l and gradient s, among all segments that could have become part of a line, the probability to
+be part of one is
+
+.. math:: p = \frac{1}{1 + \exp(-w_0 - w_1 \log l - w_2 \log s)},
+
+fitted to what became of them (logistic regression, maximum posterior with a standard normal prior of the slopes, which
+leaves p the same for all where there are too few to tell). A line is of a kind that is found again if the mean of p
+over its segments reaches
+
+.. math:: \min(\max(p_\text{least},\ 1 - \bar p),\ 0.6\,p_\text{top}).
+
+:math:`\bar p` is the share of all segments that are part of a line. For :math:`p \ge 1 - \bar p` the odds of the kind
+times the odds of the scene are at least one: the less of a scene is found again, the more is asked of a line.
+:math:`p_\text{top}` is what the best tenth of the segments reach; where images are few or far apart that is
+little, and then little is asked.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+
+#: What is at most asked of a line, over what the best kind of segment reaches.
+TOP_SHARE = 0.6
+#: The quantile of p that stands for the best kind.
+TOP_QUANTILE = 0.9
+#: Newton steps of the fit at most.
+_STEPS = 50
+
+
+def repeatability(length: FloatArray, strength: FloatArray, eligible: BoolArray, mapped: BoolArray) -> FloatArray:
+    """(S,) probability that a segment of such length and strength is part of a line; learned from the eligible ones."""
+    features = np.zeros((len(length), 3))
+    features[:, 0] = 1.0
+    for column, values in ((1, length), (2, strength)):
+        logs = np.log(np.maximum(values, 1e-12))
+        spread = float(logs[eligible].std()) if eligible.any() else 0.0
+        if spread > 1e-6:  # segments from elsewhere may all have one strength
+            features[:, column] = np.clip((logs - logs[eligible].mean()) / spread, -10.0, 10.0)
+    rows, target = features[eligible], mapped[eligible].astype(np.float64)
+    weights, prior = np.zeros(3), np.diag([1e-9, 1.0, 1.0])
+    for _ in range(_STEPS):
+        p = 1.0 / (1.0 + np.exp(-np.clip(rows @ weights, -30.0, 30.0)))
+        information = (rows * np.maximum(p * (1.0 - p), 1e-9)[:, None]).T @ rows + prior
+        step = np.linalg.solve(information, rows.T @ (target - p) - prior @ weights)
+        weights += np.clip(step, -2.0, 2.0)
+        if np.abs(step).max() < 1e-8:
+            break
+    return 1.0 / (1.0 + np.exp(-np.clip(features @ weights, -30.0, 30.0)))
+
+
+def found_again(
+    length: FloatArray, strength: FloatArray, line_of: IntArray, eligible: BoolArray, num_lines: int, least: float
+) -> BoolArray:
+    """Lines whose segments are of a kind that is found again.
+
+    Parameters
+    ----------
+    length, strength : (S,) float64
+        Length in pixels and mean gradient of each segment.
+    line_of : (S,) int
+        Line of each segment, -1 for none.
+    eligible : (S,) bool
+        Segments that could have become part of a line.
+    num_lines : int
+        Number of lines.
+    least : float
+        The mean probability asked of a line where most segments are part of one; 0 keeps all lines.
+
+    Returns
+    -------
+    (L,) bool
+    """
+    member = line_of >= 0
+    eligible = eligible | member
+    if least <= 0.0 or not member.any():
+        return np.ones(num_lines, bool)
+    p = repeatability(length, strength, eligible, member)
+    asked = min(
+        max(least, 1.0 - float(member[eligible].mean())), TOP_SHARE * float(np.quantile(p[eligible], TOP_QUANTILE))
+    )
+    number = np.bincount(line_of[member], minlength=num_lines)
+    mean = np.bincount(line_of[member], p[member], minlength=num_lines) / np.maximum(number, 1)
+    return mean >= asked
+
+
+__all__ = ["found_again", "repeatability"]

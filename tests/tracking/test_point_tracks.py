@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Points that are followed: real ones to a fraction of a pixel, and none where there is only noise."""
+
+import cv2
+import numpy as np
+import pytest
+
+from groma.frontend.point_tracks import corners, follow, image_noise
+
+
+def _texture(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return cv2.GaussianBlur(120 + 60 * rng.normal(size=(240, 320)), (0, 0), 2.0)
+
+
+def _noisy(image: np.ndarray, sigma: float, seed: int) -> np.ndarray:
+    return np.clip(image + sigma * np.random.default_rng(seed).normal(size=image.shape), 0, 255).astype(np.uint8)
+
+
+def test_texture_is_followed():
+    image = _texture(0)
+    moved = cv2.warpAffine(image, np.array([[1, 0, 3.4], [0, 1, -2.2]]), (320, 240), borderMode=cv2.BORDER_REFLECT)
+    one, two = _noisy(image, 2.0, 1), _noisy(moved, 2.0, 2)
+    pixels = corners(one, 200, 10)
+    inside = ((pixels > 20) & (pixels < (300, 220))).all(axis=1)
+    there, good = follow(one, two, pixels[inside])
+    assert good.mean() > 0.9
+    error = np.linalg.norm(there[good] - pixels[inside][good] - (3.4, -2.2), axis=1)
+    assert np.median(error) < 0.1
+    assert np.quantile(error, 0.95) < 0.5
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
+def test_noise_is_not_followed(sigma):
+    """On a plain wall every point would stay where it was expected, and confirm it."""
+    wall = np.tile(np.linspace(118, 122, 320), (240, 1))
+    one, two = _noisy(wall, sigma, 3), _noisy(wall, sigma, 4)
+    assert abs(image_noise(one) / sigma - 1) < 0.15
+    assert len(corners(one, 200, 10)) <= 2
+    pixels = np.random.default_rng(5).uniform(20, 220, (200, 2))
+    _, good = follow(one, two, pixels)
+    assert good.mean() < 0.02
+
+
+def test_no_image_content_at_all():
+    plain = np.full((120, 160), 90, np.uint8)
+    assert corners(plain, 50, 8).shape == (0, 2)
+    there, good = follow(plain, plain, np.array([[40.0, 40.0]]))
+    assert there.shape == (1, 2)
+    assert not good.any()

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Fast turns in rendered rooms: nothing is lost, no pose is said that is wrong, and what cannot be seen is not said.
+
+Limits are those of a camera of 320 x 240 pixels at 2 to 3 units from the walls, where a pixel spans a centimetre.
+``benchmarks/turns.py`` does the same in larger rooms, with blur, holes, and a street.
+"""
+
+import dataclasses
+
+import _room
+import numpy as np
+import pytest
+
+from groma.geometry import quaternion, se3, so3
+from groma.tracking import Tracker, TrackOptions
+from groma.tracking.camera import TrackCamera
+from groma.tracking.depth_check import depth_agreement
+from groma.tracking.features import FrameFeatures
+from groma.tracking.track_map import TrackMap
+
+pytestmark = pytest.mark.filterwarnings("error")
+OPTIONS = TrackOptions(num_points=250, num_features=500)
+
+
+def _swing(degrees: float, count: int = 22) -> np.ndarray:
+    """Looks around by up to some degrees a frame, from rest to full speed in two frames, and turns back at once."""
+    speed = np.radians(degrees) * np.clip((np.arange(count) - 1) / 2, 0, 1) * np.where(np.arange(count) % 13 < 9, 1, -1)
+    path = np.cumsum(speed)
+    yaw, pitch, roll = 0.9 * path, 0.15 * np.sin(1.1 * path), 0.2 * np.sin(1.7 * path)
+    R = (
+        so3.exp(np.outer(yaw, [0, 1.0, 0]))
+        @ so3.exp(np.outer(pitch, [1.0, 0, 0]))
+        @ so3.exp(np.outer(roll, [0, 0, 1.0]))
+    )
+    center = 0.02 * np.arange(count)[:, None] * (1.0, 0.1, 0.3) + R @ (0.0, 0.0, 0.15)
+    return se3.inverse(np.hstack([quaternion.from_matrix(R), center]))
+
+
+def _worst(rows, poses: np.ndarray) -> tuple[float, float]:
+    """Largest error of a pose as it was said: scene units, degrees."""
+    exact = se3.compose(poses, np.tile(se3.inverse(poses[:1]), (len(poses), 1)))
+    said = [k for k, row in enumerate(rows) if row.pose is not None]
+    mine = np.array([rows[k].pose for k in said])
+    shift = np.linalg.norm(se3.inverse(mine)[:, 4:] - se3.inverse(exact[said])[:, 4:], axis=1)
+    turn = np.linalg.norm(se3.log(se3.compose(mine, se3.inverse(exact[said])))[:, 3:], axis=1)
+    return float(shift.max()), float(np.degrees(turn.max()))
+
+
+@pytest.mark.parametrize("degrees", [10, 18, 25])
+def test_a_swinging_depth_camera(degrees):
+    poses = _swing(degrees)
+    tracker = Tracker(_room.camera(), OPTIONS)
+    rows = [tracker.process(frame) for frame in _room.frames("rgbd", poses)]
+    result = tracker.finish()
+    assert {row.status for row in rows} <= {"tracked", "found"}
+    shift, turn = _worst(rows, poses)
+    assert shift < 0.04
+    assert turn < 1.0
+    assert _room.position_error(result.trajectory, poses) < 0.015
+
+
+def test_a_stereo_pair_turns_fast():
+    angle = np.concatenate([np.zeros(4), np.arange(0, 91, 10.0), np.full(3, 90.0)])
+    R = so3.exp(np.outer(np.radians(angle), [0, 1.0, 0]))
+    center = 0.02 * np.arange(len(angle))[:, None] * (1.0, 0.0, 0.5)
+    poses = se3.inverse(np.hstack([quaternion.from_matrix(R), center]))
+    tracker = Tracker(_room.camera(_room.BASELINE), OPTIONS)
+    rows = [tracker.process(frame) for frame in _room.frames("stereo", poses)]
+    tracker.finish()
+    assert {row.status for row in rows} <= {"tracked", "found"}
+    shift, turn = _worst(rows, poses)
+    assert shift < 0.08
+    assert turn < 1.5
+
+
+def test_what_is_covered_is_not_tracked():
+    """A hand over the camera while it turns on: grey noise without depth, then the room from elsewhere."""
+    poses = _swing(8, 20)
+    frames = _room.frames("rgbd", poses)
+    rng = np.random.default_rng(0)
+    for k in range(9, 12):
+        hand = np.clip(60 + 8 * rng.normal(size=frames[k].gray.shape), 0, 255).astype(np.uint8)
+        frames[k] = dataclasses.replace(frames[k], gray=hand, depth=np.zeros_like(frames[k].depth))
+    tracker = Tracker(_room.camera(), OPTIONS)
+    rows = [tracker.process(frame) for frame in frames]
+    tracker.finish()
+    assert {row.status for row in rows[9:12]} <= {"lost", "skipped"}
+    assert all(row.pose is not None for row in rows[14:])
+    shift, turn = _worst(rows, poses)
+    assert shift < 0.04
+    assert turn < 1.0
+
+
+def test_depth_confirms_a_pose_and_denies_others():
+    poses = _room.poses(5)
+    frames = _room.frames("rgbd", poses)
+    camera = TrackCamera.of(_room.camera())
+    tracker = Tracker(_room.camera(), OPTIONS)
+    tracker.process(frames[0])
+    track_map: TrackMap = tracker.map
+    grid = FrameFeatures(frames[4], camera, OPTIONS).depth_grid
+    exact = se3.compose(poses[4:5], se3.inverse(poses[:1]))[0]
+    agree, through = depth_agreement(camera, track_map.keyframes, grid, exact)
+    assert agree > 0.95
+    assert through < 0.02
+    turned = se3.compose(np.array([[0, np.sin(0.35), 0, np.cos(0.35), 0, 0, 0]]), exact[None])[0]
+    agree, through = depth_agreement(camera, track_map.keyframes, grid, turned)
+    assert agree < 0.6
+    nearer = exact + np.array([0, 0, 0, 0, 0, 0, -0.6])
+    assert depth_agreement(camera, track_map.keyframes, grid, nearer)[1] > 0.8
+    assert np.isnan(depth_agreement(camera, track_map.keyframes, np.full_like(grid, np.nan), exact)).all()
+    tracker.finish()
