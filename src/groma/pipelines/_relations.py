@@ -179,7 +179,11 @@ def _point_heights(
 def _line_heights(
     marks: Landmarks, rows: IntArray, plane: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Larger distance of the two ends, larger standard deviation, and the squared whitened pair of distances."""
+    """Height of the segment where it is known best, its standard deviation, and the squared whitened heights of the ends.
+
+    Clutter beside a plane is often parallel to it (mouldings, frames), so that the height of a segment tells it from
+    what lies on the plane, and its tilt does not: the mixture looks at the one, the chi-square test at both.
+    """
     ends = marks.segments[rows]
     height = ends @ plane[:3] + plane[3]
     slope = marks.line_noise.across[rows] @ plane[:3]
@@ -190,8 +194,9 @@ def _line_heights(
     size = np.trace(noise, axis1=1, axis2=2)
     noise = noise + (1e-9 * size + 1e-300)[:, None, None] * np.eye(2)
     squared = np.einsum("ne,ne->n", height, np.linalg.solve(noise, height[..., None])[..., 0])
-    spread = np.sqrt(np.diagonal(noise, axis1=1, axis2=2).max(axis=1, initial=0.0))
-    return np.abs(height).max(axis=1, initial=0.0), spread, squared
+    weight = np.linalg.solve(noise, np.ones((len(rows), 2, 1)))[..., 0]
+    information = weight.sum(axis=1)
+    return np.abs((weight * height).sum(axis=1)) / information, 1.0 / np.sqrt(information), squared
 
 
 def _near_segments(points: FloatArray, segments: FloatArray) -> IntArray:

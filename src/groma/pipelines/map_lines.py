@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
 #: Segments whose deviation is that many times the usual one make no line by themselves.
 MAX_BLUR = 2.8
-#: Segments that no image or geometry lets become part of a line say nothing about others of their kind.
-_IMPOSSIBLE = (Fate.TOO_SHORT, Fate.NO_NEIGHBOR, Fate.NO_MATCH, Fate.DEGENERATE)
+#: Segments that no neighbour or geometry lets become part of a line say nothing about others of their kind.
+_IMPOSSIBLE = (Fate.TOO_SHORT, Fate.NO_NEIGHBOR, Fate.DEGENERATE)
 
 
 @dataclass(frozen=True)

@@ -94,9 +94,11 @@ class Belief:
         found = find_pose(track_map, self.camera, data, nearest, guesses, predicted, WIDER * prior_sigma)
         if found is None or not is_near(found.estimate.pose, predicted, prior_sigma) or self._denied(data, found):
             return None
-        shared = found.score >= CERTAIN or found.share >= LEAST_AGREEING or not self.options.points
+        # Rooms are alike at both ends, in depth too: of the features in view some must agree.
+        if not (found.score >= CERTAIN or found.share >= LEAST_AGREEING or not self.options.points):
+            return None
         enough = evidence(found.estimate.counts) >= FOUND_SHARE * self._least_evidence
-        if shared and enough and found.score >= LEAST_SCORE and len(found.estimate.weak) <= 2:
+        if enough and found.score >= LEAST_SCORE and len(found.estimate.weak) <= 2:
             return found
         return found if self._confirmed(nearest, data, found.estimate) else None
 
