@@ -91,10 +91,14 @@ class _Files:
         payload = content[_DIGEST + _CHECKSUM :]
         if content[: _DIGEST + _CHECKSUM] != _head(key, payload):
             return None
+        try:
+            found = pickle.loads(payload)
+        except ImportError:  # it calls a function of a module that is not there any more
+            return None
         with _lock:
             counts.loaded += 1
             _used.add(path)
-        return pickle.loads(payload)
+        return found
 
     def save(self, key: tuple, data: Any) -> None:
         """Write what was compiled for a key."""

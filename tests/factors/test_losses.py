@@ -112,7 +112,7 @@ def test_by_name():
 
 
 def test_errors_say_what_to_do():
-    with pytest.raises(InputError, match=r"no loss named 'hubert'; choose one of barron, cauchy"):
+    with pytest.raises(InputError, match=r"no loss named 'hubert'; choose one of none, barron, cauchy"):
         loss("hubert")
     with pytest.raises(InputError, match=r"positive number .* got 0.0"):
         Huber(0.0)

@@ -117,7 +117,7 @@ def _fit_side(t, d, rho, weight, count, scratch, A, b, x, inverse):
 
 
 @loop
-def _fit_all(ends, depth, pinhole, noise, correlation, near, far, min_share, inverse_depth, covariance, support, share):
+def _fit_all(ends, depth, noise, correlation, near, far, min_share, inverse_depth, covariance, support, share):
     """Fit segments (N, 4); write inverse depths (N, 2), covariances (N, 2, 2), kinds (N,), shares of inliers (N,)."""
     size = _ALONG * _ACROSS
     t, d, rho, weight = np.empty((2, size)), np.empty((2, size)), np.empty((2, size)), np.empty((2, size))
@@ -310,7 +310,7 @@ def fit_depth_lines(
     inverse_depth, covariance = np.empty((count, 2)), np.empty((count, 2, 2))
     support, share = np.empty(count, np.int8), np.empty(count)
     _fit_all(
-        segments, image, camera, noise.numbers, noise.correlation, near, far, min_share, inverse_depth, covariance,
+        segments, image, noise.numbers, noise.correlation, near, far, min_share, inverse_depth, covariance,
         support, share,
     )  # fmt: skip
     variance = np.diagonal(covariance, axis1=1, axis2=2)

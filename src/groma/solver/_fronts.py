@@ -73,7 +73,6 @@ class Fronts:
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
         first = np.concatenate([[0], np.cumsum([c.count for c in layout.kept])])
-        self._first_block = first
         self._widths = np.concatenate([np.full(c.count, c.width, np.int64) for c in layout.kept])
         self._starts = np.concatenate([c.start + c.width * np.arange(c.count, dtype=np.int64) for c in layout.kept])
         pairs = {

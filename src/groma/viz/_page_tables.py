@@ -34,6 +34,8 @@ _FATES = {
     "outlier": ("outlier of its line", "#d64b36"),
     "few_images": ("line in too few images", "#93a7bd"),
     "uncertain": ("line too uncertain", "#6d7f93"),
+    "short_line": ("line of short segments only", "#a9895f"),
+    "texture": ("texture", "#b5a7d6"),
 }
 
 
@@ -236,6 +238,8 @@ def _residual_table(before: Drawable | None, after: Drawable) -> str:
     if any(unseen):
         rows.append(["not visible from their camera", *(f"{count:,}" for count in unseen)])
     caption = "Residuals of all observations. The rms counts wrong matches in full; the median does not notice them."
+    if any(name == "line ends" for name in after.residual_kinds):
+        caption += " Each end of a segment counts by itself; the terminal and the summary take both ends together."
     if before is not None:
         caption += " Kinds that are adjusted together share what is left: one may grow while the robust cost falls."
     return table("Numbers", caption, ["", *columns], rows) if rows else ""
