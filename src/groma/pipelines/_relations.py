@@ -179,7 +179,7 @@ def _point_heights(
 def _line_heights(
     marks: Landmarks, rows: IntArray, plane: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Height of the segment where it is known best, its standard deviation, and the squared whitened heights of the ends.
+    """Height of the segment where it is known best, its deviation, and the squared whitened heights of both ends.
 
     Clutter beside a plane is often parallel to it (mouldings, frames), so that the height of a segment tells it from
     what lies on the plane, and its tilt does not: the mixture looks at the one, the chi-square test at both.
