@@ -2,8 +2,8 @@
 """Whether the pose of a frame is to be believed, and the search for a frame that could not be followed.
 
 A pose needs enough points and lines that agree with it, of enough that were looked at. Fewer will do where the depth of
-the frame confirms it: what the map knows to be somewhere is then measured there. A pose by which the frame looks
-through what the map knows is not believed.
+the frame confirms it: what the map knows to be somewhere is then measured there. Where few agree and
+depth is known, it must; and a pose that was searched must not look through what the map knows.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ CERTAIN, LEAST_AGREEING = 40.0, 0.03
 #: A pose found without a prediction needs this score; less where no points are followed. Above the second, no other
 #: keyframe is tried.
 ANYWHERE_SCORE, ENOUGH_SCORE = 36.0, 120.0
-#: Below this score more than half of the planes must agree, where the frame sees any of the map.
+#: Below this score more than half of the planes must agree, where the frame sees any of the map, and depth must confirm
+#: the pose, where it is known.
 DOUBTFUL_SCORE = 80.0
 #: The prior of a pose found by features is wider by this factor.
 WIDER = 3.0
@@ -56,14 +57,16 @@ class Belief:
         self.camera, self.options = camera, options
         self._least_evidence = LEAST_EVIDENCE if options.points or options.lines else 0.0
 
-    def trusts(self, track_map: TrackMap, estimate: PoseEstimate) -> bool:
-        """Whether enough agrees with the pose of a frame that was followed, and enough of what was followed."""
+    def trusts(self, track_map: TrackMap, data: FrameFeatures, estimate: PoseEstimate) -> bool:
+        """Whether enough agrees with the pose of a frame that was followed; depth decides where that is not much."""
         counts = estimate.counts
         score = evidence(counts) + PLANE_WEIGHT * counts["planes"]
         if len(estimate.planes) >= 2 and 2 * counts["planes"] <= len(estimate.planes) and score < DOUBTFUL_SCORE:
             return False
         enough = score >= LEAST_SCORE and evidence(counts) >= self._least_evidence
-        return enough and _keeps(track_map, estimate) and _share(estimate) >= LEAST_SHARE and len(estimate.weak) < 6
+        if not enough or not _keeps(track_map, estimate) or _share(estimate) < LEAST_SHARE or len(estimate.weak) == 6:
+            return False
+        return score >= DOUBTFUL_SCORE or not self._contradicted([track_map.near], data, estimate)
 
     def confirms(self, track_map: TrackMap, data: FrameFeatures, estimate: PoseEstimate) -> bool:
         """Whether depth confirms the pose of a frame that was followed with few points and lines."""
@@ -75,6 +78,11 @@ class Belief:
             return False
         agree, _ = depth_agreement(self.camera, keyframes, data.depth_grid, estimate.pose)
         return agree > CONFIRMS
+
+    def _contradicted(self, keyframes: list[Keyframe], data: FrameFeatures, estimate: PoseEstimate) -> bool:
+        """Whether depth, where it is known, does not confirm a pose."""
+        agree, _ = depth_agreement(self.camera, keyframes, data.depth_grid, estimate.pose)
+        return agree < CONFIRMS
 
     def _denied(self, data: FrameFeatures, found: Found) -> bool:
         """Whether depth denies a pose."""
@@ -119,6 +127,8 @@ class Belief:
         # Two places may have like features; planes that are seen and are not there tell them apart.
         seen = 0 if data.planes is None else len(data.planes)
         if seen >= 2 and not best.estimate.planes.any() and best.score < DOUBTFUL_SCORE:
+            return None
+        if best.score < DOUBTFUL_SCORE and self._contradicted(best.known.keyframes, data, best.estimate):
             return None
         return None if self._denied(data, best) else best
 

@@ -133,7 +133,7 @@ class Tracker:
                 self.map, self.camera, self.options, present.data, data, present.followed, present.pose, predicted,
                 prior_sigma, watch,
             )  # fmt: skip
-            if estimate is not None and not self._belief.trusts(self.map, estimate):
+            if estimate is not None and not self._belief.trusts(self.map, data, estimate):
                 doubtful, estimate = estimate, None
         if estimate is None:
             before = present.pose
