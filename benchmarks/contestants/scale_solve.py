@@ -6,6 +6,7 @@ Compiled functions are loaded by small solves first, those that only large probl
 
 from __future__ import annotations
 
+import resource
 import sys
 import time
 from pathlib import Path
@@ -47,8 +48,14 @@ def main() -> None:
     made = making.read()
     after_making = peak_memory_mib()
     rule: dict = {"function_tolerance": 0.0, "gradient_tolerance": 0.0, "step_tolerance": 0.0}
+    ends: list[float] = []
+
+    def note_end_of_step(_step) -> None:
+        ends.append(time.process_time())
+
+    system = resource.getrusage(resource.RUSAGE_SELF).ru_stime
     clock = Clock()
-    solved = solve(problem, SolverOptions(max_iterations=steps, threads=threads, **rule)).report
+    solved = solve(problem, SolverOptions(max_iterations=steps, threads=threads, **rule), note_end_of_step).report
     times = clock.read()
     report(
         contestant="groma",
@@ -60,6 +67,8 @@ def main() -> None:
         read_s=read["cpu_s"],
         assemble_s=made["cpu_s"],
         **times,
+        system_s=resource.getrusage(resource.RUSAGE_SELF).ru_stime - system,
+        later_step_s=(ends[-1] - ends[0]) / (len(ends) - 1),
         iterations=solved.iterations,
         initial_cost=solved.initial_cost,
         final_cost=solved.final_cost,

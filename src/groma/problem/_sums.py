@@ -13,26 +13,29 @@ from groma._simd import add_product, set_product
 
 @loop
 def add_primary(
-    record, begin, first, landmark, l_column, incidence, block, c_column, V, g_l, W, H, g_c, sole,
+    record, begin, first, landmark, l_column, incidence, block, c_column, V, g_l, W, H, g_c, alone,
     rows, l_width, c_width, one,
 ):  # fmt: skip
     """Sum the landmark, its incidence and its kept block, for factors with a landmark and a first kept block.
 
-    Incidences with a ``sole`` contribution are written instead of added to. W begins with the incidence ``first``.
+    W begins with the incidence ``first``. Where these factors ``alone`` make up W, the first of an incidence writes it
+    and the others, which follow at once, add to it; otherwise all add.
     """
     n, m, columns = record.shape
     flat = record.reshape(record.size)
     dl, dc = len(l_width), len(c_width)
+    previous = np.int64(-1)
     for i in range(n):
         base = i * m * columns
         at_l, at_c, at_r = base + l_column, base + c_column, base + columns - 1
         p, q, c = np.int64(landmark[begin + i]), incidence[begin + i] - first, np.int64(block[begin + i])
         add_product(V, p * (dl * dl), flat, at_l, columns, flat, at_l, columns, rows, l_width, l_width)
         add_product(g_l, p * dl, flat, at_r, columns, flat, at_l, columns, rows, one, l_width)
-        if sole:
+        if alone and q != previous:
             set_product(W, q * (dl * dc), flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
         else:
             add_product(W, q * (dl * dc), flat, at_l, columns, flat, at_c, columns, rows, l_width, c_width)
+        previous = q
         add_product(H, c * (dc * dc), flat, at_c, columns, flat, at_c, columns, rows, c_width, c_width)
         add_product(g_c, c * dc, flat, at_r, columns, flat, at_c, columns, rows, one, c_width)
 

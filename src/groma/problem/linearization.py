@@ -89,9 +89,8 @@ class NormalEquations:
         self._chunk_W: list[list[dict[int, Any]]] = [
             self._room_for_chunks() if compact else self.W for _ in self.shares
         ]
-        self._sole = [
-            {c: _has_sole_contributions(layout, number, c) for c in e.incidences}
-            for number, e in enumerate(layout.eliminated)
+        self._alone = [
+            {c: _has_one_source(layout, number, c) for c in e.incidences} for number, e in enumerate(layout.eliminated)
         ]
         self._H = [
             {p: np.zeros(n * layout.kept[p[0]].width * layout.kept[p[1]].width) for p, n in layout.num_direct.items()}
@@ -239,7 +238,7 @@ class NormalEquations:
         self.V[chunk.eliminated][chunk.begin * e.dof**2 : chunk.end * e.dof**2] = 0.0
         self.g_landmarks[chunk.eliminated][chunk.begin * e.dof : chunk.end * e.dof] = 0.0
         for c, incidences in e.incidences.items():
-            if self._sole[chunk.eliminated][c]:
+            if self._alone[chunk.eliminated][c]:
                 continue
             size = e.dof * self.layout.kept[c].width
             begin, end = incidences.pointer[chunk.begin], incidences.pointer[chunk.end]
@@ -324,7 +323,7 @@ class NormalEquations:
             first, rest = layout.kept[0], layout.kept[1:]
             c = first.kept_class
             indices = (layout.landmark, layout.landmark_column, first.incidence, first.block, first.column)
-            targets = (*landmarks, self._chunk_W[share][e][c], H[c, c], g[c], self._sole[e][c])
+            targets = (*landmarks, self._chunk_W[share][e][c], H[c, c], g[c], self._alone[e][c])
             widths = (rows, l_width, width(self.layout.kept[c].width), _ONE)
             sums.append((add_primary, c, (*indices, *targets, *widths)))
             for entry in rest:
@@ -347,18 +346,19 @@ class NormalEquations:
         return sums
 
 
-def _has_sole_contributions(layout: Layout, eliminated: int, kept_class: int) -> bool:
-    """Return whether every incidence has one factor, which is the first kept block of it: it need not be cleared."""
-    total = 0
-    for factor in layout.factors:
-        if factor.eliminated != eliminated:
-            continue
-        for position, entry in enumerate(factor.kept):
-            if entry.kept_class == kept_class and entry.incidence is not None:
-                if position > 0:
-                    return False
-                total += len(entry.incidence)
-    return total == len(layout.eliminated[eliminated].incidences[kept_class].block)
+def _has_one_source(layout: Layout, eliminated: int, kept_class: int) -> bool:
+    """Return whether all blocks W of a class come from the first kept block of one factor group.
+
+    Its factors are sorted by incidence, so that the first of each can write the block: it need not be cleared.
+    """
+    positions = [
+        position
+        for factor in layout.factors
+        if factor.eliminated == eliminated
+        for position, entry in enumerate(factor.kept)
+        if entry.kept_class == kept_class and entry.incidence is not None
+    ]
+    return positions == [0]
 
 
 def to_original_order(layout: Layout, states: States) -> dict[str, FloatArray]:
