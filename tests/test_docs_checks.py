@@ -1,17 +1,84 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The page of corrections: its programs run, with several seeds, and every row of its tables has a check that passes
-for the right form and not for the printed one."""
+"""What the pages say can be done: their commands exist with their options, and their Python runs.
+
+The page of corrections: its programs run, with several seeds, and every row of its tables has a check that passes for
+the right form and not for the printed one.
+"""
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "maths" / "corrections.md"
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGE = DOCS / "maths" / "corrections.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 #: First cells of the rows of all tables, without heads and rules.
 ROWS = [row for row in re.findall(r"^\| ([^|]+?) \|", TEXT, re.MULTILINE) if row != "eq."]
+
+#: Lines of code, and pieces of sentences in backquotes, that call the command line.
+COMMANDS = [
+    (path.relative_to(ROOT).as_posix(), found)
+    for path in [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+    for line in path.read_text(encoding="utf-8").splitlines()
+    for found in re.findall(r"`(groma [^`]*)`", line) + re.findall(r"^(?:    |\$ )(?:\$ )?(groma [^#|&]*)", line)
+]
+
+
+def options_of(words: list[str]) -> tuple[str, set[str]]:
+    """Return the command that words begin with, and its options."""
+    import typer.main
+
+    from groma.cli.app import app
+
+    command = typer.main.get_command(app)
+    name = "groma"
+    for word in words:
+        if not hasattr(command, "commands") or word.startswith("-"):
+            break
+        # As in "groma evaluate poses|lines EST REF".
+        name, command = f"{name} {word}", command.commands[word.split("|")[0]]
+    return name, {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+
+
+def test_there_are_commands_in_the_pages():
+    assert len(COMMANDS) > 40
+    assert len({page for page, _ in COMMANDS}) > 8
+
+
+@pytest.mark.parametrize(("page", "line"), COMMANDS, ids=[f"{page}: {line}" for page, line in COMMANDS])
+def test_commands_of_the_pages_exist(page, line):
+    words = [word.strip("[],") for word in shlex.split(line.replace("\\|", "|"))][1:]
+    if (words and words[0].isupper()) or words in ([], ["--help"]):
+        return  # as in "groma COMMAND --help"
+    name, known = options_of(words)
+    for word in words:
+        if word.startswith("-") and word not in ("-", "--help"):
+            assert word.split("=")[0] in known, f"{name} has no {word}"
+
+
+@pytest.fixture(scope="module")
+def start():
+    from groma.scene import synthetic
+
+    return synthetic.holistic(10, seed=1).start
+
+
+@pytest.mark.parametrize("page", ["python.md", "uncertainty.md", "large-scenes.md"])
+def test_python_of_the_pages_runs(page, start, tmp_path, monkeypatch, capsys):
+    """In a folder with a model, and with a scene at hand."""
+    import groma
+
+    monkeypatch.chdir(tmp_path)
+    groma.write_scene(start, "model")
+    namespace: dict = {"scene": start}
+    blocks = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+    for number, block in enumerate(blocks):
+        exec(compile(block, f"{page}, block {number}", "exec"), namespace)
+    assert blocks and capsys.readouterr().out
 
 
 def run(seed: int) -> list[str]:

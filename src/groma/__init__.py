@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from groma.pipelines.adjust_parts import adjust_parts, write_parts
     from groma.pipelines.diagnosis import diagnose_scene as diagnose
     from groma.pipelines.map import MapOptions, map_images
+    from groma.pipelines.pose_graph import PoseGraphOptions, adjust_pose_graph
     from groma.pipelines.uncertainty import uncertainty
     from groma.problem.problem import Problem
     from groma.problem.variables import Variables
@@ -73,6 +74,7 @@ _HOME = {
     "PlaneObservation": "groma.factors.plane_observation",
     "PointOnPlane": "groma.factors.point_on_plane",
     "PointReprojection": "groma.factors.point_reprojection",
+    "PoseGraphOptions": "groma.pipelines.pose_graph",
     "PosePrior": "groma.factors.pose_prior",
     "Problem": "groma.problem.problem",
     "ProblemError": "groma.errors",
@@ -88,6 +90,7 @@ _HOME = {
     "Variables": "groma.problem.variables",
     "adjust": "groma.pipelines.adjust",
     "adjust_parts": "groma.pipelines.adjust_parts",
+    "adjust_pose_graph": "groma.pipelines.pose_graph",
     "diagnose": "groma.pipelines.diagnosis:diagnose_scene",
     "factor": "groma.factors.user",
     "loss": "groma.factors.losses",
@@ -131,6 +134,7 @@ __all__ = [
     "PlaneObservation",
     "PointOnPlane",
     "PointReprojection",
+    "PoseGraphOptions",
     "PosePrior",
     "Problem",
     "ProblemError",
@@ -146,6 +150,7 @@ __all__ = [
     "Variables",
     "adjust",
     "adjust_parts",
+    "adjust_pose_graph",
     "cameras",
     "diagnose",
     "errors",

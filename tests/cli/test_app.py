@@ -2,6 +2,9 @@
 """The command line as a whole: help, version, usage errors, exit codes of known errors and of Ctrl-C."""
 
 import errno
+import os
+import subprocess
+import sys
 
 import pytest
 
@@ -26,6 +29,12 @@ def test_every_command_has_the_common_options(command, option, capsys):
     assert option in capsys.readouterr().out
 
 
+def test_the_list_of_commands_is_not_cut_off(capsys):
+    for words in ([], ["evaluate"]):
+        assert run([*words, "--help"]) == 0
+        assert "..." not in capsys.readouterr().out.split("Commands:")[1]
+
+
 def test_version(capsys):
     assert run(["--version"]) == 0
     assert capsys.readouterr().out.startswith("groma 0.")
@@ -41,6 +50,8 @@ def test_version(capsys):
         ["adjust", "x", "--threads", "0"],
         ["adjust", "x", "--max-iterations", "-1"],
         ["synth"],
+        ["synth", "-o", "x", "--seed", "-1"],
+        ["adjust", "x", "--seed", "-1"],
         ["evaluate", "poses", "only-one"],
     ],
     ids=" ".join,
@@ -70,6 +81,22 @@ def test_known_errors_are_one_line(error, code, words, capsys):
     text = capsys.readouterr().err
     assert words in text
     assert text.count("\n") == 1
+
+
+def test_no_standard_output_at_all(monkeypatch):
+    """As with ``groma ... >&-``: what would be said is lost, and nothing else."""
+    monkeypatch.setattr("sys.stdout", None)
+    guard(lambda: print("said"))()
+
+
+def test_names_that_the_terminal_cannot_show(tmp_path):
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    program = "from groma.cli.main import main; main()"
+    arguments = [sys.executable, "-c", program, "adjust", str(tmp_path / "Brücke"), "--loss", "日本"]
+    finished = subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=300)
+    assert finished.returncode == 1
+    assert finished.stderr.startswith("groma: Cannot read ") and finished.stderr.count("\n") == 1
+    assert "Br\\xfccke" in finished.stderr
 
 
 def test_our_own_errors_keep_their_traceback():

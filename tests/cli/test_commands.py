@@ -222,7 +222,11 @@ def test_standard_deviations_in_a_file(scenes, here):
         ["adjust", "folder", "-o", "out"],
         ["adjust", "GOOD", "-o", "no/such/folder/out.npz"],
         ["adjust", "GOOD", "-o", "out.xyz"],
+        ["adjust", "GOOD", "-o", "out.txt"],
         ["adjust", "GOOD", "-o", "taken.npz"],
+        ["adjust", "GOOD", "-o", "a", "--report", "a"],
+        ["adjust", "GOOD", "--report", "p.html", "--json", "./p.html"],
+        ["adjust", "GOOD", "--contributions", "--truth", "missing"],
         ["adjust", "GOOD", "--json", "taken.npz"],
         ["adjust", "GOOD", "--report", "taken.npz"],
         ["adjust", "GOOD", "--loss", "magic"],
@@ -236,12 +240,16 @@ def test_standard_deviations_in_a_file(scenes, here):
         ["adjust", "GOOD", "--covariance", "c.npz", "--sigma0", "0"],
         ["convert", "GOOD", "taken.npz"],
         ["convert", "missing", "out.npz"],
+        ["convert", "parent", "out.npz"],
         ["report", "missing", "-o", "out.html"],
+        ["report", "GOOD", "-o", "folder", "--force"],
+        ["view", "missing", "--no-browser"],
         ["evaluate", "poses", "GOOD", "missing"],
         ["evaluate", "planes", "GOOD", "GOOD", "--threshold", "1"],
         ["evaluate", "trajectory", "noise.npz", "noise.npz"],
         ["map", "walk.MP4", "-o", "out"],
         ["map", "folder", "-o", "out"],
+        ["map", "folder", "-o", "out", "--model", "missing"],
         ["synth", "-o", "taken.npz"],
         ["selfcheck", "--golden", "missing"],
     ],
@@ -252,6 +260,8 @@ def test_bad_input_is_one_line(scenes, here, arguments, capsys):
     (here / "noise.npz").write_bytes(np.random.default_rng(0).bytes(500))
     (here / "taken.npz").write_text("precious")
     (here / "folder").mkdir()
+    (here / "parent" / "model").mkdir(parents=True)
+    (here / "parent" / "model" / "cameras.txt").touch()
     (here / "walk.MP4").touch()
     before = sorted(os.listdir(here))
     files = {"GOOD": str(scenes / "start.npz"), "POINTS": str(scenes / "points.npz")}
@@ -260,6 +270,26 @@ def test_bad_input_is_one_line(scenes, here, arguments, capsys):
     assert said.startswith("groma: ") and said.count("\n") == 1, said
     assert sorted(os.listdir(here)) == before
     assert (here / "taken.npz").read_text() == "precious"
+
+
+@pytest.mark.parametrize("name", ["out.xyz", "out.txt"])
+def test_a_target_that_cannot_hold_the_result_is_refused_before_the_work(scenes, here, name, monkeypatch):
+    """The work takes hours in large scenes, and its result would be lost."""
+    monkeypatch.setattr("groma.pipelines.adjust.adjust", lambda *_: pytest.fail("was adjusted"))
+    assert run(["adjust", str(scenes / "start.npz"), "-o", name]) == 1
+    assert os.listdir(here) == []
+
+
+def test_a_folder_of_archives_says_so(scenes, here, capsys):
+    assert run(["report", str(scenes)]) == 1
+    assert "points.npz" in capsys.readouterr().err
+
+
+def test_planes_that_match_nothing_have_no_errors(scenes, here, capsys):
+    assert run(["evaluate", "planes", str(scenes / "points.npz"), str(scenes / "truth.npz")]) == 0
+    said = capsys.readouterr()
+    assert "recall 0.0 %" in said.out and "nan" not in said.out
+    assert "holds no planes" in said.err
 
 
 def test_counts_are_words():

@@ -44,7 +44,7 @@ def test_ctrl_c_in_mid_solve(tmp_path):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     assert finished.returncode == 130
-    assert finished.stderr == "groma: interrupted; nothing was written.\n"
+    assert finished.stderr == "groma: interrupted; nothing is left half written.\n"
     assert os.listdir(tmp_path) == ["in"]
 
 

@@ -3,11 +3,12 @@
 
 import json
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from groma.cli._output import atomic_output, check_json, check_output, plain, write_json
+from groma.cli._output import atomic_output, check_json, check_output, check_outputs, plain, write_json
 from groma.errors import OutputError
 
 
@@ -60,6 +61,60 @@ def test_force_does_not_replace_a_folder_with_other_things(tmp_path):
     (tmp_path / "home" / "thesis.tex").write_text("years of work")
     with pytest.raises(OutputError, match=r"thesis\.tex"):
         check_output(tmp_path / "home", force=True)
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "mine.npz", "database.db", "sparse"])
+def test_force_knows_the_files_of_results_by_name(tmp_path, name):
+    (tmp_path / "cameras.bin").touch()
+    check_output(tmp_path, force=True)
+    (tmp_path / name).touch()
+    with pytest.raises(OutputError, match=name):
+        check_output(tmp_path, force=True)
+
+
+def test_force_replaces_a_track_in_parts(tmp_path):
+    for name in ("part_2", "part_13", "structures"):
+        (tmp_path / "track" / name).mkdir(parents=True)
+    for name in ("trajectory.txt", "scene.npz", "summary.json", "report.html", "rigs.bin", "lines.obj", "planes.ply"):
+        (tmp_path / "track" / name).touch()
+    check_output(tmp_path / "track", force=True)
+
+
+def test_a_file_never_replaces_a_folder(tmp_path):
+    """A page named like the folder of a map would cost the map."""
+    (tmp_path / "map").mkdir()
+    (tmp_path / "map" / "cameras.bin").touch()
+    with pytest.raises(OutputError, match="is a folder"):
+        check_outputs(True, tmp_path / "map", file=True)
+    with pytest.raises(OutputError, match="is a folder"):
+        check_outputs(True, None, tmp_path / "map")
+
+
+def test_two_results_of_one_name_are_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    check_outputs(False, Path("a"), Path("b"), None, json_target="c")
+    for words in ({"json_target": "a"}, {"json_target": str(tmp_path / "a")}):
+        with pytest.raises(OutputError, match="two results"):
+            check_outputs(True, Path("a"), Path("b"), **words)
+    with pytest.raises(OutputError, match="two results"):
+        check_outputs(False, Path("a"), Path("b"), Path("b"))
+    assert os.listdir(tmp_path) == []
+
+
+def test_devices_are_not_replaced(tmp_path):
+    """``--json /dev/stdout --force`` would put a file in place of the device."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OutputError, match="device or a pipe"):
+        check_output(tmp_path / "pipe", force=True)
+
+
+def test_a_folder_where_nothing_can_be_made(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("tempfile.mkdtemp", refuse)
+    with pytest.raises(OutputError, match=r"nothing can be made .* \(Read-only file system\)"):
+        check_output(tmp_path / "a.txt", force=False)
 
 
 def test_missing_parent(tmp_path):

@@ -160,3 +160,13 @@ def test_surveyed_scenes(shared_data, name, rmse, largest, angle, largest_angle)
         assert scores.center_max == pytest.approx(largest, abs=5e-4)
         assert scores.rotation_deg_mean == pytest.approx(angle, abs=5e-4)
         assert scores.rotation_deg_max == pytest.approx(largest_angle, abs=5e-4)
+
+
+def test_poses_that_are_no_numbers_are_named():
+    poses = random_poses(np.random.default_rng(0), np.random.default_rng(1).normal(size=(5, 3)))
+    broken = poses.copy()
+    broken[3, 5] = np.nan
+    with pytest.raises(InputError, match="row 3 of source"):
+        score_poses(broken, poses)
+    with pytest.raises(InputError, match="row 3 of target"):
+        align_poses(poses, broken)

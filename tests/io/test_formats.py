@@ -19,6 +19,7 @@ from groma.errors import FileFormatError, GromaError, InputError, OutputError
 from groma.geometry import quaternion, se3
 from groma.io import (
     Trajectory,
+    check_target,
     from_pycolmap,
     read_archive,
     read_bal,
@@ -284,6 +285,43 @@ def test_archive_messages(tmp_path, changes, message):
     path = _changed(tmp_path, **changes)
     with pytest.raises(FileFormatError, match=message):
         read_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [
+        ("cameras.txt", "30 PINHOLE wide 480 1 1 1 1"),
+        ("images.txt", "1 0 0 x 0 1 0 0 1 a.jpg"),
+        ("points3D.txt", "7 nan 0 0 1 2 3 0.5 1 0"),
+        ("points3D.txt", "7 1 0 0 1 2"),
+    ],
+)
+def test_damaged_text_models_name_the_line(tmp_path, name, row):
+    write_colmap(rig_scene(), tmp_path / "model", "text")
+    path = tmp_path / "model" / name
+    text = path.read_text()
+    path.write_text(f"{text}{row}\n")
+    with pytest.raises(FileFormatError) as caught:
+        read_colmap(tmp_path / "model")
+    number = text.count("\n") + 1
+    assert f"damaged in {name}, line {number}: {row!r}" in str(caught.value)
+
+
+def test_empty_binary_files_are_incomplete(tmp_path):
+    write_colmap(rig_scene(), tmp_path / "model")
+    (tmp_path / "model" / "frames.bin").write_bytes(b"")
+    with pytest.raises(FileFormatError, match="ends after 0 bytes"):
+        read_colmap(tmp_path / "model")
+
+
+def test_what_a_target_can_hold_is_known_before(tmp_path):
+    scene = rig_scene()
+    assert check_target(scene, tmp_path / "a.npz") == "archive"
+    assert check_target(scene, tmp_path / "a") == check_target(scene, tmp_path) == "colmap"
+    assert check_target(scene, "a", "colmap_text") == "colmap_text"
+    for path, words in (("a.xyz", "'.xyz'"), ("a.txt", "BAL")):
+        with pytest.raises(InputError, match=words):
+            check_target(scene, path)
 
 
 def test_read_scene_says_what_it_wants(tmp_path):

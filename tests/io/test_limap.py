@@ -193,6 +193,23 @@ def test_segments_without_length_are_left_out_unless_known():
     assert with_structures(Scene(), Structures(lines=line), exact).lines.ids.tolist() == [6]
 
 
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_lines_of_no_place_are_left_out_and_counted(tmp_path, form):
+    """LIMAP writes lines that it could not triangulate with NaN, and short ones with ends that coincide in text."""
+    scene = holistic(6, seed=1).truth
+    write_colmap(scene, tmp_path / "model", form)
+    structures = read_limap(tmp_path / "model")
+    segments = structures.lines.segments.copy()
+    segments[1], segments[3] = np.nan, 1.0
+    spoilt = replace(structures, lines=replace(structures.lines, segments=segments))
+    write_limap(spoilt, tmp_path / "model" / "structures", form, force=True)
+    with pytest.warns(UserWarning, match=f"2 of {scene.num_lines} lines in .*structures have no direction"):
+        read = read_scene(tmp_path / "model")
+    assert read.lines.ids.tolist() == np.delete(scene.lines.ids, [1, 3]).tolist()
+    seen = np.isin(scene.line_observations.line_idx, [1, 3])
+    assert read.num_line_observations == (~seen).sum()
+
+
 def test_what_was_deleted_is_left_out():
     scene = read_scene(DATA / "binary")
     structures = read_limap(DATA / "binary")

@@ -214,3 +214,40 @@ def test_arguments_are_not_changed():
     scene = Scene(points=Points.at(xyz)).transformed(some_similarity())
     np.testing.assert_array_equal(xyz, before)
     assert scene.num_points == 2
+
+
+def test_a_scene_is_shown_by_its_counts():
+    scene = holistic(6, seed=0).truth
+    assert repr(Scene()) == "Scene(empty)"
+    assert repr(scene) == (
+        f"Scene(6 images, {scene.num_cameras} cameras, {scene.num_points} points, {scene.num_lines} lines, "
+        f"{scene.num_planes} planes, {scene.num_observations} observations)"
+    )
+    assert repr(scene.points) == f"Points({scene.num_points} rows: ids, xyz, color, error)"
+
+
+@pytest.mark.parametrize(
+    ("chosen", "words"),
+    [
+        (np.ones(5, bool), r"must have shape \(6,\)"),
+        (["00001.png"], "must be integers or a mask"),
+        ([0.0, 1.0], "must be integers or a mask"),
+        ([[0, 1]], r"must have shape \(n,\)"),
+        ([0, 6], "not in the scene"),
+        ([-1], "not in the scene"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_chosen(chosen, words):
+    scene = holistic(6, seed=0).truth
+    with pytest.raises(InputError, match=words):
+        scene.subset(chosen)
+    with pytest.raises(InputError, match=words):
+        scene.images.take(chosen)
+
+
+def test_choices_by_number_and_by_mask_are_the_same():
+    scene = holistic(6, seed=0).truth
+    mask = np.array([True, False, True, False, False, True])
+    assert equal(scene.subset(mask), scene.subset([0, 2, 5]))
+    assert len(scene.images.take([])) == 0 and len(scene.images.take(np.int32(3))) == 1

@@ -21,9 +21,10 @@ def guard(command: Callable[P, None]) -> Callable[P, None]:
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
             command(*args, **kwargs)
-            sys.stdout.flush()
+            if sys.stdout is not None:  # a process may be started without one
+                sys.stdout.flush()
         except KeyboardInterrupt:
-            _fail("interrupted; nothing was written.", INTERRUPTED)
+            _fail("interrupted; nothing is left half written.", INTERRUPTED)
         except BrokenPipeError:
             # The reader of a pipe has gone (``groma ... | head``). Nothing more can be said to it.
             sys.stdout = None  # type: ignore[assignment]

@@ -34,14 +34,14 @@ def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, f
     lines = [", ".join(counted(numbers[f"num_{kind}"], kind) for kind in kinds if numbers.get(f"num_{kind}"))]
     for kind, rmse in numbers.get("rmse_px", {}).items():
         if rmse.get("before") is not None and rmse.get("after") is not None:
-            lines.append(f"  {kind + ' error':<16}{rmse['before']:>10.3f} px  ->{rmse['after']:>9.3f} px   (rms)")
-    lines.append(f"  {'cost':<16}{numbers['initial_cost']:>10.5g}     ->{numbers['final_cost']:>9.5g}")
+            lines.append(f"  {kind + ' error':<16}{rmse['before']:>10.3f} px  -> {rmse['after']:>9.3f} px   (rms)")
+    lines.append(f"  {'cost':<16}{numbers['initial_cost']:>10.5g}     -> {numbers['final_cost']:>9.5g}")
     grew = any((rmse.get("after") or 0) > (rmse.get("before") or 0) for rmse in numbers.get("rmse_px", {}).values())
     if grew and numbers["final_cost"] < numbers["initial_cost"]:
         lines.append("  The rms counts wrong matches in full and may grow; the robust cost, which doubts them, fell.")
     seconds = numbers["seconds"]
     compiled = " (with compilation)" if fresh else ""
-    lines.append(f"  {numbers['iterations']} steps in {seconds['total']:.2f} s{compiled}. {sentence}")
+    lines.append(f"  {counted(numbers['iterations'], 'steps')} in {seconds['total']:.2f} s{compiled}. {sentence}")
     if verbose:
         lines += describe_relations(numbers.get("relations") or {})
         stages = ", ".join(f"{name} {value:.3f} s" for name, value in seconds.items() if name != "total")

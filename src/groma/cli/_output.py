@@ -2,35 +2,82 @@
 """Writing results: complete or not at all, and never over something that was there unless asked to."""
 
 import json
-import os
+import re
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from groma.errors import OutputError
 
-#: A folder that holds anything else is not a result of groma, and ``--force`` does not replace it.
-_RESULT_NAMES = {"structures", "report.html", "report.json", "adjusted.npz", "rigs", "sparse", "truth", "start"}
-_RESULT_SUFFIXES = {".bin", ".txt", ".npz", ".json", ".html", ".npy", ".obj", ".ply"}
+#: What the commands write into folders. A folder that holds anything else is not replaced by ``--force``.
+_RESULTS = re.compile(
+    r"(cameras|images|points3D|rigs|frames)\.(bin|txt)|structures|(scene|start|truth)\.npz|(lines|planes)\.(ply|obj)|"
+    r"summary\.json|report\.html|trajectory\.txt|part_\d+"
+)
 
 
-def check_output(path: Path, force: bool) -> None:
-    """Refuse early, before any work is done, what :func:`atomic_output` would refuse at the end."""
+def check_outputs(
+    force: bool, output: Path | None, *files: Path | None, json_target: str | None = None, file: bool = False
+) -> None:
+    """Refuse early, before any work is done, places that cannot be written, or that are given twice.
+
+    Parameters
+    ----------
+    force : bool
+        What is there may be replaced.
+    output : Path, optional
+        Where the result goes, a file or a folder.
+    files : Path or None
+        Further results, which are files; None for those that are not wanted.
+    json_target : str, optional
+        Value of --json.
+    file : bool
+        ``output`` is a file, too.
+    """
+    report = None if json_target in (None, "-") else Path(json_target)
+    taken: set[Path] = set()
+    for number, path in enumerate((output, *files, report)):
+        if path is None:
+            continue
+        check_output(path, force, file=number > 0 or file)
+        if path.absolute() in taken:
+            raise OutputError(f"{path} is given for two results, and one would replace the other. Name them apart.")
+        taken.add(path.absolute())
+
+
+def check_output(path: Path, force: bool, file: bool = False) -> None:
+    """Refuse early, before any work is done, what :func:`atomic_output` would refuse at the end.
+
+    Parameters
+    ----------
+    path : Path
+        Where a result goes.
+    force : bool
+        What is there may be replaced, if groma wrote it.
+    file : bool
+        The result is a file: it never replaces a folder.
+    """
     parent = path.absolute().parent
     if not parent.is_dir():
         raise OutputError(f"Cannot write {path}: the folder {parent} does not exist. Make it first.")
-    if not os.access(parent, os.W_OK):
-        raise OutputError(f"Cannot write {path}: the folder {parent} is not writable. Choose another place.")
+    try:
+        tempfile.TemporaryDirectory(prefix=".groma.", dir=parent).cleanup()
+    except OSError as error:
+        raise OutputError(
+            f"Cannot write {path}: nothing can be made in the folder {parent} ({error.strerror or error}). Choose "
+            "another place."
+        ) from error
     if not (path.exists() or path.is_symlink()):
         return
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OutputError(f"{path} is a device or a pipe, not a file. Pass a file name; --json - is standard output.")
+    if file and path.is_dir():
+        raise OutputError(f"{path} is a folder. Pass the name of a file.")
     if not force:
         raise OutputError(f"{path} exists already. Pass --force to replace it, or choose another name.")
     if path.is_dir():
-        foreign = [
-            entry.name
-            for entry in path.iterdir()
-            if entry.name not in _RESULT_NAMES and entry.suffix not in _RESULT_SUFFIXES
-        ]
+        foreign = sorted(entry.name for entry in path.iterdir() if not _RESULTS.fullmatch(entry.name))
         if foreign:
             raise OutputError(
                 f"{path} holds {foreign[0]!r}, which groma did not write; --force does not replace such a folder. "
@@ -54,10 +101,7 @@ def atomic_output(path: Path, force: bool, workshop_in: Path | None = None) -> I
 def check_json(target: str | None, force: bool) -> None:
     """Refuse a report that could not be written, before any work is done."""
     if target not in (None, "-"):
-        path = Path(target)
-        if path.is_dir():
-            raise OutputError(f"--json {target} is a folder. Give a file name, or '-' for standard output.")
-        check_output(path, force)
+        check_output(Path(target), force, file=True)
 
 
 def write_json(target: str | None, content: dict[str, object], force: bool = False) -> None:

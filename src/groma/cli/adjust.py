@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""``groma adjust``: bundle adjustment of a COLMAP model, a BAL file or a groma archive."""
+"""``groma adjust``: bundle adjustment of a COLMAP model, a BAL file or a groma archive; of a pose graph, too."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from groma.cli import _options
 from groma.errors import InputError, ProblemError
+
+if TYPE_CHECKING:
+    from groma.pipelines.adjust import AdjustResult
+    from groma.scene import Scene
 
 LinearSolver = Literal["auto", "dense", "sparse", "pcg"]
 CovarianceGauge = Literal["auto", "inner", "held"]
@@ -110,28 +114,41 @@ def adjust(
 
     Reads a scene, minimises the robust reprojection error over everything in it and writes the scene back. The input
     is never changed. LIMAP's structures beside a COLMAP model are read and written too, with what they hold besides.
-    What the data do not determine is said in words at the end.
+    What the data do not determine is said in words at the end. A pose graph (.g2o, .g2o.gz) is adjusted, too.
     Chance plays no part here: --seed is accepted so that scripts can pass it everywhere.
     """
     from groma.cli import _output
     from groma.cli._console import Console
+    from groma.cli._input import check_inputs
+    from groma.cli._pose_graph import adjust_pose_graph_file, is_pose_graph
 
     console = Console(quiet, verbose, json_target, threads)
-    for path in (output, page, covariance):
-        if path is not None:
-            _output.check_output(path, force)
+    _output.check_outputs(force, output, page, covariance, json_target=json_target)
     if covariance is not None and covariance.suffix not in (".npz", ".json"):
         raise InputError(f"--covariance must end in .npz or .json; got {covariance}.")
     if not 0.0 < sigma0 < float("inf"):
         raise InputError(f"--sigma0 must be positive; got {sigma0}.")
     if truth is not None and not contributions:
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
-    _output.check_json(json_target, force)
+    check_inputs(source, truth)
+    if is_pose_graph(source):
+        refused = {
+            "--report": page, "--covariance": covariance, "--contributions": contributions, "--gauge": gauge,
+            "--line-chart": line_chart, "--refine-intrinsics": refine_intrinsics, "--refine-rigs": refine_rigs,
+        }  # fmt: skip
+        given = {
+            "loss": "none" if loss == "auto" else loss, "loss_scale": loss_scale, "linear_solver": linear_solver,
+            "max_iterations": max_iterations, "threads": threads,
+        }  # fmt: skip
+        options_of_graph = {name: value for name, value in given.items() if value is not None}
+        numbers_of_graph = adjust_pose_graph_file(source, output, console, force, options_of_graph, refused)
+        _output.write_json(json_target, numbers_of_graph, force)
+        return
 
     from groma.cli._contributions import describe_contributions
     from groma.cli._diagnosis import diagnosis_of, say_diagnosis
     from groma.cli._numbers import describe, describe_uncertainty
-    from groma.io import read_scene, structures_of, write_scene
+    from groma.io import check_target, read_scene, structures_of, write_scene
     from groma.pipelines.adjust import AdjustOptions
     from groma.pipelines.adjust import adjust as run_adjust
     from groma.pipelines.diagnosis import diagnose_scene
@@ -155,6 +172,8 @@ def adjust(
         **{name: value for name, value in chosen.items() if value is not None},  # type: ignore[arg-type]
     )
     before = read_scene(source)
+    if output is not None:
+        check_target(before, output)
     true = None if truth is None else read_scene(truth)
     fresh = console.announce_compilation()
     with console.progress() as progress:
@@ -171,35 +190,22 @@ def adjust(
     if output is not None:
         write_scene(result.scene, output, force=force, like=structures_of(source))
     if page is not None:
-        from groma.viz._page_tables import contributions_card
-        from groma.viz.report import write_report
-
-        with _output.atomic_output(page, force) as draft:
-            cards = contributions_card(numbers.get("contributions"))
-            write_report(draft, before, result.scene, result.report, diagnosis=numbers["diagnosis"], cards=cards)
-    found, failure = None, None
+        _write_page(page, before, result, numbers, f"Adjustment of {source.absolute().name}", force)
+    failure = None
     if covariance is not None:
-        from groma.cli._covariance import write_covariances
-        from groma.pipelines.uncertainty import uncertainty
-
         try:
-            found = uncertainty(result.scene, gauge=covariance_gauge, sigma0=sigma0, problem=result.problem)
+            numbers["uncertainty"] = _write_covariances(covariance, result, covariance_gauge, sigma0, force)
         except ProblemError as error:  # raised at the end, when all else is written and said
             failure = error
-        else:
-            write_covariances(covariance, result.scene, found, force)
-            numbers["uncertainty"] = found.to_dict()
-    for line in describe(numbers, result.report.termination.sentence, verbose=console.verbose, fresh=fresh):
-        console.say(line)
-    if found is not None:
-        for line in describe_uncertainty(found.to_dict()):
-            console.say(line)
-    for line in describe_contributions(numbers.get("contributions", [])):
+    said = describe(numbers, result.report.termination.sentence, verbose=console.verbose, fresh=fresh)
+    said += describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else []
+    said += describe_contributions(numbers.get("contributions", []))
+    for line in said:
         console.say(line)
     say_diagnosis(numbers["diagnosis"], console)
     for sentence in result.report.warnings:
         console.warn(sentence)
-    for path in (output, page, covariance if found is not None else None):
+    for path in (output, page, covariance if failure is None else None):
         if path is not None:
             console.say(f"Wrote {path}")
     if output is None and page is None and covariance is None and json_target is None:
@@ -207,3 +213,35 @@ def adjust(
     _output.write_json(json_target, {**numbers, "warnings": list(result.report.warnings)}, force)
     if failure is not None:
         raise failure
+
+
+def _write_page(
+    page: Path, before: "Scene", result: "AdjustResult", numbers: dict[str, Any], title: str, force: bool
+) -> None:
+    """Write the HTML page of an adjustment."""
+    from groma.cli import _output
+    from groma.viz._page_tables import contributions_card
+    from groma.viz.report import write_report
+
+    with _output.atomic_output(page, force) as draft:
+        write_report(
+            draft,
+            before,
+            result.scene,
+            result.report,
+            title=title,
+            diagnosis=numbers["diagnosis"],
+            cards=contributions_card(numbers.get("contributions")),
+        )
+
+
+def _write_covariances(
+    path: Path, result: "AdjustResult", gauge: CovarianceGauge, sigma0: float, force: bool
+) -> dict[str, Any]:
+    """Write the covariances of an adjusted scene and return their summary."""
+    from groma.cli._covariance import write_covariances
+    from groma.pipelines.uncertainty import uncertainty
+
+    found = uncertainty(result.scene, gauge=gauge, sigma0=sigma0, problem=result.problem)
+    write_covariances(path, result.scene, found, force)
+    return found.to_dict()

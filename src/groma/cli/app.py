@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The application: which commands there are. Each lives in a file of its own name."""
 
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -18,22 +19,36 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("demo")(guard(demo.demo))
-app.command("map")(guard(map.map_))
-app.command("track")(guard(track.track))
-app.command("adjust")(guard(adjust.adjust))
-app.command("convert")(guard(convert.convert))
-app.command("report")(guard(report.report))
-app.command("view")(guard(view.view))
-app.command("synth")(guard(synth.synth))
-app.command("selfcheck")(guard(selfcheck.selfcheck))
-app.command("warmup")(guard(warmup.warmup))
+#: Name, function, and a few words for the list of ``groma --help``; the command's own help says the rest.
+_Commands = tuple[tuple[str, Callable[..., None], str], ...]
+_COMMANDS: _Commands = (
+    ("demo", demo.demo, "Map photographs that are shipped with groma: where to begin."),
+    ("map", map.map_, "Photographs to points, lines, planes and poses."),
+    ("track", track.track, "Follow a camera through a sequence, and map on the way."),
+    ("adjust", adjust.adjust, "Bundle adjustment of a COLMAP model, BAL file or archive."),
+    ("convert", convert.convert, "From one file format to another."),
+    ("report", report.report, "A scene as one HTML page that needs no network."),
+    ("view", view.view, "Look at a scene in the browser."),
+    ("synth", synth.synth, "A synthetic scene whose exact truth is known."),
+    ("selfcheck", selfcheck.selfcheck, "Check derivatives and covariances on this machine."),
+    ("warmup", warmup.warmup, "Compile everything once, so that no command waits for it."),
+)
+_COMPARISONS: _Commands = (
+    ("poses", evaluate.poses, "Camera poses of two scenes."),
+    ("trajectory", evaluate.trajectory, "Two trajectories: absolute, relative errors and drift."),
+    ("lines", evaluate.lines, "3D lines with lines, edges, a mesh or points."),
+    ("planes", evaluate.planes, "Planes with planes or points."),
+)
+
+
+def _add(group: typer.Typer, commands: _Commands) -> None:
+    for name, command, words in commands:
+        group.command(name, short_help=words)(guard(command))
+
 
 _evaluate = typer.Typer(help="Compare a result with a reference.", no_args_is_help=True, rich_markup_mode=None)
-_evaluate.command("poses")(guard(evaluate.poses))
-_evaluate.command("lines")(guard(evaluate.lines))
-_evaluate.command("planes")(guard(evaluate.planes))
-_evaluate.command("trajectory")(guard(evaluate.trajectory))
+_add(app, _COMMANDS)
+_add(_evaluate, _COMPARISONS)
 app.add_typer(_evaluate, name="evaluate")
 
 

@@ -8,6 +8,7 @@ import typer
 
 from groma.cli import _options, _output
 from groma.cli._console import Console
+from groma.cli._input import check_inputs
 
 
 def convert(
@@ -28,8 +29,8 @@ def convert(
 ) -> None:
     """Read a scene and write it in another format."""
     console = Console(quiet, verbose, json_target, threads)
-    _output.check_output(target, force)
-    _output.check_json(json_target, force)
+    _output.check_outputs(force, target, json_target=json_target)
+    check_inputs(source)
 
     from groma.cli._counts import counts_of, sentence_of
     from groma.io import read_scene, structures_of, write_scene

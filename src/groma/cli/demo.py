@@ -27,8 +27,7 @@ def demo(
     The result is compared with poses by motion capture and with the size of the cabinet.
     """
     console = Console(quiet, verbose, json_target, threads)
-    _output.check_output(output, force)
-    _output.check_json(json_target, force)
+    _output.check_outputs(force, output, json_target=json_target)
 
     from groma.cli import _cabinet
     from groma.cli._mapping import map_and_write

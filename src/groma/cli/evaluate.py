@@ -9,6 +9,7 @@ import typer
 from groma.cli import _options, _output
 from groma.cli._console import Console
 from groma.cli._counts import counted
+from groma.cli._input import check_inputs
 from groma.errors import InputError
 
 # As groma.io.trajectories and groma.evaluation.trajectory have them; not imported, because they load NumPy.
@@ -29,6 +30,7 @@ def poses(
     """Compare the camera poses of two scenes after similarity alignment; images are matched by name."""
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
+    check_inputs(estimate, reference)
 
     from groma.evaluation.poses import evaluate_poses
     from groma.io import read_scene
@@ -81,6 +83,7 @@ def lines(
     """Compare 3D line segments with a reference: how much of it is covered, how much of the lines is right."""
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
+    check_inputs(estimate, reference)
 
     from groma.evaluation.lines import evaluate_lines, score_lines
     from groma.io import read_scene
@@ -125,6 +128,7 @@ def planes(
     """Compare planes with reference planes (angles and offsets of matches) or with points (share explained)."""
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
+    check_inputs(estimate, reference)
 
     from groma.evaluation.planes import evaluate_planes, score_planes_by_points
     from groma.io import read_scene
@@ -140,10 +144,11 @@ def planes(
         planes_there = counted(found.num_planes, "planes")
         console.say(f"{len(found.matches)} of {planes_there} match {found.num_reference} of the reference")
         console.say(f"  precision   {_percent(found.precision)}, recall {_percent(found.recall)}")
-        console.say(f"  normals     {found.normal_deg_mean:.4g} deg mean, {found.normal_deg_max:.4g} max")
-        console.say(
-            f"  offsets     {found.offset_mean:.4g} mean, {found.offset_max:.4g} max, in units of the reference"
-        )
+        if len(found.matches):
+            console.say(f"  normals     {found.normal_deg_mean:.4g} deg mean, {found.normal_deg_max:.4g} max")
+            console.say(
+                f"  offsets     {found.offset_mean:.4g} mean, {found.offset_max:.4g} max, in units of the reference"
+            )
         _output.write_json(json_target, found.to_dict(), force)
         return
     shares = score_planes_by_points(scene.planes.hesse, read_reference(reference).surface_points(), threshold)
@@ -172,6 +177,7 @@ def trajectory(
     """Compare a trajectory with a reference: absolute and relative errors, and drift; poses are matched by time."""
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
+    check_inputs(estimate, reference)
 
     from groma.evaluation.trajectory import Spread, score_trajectory
     from groma.io import read_trajectory
@@ -192,16 +198,17 @@ def trajectory(
     )
     applied = {"se3": "rotation and translation", "sim3": f"similarity of scale {scores.similarity.scale:.6g}"}
     console.say(
-        f"{scores.num_poses} poses associated of {scores.num_estimate} and {scores.num_reference}, path of "
+        f"{counted(scores.num_poses, 'poses')} associated of {scores.num_estimate} and {scores.num_reference}, path of "
         f"{scores.path_length:.6g} m; alignment: {applied.get(align, 'none')}"
     )
+    step = f"{rpe_delta:g} {rpe_unit.removesuffix('s') if rpe_delta == 1 else rpe_unit}"
     row("absolute, position", scores.ate, "m")
     row("absolute, rotation", scores.rotation_deg, "deg")
     if scores.rpe_translation is None or scores.rpe_rotation_deg is None:
-        console.warn(f"No two associated poses are {rpe_delta:g} {rpe_unit} apart; there are no relative errors.")
+        console.warn(f"No two associated poses are {step} apart; there are no relative errors.")
     else:
-        row("relative, position", scores.rpe_translation, f"m per {rpe_delta:g} {rpe_unit}")
-        row("relative, rotation", scores.rpe_rotation_deg, f"deg per {rpe_delta:g} {rpe_unit}")
+        row("relative, position", scores.rpe_translation, f"m per {step}")
+        row("relative, rotation", scores.rpe_rotation_deg, f"deg per {step}")
     if scores.drift_percent is not None:
         console.say(
             f"  drift                {scores.drift_percent:10.6g} %   {scores.drift_deg_per_metre:10.6g} deg/m, "

@@ -6,6 +6,7 @@ Exit codes: 0 success, 1 a known error (one line on standard error), 2 wrong usa
 
 import os
 import sys
+from io import TextIOWrapper
 
 from groma.cli._interrupt import INTERRUPTED
 
@@ -20,13 +21,17 @@ def run(arguments: list[str] | None = None) -> int:
         code = exit_request.code
         return code if isinstance(code, int) else int(code is not None)
     except KeyboardInterrupt:
-        sys.stderr.write("groma: interrupted; nothing was written.\n")
+        sys.stderr.write("groma: interrupted; nothing is left half written.\n")
         return INTERRUPTED
     return 0
 
 
 def main() -> None:
     """Run as a process."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            # A name that the terminal cannot show is shown by its numbers; it is no reason to end.
+            stream.reconfigure(errors="backslashreplace")
     code = run()
     if code == INTERRUPTED:
         # Worker threads may still be inside a compiled kernel; the normal exit would wait for them.

@@ -67,10 +67,11 @@ def map_(
     """
     from groma.cli import _output
     from groma.cli._console import Console
+    from groma.cli._input import check_inputs
 
     console = Console(quiet, verbose, json_target, threads)
-    _output.check_output(output, force)
-    _output.check_json(json_target, force)
+    _output.check_outputs(force, output, json_target=json_target)
+    check_inputs(images, model, line_matches, truth)
 
     if model is not None and (camera_params is not None or camera_model != "SIMPLE_RADIAL"):
         raise InputError("--camera-model and --camera-params are for images without a model. Leave them out.")

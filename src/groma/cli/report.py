@@ -33,10 +33,11 @@ def report(
     """
     from groma.cli import _output
     from groma.cli._console import Console
+    from groma.cli._input import check_inputs
 
     console = Console(quiet, verbose, json_target, threads)
-    _output.check_output(output, force)
-    _output.check_json(json_target, force)
+    _output.check_outputs(force, output, json_target=json_target, file=True)
+    check_inputs(source, images, before)
 
     from groma.cli._counts import counts_of
     from groma.errors import InputError

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from groma.cli import _options
+from groma.errors import InputError
 
 
 def selfcheck(
@@ -39,6 +40,8 @@ def selfcheck(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
+    if golden is not None and not golden.is_dir():
+        raise InputError(f"--golden must be a folder of reference values; there is none at {golden}. Check the path.")
     console.announce_compilation()
     passed, numbers = _check_covariances(console, runs, seed) if nees else _check_derivatives(console, golden, seed)
     _output.write_json(json_target, numbers, force)

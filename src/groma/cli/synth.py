@@ -40,8 +40,7 @@ def synth(
     from groma.cli._console import Console
 
     console = Console(quiet, verbose, json_target, threads)
-    _output.check_output(output, force)
-    _output.check_json(json_target, force)
+    _output.check_outputs(force, output, json_target=json_target)
 
     from groma.cli._counts import counts_of, sentence_of
     from groma.io import write_scene

@@ -38,6 +38,7 @@ def view(
 
     from groma.cli import _output
     from groma.cli._console import Console
+    from groma.cli._input import check_inputs
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
@@ -45,6 +46,7 @@ def view(
     if live:
         _follow(source, port, browser, console, json_target, force)
         return
+    check_inputs(source, images)
 
     from groma.cli._counts import counts_of, sentence_of
     from groma.io import read_scene

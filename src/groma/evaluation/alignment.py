@@ -80,13 +80,17 @@ def align_poses(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool =
     ShapeError
         If the shapes are not (N, 7) twice.
     InputError
-        If there is no pose.
+        If there is no pose, or one that is not finite.
     """
     from_source, from_target = np.asarray(source, float), np.asarray(target, float)
     if from_source.shape != from_target.shape or from_source.ndim != 2 or from_source.shape[1] != 7:
         raise ShapeError(f"Poses must have shape (N, 7), twice; got {from_source.shape} and {from_target.shape}.")
     if len(from_source) == 0:
         raise InputError("Alignment needs at least one pose; got none.")
+    for name, poses in (("source", from_source), ("target", from_target)):
+        if not np.isfinite(poses).all():
+            row = int(np.argwhere(~np.isfinite(poses))[0, 0])
+            raise InputError(f"Poses must be finite; row {row} of {name} is {poses[row].tolist()}. Leave it out.")
     x, y = camera_centers(from_source), camera_centers(from_target)
     if len(x) >= 3 and min(_rank(x), _rank(y)) >= 2:
         return align_points(x, y, with_scale)

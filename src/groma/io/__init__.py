@@ -13,14 +13,26 @@ from groma.errors import FileFormatError, InputError
 from groma.io._atomic import atomic_output
 from groma.io._reading import existing, reading
 from groma.io.archive import is_archive_name, looks_like_archive, read_archive, write_archive
-from groma.io.bal import looks_like_bal, read_bal, write_bal
-from groma.io.colmap import from_pycolmap, read_colmap, to_pycolmap, write_colmap
+from groma.io.bal import check_bal, looks_like_bal, read_bal, write_bal
+from groma.io.colmap import check_colmap, from_pycolmap, read_colmap, to_pycolmap, write_colmap
+from groma.io.g2o import read_g2o, write_g2o
 from groma.io.limap import Structures, structures_of
 from groma.io.ply import write_geometry, write_obj, write_ply
 from groma.io.trajectories import Trajectory, read_trajectory, read_tum, write_trajectory, write_tum
 from groma.scene import Scene
 
 Format = Literal["auto", "colmap", "colmap_text", "archive", "bal", "ply", "obj"]
+
+#: Formats by the ending of a name.
+_ENDINGS: dict[str, Format] = {
+    ".npz": "archive",
+    ".txt": "bal",
+    ".bz2": "bal",
+    ".gz": "bal",
+    ".ply": "ply",
+    ".obj": "obj",
+    "": "colmap",
+}
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene:
@@ -93,17 +105,7 @@ def write_scene(
     OutputError
         If something is there already or the file system refuses.
     """
-    suffixes = {
-        ".npz": "archive",
-        ".txt": "bal",
-        ".bz2": "bal",
-        ".gz": "bal",
-        ".ply": "ply",
-        ".obj": "obj",
-        "": "colmap",
-    }
-    suffix = Path(path).suffix.lower()
-    chosen = suffixes.get(suffix, "colmap" if Path(path).is_dir() else None) if format == "auto" else format
+    chosen = check_target(scene, path, format)
     if chosen == "archive":
         write_archive(scene, path, force)
     elif chosen == "bal":
@@ -114,12 +116,40 @@ def write_scene(
         write_colmap(scene, path, "text", force, like)
     elif chosen == "ply":
         write_ply(scene, path, force)
-    elif chosen == "obj":
-        write_obj(scene, path, force)
     else:
+        write_obj(scene, path, force)
+
+
+def check_target(scene: Scene, path: str | os.PathLike[str], format: Format = "auto") -> Format:
+    """Return the format that :func:`write_scene` chooses; ask before long work whether it can hold the scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is to be written, or will be adjusted first.
+    path : path
+        Where.
+    format : str
+        As in :func:`write_scene`.
+
+    Raises
+    ------
+    InputError
+        If the format is unknown or cannot hold the scene.
+    """
+    if not isinstance(scene, Scene):
+        raise InputError(f"What is written must be a groma.Scene; got {type(scene).__name__}. Pass result.scene.")
+    suffix = Path(path).suffix.lower()
+    chosen = _ENDINGS.get(suffix, "colmap" if Path(path).is_dir() else None) if format == "auto" else format
+    if chosen == "bal":
+        check_bal(scene)
+    elif chosen in ("colmap", "colmap_text"):
+        check_colmap(scene, "binary" if chosen == "colmap" else "text")
+    elif chosen not in ("archive", "ply", "obj"):
         known = "a folder name for COLMAP, .npz for an archive, .txt, .bz2 or .gz for BAL, .ply or .obj"
         what = f"format {format!r}" if format != "auto" else f"the ending {suffix!r}"
         raise InputError(f"Cannot tell the format from {what} of {path}. Use {known}.")
+    return chosen
 
 
 def _unpacked_head(path: Path, head: bytes) -> bytes:
@@ -140,10 +170,12 @@ __all__ = [
     "Structures",
     "Trajectory",
     "atomic_output",
+    "check_target",
     "from_pycolmap",
     "read_archive",
     "read_bal",
     "read_colmap",
+    "read_g2o",
     "read_scene",
     "read_trajectory",
     "read_tum",
@@ -152,6 +184,7 @@ __all__ = [
     "write_archive",
     "write_bal",
     "write_colmap",
+    "write_g2o",
     "write_geometry",
     "write_obj",
     "write_ply",

@@ -9,6 +9,7 @@ Walking over the counts costs milliseconds and makes the reader safe. Nothing is
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 from collections.abc import Mapping
@@ -38,12 +39,24 @@ def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "t
         for suffix, form in ((".bin", "binary"), (".txt", "text")):
             if all((place / f"{name}{suffix}").is_file() for name in _FILES):
                 return place, form  # type: ignore[return-value]
-    pictures = any(entry.suffix.lower() in IMAGES for entry in root.iterdir()) if root.is_dir() else False
-    remedy = "It holds images: groma map makes a model of them." if pictures else "Check the path."
     raise FileFormatError(
         f"{root} holds no COLMAP model: expected cameras, images and points3D, all .bin or all .txt, there, in sparse "
-        f"or in sparse/0. {remedy}"
+        f"or in sparse/0. {_remedy(root)}"
     )
+
+
+def _remedy(root: Path) -> str:
+    """Say what to do with a folder without a model, by what else is in it."""
+    names = sorted(entry.name for entry in root.iterdir()) if root.is_dir() else []
+    archives = [name for name in names if name.lower().endswith(".npz")]
+    models = [
+        name for name in names if (root / name / "cameras.bin").is_file() or (root / name / "cameras.txt").is_file()
+    ]
+    if archives or models:
+        return f"It holds {' and '.join((archives + models)[:3])}: pass {root / (archives + models)[0]}, for example."
+    if any(name.lower().endswith(IMAGES) for name in names):
+        return "It holds images: groma map makes a model of them."
+    return "Check the path."
 
 
 def check_binary_model(folder: Path, num_params: Mapping[int, int]) -> None:
@@ -70,11 +83,46 @@ def check_binary_model(folder: Path, num_params: Mapping[int, int]) -> None:
         data = path.read_bytes()
         try:
             end = walk(data)
-        except (struct.error, IndexError, OverflowError, ValueError) as error:
+        except (struct.error, IndexError) as error:
+            raise FileFormatError(f"{path} is incomplete: it ends after {len(data)} bytes. Export it again.") from error
+        except (OverflowError, ValueError) as error:
             raise FileFormatError(f"{path} is incomplete or damaged: {error}. Fetch or export it again.") from error
         if end != len(data):
             what = "ends too early" if end > len(data) else f"holds {len(data) - end} bytes too many"
             raise FileFormatError(f"{path} is damaged: it {what} for its counts. Fetch or export it again.")
+
+
+def damage_in_text(folder: Path) -> str:
+    """Return where the text files of a model are damaged, in words, or "" where their rows look as they should.
+
+    COLMAP's own reader names neither the file nor the line. Rows are only looked at, not interpreted.
+    """
+    rows = {
+        "cameras.txt": lambda words: len(words) >= 4 and _numbers(words[:1] + words[2:]),
+        "images.txt": lambda words: len(words) >= 10 and _numbers(words[:9]),
+        "points3D.txt": lambda words: len(words) >= 8 and _numbers(words),
+    }
+    for name, is_row in rows.items():
+        observations = False  # every second row of the images
+        with (folder / name).open(encoding="utf-8", errors="replace") as file:
+            for number, line in enumerate(file, 1):
+                words = line.split()
+                if observations:
+                    good, observations = len(words) % 3 == 0 and _numbers(words), False
+                elif not words or words[0].startswith("#"):
+                    continue
+                else:
+                    good, observations = is_row(words), name == "images.txt"
+                if not good:
+                    return f"{name}, line {number}: {' '.join(words[:10])[:80]!r}"
+    return ""
+
+
+def _numbers(words: list[str]) -> bool:
+    try:
+        return all(math.isfinite(float(word)) for word in words)
+    except ValueError:
+        return False
 
 
 def _count(data: bytes, least_row: int) -> int:

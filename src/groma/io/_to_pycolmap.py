@@ -25,7 +25,7 @@ def to_pycolmap(scene: Scene) -> pycolmap.Reconstruction:
 
     reconstruction = pycolmap.Reconstruction()
     for row, number in enumerate(scene.cameras.ids.tolist()):
-        name, params = _colmap_camera(scene.cameras, row)
+        name, params = colmap_camera(scene.cameras, row)
         reconstruction.add_camera(
             pycolmap.Camera(
                 camera_id=number,
@@ -42,7 +42,8 @@ def to_pycolmap(scene: Scene) -> pycolmap.Reconstruction:
     return reconstruction
 
 
-def _colmap_camera(cameras: Cameras, row: int) -> tuple[str, list[float]]:
+def colmap_camera(cameras: Cameras, row: int) -> tuple[str, list[float]]:
+    """Return COLMAP's name of the model of a camera and its parameters; raise InputError where COLMAP has none."""
     name, params = cameras.models[row], cameras.params_of(row).tolist()
     if name == "BAL":
         return "RADIAL", [params[0], cameras.width[row] / 2, cameras.height[row] / 2, *params[1:]]
@@ -132,4 +133,4 @@ def _rigid(pycolmap: Any, pose: FloatArray) -> Any:
     return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:4]), pose[4:])
 
 
-__all__ = ["to_pycolmap"]
+__all__ = ["colmap_camera", "to_pycolmap"]

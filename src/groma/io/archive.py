@@ -42,9 +42,9 @@ def write_archive(scene: Scene, path: str | os.PathLike[str], force: bool = Fals
         for table in fields(scene):
             for item in fields(getattr(scene, table.name)):
                 value = getattr(getattr(scene, table.name), item.name)
-                if (fill := item.metadata.get("fill")) is not None and not isinstance(value, tuple):
-                    if (value == fill).all():
-                        continue  # as if left out; readers that do not know the column can read the file
+                fill = item.metadata.get("fill")
+                if fill is not None and not isinstance(value, tuple) and (value == fill).all():
+                    continue  # as if left out; readers that do not know the column can read the file
                 array = np.array(value, dtype="<U1" if not value else None) if isinstance(value, tuple) else value
                 _write_array(file, f"{table.name}.{item.name}", array)
 

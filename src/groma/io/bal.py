@@ -85,12 +85,7 @@ def write_bal(scene: Scene, path: str | os.PathLike[str], force: bool = False) -
     InputError
         If the scene holds lines or planes, or cameras that the BAL model cannot express (see :func:`bal_params`).
     """
-    if scene.num_lines or scene.num_planes or scene.num_directions:
-        raise InputError(
-            f"A BAL file holds points only; the scene has {scene.num_lines} lines, {scene.num_planes} planes and "
-            f"{scene.num_directions} directions. Write a groma archive (.npz), or scene.points_only()."
-        )
-    params, principal_point = bal_params(scene)
+    params, principal_point = check_bal(scene)
     seen = scene.point_observations
     pixel = (seen.pixel - principal_point[seen.image_idx]) * [1, -1]
     poses = scene.cam_from_world
@@ -110,6 +105,22 @@ def write_bal(scene: Scene, path: str | os.PathLike[str], force: bool = False) -
         content = gzip.compress(content, mtime=0)
     with atomic_output(path, force) as draft:
         draft.write_bytes(content)
+
+
+def check_bal(scene: Scene) -> tuple[FloatArray, FloatArray]:
+    """Return what :func:`bal_params` does, if a BAL file can hold the scene.
+
+    Raises
+    ------
+    InputError
+        If the scene holds lines or planes, or cameras that the BAL model cannot express.
+    """
+    if scene.num_lines or scene.num_planes or scene.num_directions:
+        raise InputError(
+            f"A BAL file holds points only; the scene has {scene.num_lines} lines, {scene.num_planes} planes and "
+            f"{scene.num_directions} directions. Write a groma archive (.npz), or scene.points_only()."
+        )
+    return bal_params(scene)
 
 
 def bal_params(scene: Scene) -> tuple[FloatArray, FloatArray]:
@@ -219,4 +230,4 @@ def _scene(image_idx: IntArray, point_idx: IntArray, pixel: FloatArray, camera: 
     )
 
 
-__all__ = ["bal_params", "looks_like_bal", "read_bal", "write_bal"]
+__all__ = ["bal_params", "check_bal", "looks_like_bal", "read_bal", "write_bal"]

@@ -23,9 +23,10 @@ from groma import cameras as camera_models
 from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError
 from groma.io._atomic import atomic_output
-from groma.io._colmap_files import check_binary_model, find_model
+from groma.io._colmap_files import check_binary_model, damage_in_text, find_model
+from groma.io._quiet import quiet
 from groma.io._reading import reading
-from groma.io._to_pycolmap import to_pycolmap
+from groma.io._to_pycolmap import colmap_camera, to_pycolmap
 from groma.io.limap import Structures, read_beside, write_beside
 from groma.scene import Cameras, Frames, Images, Keypoints, PointObservations, Points, Rigs, Scene, Sensors
 from groma.scene.camera import CAMERA, OTHER
@@ -59,13 +60,13 @@ def read_colmap(path: str | os.PathLike[str]) -> Scene:
     import pycolmap
 
     folder, form = find_model(path)
-    with reading(folder, _KIND), _quiet(pycolmap):
+    with reading(folder, _KIND), quiet(pycolmap):
         reconstruction = pycolmap.Reconstruction()
         if form == "binary":
             check_binary_model(folder, _num_params_by_number(pycolmap))
             reconstruction.read_binary(str(folder))
         else:
-            reconstruction.read_text(str(folder))
+            _read_text(reconstruction, folder)
         scene = from_pycolmap(reconstruction)
         if form == "text":
             whole = _spaced_names(folder / "images.txt")
@@ -73,6 +74,15 @@ def read_colmap(path: str | os.PathLike[str]) -> Scene:
             names = tuple(whole.get(number, name) for number, name in pairs)
             scene = scene.replace(images=scene.images.replace(names=names))
     return read_beside(scene, folder)
+
+
+def _read_text(reconstruction: pycolmap.Reconstruction, folder: Path) -> None:
+    try:
+        reconstruction.read_text(str(folder))
+    except Exception as error:  # whatever pycolmap raises on damaged files
+        if place := damage_in_text(folder):
+            raise FileFormatError(f"{folder} is damaged in {place}. Fetch or export it again.") from error
+        raise
 
 
 def _spaced_names(path: Path) -> dict[int, str]:
@@ -245,19 +255,6 @@ def _num_params_by_number(pycolmap: Any) -> dict[int, int]:
     }
 
 
-class _quiet:  # noqa: N801 - used like a function
-    """Keep pycolmap's own log off the terminal: what it reports comes back as one line of ours."""
-
-    def __init__(self, pycolmap: Any) -> None:
-        self.logging = pycolmap.logging
-
-    def __enter__(self) -> None:
-        self.level, self.logging.minloglevel = self.logging.minloglevel, 3
-
-    def __exit__(self, *_: object) -> None:
-        self.logging.minloglevel = self.level
-
-
 # Writing
 
 
@@ -290,13 +287,7 @@ def write_colmap(
         If an image name has white space in a text model, or a camera model is unknown to COLMAP. The BAL model is
         written as RADIAL, its centre at half the image size.
     """
-    if form not in ("binary", "text"):
-        raise InputError(f"form must be 'binary' or 'text'; got {form!r}.")
-    spaced = [name for name in scene.images.names if name.split() != [name]]
-    if form == "text" and spaced:
-        raise InputError(
-            f"A COLMAP text model cannot hold the image name {spaced[0]!r}: it is cut at white space. Use binary."
-        )
+    check_colmap(scene, form)
     reconstruction = to_pycolmap(scene)
     with atomic_output(path, force) as draft:
         draft.mkdir()
@@ -304,4 +295,23 @@ def write_colmap(
         write_beside(scene, draft, form, like)
 
 
-__all__ = ["find_model", "from_pycolmap", "read_colmap", "to_pycolmap", "write_colmap"]
+def check_colmap(scene: Scene, form: Literal["binary", "text"] = "binary") -> None:
+    """Ask whether a COLMAP model can hold a scene.
+
+    Raises
+    ------
+    InputError
+        If an image name has white space in a text model, or a camera model is unknown to COLMAP.
+    """
+    if form not in ("binary", "text"):
+        raise InputError(f"form must be 'binary' or 'text'; got {form!r}.")
+    spaced = [name for name in scene.images.names if name.split() != [name]]
+    if form == "text" and spaced:
+        raise InputError(
+            f"A COLMAP text model cannot hold the image name {spaced[0]!r}: it is cut at white space. Use binary."
+        )
+    for row in range(scene.num_cameras):
+        colmap_camera(scene.cameras, row)
+
+
+__all__ = ["check_colmap", "find_model", "from_pycolmap", "read_colmap", "to_pycolmap", "write_colmap"]

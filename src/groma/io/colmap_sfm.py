@@ -11,6 +11,7 @@ anything runs in parallel, and every source of random numbers is seeded.
 from __future__ import annotations
 
 import errno
+import math
 import os
 import shutil
 import tempfile
@@ -23,6 +24,7 @@ from typing import Any
 
 from groma import cameras as camera_models
 from groma.errors import GromaError, InputError, OutputError
+from groma.io._quiet import quiet
 from groma.io.colmap import from_pycolmap
 from groma.scene import Scene
 
@@ -50,6 +52,7 @@ class PointModelOptions:
     camera_params: tuple[float, ...] | None = None
     #: Seed of the random numbers of matching and mapping.
     seed: int = 0
+    #: Most threads of pycolmap; None: as many as there are processors.
     threads: int | None = None
 
     def __post_init__(self) -> None:
@@ -62,6 +65,11 @@ class PointModelOptions:
             raise InputError(
                 f"Camera model {model.name} has {model.num_parameters} parameters "
                 f"({', '.join(model.parameter_names)}); got {len(given)}. Pass them in this order."
+            )
+        if given is not None and not (all(map(math.isfinite, given)) and given[0] > 0):
+            raise InputError(
+                f"The camera parameters ({', '.join(model.parameter_names)}) must be numbers, the focal length "
+                f"positive; got {', '.join(f'{value:g}' for value in given)}."
             )
 
 
@@ -109,7 +117,7 @@ def reconstruct_points(
     folder, names = Path(work), sorted(names)
     database = folder / "database.db"
     pycolmap.set_random_seed(options.seed)
-    with _quiet(pycolmap), _explained(folder):
+    with quiet(pycolmap), _explained(folder):
         folder.mkdir(parents=True, exist_ok=True)
         _check_room(folder)
         _enter_images(pycolmap, database, Path(images), names, options)
@@ -306,17 +314,6 @@ def _explained(folder: Path) -> Iterator[None]:
             f"The points of the images cannot be reconstructed in {folder}: {reason.rstrip('.')}. See that there is "
             "room and you may write there; the same command then goes on. If it fails again, remove that folder."
         ) from error
-
-
-@contextmanager
-def _quiet(pycolmap: Any) -> Iterator[None]:
-    """Keep pycolmap's own log off the terminal: what it reports comes back as one line of ours."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level
 
 
 __all__ = ["EXHAUSTIVE_LIMIT", "PointModelOptions", "pair_blocks", "reconstruct_points"]

@@ -63,6 +63,13 @@ class Table:
     def _check(self) -> None:
         """Check what only this table knows."""
 
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        cls.__repr__ = Table.__repr__  # type: ignore[method-assign] - not the dataclass's, which prints every number
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self):,} rows: {', '.join(item.name for item in fields(self))})"
+
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
@@ -72,10 +79,7 @@ class Table:
 
     def take(self, rows: npt.ArrayLike) -> Self:
         """Return the chosen rows: integer indices or a boolean mask."""
-        chosen = np.asarray(rows)
-        if chosen.dtype == bool:
-            chosen = np.flatnonzero(chosen)
-        chosen = chosen.astype(np.int64, copy=False).reshape(-1)
+        chosen = rows_of(f"rows of {type(self).__name__}", rows, len(self), f"{self.noun}s")
         columns = {}
         for item in fields(self):
             value = getattr(self, item.name)
@@ -125,6 +129,36 @@ def _convert_text(name: str, value: Any) -> tuple[str, ...]:
         if any(character in entry for character in "\0\n\r"):
             raise InputError(f"{name}[{index}] must not hold line breaks or NUL; got {entry!r}. Rename it.")
     return names
+
+
+def rows_of(name: str, chosen: npt.ArrayLike, size: int, target: str) -> IntArray:
+    """Return rows of a table of ``size`` rows that were chosen by integers or by a boolean mask, as integers.
+
+    Raises
+    ------
+    ShapeError
+        If a mask is not as long as the table, or the choice has more than one axis.
+    InputError
+        If the choice is neither, or points outside.
+    """
+    rows = np.asarray(chosen)
+    if rows.dtype == bool:
+        if rows.shape != (size,):
+            raise ShapeError(
+                f"{name}: a mask must have shape ({size},), one entry for each of {target}; got {rows.shape}."
+            )
+        return np.flatnonzero(rows)
+    if rows.size == 0:
+        return np.zeros(0, np.int64)
+    if rows.ndim > 1:
+        raise ShapeError(f"{name} must have shape (n,); got {rows.shape}.")
+    if rows.dtype.kind not in "iu":
+        raise InputError(
+            f"{name} must be integers or a mask; got {rows.dtype} such as {rows.flat[0]!r}. Pass positions."
+        )
+    rows = rows.astype(np.int64, copy=False).reshape(-1)
+    check_index(name, rows, size, target)
+    return rows
 
 
 def check_sigma(name: str, sigma: FloatArray) -> None:

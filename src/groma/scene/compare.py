@@ -57,18 +57,18 @@ def near(first: Scene, second: Scene, tolerance: float = 1e-9) -> Comparison:
         if reason := _shape_difference(name, one, two):
             return Comparison(False, reason)
         if isinstance(one, tuple) or one.dtype.kind != "f":
-            if (isinstance(one, tuple) and one == two) or (not isinstance(one, tuple) and np.array_equal(one, two)):
+            if one == two if isinstance(one, tuple) else np.array_equal(one, two):
                 continue
             return Comparison(False, f"{name} differs")
         if one.size == 0:
             continue
-        two = _same_sign(name, one, two)
-        difference = np.abs(one - two) / np.maximum(1, np.maximum(np.abs(one), np.abs(two)))
+        turned = _same_sign(name, one, two)
+        difference = np.abs(one - turned) / np.maximum(1, np.maximum(np.abs(one), np.abs(turned)))
         if difference.max() > tolerance:
             row = int(np.unravel_index(difference.argmax(), difference.shape)[0])
             return Comparison(
                 False,
-                f"{name}[{row}] is {one[row]} in the first, {two[row]} in the second: "
+                f"{name}[{row}] is {one[row]} in the first, {turned[row]} in the second: "
                 f"relative difference {difference.max():.3g}, tolerance {tolerance:g}",
             )
     return Comparison(True)

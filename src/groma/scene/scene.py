@@ -25,7 +25,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3
-from groma.scene._table import check_index
+from groma.scene._table import check_index, rows_of
 from groma.scene.camera import CAMERA, Cameras, Rigs, Sensors
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
@@ -36,7 +36,7 @@ _QUATERNION_TOLERANCE = 1e-6
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """Everything known about a scene; see the module. Compare scenes with :mod:`groma.scene.compare`."""
 
@@ -97,6 +97,11 @@ class Scene:
             pairs = getattr(self.relations, item.name)
             check_index(f"relations.{item.name}[:, 0]", pairs[:, 0], sizes[first], f"{first}s")
             check_index(f"relations.{item.name}[:, 1]", pairs[:, 1], sizes[second], f"{second}s")
+
+    def __repr__(self) -> str:
+        counts = [(name, getattr(self, f"num_{name}")) for name in ("images", "cameras", "points", "lines", "planes")]
+        counts += [("directions", self.num_directions), ("observations", self.num_observations)]
+        return f"Scene({', '.join(f'{count:,} {name}' for name, count in counts if count) or 'empty'})"
 
     @classmethod
     def from_images(
@@ -312,9 +317,7 @@ class Scene:
         min_observations : int
             Points and lines seen less often are dropped; 0 keeps all of them.
         """
-        chosen = np.asarray(image_idx)
-        chosen = np.flatnonzero(chosen) if chosen.dtype == bool else chosen.astype(np.int64)
-        check_index("image_idx", chosen, self.num_images, "images")
+        chosen = rows_of("image_idx", image_idx, self.num_images, "images")
         new_image = _new_index(chosen, self.num_images)
         kept_frames, frame_idx = np.unique(self.images.frame_idx[chosen], return_inverse=True)
         seen = self.replace(
@@ -349,9 +352,7 @@ class Scene:
             table = getattr(self, f"{kind}s")
             new[kind] = np.arange(len(table))
             if rows is not None:
-                kept = np.asarray(rows)
-                kept = np.flatnonzero(kept) if kept.dtype == bool else kept.astype(np.int64)
-                check_index(f"{kind}s", kept, len(table), f"{kind}s")
+                kept = rows_of(f"{kind}s", rows, len(table), f"{kind}s")
                 new[kind], tables[f"{kind}s"] = _new_index(kept, len(table)), table.take(kept)
         for kind in {"point", "line"} & {name.removesuffix("s") for name in tables}:
             seen = getattr(self, f"{kind}_observations")

@@ -26,13 +26,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
 from scipy.linalg import get_lapack_funcs, solve_triangular
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.problem.layout import Layout
 from groma.solver._observability import distinct
+from groma.solver._ordering import fill_reducing_order
 from groma.solver.linear import Blocks
 
 #: A reduced system with more than this share of its blocks filled is one front.
@@ -207,20 +206,7 @@ def _arrange(pairs: dict, count: int, widths: IntArray) -> tuple[IntArray, list[
     rows, columns = rows[off], columns[off]
     if 2 * len(rows) > FULL_SHARE * count * count or count <= FEW_BLOCKS:
         return np.arange(count), [_Front(np.arange(count), count)]
-    degree = np.bincount(rows, minlength=count) + np.bincount(columns, minlength=count)
-    every = np.arange(count)
-    graph = scipy.sparse.csc_matrix(
-        (
-            np.concatenate([degree + 1.0, np.full(2 * len(rows), -1.0)]),
-            (np.concatenate([every, rows, columns]), np.concatenate([every, columns, rows])),
-        ),
-        shape=(count, count),
-    )
-    # the ordering of a factorisation of the block graph itself, which is small and diagonally dominant
-    ordering = scipy.sparse.linalg.splu(
-        graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
-    position = np.asarray(ordering.perm_c, np.int64)
+    position = fill_reducing_order(rows, columns, count)
     return position, _supernodes(position, rows, columns, widths)
 
 

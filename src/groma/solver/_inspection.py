@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from groma.problem.gauge import gauge_directions
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 from groma.problem.problem import Problem
+from groma.problem.residuals import squared_norms
 from groma.solver._datum import FREE_TOLERANCE, free_motions, held_coordinates, middle_and_extent, unmoved
 from groma.solver._observability import camera_centers, motion
 from groma.solver._words import Names
@@ -143,7 +143,7 @@ class Inspection:
     @cached_property
     def squares(self) -> list[FloatArray]:
         """Squared norm of every residual of every group of factors, divided by the noise, without the loss."""
-        return [_weighted_squares(factor, self.problem) for factor in self.problem.factors]
+        return [squared_norms(factor, self.problem.variables) for factor in self.problem.factors]
 
     def worst_residuals(self, name: str, chosen: BoolArray) -> FloatArray:
         """Largest weighted residual (count,) of the chosen variables; zero for others."""
@@ -168,18 +168,6 @@ class Inspection:
             sums += np.bincount(index, weights=squares, minlength=len(sums))
             rows += factor.residual_rank * np.bincount(index, minlength=len(rows))
         return result
-
-
-def _weighted_squares(factor: Any, problem: Problem) -> FloatArray:
-    if len(factor) == 0:
-        return np.zeros(0)
-    ambients = tuple(problem.variables[ref.group].ambient() for _, ref in factor.references())
-    residual = np.empty((len(factor), factor.residual_size))
-    factor.residuals(factor.prepare(ambients), 0, len(factor), residual)
-    information = np.asarray(factor.sqrt_information, dtype=np.float64)
-    if information.ndim == 3:
-        return (np.einsum("nij,nj->ni", information, residual) ** 2).sum(axis=1)
-    return np.einsum("ni,ni->n", residual, residual) * information**2
 
 
 __all__ = ["UNDETERMINED", "WEAK", "Inspection"]

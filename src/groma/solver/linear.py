@@ -4,7 +4,8 @@
 ``dense``
     Cholesky (LAPACK). Best for small systems.
 ``sparse``
-    Direct factorisation with a fill-reducing symmetric ordering (SuperLU). Best when cameras see few others.
+    Direct factorisation with a fill-reducing symmetric ordering: block by block where all have one size
+    (:mod:`groma.solver._block_cholesky`), else by numbers (SuperLU). Best for graphs of poses.
 ``pcg``
     Conjugate gradients, preconditioned with the inverses of the diagonal blocks and, in large systems, with the motions
     of clusters of cameras (:mod:`groma.solver._coarse`). Stopped early: a Newton step needs few digits. Best for large
@@ -28,6 +29,7 @@ from groma._numba import loop
 from groma._simd import add_matvec, add_product, width
 from groma._typing import FloatArray
 from groma.problem.layout import Layout
+from groma.solver._block_cholesky import BlockCholesky
 from groma.solver._coarse import coarse_space
 
 Blocks = dict[tuple[int, int], FloatArray]
@@ -37,6 +39,8 @@ DENSE_FLOPS_PER_SECOND = 2.5e10
 BYTES_PER_SECOND = 6e9
 #: Iterations of conjugate gradients in a step where poses alone are kept, and otherwise (calibration, planes).
 POSE_ITERATIONS, OTHER_ITERATIONS = 15, 60
+#: ... and where nothing is eliminated: motions between poses are hard for conjugate gradients.
+GRAPH_ITERATIONS = 100
 #: Up to this many unknowns a dense factorisation costs little, and is exact: where poses alone are kept, and otherwise.
 DENSE_POSE_UNKNOWNS, DENSE_OTHER_UNKNOWNS = 360, 1000
 
@@ -103,10 +107,15 @@ def choose(layout: Layout, name: str) -> LinearSolver:
         poses_alone = all(variables[member.group].manifold.kind == "pose" for member in members)
         iterations = POSE_ITERATIONS if poses_alone else OTHER_ITERATIONS
         small = unknowns <= (DENSE_POSE_UNKNOWNS if poses_alone else DENSE_OTHER_UNKNOWNS)
+        if not small and poses_alone and not layout.eliminated and len(layout.kept) == 1:
+            sparse = SparseBlocks(layout)
+            if sparse.flops / DENSE_FLOPS_PER_SECOND < GRAPH_ITERATIONS * 8 * stored / BYTES_PER_SECOND:
+                return sparse
         dense_seconds = unknowns**3 / 3 / DENSE_FLOPS_PER_SECOND
         pcg_seconds = iterations * 8 * stored / BYTES_PER_SECOND
         name = "dense" if small or dense_seconds < pcg_seconds else "pcg"
-    return {"dense": Dense, "sparse": Sparse, "pcg": ConjugateGradients}[name](layout)
+    sparse = SparseBlocks if len(layout.kept) == 1 else Sparse
+    return {"dense": Dense, "sparse": sparse, "pcg": ConjugateGradients}[name](layout)
 
 
 def multiply(layout: Layout, blocks: Blocks, x: list[FloatArray]) -> list[FloatArray]:
@@ -169,6 +178,27 @@ class Dense(_Stateless):
         for (a, b), S in blocks.items():
             rows, columns = layout.blocks[a, b]
             _scatter(S, rows, columns, layout.kept[a].start, layout.kept[b].start, M)
+
+
+class SparseBlocks(_Stateless):
+    """Factorisation of the sparse matrix of blocks, where all have one size."""
+
+    name = "sparse"
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._cholesky = BlockCholesky(layout)
+
+    @property
+    def flops(self) -> float:
+        """Floating point operations of a factorisation."""
+        return 2.0 * self._cholesky.num_products * self._layout.kept[0].width ** 3
+
+    def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
+        if not self._cholesky.factorize(blocks[0, 0]):
+            return None
+        x = self._cholesky.solve(rhs[0])
+        return [x] if np.isfinite(x).all() else None
 
 
 class Sparse(_Stateless):

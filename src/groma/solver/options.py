@@ -23,7 +23,8 @@ class SolverOptions:
     step_tolerance: float = 1e-10
     #: ``levenberg_marquardt`` or ``dogleg``.
     strategy: str = "levenberg_marquardt"
-    #: First damping, relative to the diagonal of the normal equations; None: 1e-4 where lines move, else 1e-5.
+    #: First damping, relative to the diagonal of the normal equations; None: 1e-4 where lines move, 1e-8 between poses
+    #: alone, else 1e-5.
     initial_damping: float | None = None
     #: ``auto``, ``dense``, ``sparse`` or ``pcg``: how the reduced system is solved.
     linear_solver: str = "auto"
@@ -55,9 +56,11 @@ class SolverOptions:
 
 
 def first_damping(layout: Layout, options: SolverOptions) -> float:
-    """Lines are more bent than points, and long first steps throw some into minima of their own."""
+    """Lines are more bent than points, and long first steps throw some into minima of their own; motions are not."""
     if options.initial_damping is not None:
         return options.initial_damping
     variables = layout.problem.variables.values()
+    if all(group.manifold.kind == "pose" for group in variables):
+        return 1e-8
     moving_lines = any(group.manifold.kind == "line" and not group.is_constant for group in variables)
     return 1e-4 if moving_lines else 1e-5

@@ -12,17 +12,17 @@ class Termination(Enum):
     COST_CONVERGED = (
         "cost_converged",
         True,
-        "Converged: the relative change of the cost fell below function_tolerance.",
+        "Converged: the cost hardly falls any more (by less than function_tolerance in a step).",
     )
     GRADIENT_CONVERGED = (
         "gradient_converged",
         True,
-        "Converged: the gradient vanished (largest component below gradient_tolerance).",
+        "Converged: the gradient has vanished (its largest component is below gradient_tolerance).",
     )
     STEP_CONVERGED = (
         "step_converged",
         True,
-        "Converged: the step became negligible (below step_tolerance).",
+        "Converged: steps have become negligible (below step_tolerance).",
     )
     MAX_ITERATIONS = (
         "max_iterations",

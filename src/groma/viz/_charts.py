@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.viz import _digits
 
 WIDTH, HEIGHT = 560, 250
 #: Images shown in the bar chart.
@@ -18,27 +19,19 @@ MAX_BARS = 24
 _LEFT, _RIGHT, _TOP, _BOTTOM = 58, 12, 10, 40
 
 
-def _svg(body: list[str], height: int = HEIGHT) -> str:
-    return f'<svg viewBox="0 0 {WIDTH} {height}" role="img">{"".join(body)}</svg>'
+def svg(label: str, body: list[str], height: int = HEIGHT) -> str:
+    """Return a drawing; ``label`` says what it is to those who cannot see it."""
+    return f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{html.escape(label)}">{"".join(body)}</svg>'
 
 
-def _text(x: float, y: float, words: str, anchor: str = "middle") -> str:
+def text(x: float, y: float, words: str, anchor: str = "middle") -> str:
+    """Return words at a place."""
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{html.escape(words)}</text>'
 
 
-def _line(x1: float, y1: float, x2: float, y2: float, name: str) -> str:
+def line(x1: float, y1: float, x2: float, y2: float, name: str) -> str:
+    """Return a straight line; ``name`` is a class of the style sheet."""
     return f'<line class="{name}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
-
-
-def _number(value: float) -> str:
-    if value == 0:
-        return "0"
-    if 1e-3 <= abs(value) < 1e6:
-        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-    if 1e6 <= abs(value) < 1e9:
-        return f"{value / 1e6:.4g} M"
-    mantissa, exponent = f"{value:.0e}".split("e")
-    return f"{mantissa}e{int(exponent)}"
 
 
 def histogram(before: FloatArray | None, after: FloatArray) -> str:
@@ -52,6 +45,7 @@ def histogram(before: FloatArray | None, after: FloatArray) -> str:
     edges = np.logspace(-2, 2, 49)
     width = (WIDTH - _LEFT - _RIGHT) / 48
     bottom = HEIGHT - _BOTTOM
+    limits = [_digits.tick(edge) for edge in edges]
     series = [("before", before)] if before is not None else []
     series.append(("after", after))
     shares = [(name, _shares(values, edges)) for name, values in series if values is not None]
@@ -59,20 +53,29 @@ def histogram(before: FloatArray | None, after: FloatArray) -> str:
     body = []
     for exponent in range(-2, 3):
         x = _LEFT + (exponent + 2) * 12 * width
-        body.append(_line(x, _TOP, x, bottom, "grid") + _text(x, bottom + 16, f"{10.0**exponent:g}"))
+        beyond = {-2: "≤ ", 2: "≥ "}.get(exponent, "")  # the first and the last bar hold what lies outside
+        body.append(
+            line(x, _TOP, x, bottom, "grid")
+            + text(
+                x + 6 * (exponent == 2),
+                bottom + 16,
+                f"{beyond}{10.0**exponent:g}",
+                "end" if exponent == 2 else "middle",
+            )
+        )
     for name, share in shares:
         bars = [
             f'<rect x="{_LEFT + i * width:.1f}" y="{bottom - s / top * (bottom - _TOP):.1f}" width="{width - 0.6:.1f}" '
-            f'height="{s / top * (bottom - _TOP):.1f}"><title>{_number(edges[i])} to {_number(edges[i + 1])} px: '
+            f'height="{s / top * (bottom - _TOP):.1f}"><title>{limits[i]} to {limits[i + 1]} px: '
             f"{100 * s:.2g} % {name}</title></rect>"
             for i, s in enumerate(share)
             if s > 0
         ]
         body.append(f'<g class="{name}" opacity="0.62">{"".join(bars)}</g>')
-    body.append(_line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
-    body.append(_text((_LEFT + WIDTH) / 2, HEIGHT - 5, "length of a residual, pixels"))
-    body.append(_text(_LEFT - 8, _TOP + 10, f"{100 * top:.2g} %", "end") + _text(_LEFT - 8, bottom, "0", "end"))
-    return _svg(body)
+    body.append(line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
+    body.append(text((_LEFT + WIDTH) / 2, HEIGHT - 5, "length of a residual, pixels"))
+    body.append(text(_LEFT - 8, _TOP + 10, f"{100 * top:.2g} %", "end") + text(_LEFT - 8, bottom, "0", "end"))
+    return svg("Histogram of residuals", body)
 
 
 def _shares(values: FloatArray, edges: FloatArray) -> FloatArray:
@@ -104,7 +107,7 @@ def convergence(history: Sequence[Any], stages: Sequence[Mapping[str, Any]] = ()
     rows.sort(key=lambda row: (row.get("stage", 1), row["iteration"]))
     rows = [row for row in rows if math.isfinite(row["cost"]) and row["cost"] > 0]
     if not rows:
-        return _svg([_text(WIDTH / 2, HEIGHT / 2, "no steps were taken")])
+        return svg("Convergence", [text(WIDTH / 2, HEIGHT / 2, "no steps were taken")])
     steps = [int(row["iteration"]) for row in rows]
     low, high = (math.log10(pick(float(row["cost"]) for row in rows)) for pick in (min, max))
     if high - low < 0.05:
@@ -121,14 +124,14 @@ def convergence(history: Sequence[Any], stages: Sequence[Mapping[str, Any]] = ()
     body = []
     for tick in _log_ticks(low, high):
         y = place(first, tick)[1]
-        body.append(_line(_LEFT, y, WIDTH - _RIGHT, y, "grid") + _text(_LEFT - 6, y + 4, _number(tick), "end"))
+        body.append(line(_LEFT, y, WIDTH - _RIGHT, y, "grid") + text(_LEFT - 6, y + 4, _digits.tick(tick), "end"))
     stride = max(1, math.ceil((final - first) / 10))
-    body += [_text(place(i, 10**low)[0], bottom + 16, str(i)) for i in range(first, final + 1, stride)]
+    body += [text(place(i, 10**low)[0], bottom + 16, str(i)) for i in range(first, final + 1, stride)]
     if len(stages) > 1:
         for stage in stages:
             x = place(max(first, stage["first_step"] - 1), 10**low)[0]
-            body.append(_line(x, _TOP, x, bottom, "grid"))
-            body.append(_text(x + 5, _TOP + 10, str(stage["loss"]).replace("_", " "), "start"))
+            body.append(line(x, _TOP, x, bottom, "grid"))
+            body.append(text(x + 5, _TOP + 10, str(stage["loss"]).replace("_", " "), "start"))
     for stage in sorted({row.get("stage", 1) for row in rows}):
         mine = [row for row in rows if row.get("stage", 1) == stage]
         taken = [place(int(row["iteration"]), float(row["cost"])) for row in mine if row["accepted"]]
@@ -140,9 +143,9 @@ def convergence(history: Sequence[Any], stages: Sequence[Mapping[str, Any]] = ()
             f'<circle class="{name}" cx="{x:.1f}" cy="{y:.1f}" r="4"><title>step {row["iteration"]}: cost '
             f"{row['cost']:.6g}{'' if row['accepted'] else ', rejected'}</title></circle>"
         )
-    body.append(_line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
-    body.append(_text((_LEFT + WIDTH) / 2, HEIGHT - 5, "step"))
-    return _svg(body)
+    body.append(line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
+    body.append(text((_LEFT + WIDTH) / 2, HEIGHT - 5, "step"))
+    return svg("Cost after each step", body)
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
@@ -154,9 +157,7 @@ def _log_ticks(low: float, high: float) -> list[float]:
             return ticks[:: max(1, len(ticks) // 6)]
     # A narrow range: round numbers at even steps.
     first, final = 10.0**low, 10.0**high
-    power = 10.0 ** math.floor(math.log10(final - first))
-    step = next(f * power for f in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0) if (final - first) / (f * power) <= 6)
-    return [step * place for place in range(math.ceil(first / step), math.floor(final / step) + 1)]
+    return _digits.ticks(first, final, _digits.round_step(final - first, 6))
 
 
 def _percent(share: float) -> str:
@@ -171,6 +172,7 @@ def bars(names: Sequence[str], before: FloatArray | None, after: FloatArray) -> 
     labels = [name if len(name) <= 26 else "…" + name[-25:] for name in names]
     left, right = 14 + 7 * max((len(labels[index]) for index in order), default=0), 104
     values = after if before is None else np.concatenate([before, after])
+    told = [_digits.even(series[order].tolist()) for series in (before, after) if series is not None]
     finite = values[np.isfinite(values)]
     # One image that is far off at the start must not flatten all the others.
     top = min(float(finite.max()), 4 * float(np.median(finite))) if len(finite) else 1.0
@@ -178,8 +180,8 @@ def bars(names: Sequence[str], before: FloatArray | None, after: FloatArray) -> 
     body = []
     for position, index in enumerate(order):
         y = row * position + 4
-        words = f"{after[index]:.3g}" if before is None else f"{before[index]:.3g} → {after[index]:.3g}"
-        body.append(_text(left - 8, y + 13, labels[index], "end"))
+        words = " → ".join(column[position] for column in told)
+        body.append(text(left - 8, y + 13, labels[index], "end"))
         longest = 0.0
         for kind, series, offset in (("before", before, 0), ("after", after, 9 if before is not None else 4)):
             if series is not None:
@@ -188,8 +190,8 @@ def bars(names: Sequence[str], before: FloatArray | None, after: FloatArray) -> 
                 body.append(
                     f'<rect class="{kind}" x="{left}" y="{y + offset}" width="{length:.1f}" height="8" rx="2"/>'
                 )
-        body.append(_text(min(left + longest, WIDTH - right) + 6, y + 12, words, "start"))
-    return _svg(body, height)
+        body.append(text(min(left + longest, WIDTH - right) + 6, y + 12, words, "start"))
+    return svg("Residuals by image", [f'<g class="names">{"".join(body)}</g>'], height)
 
 
 def tracks(lengths: Mapping[str, IntArray]) -> str:
@@ -225,11 +227,11 @@ def tracks(lengths: Mapping[str, IntArray]) -> str:
         if place > last - first - stride and place != last - first:
             continue
         more = "+" if place == last - first and bool((every > last).any()) else ""
-        body.append(_text(_LEFT + (place + 0.5) * step, bottom + 16, f"{first + place}{more}"))
-    body.append(_line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
-    body.append(_text((_LEFT + WIDTH) / 2, HEIGHT - 5, "images that observe it"))
-    body.append(_text(_LEFT - 8, _TOP + 10, f"{100 * top:.2g} %", "end") + _text(_LEFT - 8, bottom, "0", "end"))
-    return _svg(body)
+        body.append(text(_LEFT + (place + 0.5) * step, bottom + 16, f"{first + place}{more}"))
+    body.append(line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
+    body.append(text((_LEFT + WIDTH) / 2, HEIGHT - 5, "images that observe it"))
+    body.append(text(_LEFT - 8, _TOP + 10, f"{100 * top:.2g} %", "end") + text(_LEFT - 8, bottom, "0", "end"))
+    return svg("Landmarks by the number of images that observe them", body)
 
 
 def spreads(rows: Sequence[tuple[str, Sequence[float], float | None]], axis: str) -> str:
@@ -246,37 +248,31 @@ def spreads(rows: Sequence[tuple[str, Sequence[float], float | None]], axis: str
     height = top + step * len(rows) + _BOTTOM
     bottom = top + step * len(rows)
     most = max([max(*values, mark or 0.0) for _, values, mark in rows], default=0.0) or 1.0
-    ticks = _even_ticks(most)
+    step_of_axis = _digits.round_step(most, 5)
+    ticks = [step_of_axis * k for k in range(math.ceil(most / step_of_axis - 1e-9) + 1)]
 
     def x(value: float) -> float:
         return left + value / ticks[-1] * (WIDTH - _RIGHT - 14 - left)
 
     body = []
     for value in ticks:
-        body.append(_line(x(value), top, x(value), bottom, "grid") + _text(x(value), bottom + 16, _number(value)))
+        body.append(line(x(value), top, x(value), bottom, "grid") + text(x(value), bottom + 16, _digits.tick(value)))
     for number, (words, values, mark) in enumerate(rows):
         y = top + step * (number + 0.5)
         low, first, middle, third, high = (x(value) for value in values)
-        told = f"{words}: half of them below {_number(values[2])}, 95 % below {_number(values[4])}"
-        told += "" if mark is None else f"; predicted {_number(mark)}"
+        told = f"{words}: half of them below {_digits.tick(values[2])}, 95 % below {_digits.tick(values[4])}"
+        told += "" if mark is None else f"; predicted {_digits.tick(mark)}"
         ring = "" if mark is None else f'<circle class="rejected" cx="{x(mark):.1f}" cy="{y:.1f}" r="5"/>'
         body.append(
-            f"<g><title>{html.escape(told)}</title>{_text(left - 12, y + 4, words, 'end')}"
-            f"{_line(low, y, high, y, 'axis')}"
+            f"<g><title>{html.escape(told)}</title>{text(left - 12, y + 4, words, 'end')}"
+            f"{line(low, y, high, y, 'axis')}"
             f'<rect class="after" x="{first:.1f}" y="{y - 9:.1f}" width="{max(third - first, 1.0):.1f}" height="18" '
             f'rx="3" opacity="0.62"/>'
             f'<rect class="after" x="{middle - 1.5:.1f}" y="{y - 12:.1f}" width="3" height="24"/>{ring}</g>'
         )
-    body.append(_line(left, bottom, WIDTH - _RIGHT, bottom, "axis"))
-    body.append(_text((left + WIDTH) / 2, height - 5, axis))
-    return _svg(body, height)
-
-
-def _even_ticks(most: float) -> list[float]:
-    """Return three to six round values from zero up to at least ``most``."""
-    unit = 10.0 ** math.floor(math.log10(most))
-    step = next(step * unit for step in (0.2, 0.25, 0.5, 1.0, 2.0) if most <= 5 * step * unit)
-    return [step * k for k in range(math.ceil(most / step - 1e-9) + 1)]
+    body.append(line(left, bottom, WIDTH - _RIGHT, bottom, "axis"))
+    body.append(text((left + WIDTH) / 2, height - 5, axis))
+    return svg("Distributions", body, height)
 
 
 def shares(parts: Sequence[tuple[str, int, str]]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.scene.patches import PALETTE, patch_area, patch_groups
-from groma.viz import _charts, _colours
+from groma.viz import _charts, _colours, _digits
 
 if TYPE_CHECKING:
     from groma.scene import Scene
@@ -60,8 +60,7 @@ def tiles(scene: Scene, before: Drawable | None, after: Drawable, numbers: Mappi
     """Return the most important numbers in large letters."""
 
     def change(first: float | None, second: float, unit: str) -> str:
-        start = f"{_short(first)} <i>→</i> " if first is not None else ""
-        return f"{start}{_short(second)}{unit}"
+        return " <i>→</i> ".join(_digits.short([second] if first is None else [first, second])) + unit
 
     def summary(statistic: Callable[[FloatArray], float], kind: int) -> str:
         values = [None if state is None else statistic(_of_kind(state, kind)) for state in (before, after)]
@@ -138,12 +137,17 @@ def number_tables(scene: Scene, before: Drawable | None, after: Drawable, number
         ]
         caption = "What lies on what. Relations that the robust loss gave up are no longer in the scene."
         text += table("Relations", caption, ["", "hold", "given up"], rows)
-    rows = [[name, f"{count:,}"] for name, count in counts_of(scene, after)]
+    rows = [[name, f"{count:,}"] for name, count in counts_of(scene, after) if count]
     text += table("Scene", "What it holds.", ["", "number"], rows)
     if numbers is not None:
         seconds = [[name, f"{value:.3f} s"] for name, value in numbers["seconds"].items() if name != "total"]
         seconds.append(["total", f"{numbers['seconds']['total']:.3f} s"])
-        text += table("Time", "Where the last adjustment spent it.", ["stage", "seconds"], seconds)
+        text += table(
+            "Time",
+            "Where the last adjustment spent it; the first run on a machine compiles, too.",
+            ["stage", "seconds"],
+            seconds,
+        )
     return text
 
 
@@ -159,11 +163,12 @@ def diagnosis_card(diagnosis: Mapping[str, Any] | None) -> str:
         [name.replace("_", " "), *(f"{counts[key]:,}" for key in ("determined", "weak", "undetermined"))]
         for name, counts in diagnosis.get("observability", {}).items()
     ]
-    head = "".join(f"<th>{cell}</th>" for cell in ("cameras held", "determined", "weak", "not determined"))
+    head = "".join(f"<th>{cell}</th>" for cell in ("", "determined", "weak", "not determined"))
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     counts = f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>' if rows else ""
     caption = (
-        "Red: not determined, the standard deviation exceeds the viewing distance (or a radian). Yellow: weak, or odd."
+        "Red: not determined, the standard deviation exceeds the viewing distance (or a radian). Yellow: weak, or odd. "
+        "The table takes the cameras as known."
     )
     return card("What the data determine", caption, f'<ul class="findings">{items}</ul>{counts}')
 
@@ -185,7 +190,7 @@ def contributions_card(entries: Sequence[Mapping[str, Any]] | None) -> str:
         ("steps", lambda entry: f"{entry['iterations']}"),
     ]
     rows = [
-        [name, *("–" if cell is None else cell if isinstance(cell, str) else _digits(cell) for cell in cells)]
+        [name, *("–" if cell is None else cell if isinstance(cell, str) else _digits.fixed(cell) for cell in cells)]
         for name, cells in ((name, [value(entry) for entry in entries]) for name, value in measures)
         if any(cell is not None for cell in cells)
     ]
@@ -233,7 +238,7 @@ def _residual_table(before: Drawable | None, after: Drawable) -> str:
         if not len(picked[-1]):
             continue
         for label, function in (("rms", _rms), ("median", _median), ("95 of 100 below", _high), ("largest", _largest)):
-            rows.append([f"{name}, {label}", *(f"{_digits(function(values))} px" for values in picked)])
+            rows.append([f"{name}, {label}", *(f"{_digits.fixed(function(values))} px" for values in picked)])
     unseen = [int(np.isnan(state.lengths).sum()) for state in states]
     if any(unseen):
         rows.append(["not visible from their camera", *(f"{count:,}" for count in unseen)])
@@ -268,7 +273,7 @@ def _plane_table(scene: Scene, after: Drawable) -> str:
         )
         areas.append(patch_area(after.patches[plane]) if len(places) >= 3 else float("nan"))
         far_off.append(_rms(far))
-    for row, area, far in zip(rows, _even_digits(areas), _even_digits(far_off), strict=True):
+    for row, area, far in zip(rows, _digits.even(areas), _digits.even(far_off), strict=True):
         row += [area, far]
     marks = [_colours.css(colours[plane]) for plane in order]
     left = scene.num_planes - len(order)
@@ -354,25 +359,3 @@ def _high(values: FloatArray) -> float:
 
 def _largest(values: FloatArray) -> float:
     return float(known.max()) if len(known := _known(values)) else float("nan")
-
-
-def _digits(value: float) -> str:
-    """Return three decimals where they say something, else three digits."""
-    return f"{value:.3f}" if 0.01 <= abs(value) < 1e4 else f"{value:.3g}"
-
-
-def _even_digits(values: list[float]) -> list[str]:
-    """Return a column of numbers with the same decimals, three digits of the middle one."""
-    known = [value for value in values if np.isfinite(value) and value > 0]
-    decimals = int(max(2 - np.floor(np.log10(np.median(known))), 0)) if known else 0
-    if decimals > 8:
-        return [f"{value:.1e}" if np.isfinite(value) else "–" for value in values]
-    return [f"{value:,.{decimals}f}" if np.isfinite(value) else "–" for value in values]
-
-
-def _short(value: float) -> str:
-    """Return three digits, with k and M for thousands and millions."""
-    for limit, unit in ((1e6, "M"), (1e3, "k")):
-        if limit <= abs(value) < 1e3 * limit:
-            return f"{value / limit:.3g} {unit}"
-    return f"{value:.3g}"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.viz import _charts
+from groma.viz import _charts, _digits
 
 #: Places of a curve that are drawn; of longer ones, the largest value of each of so many pieces.
 MAX_PLACES = 1200
@@ -50,7 +50,7 @@ def path(curves: Sequence[Curve], marks: FloatArray, across: str, upwards: str) 
     places = np.concatenate([curve.values for curve in curves])
     places = places[np.isfinite(places).all(axis=1)]
     if not len(places):
-        return _charts._svg([_charts._text(_charts.WIDTH / 2, _charts.HEIGHT / 2, "no poses")])
+        return _charts.svg("Path", [_charts.text(_charts.WIDTH / 2, _charts.HEIGHT / 2, "no poses")])
     low, high = places.min(axis=0), places.max(axis=0)
     middle, extent = 0.5 * (low + high), np.maximum(high - low, 1e-3 * (high - low).max() + 1e-12) * 1.06
     wide = _charts.WIDTH - _LEFT - _RIGHT
@@ -65,15 +65,15 @@ def path(curves: Sequence[Curve], marks: FloatArray, across: str, upwards: str) 
     first, last = middle - 0.5 * np.array([wide, tall]) / scale, middle + 0.5 * np.array([wide, tall]) / scale
     body = []
     # as many grid lines as there is room for in the shorter direction, at the same steps in both
-    step = _step(float((last - first).max()), 8)
-    for tick in _ticks(first[0], last[0], step):
+    step = _digits.round_step(float((last - first).max()), 8)
+    for tick in _digits.ticks(first[0], last[0], step):
         x = float(place(np.array([tick, middle[1]]))[0])
-        body.append(_charts._line(x, _TOP, x, _TOP + tall, "grid"))
-        body.append(_charts._text(x, _TOP + tall + 16, _number(tick, step)))
-    for tick in _ticks(first[1], last[1], step):
+        body.append(_charts.line(x, _TOP, x, _TOP + tall, "grid"))
+        body.append(_charts.text(x, _TOP + tall + 16, _digits.tick_of_step(tick, step)))
+    for tick in _digits.ticks(first[1], last[1], step):
         y = float(place(np.array([middle[0], tick]))[1])
-        body.append(_charts._line(_LEFT, y, _charts.WIDTH - _RIGHT, y, "grid"))
-        body.append(_charts._text(_LEFT - 6, y + 4, _number(tick, step), "end"))
+        body.append(_charts.line(_LEFT, y, _charts.WIDTH - _RIGHT, y, "grid"))
+        body.append(_charts.text(_LEFT - 6, y + 4, _digits.tick_of_step(tick, step), "end"))
     body += [_drawn(place(curve.values), curve) for curve in reversed(curves)]
     for x, y in place(marks) if len(marks) else []:
         body.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2" style="fill:{curves[0].colour}"/>')
@@ -86,9 +86,9 @@ def path(curves: Sequence[Curve], marks: FloatArray, across: str, upwards: str) 
                 f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" style="fill:{fill};stroke:{curves[0].colour};'
                 f'stroke-width:2"><title>{name}</title></circle>'
             )
-    body.append(_charts._text((_LEFT + _charts.WIDTH) / 2, height - 5, across))
-    body.append(_charts._text(_LEFT + 4, _TOP + 8, upwards, "start"))
-    return _charts._svg(body, height)
+    body.append(_charts.text((_LEFT + _charts.WIDTH) / 2, height - 5, across))
+    body.append(_charts.text(_LEFT + 4, _TOP + 8, upwards, "start"))
+    return _charts.svg("Path of the camera", body, height)
 
 
 def over_time(times: FloatArray, curves: Sequence[Curve], bands: Sequence[tuple[FloatArray, str]] = ()) -> str:
@@ -106,7 +106,7 @@ def over_time(times: FloatArray, curves: Sequence[Curve], bands: Sequence[tuple[
     values = [curve.values[np.isfinite(curve.values)] for curve in curves]
     top = max((float(part.max()) for part in values if len(part)), default=0.0)
     if top <= 0 or not len(times):
-        return _charts._svg([_charts._text(_charts.WIDTH / 2, _charts.HEIGHT / 2, "nothing to show")])
+        return _charts.svg("Over time", [_charts.text(_charts.WIDTH / 2, _charts.HEIGHT / 2, "nothing to show")])
     first, final = float(times[0]), float(times[-1]) if times[-1] > times[0] else float(times[0]) + 1.0
     wide, bottom = _charts.WIDTH - _LEFT - _RIGHT, _charts.HEIGHT - _BOTTOM
     top *= 1.05
@@ -115,14 +115,14 @@ def over_time(times: FloatArray, curves: Sequence[Curve], bands: Sequence[tuple[
         return _LEFT + wide * (when - first) / (final - first)
 
     body = []
-    step = _step(top, 5)
-    for tick in _ticks(0.0, top, step):
+    step = _digits.round_step(top, 5)
+    for tick in _digits.ticks(0.0, top, step):
         y = bottom - (bottom - _TOP) * tick / top
-        body.append(_charts._line(_LEFT, y, _charts.WIDTH - _RIGHT, y, "grid"))
-        body.append(_charts._text(_LEFT - 6, y + 4, _number(tick, step), "end"))
-    step = _step(final - first, 8)
-    for tick in _ticks(0.0, final - first, step):
-        body.append(_charts._text(_LEFT + wide * tick / (final - first), bottom + 16, _number(tick, step)))
+        body.append(_charts.line(_LEFT, y, _charts.WIDTH - _RIGHT, y, "grid"))
+        body.append(_charts.text(_LEFT - 6, y + 4, _digits.tick_of_step(tick, step), "end"))
+    step = _digits.round_step(final - first, 8)
+    for tick in _digits.ticks(0.0, final - first, step):
+        body.append(_charts.text(_LEFT + wide * tick / (final - first), bottom + 16, _digits.tick_of_step(tick, step)))
     for moments, colour in bands:
         width = max(wide / max(len(times), 1), 1.5)
         body.append(
@@ -133,9 +133,9 @@ def over_time(times: FloatArray, curves: Sequence[Curve], bands: Sequence[tuple[
     for curve in curves:
         when, numbers = _thinned(times, curve.values)
         body.append(_drawn(np.stack([across(when), bottom - (bottom - _TOP) * numbers / top], axis=1), curve))
-    body.append(_charts._line(_LEFT, bottom, _charts.WIDTH - _RIGHT, bottom, "axis"))
-    body.append(_charts._text((_LEFT + _charts.WIDTH) / 2, _charts.HEIGHT - 5, "time, seconds"))
-    return _charts._svg(body)
+    body.append(_charts.line(_LEFT, bottom, _charts.WIDTH - _RIGHT, bottom, "axis"))
+    body.append(_charts.text((_LEFT + _charts.WIDTH) / 2, _charts.HEIGHT - 5, "time, seconds"))
+    return _charts.svg(f"{', '.join(curve.name for curve in curves)} over time", body)
 
 
 def _drawn(places: FloatArray, curve: Curve) -> str:
@@ -159,18 +159,3 @@ def _thinned(times: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatAr
     bounds = np.linspace(0, len(values), MAX_PLACES + 1).astype(int)[:-1]
     peaks = np.maximum.reduceat(np.where(np.isfinite(values), values, -np.inf), bounds)
     return times[bounds], np.where(np.isfinite(peaks), peaks, np.nan)
-
-
-def _step(extent: float, most: int) -> float:
-    """Return a round step that divides an extent into at most so many parts."""
-    power = 10.0 ** math.floor(math.log10(extent / most))
-    return next(f * power for f in (1.0, 2.0, 5.0, 10.0) if extent / (f * power) <= most)
-
-
-def _ticks(low: float, high: float, step: float) -> list[float]:
-    return [step * k for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
-
-
-def _number(tick: float, step: float) -> str:
-    decimals = max(0, -math.floor(math.log10(step) + 1e-9))
-    return f"{tick + 0.0:,.{decimals}f}" if decimals <= 6 else f"{tick:.2g}"

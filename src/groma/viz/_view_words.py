@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from groma.viz import _colours
+from groma.viz._page_tables import words
 from groma.viz._pictures import ImageFiles, image_file, read_picture
 from groma.viz._view_arrays import even
 from groma.viz.overlays import observation_crop, residual_top
@@ -27,13 +28,13 @@ _RAMP = "linear-gradient(90deg,#2c6fbb,#3fb6a8,#e8c53a,#d9472b)"
 def counts(scene: Scene, max_cameras: int) -> str:
     """Return what a scene holds, and what of it is drawn."""
     parts = [
-        (scene.num_images, "images"),
-        (scene.num_points, "points"),
-        (scene.num_lines, "lines"),
-        (scene.num_planes, "planes"),
-        (scene.num_directions, "directions"),
+        ("images", scene.num_images),
+        ("points", scene.num_points),
+        ("lines", scene.num_lines),
+        ("planes", scene.num_planes),
+        ("directions", scene.num_directions),
     ]
-    text = ", ".join(f"{count:,} {name if count != 1 else name[:-1]}" for count, name in parts if count)
+    text = words(parts)
     thinned = f". {max_cameras} of the cameras are drawn" if scene.num_images > max_cameras else ""
     return text + thinned
 

@@ -21,7 +21,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.evaluation.trajectory import apply_similarity
 from groma.geometry import quaternion
-from groma.viz import _page_tables
+from groma.viz import _digits, _page_tables
 from groma.viz._framing import horizontal, upward
 from groma.viz._path_charts import Curve, legend, over_time, path
 from groma.viz._pictures import ImageFiles
@@ -165,7 +165,8 @@ def _tiles(track: Track, scores: TrajectoryScores | None) -> str:
         )
     total = numbers.get("milliseconds", {}).get("total")
     if total:
-        cells.append((f"{_short(total['median'])} ms", f"per frame, median; 95 of 100 below {_short(total['p95'])} ms"))
+        median, high = _digits.even([total["median"], total["p95"]])
+        cells.append((f"{median} ms", f"per frame, median; 95 of 100 below {high} ms"))
     cells += [(f"{len(track.keyframes):,}", "keyframes"), (f"{numbers.get('loops', 0):,}", "loops closed")]
     return "".join(f'<div class="tile"><b>{value}</b><span>{html.escape(label)}</span></div>' for value, label in cells)
 
@@ -260,10 +261,6 @@ def _time_cards(track: Track, frames: Sequence[Frame], scores: TrajectoryScores 
         chart = over_time(times, [Curve("total", "var(--after)", np.minimum(spent, most))])
         cards += _page_tables.card("Time per frame", caption, chart)
     return cards
-
-
-def _short(value: float) -> str:
-    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def _stage_table(track: Track) -> str:

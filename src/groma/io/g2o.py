@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Pose graphs in the text format of g2o, plain or compressed by gzip.
+
+====================  =============================================================================================
+``VERTEX_SE3:QUAT``   id, x y z, qx qy qz qw: world_from_body
+``EDGE_SE3:QUAT``     two ids, the same seven numbers: first_from_second, and the upper triangle (21) of its information
+``VERTEX_SE2``        id, x y angle
+``EDGE_SE2``          two ids, x y angle, and the upper triangle (6) of its information
+``FIX``               ids of poses that are held
+====================  =============================================================================================
+
+g2o states the rotation error of ``EDGE_SE3:QUAT`` as the vector part of a quaternion, which is half the angle. Here
+errors are in radians, so the information is
+
+.. math:: \Sigma^{-1} = S\, \Sigma_{file}^{-1}\, S, \qquad S = \mathrm{diag}(1, 1, 1, \tfrac12, \tfrac12, \tfrac12) .
+
+Other readers take the numbers as they are, and thereby rotations for twice as certain as they were written.
+Lines with ``#`` and parameters of sensors (``PARAMS_...``) are passed over; other vertices and edges are refused.
+
+Reference: R. Kuemmerle, G. Grisetti, H. Strasdat, K. Konolige, W. Burgard, *g2o: a general framework for graph
+optimization*, ICRA 2011, and its ``EdgeSE3::computeError``.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.errors import FileFormatError
+from groma.geometry import quaternion
+from groma.io._atomic import atomic_output
+from groma.io._reading import existing, reading
+from groma.scene.pose_graph import GraphPoses, Motions, PoseGraph
+
+#: Numbers after the tag.
+_NUMBERS = {"VERTEX_SE3:QUAT": 8, "EDGE_SE3:QUAT": 30, "VERTEX_SE2": 4, "EDGE_SE2": 11}
+_HALF_ANGLES = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
+#: Coordinates of a planar motion within (rho, omega).
+_PLANAR = np.array([0, 1, 5])
+
+
+def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
+    """Read a pose graph; poses that only motions name are composed from these.
+
+    Raises
+    ------
+    InputError
+        If there is no such file.
+    FileFormatError
+        If a line is not what its tag promises, names a pose that is not there, or has a tag that is not known.
+    """
+    place = existing(path)
+    with reading(place, "g2o file"):
+        return _graph(_rows_by_tag(_text(place), place), place)
+
+
+def write_g2o(graph: PoseGraph, path: str | os.PathLike[str], force: bool = False) -> None:
+    """Write a pose graph, compressed if the name ends in .gz; numbers keep all their digits."""
+    text = io.StringIO()
+    ids = graph.poses.ids
+    firsts, seconds = ids[graph.motions.first_idx].tolist(), ids[graph.motions.second_idx].tolist()
+    if graph.planar:
+        tags, size = ("VERTEX_SE2", "EDGE_SE2"), 3
+        poses, motions = (_planar(pose) for pose in (graph.poses.world_from_body, graph.motions.first_from_second))
+        information = graph.motions.information[:, _PLANAR[:, None], _PLANAR]
+    else:
+        tags, size = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"), 6
+        poses, motions = (_file_order(pose) for pose in (graph.poses.world_from_body, graph.motions.first_from_second))
+        information = graph.motions.information / (_HALF_ANGLES[:, None] * _HALF_ANGLES)
+    upper = information[:, *np.triu_indices(size)]
+    for name, pose in zip(ids.tolist(), poses.tolist(), strict=True):
+        text.write(f"{tags[0]} {name} {_join(pose)}\n")
+    held = ids[graph.poses.held].tolist()
+    text.writelines(f"FIX {name}\n" for name in held)
+    for first, second, motion, weights in zip(firsts, seconds, motions.tolist(), upper.tolist(), strict=True):
+        text.write(f"{tags[1]} {first} {second} {_join(motion)} {_join(weights)}\n")
+    content = text.getvalue().encode()
+    with atomic_output(path, force) as draft:
+        draft.write_bytes(gzip.compress(content, mtime=0) if Path(path).suffix.lower() == ".gz" else content)
+
+
+def looks_like_g2o(head: bytes) -> bool:
+    """Tell from the first bytes of a file, decompressed where needed, whether a pose graph begins there."""
+    return head.lstrip().split(b" ", 1)[0].decode("ascii", "replace") in (*_NUMBERS, "FIX", "PARAMS_SE3OFFSET")
+
+
+def _text(path: Path) -> str:
+    raw = path.read_bytes()
+    return (gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw).decode()
+
+
+def _rows_by_tag(text: str, path: Path) -> dict[str, list[list[str]]]:
+    """Return the words after each tag, by tag."""
+    rows: dict[str, list[list[str]]] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        tag, *words = line.split() or ["#"]
+        if tag.startswith(("#", "PARAMS_")):
+            continue
+        if tag != "FIX" and tag not in _NUMBERS:
+            raise FileFormatError(
+                f"{path}, line {number}: {tag!r} is not read; a pose graph has {', '.join(_NUMBERS)} and FIX."
+            )
+        if tag != "FIX" and len(words) != _NUMBERS[tag]:
+            raise FileFormatError(
+                f"{path}, line {number}: {tag} takes {_NUMBERS[tag]} numbers; got {len(words)}. Is it cut off?"
+            )
+        rows.setdefault(tag, []).append(words)
+    return rows
+
+
+def _graph(rows: dict[str, list[list[str]]], path: Path) -> PoseGraph:
+    planar = "VERTEX_SE2" in rows or "EDGE_SE2" in rows
+    if planar and ("VERTEX_SE3:QUAT" in rows or "EDGE_SE3:QUAT" in rows):
+        raise FileFormatError(f"{path} mixes poses of the plane (SE2) and of space (SE3); write two graphs.")
+    vertex, edge = ("VERTEX_SE2", "EDGE_SE2") if planar else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
+    vertices, edges = (_numbers(rows.get(tag, []), _NUMBERS[tag], path) for tag in (vertex, edge))
+    if not len(vertices) and not len(edges):
+        raise FileFormatError(f"{path} holds no poses and no motions; expected lines such as {vertex} and {edge}.")
+    width = 3 if planar else 7
+    known = _integers(vertices[:, 0], path)
+    named = _integers(edges[:, :2].reshape(-1), path)
+    chained = len(known) == 0
+    ids = np.unique(named) if chained else known
+    row_of = {int(name): row for row, name in enumerate(ids)}
+    if not chained and not np.isin(named, known).all():
+        missing = int(named[~np.isin(named, known)][0])
+        raise FileFormatError(f"{path}: a motion names pose {missing}, which has no {vertex} line. Add one.")
+    held = np.zeros(len(ids), dtype=bool)
+    for words in rows.get("FIX", []):
+        for name in words:
+            if int(name) not in row_of:
+                raise FileFormatError(f"{path}: FIX names pose {name}, which is not there.")
+            held[row_of[int(name)]] = True
+    if chained:
+        poses = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(ids), 1))
+    else:
+        poses = _from_planar(vertices[:, 1:]) if planar else _from_file_order(vertices[:, 1:], vertex, path)
+    order = np.argsort(ids, kind="stable")
+    index = order[np.searchsorted(ids[order], named)].reshape(-1, 2)
+    motion = edges[:, 2 : 2 + width]
+    graph = PoseGraph(
+        GraphPoses(ids, poses, held),
+        Motions(
+            index[:, 0],
+            index[:, 1],
+            _from_planar(motion) if planar else _from_file_order(motion, edge, path),
+            _information(edges[:, 2 + width :], planar, path),
+        ),
+        planar,
+    )
+    return graph.chained() if chained else graph
+
+
+def _numbers(rows: list[list[str]], width: int, path: Path) -> FloatArray:
+    values = np.array(rows, dtype=np.float64).reshape(len(rows), width)
+    if not np.isfinite(values).all():
+        raise FileFormatError(f"{path} holds a number that is not finite.")
+    return values
+
+
+def _integers(values: FloatArray, path: Path) -> IntArray:
+    whole = values.astype(np.int64)
+    if (whole != values).any():
+        raise FileFormatError(f"{path}: {values[whole != values][0]:g} is not the id of a pose; ids are whole numbers.")
+    return whole
+
+
+def _information(upper: FloatArray, planar: bool, path: Path) -> FloatArray:
+    """Return the information (E, 6, 6) in radians from the upper triangles of the file."""
+    size = 3 if planar else 6
+    small = np.zeros((len(upper), size, size))
+    rows, columns = np.triu_indices(size)
+    small[:, rows, columns] = small[:, columns, rows] = upper
+    eigenvalues = np.linalg.eigvalsh(small)
+    if len(small) and (eigenvalues[:, 0] < -1e-9 * np.abs(eigenvalues).max(axis=1)).any():
+        bad = int(np.argmin(eigenvalues[:, 0]))
+        raise FileFormatError(f"{path}: the information of motion {bad} is not positive semidefinite.")
+    if not planar:
+        return small * (_HALF_ANGLES[:, None] * _HALF_ANGLES)
+    full = np.zeros((len(upper), 6, 6))
+    full[:, _PLANAR[:, None], _PLANAR] = small
+    return full
+
+
+def _from_file_order(values: FloatArray, tag: str, path: Path) -> FloatArray:
+    length = np.linalg.norm(values[:, 3:], axis=1)
+    if (length < 1e-3).any():
+        raise FileFormatError(f"{path}: {tag} number {int(length.argmin())} has a quaternion of length 0.")
+    return np.hstack([values[:, 3:] / length[:, None], values[:, :3]])
+
+
+def _file_order(poses: FloatArray) -> FloatArray:
+    return poses[:, [4, 5, 6, 0, 1, 2, 3]]
+
+
+def _from_planar(values: FloatArray) -> FloatArray:
+    turn = np.zeros((len(values), 3))
+    turn[:, 2] = values[:, 2]
+    return np.hstack([quaternion.exp(turn), values[:, :2], np.zeros((len(values), 1))])
+
+
+def _planar(poses: FloatArray) -> FloatArray:
+    return np.column_stack([poses[:, 4], poses[:, 5], 2.0 * np.arctan2(poses[:, 2], poses[:, 3])])
+
+
+def _join(numbers: Iterable[float]) -> str:
+    return " ".join(map(repr, numbers))
+
+
+__all__ = ["looks_like_g2o", "read_g2o", "write_g2o"]
