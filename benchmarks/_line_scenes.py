@@ -29,6 +29,8 @@ class LineScene:
     edges: np.ndarray | None = None
     #: Distances at which lines are compared with the edges, scene units.
     thresholds: list[float] = field(default_factory=list)
+    #: (2, 3) two corners of the box in which the edges were marked, or None where all are known.
+    box: np.ndarray | None = None
 
     def segments(self, min_length: float) -> list[Segments]:
         """Return groma's segments of each image."""
@@ -52,15 +54,17 @@ def pavilion(name: str, folder: Path) -> LineScene:
     """Return the Barcelona pavilion: renderings with exact cameras and a graph of marked edges.
 
     Thresholds are 1, 5 and 10 thousandths of the extent, the diagonal of the box that holds the marked points between
-    their 2nd and 98th percentile: single points lie far outside of the view.
+    their 2nd and 98th percentile: single points lie far outside of the view. That box, widened by a tenth of the
+    extent, is where edges were marked; walls and trees behind it were not.
     """
     scene = _triangulated(folder)
     with np.load(folder / "gt_edges.npz") as archive:
         points, pairs = archive["points"], archive["edges"]
-    extent = float(np.linalg.norm(np.quantile(points, 0.98, axis=0) - np.quantile(points, 0.02, axis=0)))
-    return LineScene(
-        name, scene, _photographs(folder, scene), points[pairs], [k * extent for k in (0.001, 0.005, 0.01)]
-    )
+    low, high = np.quantile(points, [0.02, 0.98], axis=0)
+    extent = float(np.linalg.norm(high - low))
+    thresholds = [k * extent for k in (0.001, 0.005, 0.01)]
+    box = np.array([low - 0.1 * extent, high + 0.1 * extent])
+    return LineScene(name, scene, _photographs(folder, scene), points[pairs], thresholds, box)
 
 
 def _photographs(folder: Path, scene: Scene) -> list[np.ndarray]:
@@ -114,10 +118,22 @@ SCENES: dict[str, Callable[[Path], LineScene]] = {
         "boxes-rough", BoxSettings(seed=34, texture=15.0, width=640, height=480, focal=560.0)
     ),
     "boxes-small": lambda data: boxes("boxes-small", BoxSettings(seed=5, width=640, height=480, focal=560.0)),
+    "boxes-random": lambda data: boxes("boxes-random", BoxSettings(seed=115, cameras="random")),
+    "boxes-random-small": lambda data: boxes(
+        "boxes-random-small", BoxSettings(seed=117, width=640, height=480, focal=560.0, cameras="random")
+    ),
+    "boxes-noisy": lambda data: boxes("boxes-noisy", BoxSettings(seed=110, noise=6.0)),
+    "boxes-wide": lambda data: boxes("boxes-wide", BoxSettings(seed=106, width=640, height=480, focal=480.0)),
+    "boxes-few": lambda data: boxes("boxes-few", BoxSettings(seed=119, num_images=12)),
+    "boxes-many": lambda data: boxes("boxes-many", BoxSettings(seed=121, num_images=48)),
     "pavilion": lambda data: pavilion("pavilion", data / "pavilion_chair"),
     "fountain": lambda data: strecha("fountain", data / "strecha_fountain_p11"),
     "herz-jesus": lambda data: strecha("herz-jesus", data / "strecha_herz_jesus_p8"),
     "castle": lambda data: strecha("castle", data / "strecha_castle_p30"),
 }
-#: Shortest segment of scenes where published figures fix one, pixels; otherwise that of the options of mapping.
-MIN_LENGTH = {"fountain": 40.0, "herz-jesus": 40.0, "castle": 40.0}
+#: Shortest segment of the photographs, pixels; elsewhere that of the options of mapping.
+MIN_LENGTH = {"fountain": 20.0, "herz-jesus": 20.0, "castle": 20.0}
+#: LIMAP gets the longer ones of these only: its time grows with their square.
+LIMAP_MIN_LENGTH = {"fountain": 40.0, "herz-jesus": 40.0, "castle": 40.0}
+#: Neighbours per image of the photographs; elsewhere that of the options of mapping.
+NUM_NEIGHBORS = {"fountain": 6, "herz-jesus": 6, "castle": 6}

@@ -42,6 +42,8 @@ class BoxSettings:
     noise: float = 2.0
     #: Standard deviation of the blur, pixels.
     blur: float = 0.6
+    #: "ring": on a wavy ring around the boxes; "random": anywhere above, from near and far, tilted.
+    cameras: str = "ring"
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ def render_boxes(settings: BoxSettings) -> RenderedScene:
     """Make the world of a seed, its images and its visible edges."""
     rng = np.random.default_rng(settings.seed)
     world = _boxes(settings, rng)
-    poses = _ring(settings, rng)
+    poses = _scattered(settings, rng) if settings.cameras == "random" else _ring(settings, rng)
     camera = np.array([settings.focal, settings.focal, settings.width / 2, settings.height / 2])
     blotches = [_blotches(rng, settings.blotches) for _ in world.polygons] if settings.texture else None
     images = [_picture(world, pose, camera, settings, blotches, rng) for pose in poses]
@@ -111,13 +113,30 @@ def _ring(settings: BoxSettings, rng: np.random.Generator) -> np.ndarray:
     for k in range(settings.num_images):
         a = 2 * np.pi * k / settings.num_images
         center = np.array([3.6 * np.cos(a), 3.6 * np.sin(a), 1.4 + 0.5 * np.sin(3 * a)]) + rng.normal(0, 0.05, 3)
-        z = np.array([0, 0, 0.3]) - center
-        z /= np.linalg.norm(z)
-        x = np.cross(z, [0, 0, 1.0])
-        x /= np.linalg.norm(x)
-        R = np.stack([x, np.cross(z, x), z])
-        poses.append(np.concatenate([quaternion.from_matrix(R[None])[0], -R @ center]))
+        poses.append(_looking(center, np.array([0, 0, 0.3])))
     return np.array(poses)
+
+
+def _scattered(settings: BoxSettings, rng: np.random.Generator) -> np.ndarray:
+    """Poses (C, 7) at random places around and above the boxes, turned about their axes by some degrees."""
+    poses = []
+    while len(poses) < settings.num_images:
+        away, around, up = rng.uniform(2.2, 5.0), rng.uniform(0, 2 * np.pi), rng.uniform(0.12, 1.1)
+        center = away * np.array([np.cos(around) * np.cos(up), np.sin(around) * np.cos(up), np.sin(up)])
+        if np.hypot(center[0], center[1]) < 2.0 and center[2] < 1.2:
+            continue  # among the boxes
+        poses.append(_looking(center, np.array([0, 0, 0.3]) + rng.normal(0, 0.3, 3), rng.normal(0, 0.15)))
+    return np.array(poses)
+
+
+def _looking(center: np.ndarray, target: np.ndarray, roll: float = 0.0) -> np.ndarray:
+    """Pose (7,) of a camera that looks at a target, turned about its axis by ``roll`` radians."""
+    z = (target - center) / np.linalg.norm(target - center)
+    x = np.cross(z, [0, 0, 1.0])
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    R = np.stack([np.cos(roll) * x + np.sin(roll) * y, np.cos(roll) * y - np.sin(roll) * x, z])
+    return np.concatenate([quaternion.from_matrix(R[None])[0], -R @ center])
 
 
 def _blotches(rng: np.random.Generator, size: int) -> np.ndarray:

@@ -2,193 +2,27 @@
 """Rendered sequences of a camera that turns fast: rooms with a depth camera, a street corner with a stereo pair.
 
 A world is a list of rectangles with a pattern each. Several rays per pixel, each at another moment of the exposure,
-give motion blur and soft edges at once. Poses and depths are exact until noise is added.
+give motion blur and soft edges at once. Poses and depths are exact until noise is added. :class:`Film` says what the
+camera does to the picture: long exposures, rows read one after the other, exposure that follows the brightness, noise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from _turning_worlds import World, make_corner, make_room
 
 from groma._numba import loop
 from groma.geometry import quaternion, se3, so3
 from groma.io.sequences import Frame, SequenceCamera
 
-#: Side of a pattern, texels; patterns repeat.
-TEXELS = 512
-#: Moments of the exposure, each with a ray through another part of the pixel.
-MOMENTS = np.array([[0.125, 0.625], [0.375, 0.125], [0.625, 0.875], [0.875, 0.375]]) - 0.5
+#: Rays of a pixel, each at another moment of the exposure.
+RAYS = np.array([[0.125, 0.625], [0.375, 0.125], [0.625, 0.875], [0.875, 0.375]]) - 0.5
 SKY = 205.0
 RATE = 30.0
-
-
-# ------------------------------------------------------------------------------------------------------------- worlds
-@dataclass
-class World:
-    """Rectangles: corner and two perpendicular sides (3, 3), number of the pattern, and its texels per metre."""
-
-    rng: np.random.Generator
-    rectangles: list[np.ndarray] = field(default_factory=list)
-    pattern: list[int] = field(default_factory=list)
-    scale: list[float] = field(default_factory=list)
-    patterns: list[np.ndarray] = field(default_factory=list)
-
-    def paint(self, image: np.ndarray) -> int:
-        """Add a pattern; return its number."""
-        self.patterns.append(np.clip(image, 4, 250).astype(np.float32))
-        return len(self.patterns) - 1
-
-    def add(self, corner, first, second, pattern: int, scale: float) -> None:
-        """Add a rectangle."""
-        self.rectangles.append(np.array([corner, first, second], float))
-        self.pattern.append(pattern)
-        self.scale.append(scale)
-
-    def box(self, low, high, patterns: list[int], scale: float, turn: float = 0.0) -> None:
-        """Add the six sides of a box, turned about the vertical axis through its middle."""
-        low, high = np.asarray(low, float), np.asarray(high, float)
-        middle, size = 0.5 * (low + high), high - low
-        R = so3.exp(np.array([[0.0, turn, 0.0]]))[0]
-        for axis in range(3):
-            one, two = (axis + 1) % 3, (axis + 2) % 3
-            for side in (0.0, 1.0):
-                corner = -0.5 * size
-                corner[axis] += side * size[axis]
-                sides = np.zeros((2, 3))
-                sides[0, one], sides[1, two] = size[one], size[two]
-                number = patterns[int(self.rng.integers(len(patterns)))]
-                self.add(middle + R @ corner, R @ sides[0], R @ sides[1], number, scale)
-
-    def smooth(self, level: float, spread: float, coarse: int) -> np.ndarray:
-        """A pattern of soft blotches some texels wide."""
-        noise = cv2.resize(
-            self.rng.normal(size=(TEXELS // coarse,) * 2), (TEXELS, TEXELS), interpolation=cv2.INTER_CUBIC
-        )
-        return level + spread * noise
-
-    def printed(self, level: float, count: int, contrast: float) -> np.ndarray:
-        """A pattern of rectangles in shades."""
-        image = self.smooth(level, 3.0, 32)
-        for _ in range(count):
-            u, v = self.rng.integers(0, TEXELS - 30, 2)
-            w, h = self.rng.integers(8, 120, 2)
-            image[v : v + h, u : u + w] += self.rng.uniform(-contrast, contrast)
-        return cv2.GaussianBlur(image, (0, 0), 0.8)
-
-
-def make_room(seed: int, plain: bool = False) -> World:
-    """A room of 6 x 5 metres: plain or printed walls, pictures, boards and boxes."""
-    rng = np.random.default_rng(seed)
-    world = World(rng)
-    # Plain walls show little more than a change of shade.
-    walls = [
-        world.paint(world.smooth(rng.uniform(110, 190), 3.0, 64) if plain else world.printed(150, 60, 25))
-        for _ in range(4)
-    ]
-    floor = world.paint(world.smooth(95, 6.0, 16) if plain else world.printed(100, 120, 30))
-    ceiling = world.paint(world.smooth(205, 2.0, 64))
-    prints = [world.paint(world.printed(rng.uniform(70, 180), 90, 70)) for _ in range(4)]
-    shades = [world.paint(world.smooth(level, 2.5, 64)) for level in (45, 80, 120, 170, 225)]
-    x, y, z = 3.0, 1.3, 2.5
-    per_metre = TEXELS / 6.0
-    world.add([-x, -y, z], [2 * x, 0, 0], [0, 2 * y, 0], walls[0], per_metre)
-    world.add([-x, -y, -z], [2 * x, 0, 0], [0, 2 * y, 0], walls[1], per_metre)
-    world.add([x, -y, -z], [0, 0, 2 * z], [0, 2 * y, 0], walls[2], per_metre)
-    world.add([-x, -y, -z], [0, 0, 2 * z], [0, 2 * y, 0], walls[3], per_metre)
-    world.add([-x, y, -z], [2 * x, 0, 0], [0, 0, 2 * z], floor, per_metre)
-    world.add([-x, -y, -z], [2 * x, 0, 0], [0, 0, 2 * z], ceiling, per_metre)
-    # Pictures and doors, a centimetre or two in front of the walls.
-    for wall in range(4):
-        along, depth = (2 * x, z) if wall < 2 else (2 * z, x)
-        sign = 1.0 if wall % 2 == 0 else -1.0
-        for item in range(4):
-            width, height = rng.uniform(0.3, 1.1, 2)
-            s, t = rng.uniform(0.1, along - width - 0.1), rng.uniform(0.1, 2 * y - height - 0.3)
-            number = (
-                prints[int(rng.integers(4))] if rng.random() < (0.5 if plain else 0.7) else shades[int(rng.integers(5))]
-            )
-            at = sign * (depth - 0.015 - 0.004 * item)
-            corner = [-x + s, -y + t, at] if wall < 2 else [at, -y + t, -z + s]
-            side = [width, 0, 0] if wall < 2 else [0, 0, width]
-            world.add(corner, side, [0, height, 0], number, 260.0)
-    # Furniture around the walls.
-    for k in range(7):
-        angle = 2 * np.pi * (k + rng.uniform(0.2, 0.8)) / 7
-        size = np.array([rng.uniform(0.3, 0.9), rng.uniform(0.4, 1.5), rng.uniform(0.3, 0.8)])
-        middle = np.array([0.72 * x * np.sin(angle), y - size[1] / 2, 0.72 * z * np.cos(angle)])
-        sides = shades if plain or k % 2 else [*prints, *shades[:2]]
-        world.box(middle - size / 2, middle + size / 2, sides, 260.0, rng.uniform(-0.5, 0.5))
-    return world
-
-
-def make_corner(seed: int) -> World:
-    """Two streets that cross: facades whose windows repeat, cars, posts."""
-    rng = np.random.default_rng(seed)
-    world = World(rng)
-    road = world.paint(world.smooth(105, 7.0, 4) + world.smooth(0, 4.0, 32))
-    facades = []
-    for _ in range(4):
-        image = world.smooth(rng.uniform(120, 180), 5.0, 4)
-        step = 128
-        for v in range(0, TEXELS, step):
-            for u in range(0, TEXELS, step):
-                image[v + 30 : v + 100, u + 34 : u + 94] = rng.uniform(50, 60)
-                image[v + 24 : v + 30, u + 28 : u + 100] += 40
-                image[v + 60 : v + 64, u + 34 : u + 94] = 150
-        facades.append(world.paint(cv2.GaussianBlur(image, (0, 0), 0.8)))
-    paints = [world.paint(world.printed(level, 12, 35)) for level in (50, 90, 200)]
-    marks = world.paint(np.full((TEXELS, TEXELS), 225.0))
-    world.add([-80, 1.65, -40], [200, 0, 0], [0, 0, 200], road, 40.0)
-    half, storey = 8.0, TEXELS / 13.0
-    # The first street goes along z, the second along x, crossing at z = 40.
-    for sign in (-1.0, 1.0):
-        for low, high in ((-40.0, 40.0 - half), (40.0 + half, 120.0)):
-            at = low
-            while at < high - 1.0:
-                length = min(rng.uniform(9, 18), high - at)
-                tall = rng.uniform(8, 13)
-                back = sign * (half + rng.uniform(0, 0.6))
-                number = facades[int(rng.integers(4))]
-                world.add([back, 1.65 - tall, at], [0, 0, length], [0, tall, 0], number, storey)
-                # The same along the second street.
-                away = at - 40.0
-                if away + length < -half + 1e-6 or away > half - 1e-6:
-                    world.add([away, 1.65 - tall, 40 + back], [length, 0, 0], [0, tall, 0], number, storey)
-                at += length
-    for street in (0, 1):
-        for k in range(-6, 14):
-            along = 7.0 * k + rng.uniform(-1, 1)
-            if abs(along - (40.0 if street == 0 else 0.0)) < half + 4.0:
-                continue
-            for sign in (-1.0, 1.0):
-                if rng.random() < 0.35:
-                    continue
-                across = sign * (half - 2.2)
-                low = (
-                    np.array([across - 0.9, 0.25, along - 2.1])
-                    if street == 0
-                    else np.array([along - 2.1, 0.25, 40 + across - 0.9])
-                )
-                size = np.array([1.8, 1.4, 4.2]) if street == 0 else np.array([4.2, 1.4, 1.8])
-                world.box(low, low + size, paints, 120.0, rng.uniform(-0.05, 0.05))
-            post = (
-                np.array([half - 0.6, -4.0, along + 3.0])
-                if street == 0
-                else np.array([along + 3.0, -4.0, 40 + half - 0.6])
-            )
-            world.box(post, post + np.array([0.14, 5.6, 0.14]), paints, 120.0)
-            stripe = [-0.08, 1.64, along] if street == 0 else [along, 1.64, 39.92]
-            world.add(
-                stripe,
-                [0.16, 0, 0] if street == 0 else [3.0, 0, 0],
-                [0, 0, 3.0] if street == 0 else [0, 0, 0.16],
-                marks,
-                10.0,
-            )
-    return world
 
 
 # ---------------------------------------------------------------------------------------------------------- rendering
@@ -242,6 +76,29 @@ def _shade(rectangles, pattern, scale, patterns, fx, fy, cx, cy, jx, jy, nearest
             out[i, j] += top * (1.0 - fv) + low * fv
 
 
+@dataclass(frozen=True)
+class Film:
+    """What a camera makes of the light; times are shares of the time between frames."""
+
+    #: How long light falls in, and from how many moments of it a pixel is made.
+    exposure: float
+    moments: int = 4
+    #: From the first row to the last.
+    rolling: float = 0.0
+    #: How much later depth is measured than grey levels.
+    depth_lag: float = 0.0
+    #: Standard deviation of the noise, grey levels.
+    noise: float = 2.0
+    #: The brightness goes up and down.
+    flicker: bool = False
+    #: The exposure follows the mean brightness some frames later.
+    follows: bool = False
+    #: Gain and offset of the right image.
+    right: tuple[float, float] = (0.96, 0.0)
+    #: Depth beyond this is unknown, metres.
+    max_depth: float = 5.0
+
+
 @dataclass(frozen=True, eq=False)
 class Renderer:
     """A world and a camera."""
@@ -249,33 +106,51 @@ class Renderer:
     world: World
     camera: SequenceCamera
 
-    def picture(self, before: np.ndarray, after: np.ndarray, exposure: float) -> tuple[np.ndarray, np.ndarray]:
+    def picture(
+        self, before: np.ndarray, after: np.ndarray, film: Film, time: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Grey levels and exact depth (H, W), 0 for the sky; the camera moves from one pose to the other.
 
         Parameters
         ----------
         before, after : (7,)
             cam_from_world half a frame before and after.
-        exposure : float
-            Share of the time between frames during which light falls in.
+        film
+            How long light falls in, and when.
+        time : float
+            Frames since the start, for what moves in the world.
         """
-        total = np.zeros((self.camera.height, self.camera.width))
+        height, width = self.camera.height, self.camera.width
+        total, moment = np.zeros((height, width)), np.zeros((height, width))
         motion = se3.log(se3.compose(after[None], se3.inverse(before[None])))[0]
-        for k, jitter in enumerate(MOMENTS):
-            share = 0.5 + exposure * ((k + 0.5) / len(MOMENTS) - 0.5)
-            pose = se3.compose(se3.exp(share * motion[None]), before[None])[0]
-            self._cast(pose, jitter, total)
-        middle = se3.compose(se3.exp(0.5 * motion[None]), before[None])[0]
-        inverse = self._cast(middle, np.zeros(2), None)
+
+        def pose_at(share: float) -> np.ndarray:
+            return se3.compose(se3.exp(share * motion[None]), before[None])[0]
+
+        # Each row is exposed during its own part of the time.
+        whole = film.exposure + film.rolling
+        count = int(np.ceil(film.moments * whole / film.exposure))
+        middle = 0.5 + film.rolling * ((np.arange(height) + 0.5) / height - 0.5)
+        weights = np.zeros(height)
+        for k in range(count):
+            share = 0.5 + whole * ((k + 0.5) / count - 0.5)
+            weight = (np.abs(share - middle) <= 0.5 * film.exposure + 0.5 * whole / count).astype(float)
+            moment[:] = 0.0
+            self._cast(pose_at(share), RAYS[k % len(RAYS)], moment, time)
+            total += weight[:, None] * moment
+            weights += weight
+        inverse = self._cast(pose_at(0.5 + film.depth_lag), np.zeros(2), None, time)
         with np.errstate(divide="ignore"):
             depth = np.where(inverse > 0, 1.0 / inverse, 0.0)
-        return total / len(MOMENTS), depth
+        return total / weights[:, None], depth
 
-    def _cast(self, pose: np.ndarray, jitter: np.ndarray, out: np.ndarray | None) -> np.ndarray:
+    def _cast(self, pose: np.ndarray, jitter: np.ndarray, out: np.ndarray | None, time: float) -> np.ndarray:
         fx, fy, cx, cy = self.camera.params
         height, width = self.camera.height, self.camera.width
         R = quaternion.to_matrix(pose[:4])
-        local = np.array(self.world.rectangles) @ R.T
+        world = np.array(self.world.rectangles)
+        world[:, 0] += time * np.array(self.world.speed)
+        local = world @ R.T
         local[:, 0] += pose[4:]
         corner, one, two = local[:, 0], local[:, 1], local[:, 2]
         corners = np.stack([corner, corner + one, corner + two, corner + one + two], axis=1)
@@ -296,7 +171,7 @@ class Renderer:
         return np.where(which >= 0, nearest, 0.0)
 
 
-def noisy_depth(depth: np.ndarray, rng: np.random.Generator, holes: float = 0.08) -> np.ndarray:
+def noisy_depth(depth: np.ndarray, rng: np.random.Generator, max_depth: float, holes: float = 0.08) -> np.ndarray:
     """Depth as a structured-light camera gives it: noise and steps of disparity, holes at jumps and in patches."""
     height, width = depth.shape
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -309,15 +184,16 @@ def noisy_depth(depth: np.ndarray, rng: np.random.Generator, holes: float = 0.08
         far = cv2.dilate(depth, np.ones((5, 5)))
         jump = far - near > 0.05 * depth
     patches = cv2.resize(rng.random((height // 24, width // 24)), (width, height), interpolation=cv2.INTER_LINEAR)
-    bad = jump | (patches > np.quantile(patches, 1.0 - holes)) | (depth > 5.0) | (depth < 0.4)
+    bad = jump | (patches > np.quantile(patches, 1.0 - holes)) | (depth > max_depth) | (depth < 0.4)
     return np.where(bad, 0.0, out).astype(np.float32)
 
 
 # -------------------------------------------------------------------------------------------------------------- paths
-def swinging(count: int, degrees: float, seed: int) -> np.ndarray:
+def swinging(count: int, degrees: float, seed: int, pure: bool = False) -> np.ndarray:
     """cam_from_world (count, 7): a camera in the hand looks around a room, some degrees from frame to frame at most.
 
-    It starts at rest, is at full speed three frames later, changes speed, and turns back at once now and then.
+    It starts at rest, is at full speed three frames later, changes speed, and turns back at once now and then. ``pure``
+    turns stay in one place.
     """
     rng = np.random.default_rng(1000 + seed)
     path = np.linspace(0.0, 40.0, 4000)
@@ -345,6 +221,8 @@ def swinging(count: int, degrees: float, seed: int) -> np.ndarray:
     center = np.stack([0.25 * np.sin(0.05 * t + phase[5]), 0.05 * np.sin(0.11 * t), 0.2 * np.sin(0.07 * t)], axis=1)
     # The camera is held 15 cm before the axis it turns about.
     center += R @ [0.0, 0.0, 0.15]
+    if pure:
+        center = R @ [0.0, 0.0, 0.02]
     return _poses(R, center)
 
 
@@ -392,10 +270,8 @@ class Turning:
     renderer: Renderer
     #: (2 N + 1, 7) cam_from_world, half a frame apart.
     half_poses: np.ndarray
-    exposure: float
+    film: Film
     seed: int
-    #: Whether the brightness changes.
-    flicker: bool = False
 
     @property
     def poses(self) -> np.ndarray:
@@ -411,36 +287,62 @@ class Turning:
         rng = np.random.default_rng(self.seed)
         baseline = self.renderer.camera.baseline
         shift = np.array([0, 0, 0, 1, -(baseline or 0.0), 0, 0])
+        film, follow = self.film, 1.0
         for k in range(len(self)):
             ends = self.half_poses[2 * k], self.half_poses[2 * k + 2]
-            gain = 1.0 + 0.25 * np.sin(0.8 * k) if self.flicker else 1.0
-            gray, depth = self.renderer.picture(*ends, self.exposure)
-            left, right = _film(gray, gain, rng), None
+            gray, depth = self.renderer.picture(*ends, film, k)
+            gain = 1.0 + 0.25 * np.sin(0.8 * k) if film.flicker else 1.0
+            if film.follows:
+                gain *= follow
+                follow += 0.35 * (110.0 / max(float(gray.mean()), 20.0) - follow)
+            left, right = _exposed(gain * gray, film.noise, rng), None
             if baseline:
                 ends = [se3.compose(shift[None], pose[None])[0] for pose in ends]
-                right = _film(self.renderer.picture(*ends, self.exposure)[0], 0.96 * gain, rng)
-            known = None if baseline else noisy_depth(depth, rng)
+                light = gain * self.renderer.picture(*ends, film, k)[0]
+                right = _exposed(film.right[0] * light + film.right[1], film.noise, rng)
+            known = None if baseline else noisy_depth(depth, rng, film.max_depth)
             yield Frame(k / RATE if not baseline else k / 10.0, left, known, right, f"{k:04d}.png")
 
 
-def _film(gray: np.ndarray, gain: float, rng: np.random.Generator) -> np.ndarray:
-    return np.clip(gain * gray + rng.normal(0, 2.0, gray.shape), 0, 255).astype(np.uint8)
+def _exposed(light: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
+    return np.clip(light + rng.normal(0, noise, light.shape), 0, 255).astype(np.uint8)
+
+
+#: Depth cameras in the hand: a short exposure; the blur and the noise of a dim room; and all at once.
+FILMS = {
+    "": None,
+    "blurred": Film(0.4, 8),
+    "dim": Film(0.7, 10, noise=7.0, follows=True),
+    "real": Film(0.4, 6, rolling=0.5, depth_lag=0.2, noise=4.0, follows=True, max_depth=4.0),
+}
 
 
 def room_sequence(
-    degrees: float, seed: int, plain: bool = False, count: int = 60, exposure: float | None = None
-) -> Turning:
+    degrees: float, seed: int, plain: bool = False, count: int = 60, film: str = "", size: float = 1.0,
+    pure: bool = False,
+) -> Turning:  # fmt: skip
     """A depth camera that swings by up to some degrees from frame to frame."""
     camera = SequenceCamera("PINHOLE", np.array([525.0, 525.0, 320.0, 240.0]), 640, 480)
     # An exposure of a tenth of the time between frames, and blur of at most 0.8 degrees (7 pixels).
-    exposure = min(0.3, 0.8 / degrees) if exposure is None else exposure
-    name = f"{'plain ' if plain else ''}room, {degrees:g} degrees, seed {seed}"
-    return Turning(name, Renderer(make_room(seed, plain), camera), swinging(count, degrees, seed), exposure, seed)
+    exposed = FILMS[film] or Film(min(0.3, 0.8 / degrees))
+    words = [film, "plain" if plain else "", "large" if size > 1 else "", "room"]
+    place = ", one place" if pure else ""
+    name = f"{' '.join(word for word in words if word)}, {degrees:g} degrees{place}, seed {seed}"
+    path = swinging(count, degrees, seed, pure)
+    return Turning(name, Renderer(make_room(seed, plain, size), camera), path, exposed, seed)
 
 
-def corner_sequence(degrees: float, seed: int, right: bool = True, flicker: bool = True) -> Turning:
-    """A stereo pair on a car around a corner."""
+def corner_sequence(
+    degrees: float, seed: int, right: bool = True, traffic: bool = False, wide: bool = False, uneven: bool = False
+) -> Turning:
+    """A stereo pair on a car around a corner: with a car that crosses, in wide empty streets, with uneven cameras."""
     camera = SequenceCamera("PINHOLE", np.array([707.0912, 707.0912, 602.3873, 183.6104]), 1226, 370, 0.53715)
-    name = f"corner, {degrees:g} degrees, seed {seed}{'' if right else ', left'}"
-    world = make_corner(seed)
-    return Turning(name, Renderer(world, camera), cornering(degrees, seed, right), 0.04, seed, flicker)
+    words = ["wide" if wide else "", "uneven" if uneven else "", "corner", "with traffic" if traffic else ""]
+    name = f"{' '.join(word for word in words if word)}, {degrees:g} degrees, seed {seed}{'' if right else ', left'}"
+    path = cornering(degrees, seed, right)
+    world = make_corner(seed, half=22.0 if wide else 8.0, bare=wide)
+    if traffic:
+        # It crosses before the camera where that turns.
+        world.drive([-12.0 if right else 12.0, 34.0], [0.9 if right else -0.9, 0.0])
+    film = Film(0.04, flicker=True, right=(0.7, 25.0) if uneven else (0.96, 0.0))
+    return Turning(name, Renderer(world, camera), path, film, seed)

@@ -13,12 +13,12 @@ import json
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from _line_scenes import MIN_LENGTH, SCENES, LineScene
+from _line_scenes import LIMAP_MIN_LENGTH, MIN_LENGTH, NUM_NEIGHBORS, SCENES, LineScene
 from _workshop import CACHE, CONTESTANTS, RESULTS, ROOT, machine, run_program
 
 from groma import cameras as camera_models
@@ -27,8 +27,10 @@ from groma.frontend import Segments
 from groma.frontend.matches import LineMatches
 from groma.geometry import quaternion, segment2
 from groma.pipelines._neighbors import covisible_neighbors
+from groma.pipelines._noise import noise_px
 from groma.pipelines.adjust import AdjustOptions, adjust
-from groma.pipelines.find_structure import find_structure
+from groma.pipelines.find_structure import StructureOptions, find_structure
+from groma.pipelines.map import LOSS_SIGMAS
 from groma.pipelines.map_lines import MapLinesOptions, map_lines, wide_baseline_matches
 from groma.scene import Scene
 
@@ -60,7 +62,7 @@ class Task:
     source: LineScene
     segments: list[Segments]
     neighbors: list[np.ndarray]
-    min_length: float
+    options: MapLinesOptions
     matches: dict[tuple[int, int], LineMatches] = field(default_factory=dict)
 
     @property
@@ -70,24 +72,33 @@ class Task:
 
 def prepare(source: LineScene, matching: str) -> Task:
     """Detect, choose neighbours, match."""
-    options = MapLinesOptions()
-    min_length = MIN_LENGTH.get(source.name, options.min_length)
-    segments = source.segments(min_length)
+    options = options_of(source.name)
+    segments = source.segments(options.min_length)
     neighbors = covisible_neighbors(source.scene, options.num_neighbors, options.min_shared)
     matches = {}
     if matching == "wide":
         provider = wide_baseline_matches(source.scene, segments, lambda i: source.images[i])
         pairs = {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(neighbors) for j in row}
         matches = {pair: provider(*pair) for pair in sorted(pairs)}
-    return Task(source, segments, neighbors, min_length, matches)
+    return Task(source, segments, neighbors, options, matches)
+
+
+def options_of(scene: str) -> MapLinesOptions:
+    """The defaults, but for photographs that figures were published of."""
+    usual = MapLinesOptions()
+    return replace(
+        usual,
+        min_length=MIN_LENGTH.get(scene, usual.min_length),
+        num_neighbors=NUM_NEIGHBORS.get(scene, usual.num_neighbors),
+    )
 
 
 # --------------------------------------------------------------------------------------------------------- contestants
 def run_groma(task: Task) -> list[LineSet]:
     """Lines as mapped, and after the joint adjustment of everything but the exact poses; then the same of fewer."""
     return [
-        *_run_groma(task, "groma", MapLinesOptions(min_length=task.min_length)),
-        *_run_groma(task, "groma, selective", MapLinesOptions.selective(task.min_length))[1:],
+        *_run_groma(task, "groma", task.options),
+        *_run_groma(task, "groma, selective", MapLinesOptions.selective(task.options.min_length))[1:],
     ]
 
 
@@ -100,8 +111,13 @@ def _run_groma(task: Task, name: str, options: MapLinesOptions) -> list[LineSet]
     mapped = LineSet(f"{name}, no joint adjustment", task.matching, found.segments, track, seconds)
     if not found.num_lines:
         return [mapped]
-    scene = find_structure(found.add_to(task.source.scene, task.segments))
-    adjusted = adjust(scene, AdjustOptions(refine_poses=False, threads=1)).scene
+    lined = found.add_to(task.source.scene, task.segments)
+    structure = StructureOptions()
+    weighted = AdjustOptions(
+        refine_poses=False, threads=1, loss_scale=LOSS_SIGMAS, point_sigma_px=noise_px(lined, "points"),
+        line_sigma_px=noise_px(lined, "lines"), structure_sigma_px=structure.surface_sigma_px,
+    )  # fmt: skip
+    adjusted = adjust(find_structure(lined, structure), weighted).scene
     seconds = time.process_time() - start
     return [mapped, LineSet(name, task.matching, adjusted.lines.segments, track, seconds)]
 
@@ -148,7 +164,7 @@ def for_limap(task: Task) -> dict[str, np.ndarray]:
         "match_images": np.array(list(task.matches), int).reshape(-1, 2),
         "match_pairs": np.concatenate([np.empty((0, 2), int), *pairs]),
         "match_start": np.cumsum([0, *map(len, pairs)]),
-        "min_length": np.array(task.min_length),
+        "min_length": np.array(LIMAP_MIN_LENGTH.get(task.source.name, task.options.min_length)),
     }
 
 
@@ -166,10 +182,28 @@ def row_of(task: Task, lines: LineSet) -> dict[str, object]:
         "cpu_s": lines.seconds,
     }
     if task.source.edges is not None:
-        scores = score_lines(lines.ends, task.source.edges, task.source.thresholds)
-        names = ("recall_length", "precision_count", "precision_strict", "precision_length", "inlier_length")
-        row["scores"] = {name: [float(v) for v in getattr(scores, name).values()] for name in names}
+        row["scores"] = _scores(task.source, lines.ends, task.source.edges)
+    if task.source.edges is not None and task.source.box is not None:
+        ends, edges = inside(lines.ends, task.source.box), inside(task.source.edges, task.source.box)
+        row["inside"] = {"num_lines": len(ends), **_scores(task.source, ends, edges)}
     return row
+
+
+def _scores(source: LineScene, ends: np.ndarray, edges: np.ndarray) -> dict[str, list[float]]:
+    scores = score_lines(ends, edges, source.thresholds)
+    names = ("recall_length", "precision_count", "precision_strict", "precision_length", "inlier_length")
+    return {name: [float(v) for v in getattr(scores, name).values()] for name in names}
+
+
+def inside(ends: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Parts of segments (L, 2, 3) inside a box given by two corners; none of those outside."""
+    along = ends[:, 1] - ends[:, 0]
+    along = np.where(np.abs(along) < 1e-12, 1e-12, along)
+    both = (box[:, None] - ends[:, 0]) / along
+    first, last = both.min(0).max(1).clip(0.0), both.max(0).min(1).clip(max=1.0)
+    share = np.column_stack([first, last])[first < last]
+    ends = ends[first < last]
+    return ends[:, :1] + share[:, :, None] * (ends[:, 1:] - ends[:, :1])
 
 
 def reprojection(task: Task, lines: LineSet) -> np.ndarray:
@@ -196,16 +230,30 @@ def table(source: LineScene, rows: list[dict]) -> str:
              "precision_length": "right length %"}  # fmt: skip
     scored = [name for name in names if rows and "scores" in rows[0]]
     head = ["program", "matches", "lines", "in 4 images", "images per line", "median px", "CPU s"]
-    head += [names[name] for name in scored]
-    out = ["| " + " | ".join(head) + " |", "|---|---|" + "--:|" * (len(head) - 2)]
+    table = [head + [names[name] for name in scored]]
     for row in rows:
         cells = [row["contestant"], row["matching"], row["num_lines"], row["in_4_images"]]
         cells += [f"{row['images_per_line']:.2f}", f"{row['median_px']:.3f}"]
         cells += ["" if np.isnan(row["cpu_s"]) else f"{row['cpu_s']:.1f}"]
-        cells += [" / ".join(f"{100 * v:.1f}" for v in row["scores"][name]) for name in scored]
-        out.append("| " + " | ".join(map(str, cells)) + " |")
+        table.append(cells + [_percent(row["scores"][name]) for name in scored])
     taus = ", ".join(f"{tau:.4g}" for tau in source.thresholds)
-    return f"**{source.name}**" + (f", within {taus}" if taus else "") + "\n\n" + "\n".join(out) + "\n"
+    text = f"**{source.name}**" + (f", within {taus}" if taus else "") + "\n\n" + _markdown(table, 2)
+    if rows and "inside" in rows[0]:
+        table = [["program", "matches", "lines", *names.values()]]
+        for row in rows:
+            part = row["inside"]
+            table.append([row["contestant"], row["matching"], part["num_lines"], *(_percent(part[n]) for n in names)])
+        text += "\nParts of the lines inside the box in which edges were marked:\n\n" + _markdown(table, 2)
+    return text
+
+
+def _percent(shares: list[float]) -> str:
+    return " / ".join(f"{100 * share:.1f}" for share in shares)
+
+
+def _markdown(table: list[list[object]], num_left: int) -> str:
+    rows = ["| " + " | ".join(map(str, cells)) + " |" for cells in table]
+    return "\n".join([rows[0], "|" + "---|" * num_left + "--:|" * (len(table[0]) - num_left), *rows[1:]]) + "\n"
 
 
 def draw(task: Task, lines: LineSet, image: int, target: Path) -> None:

@@ -5,15 +5,22 @@
     python benchmarks/street_rotation.py SEQUENCE TRACK
 
 SEQUENCE is a folder of the KITTI layout with ``poses.txt``. SIFT features of two frames give the rotation twice: by the
-essential matrix, and by a perspective pose from points of the stereo pair. Printed are differences in degrees, and the
-rotation of the reference from frame to frame at the start.
+essential matrix, and by a perspective pose from points of the stereo pair. With pycolmap, all frames of the left camera
+are adjusted together as well. Printed are differences in degrees, and the rotation of the reference from frame to frame
+at the start.
 """
 
 import sys
+import tempfile
 from pathlib import Path
 
 import cv2
 import numpy as np
+
+try:
+    import pycolmap
+except ImportError:
+    pycolmap = None
 
 PAIRS = [(0, 2), (0, 4), (0, 6), (10, 20), (20, 30), (30, 39)]
 #: Largest ratio of a match to the second best, reprojection errors and least disparity in pixels.
@@ -78,6 +85,30 @@ class Street:
         return cv2.Rodrigues(cv2.solvePnPRefineLM(X[inliers], x[inliers], self.K, None, turn, shift)[0])[0]
 
 
+def by_adjustment(street: Street, folder: Path) -> np.ndarray:
+    """Rotations (N, 3, 3) of all frames, cam_from_world: features, matches and adjustment by COLMAP, camera held."""
+    K = street.K
+    pycolmap.set_random_seed(0)
+    reader = pycolmap.ImageReaderOptions(
+        camera_model="PINHOLE", camera_params=f"{K[0, 0]},{K[1, 1]},{K[0, 2] + 0.5},{K[1, 2] + 0.5}"
+    )
+    images, database = street.folder / "image_0", folder / "database.db"
+    mode = pycolmap.CameraMode.SINGLE
+    pycolmap.extract_features(database, images, camera_mode=mode, reader_options=reader)
+    pairing = pycolmap.SequentialPairingOptions(overlap=6, quadratic_overlap=False, loop_detection=False)
+    pycolmap.match_sequential(database, pairing_options=pairing)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+    # A camera that goes straight on sees its points under small angles.
+    options.mapper.init_min_tri_angle, options.mapper.init_max_forward_motion = 2.0, 1.0
+    options.mapper.filter_min_tri_angle, options.triangulation.min_angle = 0.5, 0.5
+    options.mapper.abs_pose_min_num_inliers = 20
+    made = pycolmap.incremental_mapping(database, images, folder / "model", options=options)
+    model = max(made.values(), key=lambda one: one.num_reg_images())
+    found = {int(Path(image.name).stem): image.cam_from_world().rotation.matrix() for image in model.images.values()}
+    return np.array([found.get(k, np.full((3, 3), np.nan)) for k in range(max(found) + 1)])
+
+
 def angle(first, second) -> float:
     """Angle between two rotations, degrees."""
     return float(np.degrees(np.arccos(np.clip((np.trace(first @ second.T) - 1) / 2, -1, 1))))
@@ -97,12 +128,21 @@ def main() -> None:
     street = Street(Path(sys.argv[1]))
     reference = np.loadtxt(street.folder / "poses.txt").reshape(-1, 3, 4)[:, :, :3]
     groma = tracked(Path(sys.argv[2]) / "trajectory.txt", np.loadtxt(street.folder / "times.txt"))
-    print("| frames | essential matrix, reference | stereo, reference | essential matrix, stereo | groma, reference "
-          "| groma, essential matrix |\n|---|--:|--:|--:|--:|--:|")  # fmt: skip
+    columns = ["essential matrix, reference", "stereo, reference", "essential matrix, stereo", "groma, reference",
+               "groma, essential matrix"]  # fmt: skip
+    adjusted = None
+    if pycolmap is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            adjusted = by_adjustment(street, Path(folder))
+        columns += ["COLMAP, reference", "groma, COLMAP"]
+    print(f"| frames | {' | '.join(columns)} |\n|---|{'--:|' * len(columns)}", flush=True)
     for i, j in PAIRS:
         essential, stereo = street.by_essential_matrix(i, j), street.by_stereo(i, j)
         truth, ours = reference[j].T @ reference[i], groma[j].T @ groma[i]
         pairs = [(essential, truth), (stereo, truth), (essential, stereo), (ours, truth), (ours, essential)]
+        if adjusted is not None:
+            colmap = adjusted[j] @ adjusted[i].T
+            pairs += [(colmap, truth), (ours, colmap)]
         print(f"| {i} and {j} | " + " | ".join(f"{angle(*pair):.2f}" for pair in pairs) + " |", flush=True)
     print("\nThe reference from frame to frame, degrees about x, y, z:")
     for i in range(14):

@@ -3,6 +3,8 @@
 
     python benchmarks/surveyed.py SCENE ...
     python benchmarks/surveyed.py SCENE ... --scales 1 3 5 7
+    python benchmarks/surveyed.py SCENE ... --limits
+    python benchmarks/surveyed.py SCENE ... --noise --rendered 1 2 3
 
 SCENE is a folder with ``images/``, a start ``sparse_inc/`` and the survey ``sparse_gt/``, both COLMAP models. Each
 scene is mapped once with the defaults of ``groma map``; its last adjustment is then repeated from the same start with
@@ -15,8 +17,23 @@ of freedom of the poses. Perfect poses would give about one. Where it is hundred
 calibration, contradict each other, and no adjustment of these photographs could come as near to the survey as its own
 noise would allow.
 
-With ``--scales`` the last adjustment, of everything, is repeated with these scales of the first loss, in standard
-deviations of the noise, instead.
+With ``--scales`` the last adjustment, of everything, is repeated with these scales of its loss, in standard deviations
+of the noise, instead.
+
+With ``--limits`` a row says how near the survey these photographs can come at all:
+
+- *one among surveyed*: each camera in turn is placed by its photograph while all others stay at their surveyed poses;
+  how far that is from its own surveyed place, root mean square and largest, and whose;
+- *at 2, 3, 5 sigma*: the least root mean square of the centres of any result that fits points and lines worse by 4, 9
+  and 25 in twice the logarithm of the likelihood;
+- *calibrated*: the centres by points with focal lengths, principal point and distortion estimated; the distortion; and
+  what that gains in twice the logarithm of the likelihood;
+- *tails*: degrees of freedom of Student's distribution of the points' residuals, with one noise for all points and with
+  each point's own.
+
+With ``--noise`` the last adjustment is repeated with one noise for all points, and with each point's own, by points and
+by everything. ``--rendered`` adds rooms of boxes, rendered with these seeds and reconstructed from the pictures, whose
+cameras are known exactly.
 """
 
 import argparse
@@ -24,20 +41,35 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+from _renderings import BoxSettings, render_boxes
 
 import groma
 from groma.evaluation import evaluate_poses
 from groma.evaluation.alignment import align_points
+from groma.factors import Ref
+from groma.factors.position_prior import PositionPrior
+from groma.pipelines._assemble import AssemblyOptions, assemble, disassemble
+from groma.pipelines._noise import noise_px
+from groma.pipelines.adjust import squared_residuals_px
 from groma.pipelines.map import MapOptions, MapResult, map_images
 from groma.pipelines.uncertainty import position_sigma, uncertainty
-from groma.scene import Scene
+from groma.problem.problem import Problem
+from groma.problem.variables import Variables
+from groma.scene import Relations, Scene
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
 
 KINDS = {
     "points": {"lines": False, "planes": False},
     "+ lines": {"planes": False},
     "+ planes": {},
 }
+NOISES = ["points, one noise", "points, own noise", "all, one noise", "all, own noise"]
+LIMITS = ["one among surveyed", "at 2, 3, 5 sigma", "calibrated", "k1, k2", "gain", "tails"]
+#: Twice the logarithm of the likelihood that a result nearer the survey may cost.
+PRICES = (4.0, 9.0, 25.0)
 #: Scale of the one loss under which costs are compared, in standard deviations.
 MISFIT_LOSS = 3.0
 
@@ -75,7 +107,7 @@ def tell_kinds(folder: Path, start: Scene, survey: Scene, result: MapResult) -> 
 
 
 def tell_scales(folder: Path, survey: Scene, result: MapResult, scales: list[float]) -> None:
-    """Print a row: the centres' error for each scale of the first loss."""
+    """Print a row: the centres' error for each scale of the last loss."""
     cells = []
     for scale in scales:
         found = groma.adjust(result.before, replace(result.adjusted_with, loss_scale=scale))
@@ -83,15 +115,140 @@ def tell_scales(folder: Path, survey: Scene, result: MapResult, scales: list[flo
     print(f"| {folder.name} | " + " | ".join(cells) + " |", flush=True)
 
 
+def tell_noise(name: str, survey: Scene, result: MapResult) -> None:
+    """Print a row: the centres with one noise for all points, and with each point's own."""
+    one, cells = with_one_noise(result.before), []
+    plain = replace(result.adjusted_with, point_sigma_px=noise_px(with_one_noise(result.scene), "points"))
+    for kinds in (KINDS["points"], KINDS["+ planes"]):
+        for scene, options in ((one, plain), (result.before, result.adjusted_with)):
+            cells.append(scores(groma.adjust(scene, replace(options, **kinds)).scene, survey))
+    print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
+def tell_rendered(seed: int) -> None:
+    """Print a row as :func:`tell_noise` for a rendered room of boxes."""
+    settings = BoxSettings(seed=seed, num_images=30, num_boxes=10, texture=25.0, blotches=400, noise=3.0)
+    room = render_boxes(settings)
+    camera = (settings.focal, settings.focal, settings.width / 2, settings.height / 2)
+    with tempfile.TemporaryDirectory() as work:
+        images = Path(work) / "images"
+        images.mkdir()
+        for name, image in zip(room.scene.images.names, room.images, strict=True):
+            cv2.imwrite(str(images / name), image)
+        result = map_images(images, Path(work) / "map", None, MapOptions(camera_model="PINHOLE", camera_params=camera))
+    tell_noise(f"boxes {seed}", room.scene, result)
+
+
+def tell_limits(folder: Path, survey: Scene, result: MapResult) -> None:
+    """Print a row: how near the survey these photographs can come."""
+    row = {name: k for k, name in enumerate(survey.images.names)}
+    at = [row[name] for name in result.before.images.names]
+    centers, poses = survey.cam_centers_in_world[at], survey.cam_from_world[at]
+    options = replace(result.adjusted_with, planes=False)
+    scene = groma.adjust(result.before.replace(relations=Relations()), options).scene
+    scene = scene.transformed(align_points(scene.cam_centers_in_world, centers))
+    away = one_among_surveyed(scene.with_poses(poses), replace(options, lines=False))
+    worst = scene.images.names[int(np.argmax(away))]
+    alone = f"{1e3 * np.sqrt(np.mean(away**2)):.2f} / {1e3 * away.max():.1f} ({worst})"
+    bought = " / ".join(f"{1e3 * rms:.2f}" for rms in nearest_at(scene, centers, options))
+    found, gain = calibrated(scene, replace(options, lines=False))
+    k1, k2 = found.cameras.params[0, 4:6]
+    tails = " / ".join(f"{tail_freedom(one):.1f}" for one in (with_one_noise(result.scene), result.scene))
+    cells = [alone, bought, scores(found, survey), f"{k1:.4f}, {k2:.4f}", f"{gain:.0f}", tails]
+    print(f"| {folder.name} | " + " | ".join(cells) + " |", flush=True)
+
+
+def one_among_surveyed(placed: Scene, options: groma.AdjustOptions) -> np.ndarray:
+    """Distances (N,) of cameras from their surveyed places, each placed by the points while the others are held."""
+    held = solved(placed, replace(options, refine_poses=False))
+    frames, away = held.variables["frames"], np.zeros(placed.num_images)
+    for image in range(placed.num_images):
+        constant = np.ones((len(frames), 6), dtype=bool)
+        constant[placed.images.frame_idx[image]] = False
+        variables = {**held.variables, "frames": Variables(frames.manifold, frames.state, constant)}
+        moved = disassemble(placed, solve(Problem(variables, held.factors), SolverOptions()).problem)
+        away[image] = np.linalg.norm(moved.cam_centers_in_world[image] - placed.cam_centers_in_world[image])
+    return away
+
+
+def nearest_at(scene: Scene, centers: np.ndarray, options: groma.AdjustOptions) -> list[float]:
+    """Root mean square of the centres at each of the prices, pulling the cameras to the survey ever harder."""
+    # What an adjustment leaves is little against its cost, but not against these prices.
+    exact = SolverOptions(function_tolerance=1e-9, max_iterations=100, landmark_steps=2)
+    free = solve(solved(scene, replace(options, gauge="free")), exact)
+    problem, factors, cost = free.problem, free.problem.factors, free.report.final_cost
+    away = np.sqrt(np.mean((scene.cam_centers_in_world - centers) ** 2))
+    path = []
+    for sigma in away * np.geomspace(4.0, 0.05, 20):
+        pull = PositionPrior(
+            pose=Ref("frames", scene.images.frame_idx),
+            cam_center_in_world=centers,
+            sqrt_information=np.full(len(centers), 1.0 / sigma),
+        )
+        pulled = solve(Problem(problem.variables, [*factors, pull]), exact).problem
+        problem = Problem(pulled.variables, factors)
+        price = 2.0 * (solve(problem, SolverOptions(max_iterations=0)).report.final_cost - cost)
+        found = disassemble(scene, problem)
+        found = found.transformed(align_points(found.cam_centers_in_world, centers)).cam_centers_in_world
+        path.append((price, float(np.sqrt(np.mean(((found - centers) ** 2).sum(axis=1))))))
+        if price > PRICES[-1]:
+            break
+    prices, rms = np.array(path).T
+    return np.interp(PRICES, np.maximum.accumulate(prices), rms).tolist()
+
+
+def solved(scene: Scene, options: groma.AdjustOptions) -> Problem:
+    """The adjusted problem, at its solution."""
+    problem = groma.adjust(scene, options).problem
+    assert problem is not None
+    return problem
+
+
+def calibrated(scene: Scene, options: groma.AdjustOptions) -> tuple[Scene, float]:
+    """The points' adjustment with pinhole parameters and distortion estimated, and twice the likelihood it gains."""
+    cameras = scene.cameras
+    params = np.hstack([cameras.params[:, :4], np.zeros((len(cameras), 4))])
+    bent = scene.replace(cameras=cameras.replace(models=("OPENCV",) * len(cameras), params=params))
+    held = groma.adjust(scene, options)
+    free = groma.adjust(bent, replace(options, refine_intrinsics=True, refine_principal_point=True))
+    return free.scene, 2.0 * (held.report.solve.final_cost - free.report.solve.final_cost)
+
+
+def with_one_noise(scene: Scene) -> Scene:
+    """The scene with all observations of points equally good."""
+    table = scene.point_observations
+    return scene.replace(point_observations=table.replace(sigma=np.ones(len(table))))
+
+
+def tail_freedom(scene: Scene) -> float:
+    """Degrees of freedom of Student's distribution that fits the points' residuals best; at most a hundred."""
+    assembly = assemble(scene, AssemblyOptions(lines=False, planes=False))
+    squares = squared_residuals_px(assembly, weighted=True)["points"]
+    surprise = []
+    for freedom in (freedoms := np.geomspace(1.0, 100.0, 60)):
+        variance = np.median(squares)
+        for _ in range(30):
+            variance = 0.5 * np.mean((freedom + 2.0) * squares / (freedom + squares / variance))
+        surprise.append(np.log(variance) + (freedom / 2 + 1) * np.mean(np.log1p(squares / (freedom * variance))))
+    return float(freedoms[np.argmin(surprise)])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", type=Path)
-    parser.add_argument("--scales", nargs="+", type=float, metavar="S", help="scales of the first loss to compare")
+    parser.add_argument("scenes", nargs="*", type=Path)
+    parser.add_argument("--scales", nargs="+", type=float, metavar="S", help="scales of the last loss to compare")
+    parser.add_argument("--limits", action="store_true", help="how near the survey these photographs can come")
+    parser.add_argument("--noise", action="store_true", help="one noise for all points, and each point's own")
+    parser.add_argument("--rendered", nargs="+", type=int, metavar="SEED", default=[], help="rooms of boxes too")
     arguments = parser.parse_args()
     print("centres: rms / largest, thousandths of the survey's unit; rotations: mean, degrees\n")
     columns = ["start", "squares", *KINDS, "predicted", "misfit"]
     if arguments.scales:
         columns = [f"{scale:g}" for scale in arguments.scales]
+    if arguments.limits:
+        columns = LIMITS
+    if arguments.noise or arguments.rendered:
+        columns = NOISES
     print("| scene | " + " | ".join(columns) + " |\n|---|" + "--:|" * len(columns))
     for folder in arguments.scenes:
         start, survey = groma.read_scene(folder / "sparse_inc"), groma.read_scene(folder / "sparse_gt")
@@ -99,8 +256,14 @@ def main() -> None:
             result = map_images(folder / "images", work, start, MapOptions())
         if arguments.scales:
             tell_scales(folder, survey, result, arguments.scales)
+        elif arguments.noise or arguments.rendered:
+            tell_noise(folder.name, survey, result)
+        elif arguments.limits:
+            tell_limits(folder, survey, result)
         else:
             tell_kinds(folder, start, survey, result)
+    for seed in arguments.rendered:
+        tell_rendered(seed)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How the tracker holds when the camera turns fast: rendered sequences with exact poses, and real ones turned further.
 
-    python benchmarks/turns.py [--seeds N] [--only WORD] [--real FOLDER] [--write FILE]
+    python benchmarks/turns.py [--seeds N] [--harder] [--only WORD] [--real FOLDER] [--write FILE]
 
 Rooms with a depth camera that swings by up to 5, 10, 15 and 25 degrees from frame to frame, with printed and with plain
 walls; street corners with a stereo pair, 5 to 10 degrees a frame, windows that repeat and a brightness that changes.
+``--harder`` renders others: blur of up to 25 pixels, dim light, rows exposed one after the other and depth that comes
+later (``real``), large rooms whose walls have no depth, turns in one place; streets with a car that crosses, wide and
+empty, or seen by two cameras of different brightness.
 ``--real`` adds a depth sequence (TUM or 7-Scenes) whose images are cut smaller and turned about the camera, back and
 forth. Printed are frames with a pose, frames lost, the position error after alignment, and the worst pose as it was
 said in its frame, against the truth. ``--write`` keeps the table.
@@ -123,16 +126,37 @@ def rendered(seeds: int):
             yield corner_sequence(degrees, seed, right=seed % 2 == 0)
 
 
+def harder(seeds: int):
+    """Rendered sequences with the traits of cameras in the hand, and streets that show little."""
+    for seed in range(seeds):
+        for film in ("blurred", "dim", "real"):
+            for plain in (False, True):
+                for degrees in (4, 7):
+                    yield room_sequence(degrees, seed, plain, 45, film)
+        for plain in (False, True):
+            yield room_sequence(7, seed, plain, film="real", size=1.8)
+            yield room_sequence(7, seed, plain, film="real", pure=True)
+        for degrees in (5, 10):
+            right = seed % 2 == 0
+            yield corner_sequence(degrees, seed, right, traffic=True)
+            yield corner_sequence(degrees, seed, right, wide=True)
+            yield corner_sequence(degrees, seed, right, uneven=True)
+            yield corner_sequence(degrees, seed, right, traffic=True, wide=True, uneven=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=2, help="worlds and paths of each kind")
+    parser.add_argument(
+        "--harder", action="store_true", help="sequences with longer exposures, less light, less to see"
+    )
     parser.add_argument("--only", default="", metavar="WORD", help="sequences whose name holds this word")
     parser.add_argument("--real", type=Path, action="append", default=[], metavar="FOLDER")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the table here too")
     arguments = parser.parse_args()
     lines = HEAD.splitlines()
     print(HEAD, flush=True)
-    for one in rendered(arguments.seeds):
+    for one in (harder if arguments.harder else rendered)(arguments.seeds):
         if arguments.only in one.name:
             world_from_cam = se3.inverse(one.poses)
             lines.append(row(one.name, one.renderer.camera, one, lambda stamps, exact=world_from_cam: exact))

@@ -5,6 +5,7 @@ import errno
 import os
 import subprocess
 import sys
+import warnings
 
 import pytest
 
@@ -105,3 +106,16 @@ def test_our_own_errors_keep_their_traceback():
 
     with pytest.raises(ZeroDivisionError):
         guard(command)()
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_warnings_of_the_library_are_lines(capsys, quiet):
+    @guard
+    def command(quiet: bool) -> None:
+        warnings.warn("2 lines were left out.", stacklevel=2)
+        warnings.warn("for developers", DeprecationWarning, stacklevel=2)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        command(quiet=quiet)
+    assert capsys.readouterr().err == ("" if quiet else "warning: 2 lines were left out.\n")

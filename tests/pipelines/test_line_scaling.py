@@ -10,10 +10,10 @@ import pytest
 from groma.cli.map import map_
 from groma.pipelines import _line_merge
 from groma.pipelines._distinct import distinct_pairs, num_distinct
-from groma.pipelines._line_fates import _REMEDIES, _WORDS, Fate, explain
+from groma.pipelines._line_fates import REMEDIES, WORDS, Fate
 from groma.pipelines._line_merge import MAX_ANGLE, MIN_OVERLAP
 from groma.pipelines._unused import without_unused
-from groma.pipelines.map_lines import LineMap
+from groma.pipelines.map_lines import LineMap, explain
 from groma.scene import Directions, Relations
 from groma.scene.compare import equal
 from groma.scene.synthetic import corridor
@@ -128,13 +128,13 @@ def line_map(counts, num_lines=0):
     return LineMap(lines=np.zeros((num_lines, 6)), **empty, fates=(fates,), neighbors=())
 
 
-@pytest.mark.parametrize("fate", list(_WORDS))
+@pytest.mark.parametrize("fate", list(WORDS))
 def test_explanations_are_sentences_with_options_that_exist(fate):
     text = explain(line_map({fate: 3}))
-    assert "3 (100 %) " + _WORDS[fate] in text
+    assert "3 (100 %) " + WORDS[fate] in text
     flags = " ".join(str(item.annotation) for item in inspect.signature(map_).parameters.values())
     names = {"--" + name.replace("_", "-") for name in inspect.signature(map_).parameters}
-    for option in re.findall(r"--[a-z-]+", _REMEDIES[fate]):
+    for option in re.findall(r"--[a-z-]+", REMEDIES[fate]):
         assert option in names or option in flags
     assert "segments were" not in text
 

@@ -1,4 +1,4 @@
-"""Lines mapped from segments: wireframes with exact truth, degenerate motion, matches, distortion, empty maps."""
+"""Lines mapped from segments: wireframes with exact truth, degenerate motion, matches, distortion, ends, empty maps."""
 
 from dataclasses import dataclass
 
@@ -443,29 +443,68 @@ def test_two_edges_of_a_bar_stay_two_lines():
     assert (true >= 0).mean() > 0.9
 
 
-def test_ends_are_where_most_images_see_them():
-    rng = np.random.default_rng(23)
-    lines = random_lines(12, rng)
-    world = wireframe(arc(12), lines, rng)
-    # All images see the whole lines, each with an error of its own along them.
+def shown_whole(world: Wireframe, rng: np.random.Generator, along: float, run_on: np.ndarray) -> list[Segments]:
+    """All images see the whole lines, with errors along them, and the second end ``run_on`` (C,) pixels further out."""
     segments = []
-    for i in range(12):
-        R, t = quaternion.to_matrix(world.scene.cam_from_world[i, None, :4])[0], world.scene.cam_from_world[i, 4:]
-        local = lines @ R.T + t
+    for pose, further in zip(world.scene.cam_from_world, run_on, strict=True):
+        local = world.lines @ quaternion.to_matrix(pose[None, :4])[0].T + pose[4:]
         pixel = (700.0 * local[..., :2] / local[..., 2:] + [400.0, 300.0]).reshape(-1, 4)
-        along = pixel[:, 2:] - pixel[:, :2]
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
-        pixel += rng.normal(0.0, 1.0, (12, 2)).repeat(2, 1) * np.hstack([along, along])
-        segments.append(Segments.from_ends(pixel, 0.05))
-    found = map_lines(world.scene, segments)
-    assert found.num_lines >= 10
-    nearest = np.linalg.norm(found.segments.mean(1)[:, None] - lines.mean(1), axis=-1).argmin(1)
-    true = lines[nearest]
+        unit = pixel[:, 2:] - pixel[:, :2]
+        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        error = rng.normal([0.0, further], along, (len(pixel), 2))
+        segments.append(Segments.from_ends(pixel + error.repeat(2, 1) * np.hstack([unit, unit]), 0.05))
+    return segments
+
+
+def pixels_beyond(world: Wireframe, found: LineMap) -> np.ndarray:
+    """(L, 2) how far both ends of mapped lines lie beyond those of the true lines, about, in pixels."""
+    nearest = np.linalg.norm(found.segments.mean(1)[:, None] - world.lines.mean(1), axis=-1).argmin(1)
+    true = world.lines[nearest]
     unit = (true[:, 1] - true[:, 0]) / np.linalg.norm(true[:, 1] - true[:, 0], axis=1, keepdims=True)
     at = np.sort(((found.segments - true.mean(1)[:, None]) * unit[:, None]).sum(-1), axis=1)
     half = 0.5 * np.linalg.norm(true[:, 1] - true[:, 0], axis=1)
-    beyond = np.concatenate([at[:, 1] - half, -at[:, 0] - half]) * 700.0 / 4.0
-    assert abs(np.median(beyond)) < 0.8  # pixels; the outermost but one of twelve lies 1.1 out
+    return np.column_stack([-at[:, 0] - half, at[:, 1] - half]) * 700.0 / 4.0
+
+
+def test_ends_are_where_most_images_see_them():
+    rng = np.random.default_rng(23)
+    world = wireframe(arc(12), random_lines(12, rng), rng)
+    found = map_lines(world.scene, shown_whole(world, rng, 1.0, np.zeros(12)))
+    assert found.num_lines >= 10
+    assert abs(np.median(pixels_beyond(world, found))) < 0.8  # pixels; the outermost but one of twelve lies 1.1 out
+
+
+@pytest.mark.parametrize("number", [2, 6])
+def test_few_images_that_run_on_do_not_make_a_line_longer(number):
+    rng = np.random.default_rng(25)
+    world = wireframe(arc(12), random_lines(12, rng), rng)
+    run_on = np.zeros(12)
+    run_on[3 : 3 + number] = 40.0
+    found = map_lines(world.scene, shown_whole(world, rng, 0.5, run_on))
+    assert found.num_lines >= 10
+    first, second = np.median(pixels_beyond(world, found), axis=0)
+    assert abs(first) < 1.5
+    assert abs(second - (0.0 if number == 2 else 40.0)) < (1.5 if number == 2 else 8.0)  # foreshortened in places
+
+
+@pytest.mark.parametrize(("apart", "stays"), [(0.95, False), (5.0, True)])
+def test_a_line_that_repeats_another_beside_it_is_dropped(apart, stays):
+    rng = np.random.default_rng(26)
+    lines = random_lines(12, rng)
+    world = wireframe(arc(14), lines, rng, sigma=0.03)
+    # Four images show two of the lines beside where they are, and nothing there.
+    segments = list(world.segments)
+    for i in range(4):
+        ends = segments[i].ends.copy()
+        for k in np.flatnonzero((world.truth[i] == 0) | (world.truth[i] == 1)):
+            unit = ends[k, 2:] - ends[k, :2]
+            unit /= np.linalg.norm(unit)
+            ends[k] += np.tile(apart * np.array([-unit[1], unit[0]]), 2)
+        segments[i] = Segments.from_ends(ends, 0.05)
+    found = map_lines(world.scene, segments)
+    repeated = len(found.lines) - len(np.unique(true_lines(world, found)))
+    assert repeated == (2 if stays else 0)
+    assert (found.fate_counts()[Fate.REPEATED] == 0) == stays
 
 
 def test_lines_of_texture():

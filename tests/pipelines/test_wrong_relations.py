@@ -1,6 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Wrong relations of every kind do not make cameras worse than points alone, be they wrong by far or within a gate of
-two pixels; and no camera that hardly sees anything holds the scale that relations measured in lengths pull at."""
+two pixels; and no camera that hardly sees anything holds the scale that relations measured in lengths pull at.
+
+*Never worse* is a statement about expectation. The errors of two estimates from the same noise differ by chance, too:
+where relations halve the expected square, one scene in ten or twenty still comes out worse. So single scenes are tried
+under several draws of the noise. And cameras that see next to nothing are left out of the comparison: they stay where
+they started, and a similarity alignment to them says nothing about the others.
+"""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -22,10 +28,10 @@ SEEDS = {"holistic": (1, 2, 3), "corridor": (2, 4)}
 
 
 @lru_cache
-def world(name: str, seed: int) -> tuple[Scene, Scene]:
+def world(name: str, seed: int, size: int | None = None) -> tuple[Scene, Scene]:
     """Truth and start; lines of the corridor that run along an axis get its direction."""
     make = synthetic.holistic if name == "holistic" else synthetic.corridor
-    made = make(60 if name == "holistic" else 24, noise_px=0.5, seed=seed)
+    made = make(size or (60 if name == "holistic" else 24), noise_px=0.5, seed=seed)
     if name == "holistic":
         return made.truth, made.start
     d = made.truth.lines.plucker[:, 3:]
@@ -117,6 +123,69 @@ def test_never_worse_than_points_alone(name, kinds, spoil):
         bare = measured.replace(relations=Relations())
         alone += squared_error(bare, truth, lines=False, planes=False)
     assert together <= alone
+
+
+def renoised(truth: Scene, start: Scene, rng: np.random.Generator, sigma: float = 0.5) -> tuple[Scene, Scene]:
+    """Truth and start with other noise of the same size; segments keep their places along the lines."""
+    points, lines = truth.point_observations, truth.line_observations
+    exact = project(truth, points.image_idx, truth.points.xyz[points.point_idx])
+    points = replace(points, pixel=exact + rng.normal(0.0, sigma, exact.shape))
+    ends = truth.lines.segments[lines.line_idx]
+    first, second = (project(truth, lines.image_idx, ends[:, k]) for k in (0, 1))
+    along = (second - first) / np.linalg.norm(second - first, axis=1, keepdims=True)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    measured = lines.segment.reshape(-1, 2, 2) - first[:, None]
+    places = first[:, None] + np.einsum("nkj,nj->nk", measured, along)[:, :, None] * along[:, None]
+    segment = places + rng.normal(0.0, sigma, (len(lines), 2, 1)) * across[:, None]
+    seen = {"point_observations": points, "line_observations": replace(lines, segment=segment.reshape(-1, 4))}
+    return truth.replace(**seen), start.replace(**seen)
+
+
+def well_seen(scene: Scene) -> np.ndarray:
+    """Tell which images have at least a tenth of the usual number of points."""
+    count = np.bincount(scene.point_observations.image_idx, minlength=scene.num_images)
+    return count >= 0.1 * np.median(count)
+
+
+RIGHT = ("point_on_plane", "line_on_plane", "line_along_direction")
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "kinds", "spoil"),
+    [
+        ("corridor", 1, RIGHT, None),
+        ("corridor", 6, RIGHT, None),
+        ("corridor", 15, RIGHT, None),
+        ("corridor", 4, RIGHT, within_gate),
+        ("holistic", 3, ON_PLANES, within_gate),
+        ("holistic", 5, ON_PLANES, within_gate),
+    ],
+)
+def test_no_scene_is_worse_beyond_chance(name, seed, kinds, spoil):
+    """These scenes came out worse for one draw of the noise, or look worse by cameras that see next to nothing."""
+    truth, start = world(name, seed, 24)
+    use = np.flatnonzero(well_seen(start))
+    alone, together = [], []
+    for draw in range(8):
+        rng = np.random.default_rng(100 * seed + draw)
+        known, measured = renoised(truth, start, rng)
+        for kind in kinds if spoil else ():
+            measured = spoil(known, measured, kind, rng)
+            known = known.replace(
+                point_observations=measured.point_observations, line_observations=measured.line_observations
+            )
+        measured = measured.replace(relations=Relations(**{k: getattr(measured.relations, k) for k in kinds}))
+        bare = measured.replace(relations=Relations())
+        for errors, scene, options in (
+            (together, measured, groma.AdjustOptions(threads=1)),
+            (alone, bare, groma.AdjustOptions(threads=1, lines=False, planes=False)),
+        ):
+            found = groma.adjust(scene, options).scene
+            errors.append(evaluate_poses(found.subset(use, 0), truth.subset(use, 0)).center_rmse ** 2)
+    worse = np.array(together) - np.array(alone)
+    assert worse.mean() <= 2.0 * worse.std(ddof=1) / np.sqrt(len(worse))
+    if spoil is None:
+        assert np.mean(together) < 0.8 * np.mean(alone)
 
 
 def test_wrong_relations_would_matter_without_the_loss():

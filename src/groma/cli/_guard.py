@@ -3,6 +3,7 @@
 
 import functools
 import sys
+import warnings
 from collections.abc import Callable
 from typing import ParamSpec
 
@@ -15,12 +16,18 @@ P = ParamSpec("P")
 
 
 def guard(command: Callable[P, None]) -> Callable[P, None]:
-    """Wrap a command: known errors end in exit code 1 and one line, Ctrl-C in 130."""
+    """Wrap a command: known errors end in exit code 1 and one line, Ctrl-C in 130; warnings are lines, too."""
 
     @functools.wraps(command)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
-            command(*args, **kwargs)
+            with warnings.catch_warnings():
+                if not kwargs.get("quiet"):
+                    warnings.showwarning = _show
+                    warnings.simplefilter("always", UserWarning)
+                else:
+                    warnings.simplefilter("ignore")
+                command(*args, **kwargs)
             if sys.stdout is not None:  # a process may be started without one
                 sys.stdout.flush()
         except KeyboardInterrupt:
@@ -38,6 +45,12 @@ def guard(command: Callable[P, None]) -> Callable[P, None]:
             _fail("the memory of this machine is not enough for this input.", 1)
 
     return guarded
+
+
+def _show(message: Warning | str, category: type[Warning], *_where: object) -> None:
+    """Print a warning for the user as one line; others are for developers and stay silent."""
+    if category is UserWarning:
+        print(f"warning: {message}", file=sys.stderr, flush=True)
 
 
 def _fail(message: str, code: int) -> None:

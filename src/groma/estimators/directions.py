@@ -28,8 +28,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
+from groma.estimators._direction_features import Parallel, Perpendicular, crossings
 from groma.geometry._algebra import dot, norm, perpendicular, unit, vectors
 
 #: Steps of the robust refinement.
@@ -82,71 +83,6 @@ class DirectionSet:
         return len(self.vectors)
 
 
-@dataclass(frozen=True)
-class _Perpendicular:
-    """Normals to which the direction is perpendicular. Directions are (H, 3), results (H, N)."""
-
-    normals: FloatArray
-    factors: FloatArray
-    sigma: float
-    freedom: int = 1
-
-    def take(self, rows: IntArray | BoolArray) -> _Perpendicular:
-        return _Perpendicular(self.normals[rows], self.factors[rows], self.sigma)
-
-    def __len__(self) -> int:
-        return len(self.normals)
-
-    def _variance(self, directions: FloatArray) -> FloatArray:
-        return (directions @ self.factors[..., 0].T) ** 2 + (directions @ self.factors[..., 1].T) ** 2 + self.sigma**2
-
-    def squared(self, directions: FloatArray) -> FloatArray:
-        """Squared whitened residuals."""
-        return (directions @ self.normals.T) ** 2 / self._variance(directions)
-
-    def chance(self, directions: FloatArray, gate: float) -> FloatArray:
-        """Probabilities to agree with a random direction within ``gate``."""
-        # n.v of a random direction is uniform in -1 .. 1.
-        return np.minimum(np.sqrt(gate * self._variance(directions)), 1.0)
-
-    def rows(self, direction: FloatArray) -> FloatArray:
-        """Whitened rows (N, freedom, 3): residuals are their products with the direction."""
-        return (self.normals / np.sqrt(self._variance(direction[None])[0])[:, None])[:, None]
-
-
-@dataclass(frozen=True)
-class _Parallel:
-    """Directions to which the direction is parallel: whitened bases and the square roots of their determinants."""
-
-    whitened: FloatArray
-    area: FloatArray
-    freedom: int = 2
-
-    @classmethod
-    def of(cls, directions: FloatArray, covariance: FloatArray, sigma: float) -> _Parallel:
-        basis = np.stack(perpendicular(directions), axis=1)
-        inner = basis @ covariance @ np.swapaxes(basis, 1, 2) + sigma**2 * np.eye(2)
-        values, axes = np.linalg.eigh(inner)
-        scaled = np.swapaxes(axes, 1, 2) / np.sqrt(values)[..., None]
-        return cls(scaled @ basis, np.sqrt(values.prod(axis=1)))
-
-    def take(self, rows: IntArray | BoolArray) -> _Parallel:
-        return _Parallel(self.whitened[rows], self.area[rows])
-
-    def __len__(self) -> int:
-        return len(self.area)
-
-    def squared(self, directions: FloatArray) -> FloatArray:
-        return (directions @ self.whitened[:, 0].T) ** 2 + (directions @ self.whitened[:, 1].T) ** 2
-
-    def chance(self, directions: FloatArray, gate: float) -> FloatArray:
-        # An ellipse of area pi gate area on the half sphere of area 2 pi.
-        return np.minimum(0.5 * gate * self.area, 1.0)[None]
-
-    def rows(self, direction: FloatArray) -> FloatArray:
-        return self.whitened
-
-
 # -------------------------------------------------------------------------------------------------------------- Public
 def directions_from_normals(
     normals: FloatArray,
@@ -189,7 +125,7 @@ def directions_from_normals(
             f"normals and factors must have shapes (N, 3) and (N, 3, 2); got {normals.shape} and {factors.shape}."
         )
     _check_finite(normals, factors)
-    return _search(_Perpendicular(normals, factors, options.parallel_sigma), options, groups, candidates)
+    return _search(Perpendicular(normals, factors, options.parallel_sigma), options, groups, candidates)
 
 
 def directions_from_lines(
@@ -233,7 +169,7 @@ def directions_from_lines(
             f"{covariance.shape}."
         )
     _check_finite(directions, covariance)
-    features = _Parallel.of(unit(directions), covariance, options.parallel_sigma)
+    features = Parallel.of(unit(directions), covariance, options.parallel_sigma)
     best = np.argsort(features.area, kind="stable")[:_MAX_CANDIDATES]
     tried = unit(directions)[best]
     if candidates is not None:
@@ -283,7 +219,7 @@ def _check_finite(*arrays: FloatArray) -> None:
 
 
 def _search(
-    features: _Perpendicular | _Parallel,
+    features: Perpendicular | Parallel,
     options: DirectionOptions,
     groups: IntArray | None,
     candidates: FloatArray | None,
@@ -301,7 +237,10 @@ def _search(
     least = options.min_coincidences + 3 - features.freedom
     while len(found) < options.max_directions and len(remaining) >= max(least, 2):
         pool = features.take(remaining)
-        guesses = candidates if candidates is not None else _crossings(pool, rng)
+        if candidates is not None:
+            guesses = candidates
+        else:
+            guesses = crossings(pool, _MAX_CANDIDATES, rng) if isinstance(pool, Perpendicular) else np.zeros((0, 3))
         if len(guesses) == 0:
             break
         scored = pool
@@ -333,7 +272,7 @@ def _search(
 
 
 def _collect(
-    features: _Perpendicular | _Parallel,
+    features: Perpendicular | Parallel,
     found: list[FloatArray],
     covariances: list[FloatArray],
     alarms: list[float],
@@ -354,22 +293,13 @@ def _collect(
     return DirectionSet(directions, covariance, support, np.array(alarms), label, pairs)
 
 
-def _crossings(pool: _Perpendicular | _Parallel, rng: np.random.Generator) -> FloatArray:
-    """Candidates: cross products of pairs of normals, drawn by their certainty."""
-    assert isinstance(pool, _Perpendicular)
-    certainty = 1.0 / np.sqrt((pool.factors**2).sum(axis=(1, 2)) + pool.sigma**2)
-    pairs = rng.choice(len(pool), (_MAX_CANDIDATES, 2), p=certainty / certainty.sum())
-    crossed = np.cross(pool.normals[pairs[:, 0]], pool.normals[pairs[:, 1]])
-    return unit(crossed[norm(crossed) > 0.02])
-
-
-def _score(pool: _Perpendicular | _Parallel, candidates: FloatArray, gate: float) -> FloatArray:
+def _score(pool: Perpendicular | Parallel, candidates: FloatArray, gate: float) -> FloatArray:
     """Information (H,) that candidates explain: certain features count more, those near the gate less."""
     agreement = np.maximum(1.0 - pool.squared(candidates) / gate, 0.0)
     return -(agreement * np.log(np.maximum(pool.chance(candidates, gate), 1e-12))).sum(axis=1)
 
 
-def _refine(pool: _Perpendicular | _Parallel, start: FloatArray, gate: float) -> tuple[FloatArray, FloatArray]:
+def _refine(pool: Perpendicular | Parallel, start: FloatArray, gate: float) -> tuple[FloatArray, FloatArray]:
     """Robust least squares: Gauss-Newton with Geman-McClure weights inside twice the gate's radius."""
     direction = unit(start)
     information = np.eye(2)

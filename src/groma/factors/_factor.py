@@ -102,9 +102,9 @@ class Factor(ABC):
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, Ref):
-                changes[field.name] = Ref(value.group, value.index[order])
+                changes[field.name] = Ref(value.group, value.index.take(order))
             elif isinstance(value, np.ndarray) and value.ndim > 0:
-                changes[field.name] = np.ascontiguousarray(value[order])
+                changes[field.name] = value.take(order, axis=0)
         return dataclasses.replace(self, **changes)
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:

@@ -18,10 +18,11 @@ weights, other groups
 
 Quirks of the files, all survived: images without a pose have structures too; text has six digits and no 3D line on
 2D lines; binary 2D lines may name a 3D line whose track left them out (the track counts); tracks and groups may name
-images, points and lines that were deleted; segments may have no length (left out unless groma wrote them); planes
-and directions share one sequence of identifiers. LIMAP demands a structure for every image, with its number of 2D
-points, and indices within bounds; it is written so. In text it cannot read 2D groups that have points (its own
-neither), so beside a text model 2D groups are written without them; their 3D groups have them.
+images, points and lines that were deleted; segments may have no length, or ends that are not numbers (left out with
+a warning unless groma wrote them); planes and directions share one sequence of identifiers. LIMAP demands a structure
+for every image, with its number of 2D points, and indices within bounds; it is written so. In text it cannot read 2D
+groups that have points (its own neither), so beside a text model 2D groups are written without them; their 3D groups
+have them.
 
 Two things of a scene have no place in these files: a line's Plücker vector, where it is not exactly that of its end
 points, and identifiers of planes and directions that occur in both. Where they matter ``groma.npz`` lies beside,
@@ -31,6 +32,7 @@ a groma archive of the bare landmarks; it counts for a line only while its end p
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -137,7 +139,7 @@ def _form(folder: Path) -> Form | None:
 
 
 def read_beside(scene: Scene, model: Path) -> Scene:
-    """Return the scene with the structures beside its COLMAP model, where there are any."""
+    """Return the scene with the structures beside its COLMAP model, where there are any; warn of lines left out."""
     folder = model / "structures"
     form = _form(folder)
     if form is None:
@@ -145,7 +147,15 @@ def read_beside(scene: Scene, model: Path) -> Scene:
     with reading(folder, _KIND):
         structures = read_files(folder, form)
         exact = read_archive(folder / _EXACT) if (folder / _EXACT).is_file() else Scene()
-        return with_structures(scene, structures, exact)
+        scene = with_structures(scene, structures, exact)
+    count = len(structures.lines.ids)
+    if scene.num_lines < count:
+        warnings.warn(
+            f"{count - scene.num_lines} of {count} lines in {folder} have no direction (their end points coincide, or "
+            "are not finite) and were left out, with what was observed of them.",
+            stacklevel=2,
+        )
+    return scene
 
 
 def write_beside(scene: Scene, model: Path, form: Form, like: Structures | None = None) -> None:

@@ -251,9 +251,10 @@ def _point_variables(scene: Scene) -> Variables:
     def mean(values: FloatArray) -> FloatArray:
         return np.bincount(table.point_idx, weights=values, minlength=scene.num_points) / count
 
-    centers = scene.cam_centers_in_world[table.image_idx]
-    anchor = np.stack([mean(column) for column in centers.T], axis=1)
-    spread = np.sqrt(mean(((centers - anchor[table.point_idx]) ** 2).sum(axis=1)))
+    centers = scene.cam_centers_in_world
+    anchor = np.stack([mean(column.take(table.image_idx)) for column in centers.T], axis=1)
+    away = centers.take(table.image_idx, axis=0) - anchor.take(table.point_idx, axis=0)
+    spread = np.sqrt(mean(np.einsum("ni,ni->n", away, away)))
     far = np.linalg.norm(scene.points.xyz - anchor, axis=1) > FAR_FROM_CAMERAS * spread
     chart = InverseDepthPoint()
     return Variables(chart, chart.anchored(scene.points.xyz, anchor, far.astype(np.float64)))
@@ -263,9 +264,10 @@ def _point_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> 
     table = scene.point_observations
     keep = np.ones(len(table), dtype=bool)
     if options.drop_behind:
-        in_camera = se3.transform_points(scene.cam_from_world[table.image_idx], scene.points.xyz[table.point_idx])
+        row = se3.to_matrix(scene.cam_from_world)[:, 2].take(table.image_idx, axis=0)
+        depth = np.einsum("ni,ni->n", row[:, :3], scene.points.xyz.take(table.point_idx, axis=0)) + row[:, 3]
         sees_behind = np.array([camera_model(name).sees_behind for name in scene.cameras.models])
-        keep = (in_camera[:, 2] > 0) | sees_behind[scene.images.camera_idx[table.image_idx]]
+        keep = (depth > 0) | sees_behind[scene.images.camera_idx][table.image_idx]
         if not keep.all():
             notes.append(f"{int((~keep).sum())} observation(s) of points behind their camera were left out.")
     table = table.take(np.flatnonzero(keep)) if not keep.all() else table
@@ -276,7 +278,7 @@ def _point_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> 
                 camera_model=name,
                 point=Ref("points", table.point_idx[rows]),
                 intrinsics=Ref(f"intrinsics/{name}", camera),
-                pixels=table.pixel[rows],
+                pixels=table.pixel.take(rows, axis=0),
                 require_in_front=False,
                 sqrt_information=1.0 / (options.point_sigma_px * table.sigma[rows]),
                 loss=options.loss,
@@ -298,7 +300,7 @@ def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]):
                 camera_model=name,
                 line=line,
                 intrinsics=Ref(f"intrinsics/{name}", camera),
-                segments=table.segment[rows],
+                segments=table.segment.take(rows, axis=0),
                 sqrt_information=1.0 / (options.line_sigma_px * table.sigma[rows]),
                 loss=options.loss,
                 **poses,

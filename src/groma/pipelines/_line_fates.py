@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What became of every segment while lines were mapped, and how to say it."""
+"""What can become of a segment while lines are mapped, and how to say it."""
 
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from groma.pipelines.map_lines import LineMap
 
 
 class Fate(IntEnum):
@@ -41,15 +37,14 @@ class Fate(IntEnum):
     SHORT_LINE = 12
     #: Its line is made of segments of a kind that is seldom found again: ``min_repeatability``.
     TEXTURE = 13
+    #: A line of more images explains what the images of its line show.
+    REPEATED = 14
 
 
 #: Not a fate: what a segment has before its stage.
 UNKNOWN = -1
-#: Groups of segments that :func:`explain` names; the others are counted together.
-_NAMED = 4
-
 #: What is said of so many segments.
-_WORDS = {
+WORDS = {
     Fate.TOO_SHORT: "fell short of the least length, or lay where the lens model does not hold",
     Fate.NO_NEIGHBOR: "lay in images that share too few points with others",
     Fate.NO_MATCH: "had no counterpart in any neighbouring image",
@@ -61,11 +56,12 @@ _WORDS = {
     Fate.FEW_IMAGES: "lay on lines that too few images see",
     Fate.UNCERTAIN: "lay on lines too uncertain for their distance",
     Fate.SHORT_LINE: "lay on lines that only short segments show",
+    Fate.REPEATED: "lay on lines where an image cannot tell them from a line that more images see",
     Fate.TEXTURE: "lay on lines of short, weak segments, of which few are found again: texture, most likely",
 }
 
 #: What would help.
-_REMEDIES = {
+REMEDIES = {
     Fate.TOO_SHORT: "a smaller least length (--min-length), or larger images",
     Fate.NO_NEIGHBOR: "photographs that overlap more, or a model with more points",
     Fate.NO_MATCH: "a model with the right poses, calibration and image size; sharp photographs",
@@ -77,41 +73,9 @@ _REMEDIES = {
     Fate.FEW_IMAGES: "more photographs of the same parts",
     Fate.UNCERTAIN: "photographs from further apart",
     Fate.SHORT_LINE: "a smaller MapLinesOptions.min_longest, or larger images",
+    Fate.REPEATED: "photographs from nearer, which show edges close to each other as two",
     Fate.TEXTURE: "MapLinesOptions.min_repeatability = 0, if lines of texture are wanted",
 }
 
 
-def explain(line_map: LineMap) -> str:
-    """Say in words how many segments were mapped, where the others were lost, and what would help."""
-    counts = line_map.fate_counts()
-    total = sum(counts.values())
-    if not line_map.fates:
-        return "There are no images. Pass a scene with images and poses."
-    if total == 0:
-        return (
-            "No segments were found in any image. The photographs may be blank, blurred or very dark; a smaller least "
-            "length (--min-length) finds shorter ones."
-        )
-    mapped = counts[Fate.MAPPED] + counts[Fate.RECOVERED]
-    number = f"{line_map.num_lines:,} {'line' if line_map.num_lines == 1 else 'lines'}"
-    head = f"{number} from {mapped:,} of {total:,} segments in {_images(len(line_map.fates))}."
-    lost = sorted(((n, fate) for fate, n in counts.items() if fate > Fate.RECOVERED and n), reverse=True)
-    if not lost:
-        return head
-    parts = [f"{n:,} ({_percent(n, total)}) {_WORDS[fate]}" for n, fate in lost[:_NAMED]]
-    others = sum(n for n, _ in lost[_NAMED:])
-    if others:
-        parts.append(f"{others:,} ({_percent(others, total)}) were lost for other reasons")
-    start = "The map is empty" if line_map.num_lines == 0 else "Of the other segments"
-    return f"{head} {start}: {'; '.join(parts)}. What would help most: {_REMEDIES[lost[0][1]]}."
-
-
-def _images(number: int) -> str:
-    return f"{number} {'image' if number == 1 else 'images'}"
-
-
-def _percent(part: int, total: int) -> str:
-    return f"{100.0 * part / total:.0f} %" if 200 * part >= total else "under 1 %"
-
-
-__all__ = ["UNKNOWN", "Fate", "explain"]
+__all__ = ["REMEDIES", "UNKNOWN", "WORDS", "Fate"]

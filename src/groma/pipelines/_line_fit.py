@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Lines from their observations: maximum likelihood, end points, and segments that lie on them. Kernels only.
+r"""Lines from their observations: maximum likelihood, and segments that lie on them. Kernels only.
 
 A line is two points that move across it, :math:`X_k = A_k + x_k u + y_k v` with u, v perpendicular to the line: four
 numbers, regular for every finite line. Residuals are the distances of the measured end points to the projected line,
@@ -22,8 +22,6 @@ from groma._numba import kernel, loop
 
 #: Scale of the Cauchy loss, in sigma.
 _CAUCHY = 2.0
-#: Segments whose ends are that near to each other show the same end of a line, pixels.
-_SAME_END = 5.0
 
 
 # ------------------------------------------------------------------------------------------------------------- Refine
@@ -205,77 +203,7 @@ def refine(camera, image, ends, sigma, pointers, rows, active, X, squared, uncer
             unchecked[n] = max(unchecked[n], _largest_deviation(without, g, inverse))
 
 
-# ------------------------------------------------------------------------------------------------------ Trim, recover
-@kernel
-def _along(center, ray, X):
-    """Where the ray from a camera comes closest to the line X: position in units of X's length, and depth."""
-    d0, d1, d2 = X[1, 0] - X[0, 0], X[1, 1] - X[0, 1], X[1, 2] - X[0, 2]
-    w0, w1, w2 = X[0, 0] - center[0], X[0, 1] - center[1], X[0, 2] - center[2]
-    dd = d0 * d0 + d1 * d1 + d2 * d2
-    ff = ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2]
-    df = d0 * ray[0] + d1 * ray[1] + d2 * ray[2]
-    dw = d0 * w0 + d1 * w1 + d2 * w2
-    fw = ray[0] * w0 + ray[1] * w1 + ray[2] * w2
-    determinant = dd * ff - df * df
-    if not determinant > 4e-4 * dd * ff:
-        return np.nan, -1.0
-    return (df * fw - ff * dw) / determinant, (dd * fw - df * dw) / determinant
-
-
-@loop
-def trim(center, image, ray, length, pointers, rows, active, X, front):
-    """Move the end points of lines to bound what two images see; front (M,): observation lies before its camera.
-
-    Where more images end a line within a few pixels of the second that does, the outer third of them counts: the
-    outermost would be too far out the more images there are.
-    """
-    for n in range(len(pointers) - 1):
-        begin, end = pointers[n], pointers[n + 1]
-        at, change, near = np.empty(2 * (end - begin)), np.empty(2 * (end - begin)), np.empty(end - begin)
-        scale = np.empty(end - begin)
-        count = 0
-        for m in range(begin, end):
-            s = rows[m]
-            t0, z0 = _along(center[image[s]], ray[s, 0], X[n])
-            t1, z1 = _along(center[image[s]], ray[s, 1], X[n])
-            front[m] = z0 > 0.0 and z1 > 0.0
-            if active[m] and front[m]:
-                at[count], change[count] = min(t0, t1), 1.0
-                at[count + 1], change[count + 1] = max(t0, t1), -1.0
-                scale[count // 2] = abs(t1 - t0) / length[s]
-                count += 2
-        order = np.argsort(at[:count])
-        # The hull of what two images see; of what one sees, if no two overlap.
-        depth, low, high = 0, np.inf, -np.inf
-        for k in range(count):
-            e = order[k]
-            if change[e] > 0:
-                depth += 1
-                if depth == 2:
-                    low = min(low, at[e])
-            else:
-                if depth == 2:
-                    high = max(high, at[e])
-                depth -= 1
-        if low < high:
-            reach = min(_SAME_END * np.median(scale[: count // 2]), 0.25 * (high - low))
-            for side in range(2):
-                outer = low if side == 0 else high
-                number = 0
-                for k in range(side, count, 2):
-                    if abs(at[k] - outer) <= reach:
-                        near[number] = at[k]
-                        number += 1
-                if side == 0:
-                    low = np.sort(near[:number])[number // 3]
-                else:
-                    high = np.sort(near[:number])[number - 1 - number // 3]
-            a0, a1, a2 = X[n, 0, 0], X[n, 0, 1], X[n, 0, 2]
-            d0, d1, d2 = X[n, 1, 0] - a0, X[n, 1, 1] - a1, X[n, 1, 2] - a2
-            X[n, 0, 0], X[n, 0, 1], X[n, 0, 2] = a0 + low * d0, a1 + low * d1, a2 + low * d2
-            X[n, 1, 0], X[n, 1, 1], X[n, 1, 2] = a0 + high * d0, a1 + high * d1, a2 + high * d2
-
-
+# ------------------------------------------------------------------------------------------------------------ Recover
 @loop
 def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_overlap, found, distance):
     """Segments (rows) of one image that lie on projections of lines; return the number written, or needed."""

@@ -156,7 +156,7 @@ def merge_agreeing(tracks: Tracks) -> int:
     merged, pose_px = 0, 0.0
     for _ in range(ROUNDS):
         pairs, offset, covariance, unit = _compare(tracks)
-        apart = _seen_apart(tracks, pairs)
+        apart = seen_apart(tracks, pairs)
         pairs, offset, covariance, unit = pairs[~apart], offset[~apart], covariance[~apart], unit[~apart]
         if len(pairs) == 0:
             break
@@ -243,7 +243,7 @@ def _pixel_size(tracks: Tracks) -> FloatArray:
     return size[order][np.minimum(middle, len(rows) - 1)]
 
 
-def _seen_apart(tracks: Tracks, pairs: IntArray) -> BoolArray:
+def seen_apart(tracks: Tracks, pairs: IntArray) -> BoolArray:
     """Whether an image shows both lines of a pair as segments side by side."""
     views = tracks.views
     rows, pointers = tracks.table()
@@ -286,4 +286,4 @@ def _join(tracks: Tracks, pairs: IntArray, pose_px: FloatArray) -> None:
     tracks.join(alias, deviation)
 
 
-__all__ = ["merge_agreeing"]
+__all__ = ["merge_agreeing", "seen_apart"]

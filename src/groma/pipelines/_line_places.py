@@ -16,6 +16,7 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.pipelines._line_fates import UNKNOWN, Fate
 from groma.pipelines._line_matches import MatchProvider
+from groma.pipelines._line_options import MapLinesOptions
 from groma.pipelines._line_proposals import WEAK, Proposer
 from groma.pipelines._line_support import Choice, choose
 from groma.pipelines._line_views import LineViews
@@ -23,7 +24,6 @@ from groma.scene import Scene
 
 if TYPE_CHECKING:
     from groma.frontend.matching import LineMatches
-    from groma.pipelines.map_lines import MapLinesOptions
 
 
 def choose_places(

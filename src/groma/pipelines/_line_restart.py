@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Lines that settled in a minimum of their own are triangulated anew, and all of them settle under held cameras.
+r"""Lines get a second chance between two stages of an adjustment, and settle, under held cameras.
 
 The reprojection cost of a line has several local minima: a start on the wrong side of a short baseline ends in one that
 small steps never leave. A few such lines hold up the whole adjustment, because cameras move to please them. With the
-cameras nearly right the linear triangulation of a line is near its global minimum. It replaces a line that fits
-:data:`SUSPICIOUS` times worse than lines usually do, if after some steps on its own its cost is lower.
+cameras nearly right the linear triangulation of a line is near its global minimum. A line that fits
+:data:`SUSPICIOUS` times worse than lines usually do goes on from there, too, and the better of its two ends is kept.
 
 A line that is seen nearly along its length is strongly bent: Gauss-Newton steps of it overshoot, and joint steps of all
 variables are refused because of one line. Lines that start in the minimum that the cameras at hand give them hardly
 move in later steps.
+
+All lines, and the second starts of some as lines beside them, are one problem whose variables do not depend on each
+other: it is laid out once, and each line stops when it has converged.
 """
 
 from __future__ import annotations
@@ -20,99 +23,105 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.cameras import model as camera_model
 from groma.estimators.line_triangulation import triangulate_planes
-from groma.factors._factor import Factor
+from groma.estimators.trimming import TrimStatus, trim_to_ray
+from groma.factors._factor import Factor, Ref
 from groma.geometry import line3, quaternion
+from groma.pipelines._assemble import LINE_FACTORS, disassemble
 from groma.problem.problem import Problem
+from groma.problem.variables import Variables
 from groma.scene import Scene
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
 #: A line is suspicious if its mean squared residual is this many times the median of all lines.
 SUSPICIOUS = 4.0
-#: Steps of a suspicious line on its own, from both starts.
-STEPS = 10
-#: Most steps of all lines on their own; most need two or three.
-SETTLING_STEPS = 20
+#: Most steps of a line on its own; most need two or three.
+STEPS = 20
 
 
-def restart_lines(scene: Scene, problem: Problem, line_factors: tuple[str, ...]) -> Problem | None:
-    """Return the problem with better lines, or None if there are none.
+def renew_lines(scene: Scene, problem: Problem, threads: int | None = None) -> tuple[Problem, IntArray]:
+    """Return the problem with each line at a minimum of its own cost, all else held, and the lines triangulated anew.
 
     Parameters
     ----------
     scene : Scene
-        The scene at the states of the problem.
+        What the problem was made from.
     problem : Problem
-        A problem with a group ``lines`` in the order of the scene.
-    line_factors : tuple of str
-        Type names of the factors that observe lines.
-    """
-    factors = [factor for factor in problem.factors if factor.type_name in line_factors and len(factor)]
-    variables = problem.variables.get("lines")
-    if variables is None or variables.is_constant or not factors:
-        return None
-    cost, count = _line_costs(problem, factors)
-    enough: BoolArray = np.asarray(count >= 3)
-    if not enough.any():
-        return None
-    per_view = cost / np.maximum(count, 1)
-    chosen = np.flatnonzero(enough & (per_view > SUSPICIOUS * max(float(np.median(per_view[enough])), 1e-12)))
-    if len(chosen) == 0:
-        return None
-    triangulated, found = _triangulated(scene, chosen)
-    if not found.any():
-        return None
-    chosen = chosen[found]
-    mine = [_of_lines(factor, chosen) for factor in factors]
-    alone = {name: replace(group, constant=name != "lines") for name, group in problem.variables.items()}
-    anew = variables.state.copy()
-    anew[chosen] = variables.manifold.from_ambient(triangulated[found])
-    trials = []
-    for state in (variables.state, anew):
-        start = Problem({**alone, "lines": replace(variables, state=state)}, mine)
-        settled = solve(start, SolverOptions(max_iterations=STEPS, threads=1)).problem
-        trials.append((settled.variables["lines"].state, _line_costs(settled, mine)[0]))
-    (old_state, old_cost), (new_state, new_cost) = trials
-    best = np.where((new_cost < old_cost)[:, None], new_state, old_state)
-    better = np.zeros(len(cost), dtype=bool)
-    better[chosen] = np.minimum(new_cost, old_cost)[chosen] < cost[chosen] * (1.0 - 1e-3)
-    if not better.any():
-        return None
-    state = np.where(better[:, None], best, variables.state)
-    return Problem({**problem.variables, "lines": replace(variables, state=state)}, problem.factors)
-
-
-def settle_lines(problem: Problem, threads: int | None = None) -> Problem:
-    """Return the problem with each line at the minimum of its own cost, everything else held.
-
-    Parameters
-    ----------
-    problem : Problem
-        A problem; without free lines it comes back as it is.
+        A problem at any state, its lines in the order of the scene; without free lines it comes back as it is.
     threads : int, optional
         Threads; None takes one for small problems and all cores for large ones.
     """
     lines = problem.variables.get("lines")
-    mine = [factor for factor in problem.factors if any(ref.group == "lines" for _, ref in factor.references())]
-    if lines is None or lines.is_constant or not mine:
-        return problem
-    used = {ref.group for factor in mine for _, ref in factor.references()}
-    alone = {n: replace(group, constant=True) for n, group in problem.variables.items() if n in used and n != "lines"}
-    options = SolverOptions(max_iterations=SETTLING_STEPS, threads=threads)
-    settled = solve(Problem({**alone, "lines": lines}, mine), options).problem.variables["lines"]
-    return Problem({**problem.variables, "lines": settled}, problem.factors)
+    factors = [factor for factor in problem.factors if len(factor) and _slot_of_lines(factor)]
+    if lines is None or lines.is_constant or not factors:
+        return problem, np.zeros(0, np.int64)
+    chosen, second = _second_starts(scene, problem, factors)
+    doubled = [_with_second(factor, chosen, len(lines)) for factor in factors]
+    used = {ref.group for factor in factors for _, ref in factor.references()} - {"lines"}
+    held = {name: replace(problem.variables[name], constant=True) for name in used}
+    starts = Problem({**held, "lines": _joined(lines, chosen, second)}, doubled)
+    options = SolverOptions(max_iterations=STEPS, threads=threads)
+    settled = solve(starts, options).problem
+    first, other = np.split(settled.variables["lines"].state, [len(lines)])
+    cost = _line_costs(settled, doubled)[0] if len(chosen) else np.zeros(len(lines))
+    better: BoolArray = cost[len(lines) :] < cost[chosen]
+    first = first.copy()
+    first[chosen[better]] = other[better]
+    return problem.with_states({"lines": first}), chosen[better]
 
 
-def _of_lines(factor: Factor, lines: IntArray) -> Factor:
-    return factor.take(np.flatnonzero(np.isin(_line_of(factor), lines)))
+def _slot_of_lines(factor: Factor) -> str | None:
+    return next((slot.name for slot, ref in factor.references() if ref.group == "lines"), None)
 
 
 def _line_of(factor: Factor) -> IntArray:
-    return next(ref.index for _, ref in factor.references() if ref.group == "lines")
+    return getattr(factor, _slot_of_lines(factor) or "").index
+
+
+def _with_second(factor: Factor, chosen: IntArray, count: int) -> Factor:
+    """Return the factors, and once more those of the chosen lines, for the lines from ``count`` on."""
+    if len(chosen) == 0:
+        return factor
+    number = np.full(count, -1)
+    number[chosen] = count + np.arange(len(chosen))
+    line = _line_of(factor)
+    again = np.flatnonzero(number[line] >= 0)
+    both = factor.take(np.concatenate([np.arange(len(factor)), again]))
+    index = Ref("lines", np.concatenate([line, number[line[again]]]))
+    return replace(both, **{_slot_of_lines(factor) or "": index})
+
+
+def _joined(lines: Variables, chosen: IntArray, second: FloatArray) -> Variables:
+    """Return the lines and after them the second starts (Plücker) of the chosen ones."""
+    constant = lines.constant
+    if not isinstance(constant, bool | np.bool_):
+        constant = np.concatenate([constant, constant[chosen]])
+    state = np.concatenate([lines.state, lines.manifold.from_ambient(second)])
+    return replace(lines, state=state, constant=constant)
+
+
+def _second_starts(scene: Scene, problem: Problem, factors: list[Factor]) -> tuple[IntArray, FloatArray]:
+    """Return the lines that are suspicious, and each triangulated anew, (n, 6)."""
+    cost, count = _line_costs(problem, [factor for factor in factors if factor.type_name in LINE_FACTORS])
+    enough: BoolArray = np.asarray(count >= 3)
+    per_view = cost / np.maximum(count, 1)
+    usual = float(np.median(per_view[enough])) if enough.any() else 0.0
+    chosen = np.flatnonzero(enough & (per_view > SUSPICIOUS * max(usual, 1e-12)))
+    if len(chosen) == 0:
+        return chosen, np.zeros((0, 6))
+    triangulated, found = _triangulated(_with_cameras(scene, problem), chosen)
+    return chosen[found], triangulated[found]
+
+
+def _with_cameras(scene: Scene, problem: Problem) -> Scene:
+    """Return the scene with the cameras of the problem."""
+    landmarks = ("points", "lines", "planes", "directions")
+    cameras = {name: group for name, group in problem.variables.items() if name not in landmarks}
+    return disassemble(scene, Problem(cameras, []))
 
 
 def _line_costs(problem: Problem, factors: list[Factor]) -> tuple[FloatArray, IntArray]:
-    """Return the cost of each line, with noise and loss, and how often it is seen."""
+    """Return the cost of each line, with noise and loss, and how many of the factors there are for it."""
     total = np.zeros(len(problem.variables["lines"]))
     count = np.zeros(len(total), dtype=np.int64)
     for factor in factors:
@@ -130,6 +139,46 @@ def _triangulated(scene: Scene, lines: IntArray) -> tuple[FloatArray, BoolArray]
     table = scene.line_observations
     rows = np.flatnonzero(np.isin(table.line_idx, lines))
     rows = rows[np.argsort(table.line_idx[rows], kind="stable")]
+    center, rays = viewing_rays(scene, rows)
+    normal = np.cross(rays[:, 0], rays[:, 1])
+    planes = np.concatenate([normal, -np.einsum("ni,ni->n", normal, center)[:, None]], axis=1)
+    usable: BoolArray = np.asarray(np.isfinite(planes).all(axis=1))
+    weight = np.where(usable, np.linalg.norm(np.where(usable[:, None], normal, 0.0), axis=1), 0.0)
+    pointers = np.concatenate([[0], np.cumsum(np.bincount(table.line_idx[rows], minlength=scene.num_lines)[lines])])
+    result = triangulate_planes(planes, pointers, center, weight)
+    found: BoolArray = np.asarray(line3.is_finite(result.line) & (np.abs(result.line) > 0).any(axis=1))
+    return result.line, found
+
+
+def with_seen_ends(scene: Scene, lines: IntArray) -> Scene:
+    """Return the scene with new end points of lines that went elsewhere: where images see theirs, the median of them.
+
+    The feet of the old end points may lie anywhere on such a line.
+    """
+    table = scene.line_observations
+    rows = np.flatnonzero(np.isin(table.line_idx, lines))
+    center, rays = viewing_rays(scene, rows)
+    plucker = scene.lines.plucker[table.line_idx[rows]]
+    seen = trim_to_ray(plucker[:, None], center[:, None], rays)
+    good = (seen.status == TrimStatus.OK).all(axis=1)
+    owner, d = table.line_idx[rows[good]], plucker[good, 3:] / np.linalg.norm(plucker[good, 3:], axis=1, keepdims=True)
+    along = np.sort(np.einsum("nej,nj->ne", seen.point[good], d), axis=1)
+    chosen, first, count = np.unique(np.sort(owner), return_index=True, return_counts=True)
+    segments, plucker = scene.lines.segments.copy(), scene.lines.plucker[chosen]
+    length = np.linalg.norm(plucker[:, 3:], axis=1, keepdims=True)
+    foot = np.cross(plucker[:, 3:], plucker[:, :3]) / length**2
+    for end, middle in enumerate((count // 2, (count - 1) // 2)):
+        place = along[np.lexsort((along[:, end], owner))[first + middle], end]
+        segments[chosen, end] = foot + place[:, None] * plucker[:, 3:] / length
+    return scene.replace(lines=scene.lines.replace(segments=segments))
+
+
+def viewing_rays(scene: Scene, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return camera centres (n, 3) and the directions (n, 2, 3) of the ends of observed segments, in the world.
+
+    Directions are NaN where the camera model has none.
+    """
+    table = scene.line_observations
     image = table.image_idx[rows]
     bearings = np.full((len(rows), 2, 3), np.nan)
     for c in np.unique(scene.images.camera_idx[image]):
@@ -141,12 +190,5 @@ def _triangulated(scene: Scene, lines: IntArray) -> tuple[FloatArray, BoolArray]
             bearings[mine, end] = model.unproject(params, pixels)
     poses = scene.cam_from_world[image]
     world_from_cam = quaternion.conjugate(poses[:, :4])
-    normal = quaternion.rotate(world_from_cam, np.cross(bearings[:, 0], bearings[:, 1]))
     center = -quaternion.rotate(world_from_cam, poses[:, 4:])
-    planes = np.concatenate([normal, -np.einsum("ni,ni->n", normal, center)[:, None]], axis=1)
-    usable: BoolArray = np.asarray(np.isfinite(planes).all(axis=1))
-    weight = np.where(usable, np.linalg.norm(np.where(usable[:, None], normal, 0.0), axis=1), 0.0)
-    pointers = np.concatenate([[0], np.cumsum(np.bincount(table.line_idx[rows], minlength=scene.num_lines)[lines])])
-    result = triangulate_planes(planes, pointers, center, weight)
-    found: BoolArray = np.asarray(line3.is_finite(result.line) & (np.abs(result.line) > 0).any(axis=1))
-    return result.line, found
+    return center, quaternion.rotate(world_from_cam[:, None], bearings)

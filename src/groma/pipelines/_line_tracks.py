@@ -11,7 +11,7 @@ recover
     Lines are projected into the images of their neighbourhood. A free segment on a line joins it, also one whose own
     proposals were degenerate; a segment of another line is a vote that both are one.
 trim
-    The end points of a line bound the part of it that at least two images see; see :func:`._line_fit.trim`.
+    The end points of a line bound the part of it that at least two images see; see :mod:`._line_ends`.
 
 Observations of all lines are flat arrays, stored by line: those of line n are ``pointers[n] : pointers[n + 1]``.
 """
@@ -25,7 +25,8 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.pipelines._distinct import distinct_pairs, num_distinct
-from groma.pipelines._line_fit import find_on_lines, refine, trim
+from groma.pipelines._line_ends import trim
+from groma.pipelines._line_fit import find_on_lines, refine
 from groma.pipelines._line_views import LineViews
 
 #: Sum of squares of an observation's two distances over sigma up to which it belongs to a line: 99.7 %.
@@ -250,23 +251,8 @@ class Tracks:
         views, count = self.views, len(self.X)
         if count == 0:
             return 0, 0
-        reach = _images_near_lines(self.line_of, views.image_idx, neighbors, count)
         forward = self.direction() if directed else np.zeros(count)
-        hits, distances = [], []
-        room, value = np.empty((4096, 2), np.int64), np.empty(4096)
-        for i in range(len(views.camera)):
-            rows = np.arange(views.pointers[i], views.pointers[i + 1])
-            while True:
-                needed = find_on_lines(
-                    views.camera[i], self.X, reach[i], rows, views.ends, views.sigma, views.usable, forward, GATE,
-                    0.3, room, value,
-                )  # fmt: skip
-                if needed <= len(room):
-                    break
-                room, value = np.empty((2 * needed, 2), np.int64), np.empty(2 * needed)
-            hits.append(room[:needed].copy())
-            distances.append(value[:needed].copy())
-        hit, distance = np.concatenate(hits), np.concatenate(distances)
+        hit, distance = self._find(neighbors, views.sigma, forward, GATE)
         num_merged = self._merge(hit)
         merged_line = self._alias[hit[:, 0]]
         is_free = (self.line_of[hit[:, 1]] < 0) & free[hit[:, 1]]
@@ -275,6 +261,35 @@ class Tracks:
         segment, best = np.unique(hit[order, 1], return_index=True)
         self.line_of[segment] = merged_line[order][best]
         return len(segment), num_merged
+
+    def near_lines(self, neighbors: list[IntArray], reach: float | None = None) -> IntArray:
+        """Lines and segments (M, 2) whose ends lie within ``reach`` pixels of the line, or within their noise."""
+        forward = np.zeros(len(self.X))
+        if reach is None:
+            return self._find(neighbors, self.views.sigma, forward, GATE)[0]
+        return self._find(neighbors, np.full(len(self.line_of), reach), forward, 2.0)[0]
+
+    def _find(
+        self, neighbors: list[IntArray], sigma: FloatArray, forward: FloatArray, gate: float
+    ) -> tuple[IntArray, FloatArray]:
+        """Lines and segments on them (M, 2), in the images of the lines and their neighbours; and squared distances."""
+        views = self.views
+        reach = _images_near_lines(self.line_of, views.image_idx, neighbors)
+        hits, distances = [np.empty((0, 2), np.int64)], [np.empty(0)]
+        room, value = np.empty((4096, 2), np.int64), np.empty(4096)
+        for i in range(len(views.camera)):
+            rows = np.arange(views.pointers[i], views.pointers[i + 1])
+            while True:
+                needed = find_on_lines(
+                    views.camera[i], self.X, reach[i], rows, views.ends, sigma, views.usable, forward, gate, 0.3, room,
+                    value,
+                )  # fmt: skip
+                if needed <= len(room):
+                    break
+                room, value = np.empty((2 * needed, 2), np.int64), np.empty(2 * needed)
+            hits.append(room[:needed].copy())
+            distances.append(value[:needed].copy())
+        return np.concatenate(hits), np.concatenate(distances)
 
     def join(self, alias: IntArray, deviation: FloatArray) -> None:
         """Give the segments of line n, with ``deviation[n]`` more noise, to line ``alias[n]``; refine."""
@@ -317,9 +332,7 @@ class Tracks:
         return merged
 
 
-def _images_near_lines(
-    line_of: IntArray, image_idx: IntArray, neighbors: list[IntArray], num_lines: int
-) -> list[IntArray]:
+def _images_near_lines(line_of: IntArray, image_idx: IntArray, neighbors: list[IntArray]) -> list[IntArray]:
     """Lines to look for in each image: those seen in it or in a neighbour."""
     num_images = len(neighbors)
     rows = np.flatnonzero(line_of >= 0)

@@ -62,8 +62,8 @@ def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
             for c, name in enumerate(scene.cameras.models)
         ]
     )
-    distance = np.linalg.norm(scene.cam_centers_in_world[image_idx] - places[index], axis=1)
-    length = distance / focal_of[scene.images.camera_idx[image_idx]]
+    away = scene.cam_centers_in_world.take(image_idx, axis=0) - places.take(index, axis=0)
+    length = np.sqrt(np.einsum("ni,ni->n", away, away)) / focal_of[scene.images.camera_idx][image_idx]
     count = np.bincount(index, minlength=len(places))
     mean = np.bincount(index, weights=length, minlength=len(places)) / np.maximum(count, 1)
     fallback = float(np.median(length)) if len(length) else 1.0
@@ -78,7 +78,7 @@ def structure_factors(scene: Scene, sigma_px: float, loss: Loss, variables: dict
     relations = scene.relations
     factors: list[Factor] = []
     have = {name: name in variables for name in ("points", "lines", "planes", "directions")}
-    if have["points"] and (have["planes"] or have["lines"]):
+    if have["points"] and (len(relations.point_on_plane) or len(relations.point_on_line)):
         per_point = 1.0 / (sigma_px * lengths_per_pixel(scene, "point"))
         if have["planes"] and len(relations.point_on_plane):
             point, plane = relations.point_on_plane.T
@@ -100,7 +100,7 @@ def structure_factors(scene: Scene, sigma_px: float, loss: Loss, variables: dict
                     loss=loss,
                 )
             )
-    if have["lines"] and (have["planes"] or have["directions"]):
+    if have["lines"] and (len(relations.line_on_plane) or len(relations.line_along_direction)):
         per_line = 1.0 / (sigma_px * lengths_per_pixel(scene, "line"))
         ends = scene.lines.segments
         if have["planes"] and len(relations.line_on_plane):

@@ -11,25 +11,24 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import InputError
-from groma.factors._factor import Factor
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
 from groma.pipelines._assemble import LINE_FACTORS, POINT_FACTORS, Assembly, AssemblyOptions, assemble, disassemble
-from groma.pipelines._line_restart import restart_lines, settle_lines
+from groma.pipelines._line_restart import renew_lines, with_seen_ends
+from groma.pipelines._line_slips import without_slips
 from groma.pipelines._relation_outcome import drop_failed_relations
-from groma.pipelines._structure_factors import RELATION_FACTORS, SURFACE_SIGMA_PX
+from groma.pipelines._stage_reports import combined, stage_entries, with_costs_at, with_loss
+from groma.pipelines._structure_factors import SURFACE_SIGMA_PX
 from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.solver.options import SolverOptions
-from groma.solver.report import Iteration, SolveReport
+from groma.solver.report import SolveReport
 from groma.solver.solve import solve
 from groma.solver.termination import Termination
 
 #: The default for what comes from matching: first a loss that pulls from afar, then one that ignores what stayed far.
 #: Losses by name and scale in pixels; see the page *How to choose* for the measurements behind them.
 ROBUST_STAGES = (("cauchy", 1.0), ("geman_mcclure", 2.0))
-#: Scales of the same losses for relations between landmarks, in standard deviations of those.
-RELATION_SCALES = {"cauchy": 2.0, "geman_mcclure": 4.0}
 #: The last scale is at least this many standard deviations of the residuals that the stage before left: a narrower
 #: loss would doubt good measurements.
 LAST_SCALE_SIGMAS = 12.0
@@ -80,7 +79,8 @@ class AdjustOptions:
     line_chart: str = "cartesian"
     #: ``auto``, ``free`` or ``first_camera``: see :class:`groma.pipelines._assemble.AssemblyOptions`.
     gauge: str = "auto"
-    #: Steps of each landmark on its own after every joint step; None: 2 with lines or under a robust loss, else 0.
+    #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss or with lines (1 where
+    #: points are tied to lines and there is no loss), else 0.
     landmark_steps: int | None = None
     threads: int | None = None
 
@@ -203,7 +203,7 @@ def adjust(
             f"{scene.num_point_observations} point and {scene.num_line_observations} line observations, and the "
             "options leave none of them. Check the input and --no-points / --no-lines."
         )
-    problem, reports = assembly.problem, []
+    problem, reports, moved = assembly.problem, [], []
     for number, loss in enumerate(stages):
         last = number + 1 == len(stages)
         spent = sum(report.iterations for report in reports)
@@ -212,7 +212,7 @@ def adjust(
             function_tolerance=options.function_tolerance if last else _stage_tolerance(loss),
             linear_solver=options.linear_solver,
             landmark_steps=_landmark_steps(options, loss, problem),
-            landmark_groups=("lines",) if isinstance(loss, Trivial) else None,
+            landmark_groups=("lines",) if isinstance(loss, Trivial) and not _is_coupled(problem) else None,
             initial_damping=_damping_after(reports, loss),
             threads=options.threads,
         )
@@ -227,17 +227,24 @@ def adjust(
 
         if last and number:
             loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
-        staged = Problem(problem.variables, [_with_loss(factor, loss) for factor in problem.factors])
+        staged = Problem(problem.variables, [with_loss(factor, loss) for factor in problem.factors])
         solution = solve(staged, solver_options, tell)
         problem = solution.problem
         reports.append(solution.report)
         if stopped:
             break
         if not last:
-            problem = restart_lines(disassemble(scene, problem), problem, LINE_FACTORS) or problem
-            problem = settle_lines(problem, options.threads)
-    report = _combined(reports, assembly.problem, stages)
+            problem, renewed = renew_lines(scene, problem, options.threads)
+            moved.append(renewed)
+        if not isinstance(loss, Trivial):
+            problem, renewed = without_slips(problem, options.threads)
+            moved.append(renewed)
+            if last and problem is not solution.problem:
+                reports[-1] = with_costs_at(reports[-1], problem)
+    report = combined(reports, assembly.problem, stages)
     adjusted, relations = drop_failed_relations(disassemble(scene, problem), problem)
+    if any(map(len, moved)):
+        adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
     before, after = (_rmse_px(replace(assembly, problem=p)) for p in (assembly.problem, problem))
     outcome = AdjustReport(
         num_images=scene.num_images,
@@ -250,7 +257,7 @@ def adjust(
         rmse_px={kind: {"before": before[kind], "after": after[kind]} for kind in before},
         solve=report,
         relations=relations,
-        stages=_stage_entries(stages, reports),
+        stages=stage_entries(stages, reports),
         warnings=(*assembly.notes, *report.warnings),
     )
     return AdjustResult(adjusted, outcome, problem)
@@ -296,49 +303,16 @@ def _landmark_steps(options: AdjustOptions, loss: Loss, problem: Problem) -> int
     """Lines and robust losses leave a long tail of small joint steps; a few cheap steps of landmarks cut it short."""
     if options.landmark_steps is not None:
         return options.landmark_steps
-    return 0 if isinstance(loss, Trivial) and "lines" not in problem.variables else 2
+    if not isinstance(loss, Trivial):
+        return 2
+    return 0 if "lines" not in problem.variables else 1 if _is_coupled(problem) else 2
 
 
-def _with_loss(factor: Factor, loss: Loss) -> Factor:
-    """Return the factors under a loss; relations between landmarks have a noise of their own, and the plain scale."""
-    if factor.type_name in RELATION_FACTORS and loss.name in RELATION_SCALES:
-        loss = make_loss(loss.name, RELATION_SCALES[loss.name])
-    return factor if factor.loss == loss else replace(factor, loss=loss)
-
-
-def _stage_entries(stages: list[Loss], reports: list[SolveReport]) -> tuple[dict[str, Any], ...]:
-    entries, first_step = [], 1
-    for loss, report in zip(stages, reports, strict=False):
-        entries.append({"loss": loss.name, "initial_cost": report.initial_cost, "first_step": first_step})
-        first_step += report.iterations
-    return tuple(entries)
-
-
-def _combined(reports: list[SolveReport], start: Problem, stages: list[Loss]) -> SolveReport:
-    """Return one report of all stages: costs under the last loss, times and steps summed."""
-    last = reports[-1]
-    if len(reports) == 1:
-        return last
-    loss, first = stages[len(reports) - 1], reports[0]
-    if loss != stages[0]:
-        under_last = [_with_loss(factor, loss) for factor in start.factors]
-        first = solve(Problem(start.variables, under_last), SolverOptions(max_iterations=0)).report
-    history: list[Iteration] = []
-    for report in reports:
-        steps, seconds = len(history), history[-1].seconds if history else 0.0
-        history += [
-            replace(record, iteration=record.iteration + steps, seconds=record.seconds + seconds)
-            for record in report.history
-        ]
-    seconds = {stage: sum(report.seconds[stage] for report in reports) for stage in last.seconds}
-    return replace(
-        last,
-        initial_cost=first.initial_cost,
-        initial_costs=first.initial_costs,
-        iterations=sum(report.iterations for report in reports),
-        history=history,
-        seconds=seconds,
-    )
+def _is_coupled(problem: Problem) -> bool:
+    """Whether points are tied to lines. Lines are then not eliminated, and long steps tear points off their lines and
+    planes by the product of two displacements, which is much where ties are tight: points take the steps of their own.
+    """
+    return any(factor.type_name == "point_on_line" for factor in problem.factors)
 
 
 def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss) -> AssemblyOptions:

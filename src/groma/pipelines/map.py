@@ -7,8 +7,8 @@ Stages, each saved when it is finished, so that an interrupted run goes on where
                   the points' observations placed anew by their grey levels, and adjusted again (``measured``);
 2. ``segments``   line segments in every image, one image at a time;
 3. ``lines``      3D lines from the segments;
-4. ``joint``      poses, points and lines adjusted together, each weighted by its own noise; then the lines are mapped
-                  once more with the better poses;
+4. ``joint``      poses, points and lines adjusted together, each point weighted by its own noise, the lines by theirs;
+                  then the lines are mapped once more with the better poses;
 5. ``structure``  planes, common directions, and what lies on what;
 6. ``adjusted``   everything adjusted together.
 """
@@ -29,7 +29,7 @@ from groma.frontend.matches import LineMatches
 from groma.frontend.segments import Segments
 from groma.io.colmap_sfm import PointModelOptions, reconstruct_points
 from groma.pipelines._image_segments import detect_segments, given_segments
-from groma.pipelines._noise import noise_px
+from groma.pipelines._noise import noise_px, with_point_noise
 from groma.pipelines._photographs import check_images, check_names, image_files, read_gray
 from groma.pipelines._stages import Stages, digest, digest_files
 from groma.pipelines._unused import without_unused
@@ -42,6 +42,9 @@ from groma.scene import Scene
 #: Scale of the first loss in standard deviations of the estimated noise. Matches of SIFT have a narrow core and heavy
 #: tails that are still right.
 LOSS_SIGMAS = 6.0
+#: Scale of the Cauchy loss of the last adjustment, which starts close. Relative to the noise of their own point,
+#: residuals are nearly Gaussian; the distribution of Student that fits them best bends at 4 to 5.
+LAST_LOSS_SIGMAS = 4.0
 
 #: Called with the name of a stage, what is done and what there is to do.
 StageProgress = Callable[[str, int, int], None]
@@ -171,6 +174,9 @@ def _mapped(
     if options.refine_points:
         raw = points
         points = store.scene("measured", lambda: _measured(folder, raw, robust, options, say), options.refine_points)
+    # Each point's noise is estimated from the given standard deviations, not from an estimate before.
+    given_sigma = points.point_observations.sigma
+    points = with_point_noise(points)
     matches = _by_index(line_matches, start)
     given = None if line_matches is None else digest(line_matches)
     # From here on every stage depends on all options.
@@ -191,11 +197,19 @@ def _mapped(
         joint = store.scene(
             "joint", lambda: _adjusted(first, weighted, options, say, "adjusting points and lines").scene
         )
+        table = joint.point_observations
+        joint = with_point_noise(joint.replace(point_observations=table.replace(sigma=given_sigma)))
         # The lines as mapped are good starts, and only the adjusted ones tell the noise of the segments.
         sigma = {"points": noise_px(joint, "points"), "lines": noise_px(joint, "lines")}
         line_map = store.line_map("final-lines", lambda: map_lines(joint, segments, matches, options.lines, say))
         lined = line_map.add_to(joint, segments)
-        weighted = dataclasses.replace(weighted, point_sigma_px=sigma["points"], line_sigma_px=sigma["lines"])
+        weighted = dataclasses.replace(
+            weighted,
+            point_sigma_px=sigma["points"],
+            line_sigma_px=sigma["lines"],
+            loss="cauchy",
+            loss_scale=LAST_LOSS_SIGMAS,
+        )
     if options.find_planes:
         flat = lined
         weighted = dataclasses.replace(weighted, structure_sigma_px=options.structure.surface_sigma_px)

@@ -8,7 +8,8 @@ Stages, each on all images before the next begins:
    (:mod:`groma.pipelines._line_places`), one image at a time;
 3. tracks: link, refine, recover, merge, trim (:mod:`groma.pipelines._line_tracks`), and join what was mapped more than
    once (:mod:`groma.pipelines._line_merge`). Lines of segments of a kind that is seldom found again, as texture gives
-   them, are dropped (:mod:`groma.pipelines._line_kinds`).
+   them, are dropped (:mod:`groma.pipelines._line_kinds`), and so are lines that repeat another one beside it
+   (:mod:`groma.pipelines._line_ghosts`).
 
 Every segment ends with a :class:`Fate` (:mod:`groma.pipelines._line_fates`), so that the question why a line is missing
 has an answer.
@@ -18,7 +19,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,16 +28,19 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.pipelines._distinct import num_distinct
 from groma.pipelines._line_directions import depth_ratios
-from groma.pipelines._line_fates import UNKNOWN, Fate, explain
+from groma.pipelines._line_fates import UNKNOWN, Fate
+from groma.pipelines._line_ghosts import not_ghosts
 from groma.pipelines._line_kinds import found_again
+from groma.pipelines._line_map import LineMap, explain
 from groma.pipelines._line_matches import MatchProvider, external_matches, flow_matches, wide_baseline_matches
 from groma.pipelines._line_merge import merge_agreeing
+from groma.pipelines._line_options import MapLinesOptions
 from groma.pipelines._line_places import choose_places
 from groma.pipelines._line_support import Choice
 from groma.pipelines._line_tracks import Tracks, link
 from groma.pipelines._line_views import LineViews, build_views
 from groma.pipelines._neighbors import covisible_neighbors
-from groma.scene import LineObservations, Lines, Relations, Scene
+from groma.scene import Lines, Scene
 
 if TYPE_CHECKING:
     from groma.frontend.matching import LineMatches
@@ -47,107 +51,6 @@ if TYPE_CHECKING:
 MAX_BLUR = 2.8
 #: Segments that no neighbour or geometry lets become part of a line say nothing about others of their kind.
 _IMPOSSIBLE = (Fate.TOO_SHORT, Fate.NO_NEIGHBOR, Fate.DEGENERATE)
-
-
-@dataclass(frozen=True)
-class MapLinesOptions:
-    """How to map lines."""
-
-    #: Shortest segment used, pixels; detectors have a limit of their own.
-    min_length: float = 12.0
-    #: The longest segment of a line is at least so long, pixels; shorter ones join lines, and make none.
-    min_longest: float = 0.0
-    #: Neighbours per image.
-    num_neighbors: int = 10
-    #: Fewest shared points of neighbours.
-    min_shared: int = 8
-    #: Fewest images of a line.
-    min_images: int = 3
-    #: Error of poses and cameras in the image, added in quadrature to the segments' sigma; pixels.
-    noise: float = 0.15
-    #: The sigmas are scaled to what the first lines show, within these bounds; (1, 1) keeps them.
-    noise_scale: tuple[float, float] = (0.33, 4.0)
-    #: The depth range of the points around a segment is widened by this factor at both sides.
-    depth_margin: float = 2.0
-    #: Segments are directed, for example dark on the left: the same line then runs the same way in all images.
-    directed: bool = True
-    #: Share of the shorter of two segments that must overlap along the line.
-    min_overlap: float = 0.3
-    #: Largest relative standard deviation of the depth of a two-view proposal.
-    max_relative_sigma: float = 0.03
-    #: Largest standard deviation of a line's end points over their distance from the cameras.
-    max_uncertainty: float = 0.012
-    #: The same when any one image of the line is left out: beyond it, a wrong match in that image would go unnoticed.
-    max_unchecked: float = 0.04
-    #: A place is ambiguous if another one has more than this share of its support.
-    max_rival: float = 0.95
-    #: Least share of the segments of a line's kind that are part of a line: see :mod:`groma.pipelines._line_kinds`.
-    #: Where less of the whole scene is found again, more is asked. 0 keeps the lines of texture.
-    min_repeatability: float = 0.4
-    #: Use lines through known points as further proposals.
-    use_points: bool = True
-    #: Use vanishing directions, alone and with known points.
-    use_directions: bool = True
-
-    @staticmethod
-    def selective(min_length: float = 12.0) -> MapLinesOptions:
-        """Fewer lines, of which more are right: known to 2.5 thousandths of their distance, and 25 pixels long."""
-        return MapLinesOptions(min_length=min_length, max_uncertainty=0.0025, min_longest=25.0)
-
-
-@dataclass(frozen=True, eq=False)
-class LineMap:
-    """Lines, the segments that observe them, and what became of all others."""
-
-    #: (L, 6) Plücker lines (m, d), unit direction, world frame.
-    lines: FloatArray
-    #: (L, 2, 3) end points; directed like the segments.
-    segments: FloatArray
-    #: (N,) image of each observation; observations are sorted by line.
-    image_idx: IntArray
-    #: (N,) number of the segment within its image.
-    segment_idx: IntArray
-    #: (N,) line of each observation.
-    line_idx: IntArray
-    #: (N,) root mean square distance of the segment's end points to the projected line, pixels.
-    residual: FloatArray
-    #: (L,) number of images that see the line.
-    num_images: IntArray
-    #: (L,) median over its observations of ``residual``, pixels.
-    median_residual: FloatArray
-    #: (L,) largest standard deviation of the end points across the line, scene units.
-    uncertainty: FloatArray
-    #: One array per image: the :class:`Fate` of each segment.
-    fates: tuple[IntArray, ...]
-    #: One array per image: its neighbours, best first.
-    neighbors: tuple[IntArray, ...]
-    #: Number of observations whose own proposals include one from known ``points``, or from a point and one of the
-    #: vanishing ``directions``.
-    assisted: dict[str, int] = field(default_factory=dict)
-    #: Seconds per stage.
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def num_lines(self) -> int:
-        """Number of lines."""
-        return len(self.lines)
-
-    def fate_counts(self) -> dict[Fate, int]:
-        """Number of segments with each fate."""
-        counts = np.bincount(np.concatenate([*self.fates, np.empty(0, np.int64)]), minlength=len(Fate))
-        return {fate: int(counts[fate]) for fate in Fate}
-
-    def add_to(self, scene: Scene, segments: Sequence[Segments]) -> Scene:
-        """Return the scene with these lines and their observations in place of its own lines."""
-        first = np.cumsum([0, *(len(one) for one in segments)])[self.image_idx] + self.segment_idx
-        measured = np.concatenate([np.zeros((0, 4)), *(one.ends for one in segments)])[first]
-        sigma = np.concatenate([np.zeros(0), *(one.sigma for one in segments)])[first]
-        usual = float(np.median(sigma)) if len(sigma) else 1.0
-        return scene.replace(
-            lines=Lines.through(self.segments),
-            line_observations=LineObservations(self.image_idx, self.line_idx, measured, sigma / usual),
-            relations=Relations(point_on_plane=scene.relations.point_on_plane),
-        )
 
 
 def map_lines(
@@ -274,6 +177,7 @@ def _build_tracks(
     possible = views.usable & ~np.isin(fate, _IMPOSSIBLE)
     repeated = found_again(views.length, strength, tracks.line_of, possible, len(tracks.X), options.min_repeatability)
     fate[tracks.keep(repeated)] = Fate.TEXTURE
+    fate[tracks.keep(not_ghosts(tracks, _neighbors_of_neighbors(neighbors), options.min_images))] = Fate.REPEATED
     longest = np.zeros(len(tracks.X))
     rows = np.flatnonzero(tracks.line_of >= 0)
     np.maximum.at(longest, tracks.line_of[rows], views.length[rows])
@@ -281,6 +185,12 @@ def _build_tracks(
     member = tracks.line_of >= 0
     fate[member] = np.where(own[member], Fate.MAPPED, Fate.RECOVERED)
     return tracks
+
+
+def _neighbors_of_neighbors(neighbors: list[IntArray]) -> list[IntArray]:
+    """Images that are neighbours, or have a neighbour in common."""
+    none = np.empty(0, np.int64)
+    return [np.unique(np.concatenate([none, row, *(neighbors[j] for j in row)])) for row in neighbors]
 
 
 def _is_sure(tracks: Tracks, options: MapLinesOptions) -> BoolArray:

@@ -253,7 +253,7 @@ class ConjugateGradients:
     model_tolerance = 0.05
     #: ... and, where other blocks than cameras are kept, when the residual has fallen to this share. Planes converge in
     #: two phases, and the model seems to stand still between them.
-    mixed_tolerance = 0.03
+    mixed_tolerance = 0.01
     max_iterations = 500
 
     def __init__(self, layout: Layout) -> None:

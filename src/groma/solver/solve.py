@@ -185,6 +185,8 @@ def _solve_jointly(
                 termination = Termination.COST_CONVERGED
             elif trial.length <= options.step_tolerance * size_of(states):
                 termination = Termination.STEP_CONVERGED
+        elif trial is not None and trial.promised <= options.function_tolerance * cost:
+            termination = Termination.COST_CONVERGED  # even as promised the step would have ended the solve
         elif (trial is not None and trial.length <= 1e-14 * size_of(states)) or not strategy.refuse():
             termination = Termination.DAMPING_EXHAUSTED
         record = Iteration(

@@ -36,6 +36,7 @@ _FATES = {
     "uncertain": ("line too uncertain", "#6d7f93"),
     "short_line": ("line of short segments only", "#a9895f"),
     "texture": ("texture", "#b5a7d6"),
+    "repeated": ("repeats another line", "#7fb3a6"),
 }
 
 

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a common direction is tested against: normals perpendicular to it, or directions parallel to it.
+
+Both whiten their residuals and say with which probability they agree with a random direction; the formulas stand in
+:mod:`groma.estimators.directions`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.geometry._algebra import norm, perpendicular, unit
+
+
+@dataclass(frozen=True)
+class Perpendicular:
+    """Normals to which the direction is perpendicular. Directions are (H, 3), results (H, N)."""
+
+    normals: FloatArray
+    factors: FloatArray
+    sigma: float
+    freedom: int = 1
+
+    def take(self, rows: IntArray | BoolArray) -> Perpendicular:
+        return Perpendicular(self.normals[rows], self.factors[rows], self.sigma)
+
+    def __len__(self) -> int:
+        return len(self.normals)
+
+    def _variance(self, directions: FloatArray) -> FloatArray:
+        return (directions @ self.factors[..., 0].T) ** 2 + (directions @ self.factors[..., 1].T) ** 2 + self.sigma**2
+
+    def squared(self, directions: FloatArray) -> FloatArray:
+        """Squared whitened residuals."""
+        return (directions @ self.normals.T) ** 2 / self._variance(directions)
+
+    def chance(self, directions: FloatArray, gate: float) -> FloatArray:
+        """Probabilities to agree with a random direction within ``gate``."""
+        # n.v of a random direction is uniform in -1 .. 1.
+        return np.minimum(np.sqrt(gate * self._variance(directions)), 1.0)
+
+    def rows(self, direction: FloatArray) -> FloatArray:
+        """Whitened rows (N, freedom, 3): residuals are their products with the direction."""
+        return (self.normals / np.sqrt(self._variance(direction[None])[0])[:, None])[:, None]
+
+
+@dataclass(frozen=True)
+class Parallel:
+    """Directions to which the direction is parallel: whitened bases and the square roots of their determinants."""
+
+    whitened: FloatArray
+    area: FloatArray
+    freedom: int = 2
+
+    @classmethod
+    def of(cls, directions: FloatArray, covariance: FloatArray, sigma: float) -> Parallel:
+        basis = np.stack(perpendicular(directions), axis=1)
+        inner = basis @ covariance @ np.swapaxes(basis, 1, 2) + sigma**2 * np.eye(2)
+        values, axes = np.linalg.eigh(inner)
+        scaled = np.swapaxes(axes, 1, 2) / np.sqrt(values)[..., None]
+        return cls(scaled @ basis, np.sqrt(values.prod(axis=1)))
+
+    def take(self, rows: IntArray | BoolArray) -> Parallel:
+        return Parallel(self.whitened[rows], self.area[rows])
+
+    def __len__(self) -> int:
+        return len(self.area)
+
+    def squared(self, directions: FloatArray) -> FloatArray:
+        return (directions @ self.whitened[:, 0].T) ** 2 + (directions @ self.whitened[:, 1].T) ** 2
+
+    def chance(self, directions: FloatArray, gate: float) -> FloatArray:
+        # An ellipse of area pi gate area on the half sphere of area 2 pi.
+        return np.minimum(0.5 * gate * self.area, 1.0)[None]
+
+    def rows(self, direction: FloatArray) -> FloatArray:
+        return self.whitened
+
+
+def crossings(pool: Perpendicular, count: int, rng: np.random.Generator) -> FloatArray:
+    """Candidates: cross products of so many pairs of normals, drawn by their certainty."""
+    certainty = 1.0 / np.sqrt((pool.factors**2).sum(axis=(1, 2)) + pool.sigma**2)
+    pairs = rng.choice(len(pool), (count, 2), p=certainty / certainty.sum())
+    crossed = np.cross(pool.normals[pairs[:, 0]], pool.normals[pairs[:, 1]])
+    return unit(crossed[norm(crossed) > 0.02])
+
+
+__all__ = ["Parallel", "Perpendicular", "crossings"]

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Where a line ends, from the ends of the segments that show it. Kernels only.
+
+An image shows less of a line where something stands before it, or where a detector breaks the segment; and more, now
+and then, where another edge goes on in the same direction. So the outermost end is not to be trusted, and most ends lie
+too far inside. A line first reaches as far as two images see it. If some way inside of that many images end at the same
+place, within a few pixels, and few go on, then that is the end, and those that go on are wrong:
+
+.. math:: n_\text{end} \ge 3\, n_\text{beyond}.
+
+Of the images that end there, the outer third counts, by their resolution.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._numba import kernel, loop
+
+#: Segments whose ends are that near to each other show the same end of a line, pixels.
+_SAME_END = 5.0
+#: So many times more images must end at a place than go on, if these are to be wrong.
+_MAJORITY = 3
+
+
+@kernel
+def _along(center, ray, X):
+    """Where the ray from a camera comes closest to the line X: position in units of X's length, and depth."""
+    d0, d1, d2 = X[1, 0] - X[0, 0], X[1, 1] - X[0, 1], X[1, 2] - X[0, 2]
+    w0, w1, w2 = X[0, 0] - center[0], X[0, 1] - center[1], X[0, 2] - center[2]
+    dd = d0 * d0 + d1 * d1 + d2 * d2
+    ff = ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2]
+    df = d0 * ray[0] + d1 * ray[1] + d2 * ray[2]
+    dw = d0 * w0 + d1 * w1 + d2 * w2
+    fw = ray[0] * w0 + ray[1] * w1 + ray[2] * w2
+    determinant = dd * ff - df * df
+    if not determinant > 4e-4 * dd * ff:
+        return np.nan, -1.0
+    return (df * fw - ff * dw) / determinant, (dd * fw - df * dw) / determinant
+
+
+@kernel
+def _seen_twice(first, last):
+    """From where to where at least two of the intervals cover a line; empty (inf, -inf) if no two overlap."""
+    count = len(first)
+    by_first, by_last = np.argsort(first), np.argsort(last)
+    depth, low, high = 0, np.inf, -np.inf
+    i = j = 0
+    while j < count:
+        if i < count and first[by_first[i]] <= last[by_last[j]]:
+            depth += 1
+            if depth == 2:
+                low = min(low, first[by_first[i]])
+            i += 1
+        else:
+            if depth == 2:
+                high = max(high, last[by_last[j]])
+            depth -= 1
+            j += 1
+    return low, high
+
+
+@kernel
+def _end_of(last, size, limit, stop):
+    """The upper end of a line from the upper ends of its segments and the size of a pixel of each, along the line.
+
+    ``limit`` is as far as two images see; the end is not below ``stop``.
+    """
+    count = len(last)
+    place = limit
+    order = np.argsort(-last)
+    for k in order:
+        if last[k] > limit:
+            continue
+        if last[k] < stop:
+            break
+        ends, beyond = 0, 0
+        for m in range(count):
+            if last[m] > last[k] + _SAME_END * size[m]:
+                beyond += 1
+            elif last[m] >= last[k] - _SAME_END * min(size[m], size[k]):
+                ends += 1
+        if ends >= _MAJORITY * beyond and beyond > 0:
+            place = last[k]
+            break
+        if _MAJORITY * beyond > count:
+            break
+    reach = _SAME_END * np.median(size)
+    total = 0.0
+    for k in order:
+        if abs(last[k] - place) <= reach:
+            total += 1.0 / (size[k] * size[k])
+    so_far = 0.0
+    for k in order:
+        if abs(last[k] - place) <= reach:
+            so_far += 1.0 / (size[k] * size[k])
+            if so_far >= total / 3.0:
+                return last[k]
+    return place
+
+
+@loop
+def trim(center, image, ray, length, pointers, rows, active, X, front):
+    """Move the end points of lines to where they end; front (M,): observation lies before its camera."""
+    for n in range(len(pointers) - 1):
+        begin, end = pointers[n], pointers[n + 1]
+        low_ends, high_ends, sizes = np.empty(end - begin), np.empty(end - begin), np.empty(end - begin)
+        count = 0
+        for m in range(begin, end):
+            s = rows[m]
+            t0, z0 = _along(center[image[s]], ray[s, 0], X[n])
+            t1, z1 = _along(center[image[s]], ray[s, 1], X[n])
+            front[m] = z0 > 0.0 and z1 > 0.0
+            if active[m] and front[m]:
+                low_ends[count], high_ends[count] = min(t0, t1), max(t0, t1)
+                sizes[count] = max(abs(t1 - t0) / length[s], 1e-12)
+                count += 1
+        first, last, size = low_ends[:count], high_ends[:count], sizes[:count]
+        low, high = _seen_twice(first, last)
+        if low < high:
+            middle = 0.5 * (low + high)
+            high_end = _end_of(last, size, high, middle)
+            low_end = -_end_of(-first, size, -low, -middle)
+            a0, a1, a2 = X[n, 0, 0], X[n, 0, 1], X[n, 0, 2]
+            d0, d1, d2 = X[n, 1, 0] - a0, X[n, 1, 1] - a1, X[n, 1, 2] - a2
+            X[n, 0, 0], X[n, 0, 1], X[n, 0, 2] = a0 + low_end * d0, a1 + low_end * d1, a2 + low_end * d2
+            X[n, 1, 0], X[n, 1, 1], X[n, 1, 2] = a0 + high_end * d0, a1 + high_end * d1, a2 + high_end * d2
