@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""groma on a pose graph: ``groma_pose_graph.py FILE RADIANS``; RADIANS is a file to write for readers without half angles.
+"""groma on a pose graph: ``groma_pose_graph.py FILE RADIANS``; RADIANS is written for readers without half angles.
 
 A first adjustment of a few steps puts kernels into memory, as a peer has been compiled before, too.
 """

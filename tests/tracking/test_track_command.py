@@ -2,6 +2,10 @@
 """``groma track`` on a small rendered sequence in the layout of TUM RGB-D: what it writes, and what it refuses."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
 
 import _room
 import cv2
@@ -108,3 +112,40 @@ def test_finished_keyframes_are_on_disk_while_it_runs(tmp_path):
     assert read_scene(tmp_path / "work" / "scene.npz").num_images >= 1
     assert len(read_tum(tmp_path / "work" / "trajectory.txt")) >= 1
     tracker.finish()
+
+
+#: ``groma track`` that kills itself in the middle of a frame.
+KILLED = """
+import os, signal, sys
+from groma.cli.main import run
+from groma.tracking import Tracker
+
+process, done = Tracker.process, []
+
+def dying(self, frame):
+    if len(done) == 12:
+        os.kill(os.getpid(), signal.SIGKILL)
+    done.append(frame)
+    return process(self, frame)
+
+Tracker.process = dying
+run(sys.argv[1:])
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
+def test_a_track_killed_in_the_middle_leaves_what_is_finished(sequence, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["track", str(sequence), "-o", str(out), "--camera", CAMERA, "--quiet"]
+    killed = subprocess.run([sys.executable, "-c", KILLED, *arguments], timeout=300, capture_output=True)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert not out.exists()
+    work = tmp_path / "out.work"
+    assert len((work / "frames.txt").read_text().splitlines()) == 12
+    assert len(read_tum(work / "keyframes.txt")) >= 1
+    assert read_scene(work / "scene.npz").num_images >= 1
+    # Another run begins anew, and cleans up.
+    result = _run(sequence, "-o", out, "--camera", CAMERA)
+    assert result.exit_code == 0, result.output
+    assert len(read_tum(out / "trajectory.txt")) == 16
+    assert not work.exists()

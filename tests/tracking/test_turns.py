@@ -13,9 +13,12 @@ import pytest
 
 from groma.geometry import quaternion, se3, so3
 from groma.tracking import Tracker, TrackOptions
+from groma.tracking.belief import Belief
 from groma.tracking.camera import TrackCamera
 from groma.tracking.depth_check import depth_agreement
 from groma.tracking.features import FrameFeatures
+from groma.tracking.motion import PoseEstimate
+from groma.tracking.relocalise import pose_from_matches
 from groma.tracking.track_map import TrackMap
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -110,3 +113,49 @@ def test_depth_confirms_a_pose_and_denies_others():
     assert depth_agreement(camera, track_map.keyframes, grid, nearer)[1] > 0.8
     assert np.isnan(depth_agreement(camera, track_map.keyframes, np.full_like(grid, np.nan), exact)).all()
     tracker.finish()
+
+
+def test_a_pose_far_from_the_prediction_needs_more_that_agrees():
+    """Windows that repeat are followed to the next window, and agree among themselves."""
+    belief = Belief(TrackCamera.of(_room.camera()), OPTIONS)
+    sigma, none = np.full(6, 0.1), np.zeros(0, bool)
+    at = se3.identity()
+    away = at + np.array([0, 0, 0, 0, 0.5, 0, 0])
+
+    def estimate(pose: np.ndarray, agree: int) -> PoseEstimate:
+        return PoseEstimate(pose, np.arange(100) < agree, none, none, np.eye(6), ())
+
+    assert belief.is_surprised(estimate(away, 55), at, sigma)
+    assert not belief.is_surprised(estimate(away, 90), at, sigma)
+    assert not belief.is_surprised(estimate(at, 55), at, sigma)
+
+
+@pytest.mark.parametrize("kind", ["one place", "two places", "three places", "a line", "nearly one place"])
+def test_places_that_coincide_give_no_error(kind):
+    rng = np.random.default_rng(3)
+    count = 30
+    few = np.array([[0, 0, 4.0], [1, 0, 4.0], [0, 1, 5.0]])
+    places = {
+        "one place": np.tile(few[:1], (count, 1)),
+        "two places": few[rng.integers(0, 2, count)],
+        "three places": few[rng.integers(0, 3, count)],
+        "a line": few[0] + np.linspace(0, 1, count)[:, None] * [1.0, 0.3, 0.2],
+        "nearly one place": few[0] + 1e-5 * rng.normal(size=(count, 3)),
+    }[kind]
+    camera = TrackCamera.of(_room.camera())
+    for pixel in (camera.project(places), rng.uniform(0, 200, (count, 2))):
+        found = pose_from_matches(camera, places, pixel)
+        assert found is None or np.isfinite(found[0]).all()
+
+
+def test_places_give_a_pose():
+    rng = np.random.default_rng(4)
+    places = rng.uniform([-1, -1, 3], [1, 1, 5], (60, 3))
+    pose = np.array([0, np.sin(0.1), 0, np.cos(0.1), 0.2, -0.1, 0.3])
+    camera = TrackCamera.of(_room.camera())
+    pixel = camera.project(se3.transform_points(pose[None], places)) + rng.normal(0, 0.3, (60, 2))
+    pixel[:20] = rng.uniform(0, 200, (20, 2))
+    found = pose_from_matches(camera, places, pixel)
+    assert found is not None
+    assert np.abs(se3.log(se3.compose(found[0][None], se3.inverse(pose[None])))).max() < 0.02
+    assert found[1][20:].mean() > 0.95

@@ -39,6 +39,9 @@ ANYWHERE_SCORE, ENOUGH_SCORE = 36.0, 120.0
 #: Below this score more than half of the planes must agree, where the frame sees any of the map, and depth must confirm
 #: the pose, where it is known.
 DOUBTFUL_SCORE = 80.0
+#: A pose farther than this many standard deviations from the prediction is looked at twice, if less than this share of
+#: what was looked at agrees: walls whose windows repeat are followed to the next window so.
+SURPRISE, SURE_SHARE = 2.0, 0.7
 #: The prior of a pose found by features is wider by this factor.
 WIDER = 3.0
 #: A pose found without one before may be this many standard deviations of the prediction away.
@@ -60,13 +63,18 @@ class Belief:
     def trusts(self, track_map: TrackMap, data: FrameFeatures, estimate: PoseEstimate) -> bool:
         """Whether enough agrees with the pose of a frame that was followed; depth decides where that is not much."""
         counts = estimate.counts
-        score = evidence(counts) + PLANE_WEIGHT * counts["planes"]
+        score = score_of(estimate)
         if len(estimate.planes) >= 2 and 2 * counts["planes"] <= len(estimate.planes) and score < DOUBTFUL_SCORE:
             return False
         enough = score >= LEAST_SCORE and evidence(counts) >= self._least_evidence
         if not enough or not _keeps(track_map, estimate) or _share(estimate) < LEAST_SHARE or len(estimate.weak) == 6:
             return False
         return score >= DOUBTFUL_SCORE or not self._contradicted([track_map.near], data, estimate)
+
+    def is_surprised(self, estimate: PoseEstimate, predicted: FloatArray, prior_sigma: FloatArray) -> bool:
+        """Whether a pose that is trusted is far from the prediction, and much that was followed does not agree."""
+        far = not is_near(estimate.pose, predicted, prior_sigma, SURPRISE)
+        return far and _share(estimate) < SURE_SHARE
 
     def confirms(self, track_map: TrackMap, data: FrameFeatures, estimate: PoseEstimate) -> bool:
         """Whether depth confirms the pose of a frame that was followed with few points and lines."""
@@ -133,10 +141,17 @@ class Belief:
         return None if self._denied(data, best) else best
 
 
-def is_near(pose: FloatArray, predicted: FloatArray, sigma: FloatArray) -> bool:
-    """Whether the camera can have got from where it was predicted to where a pose says."""
+def score_of(estimate: PoseEstimate) -> float:
+    """Weight of all that agrees with a pose."""
+    return evidence(estimate.counts) + PLANE_WEIGHT * estimate.counts["planes"]
+
+
+def is_near(pose: FloatArray, predicted: FloatArray, sigma: FloatArray, gate: float = JUMP_GATE) -> bool:
+    """Whether the camera can have got, and turned, from where it was predicted to where a pose says."""
     centers = se3.inverse(np.stack([pose, predicted]))[:, 4:]
-    return bool(np.linalg.norm(centers[1] - centers[0]) < JUMP_GATE * np.linalg.norm(sigma[:3]))
+    turn = se3.log(se3.compose(pose[None], se3.inverse(predicted[None])))[0, 3:]
+    went = np.linalg.norm(centers[1] - centers[0]) < gate * np.linalg.norm(sigma[:3])
+    return bool(went and np.linalg.norm(turn) < gate * np.linalg.norm(sigma[3:]))
 
 
 def _keeps(track_map: TrackMap, estimate: PoseEstimate) -> bool:
@@ -151,4 +166,4 @@ def _share(estimate: PoseEstimate) -> float:
     return (estimate.counts["points"] + estimate.counts["lines"]) / looked_at if looked_at else 1.0
 
 
-__all__ = ["Belief", "evidence", "is_near"]
+__all__ = ["Belief", "evidence", "is_near", "score_of"]

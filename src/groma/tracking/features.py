@@ -31,8 +31,9 @@ from groma.tracking.options import TrackOptions
 from groma.tracking.sparse_depth import fill_sparse
 from groma.tracking.stereo import DISPARITY_SIGMA, Disparities, dense_disparities, match_columns
 
-#: Depths of a stereo pair are used where their noise is below this share of the depth.
-FAR_SHARE = 0.06
+#: Depths of a stereo pair are used where their noise is below this share of the depth. An error of the disparity shifts
+#: a point in the next image by that error times motion over baseline, far or near, so far points serve as well.
+FAR_SHARE = 0.25
 #: Errors of depth beside a segment: so many neighbours err alike.
 SEGMENT_NOISE = DepthNoise(DEPTH_FLOOR, INVERSE_DEPTH_SIGMA, 0.0, correlation=6.0, tilt=0.0, shift=0.0)
 #: Pixels from one place of the grid of depths to the next.
@@ -122,7 +123,6 @@ class FrameFeatures:
             disparity = pixels[:, 0] - self.right_columns(pixels)
             with np.errstate(divide="ignore"):
                 depth = self.camera.fx * self.camera.baseline / disparity
-            # Far away a pair of images knows little more than the direction, and noise makes depths too small or large.
             far = self.camera.fx * self.camera.baseline * FAR_SHARE / DISPARITY_SIGMA
             return np.where((depth > 0) & (depth < far), depth, np.nan)
         return np.full(len(pixels), np.nan)

@@ -114,7 +114,7 @@ class AdjustmentJob:
             at = se3.transform_points(poses[self.point_pose], track_map.points.xyz[points.index])
             away = np.linalg.norm(self.camera.project(at) - points.pixel, axis=1) / points.sigma
             wrong = ~(away < GATE * 1.2)
-            self._forget(track_map, "points", wrong, self.point_pose, self.point_rows)
+            self._forget("points", wrong, self.point_pose, self.point_rows)
             left = np.bincount(points.index[~wrong], minlength=len(track_map.points))
             gone = self.points[left[self.points] < 1]
             track_map.drop_points(gone)
@@ -129,11 +129,11 @@ class AdjustmentJob:
                     np.linalg.norm(second - lines.ends[of, 2:], axis=1),
                 )
                 wrong[of] = ~(good & (away < GATE * 1.2 * lines.sigma[of] + 1.0))
-            self._forget(track_map, "lines", wrong, self.line_pose, self.line_rows)
+            self._forget("lines", wrong, self.line_pose, self.line_rows)
             left = np.bincount(lines.index[~wrong], minlength=len(track_map.lines))
             track_map.drop_lines(self.lines[left[self.lines] < 1])
 
-    def _forget(self, track_map: TrackMap, kind: str, wrong: BoolArray, pose: IntArray, rows: IntArray) -> None:
+    def _forget(self, kind: str, wrong: BoolArray, pose: IntArray, rows: IntArray) -> None:
         for k in np.unique(pose[wrong]):
             keyframe = self.keyframes[k]
             table = getattr(keyframe.measured, kind)

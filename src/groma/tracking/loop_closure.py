@@ -7,6 +7,7 @@ pose. The error found is spread over the keyframes between by a pose graph (odom
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,6 +42,9 @@ LEAST_MATCHES, LEAST_INLIERS = 60, 35
 SHARED = 30
 #: Noise of relative poses: translation (share of the median depth of the map), rotation (radians).
 SIGMA = np.array([0.02] * 3 + [0.01] * 3)
+#: A loop that moves the newest keyframe by more than so many standard deviations of what adds up on the way is none:
+#: two places are alike.
+GATE = 6.0
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,8 @@ def close_loop(
         if not (keyframe.alive and newest.alive):
             continue
         found = agreeing_pose(track_map, camera, keyframe, newest, first, second, LEAST_INLIERS)
-        if found is not None and (best is None or len(found[1]) > len(best[2])):
+        better = found is not None and (best is None or len(found[1]) > len(best[2]))
+        if found is not None and better and _can_be(track_map, keyframe, newest, found[0]):
             best = (keyframe, *found)
     if best is None:
         return False
@@ -96,6 +101,17 @@ def close_loop(
     _spread_error(track_map)
     join_points(track_map, keyframe, newest, first, second)
     return True
+
+
+def _can_be(track_map: TrackMap, keyframe: Keyframe, newest: Keyframe, pose: FloatArray) -> bool:
+    """Whether errors that add up at random between two keyframes explain how far the newest is from a pose (7,)."""
+    way = [one for one in track_map.living() if keyframe.index <= one.index <= newest.index]
+    centers = se3.inverse(np.array([one.pose for one in way]))[:, 4:]
+    lever = float(np.linalg.norm(centers - centers[-1], axis=1).max())
+    away = se3.log(se3.compose(pose[None], se3.inverse(newest.pose[None])))[0]
+    many = GATE * math.sqrt(newest.index - keyframe.index)
+    went = np.linalg.norm(away[:3]) < many * (SIGMA[0] * newest.depth + SIGMA[3] * lever)
+    return bool(went and np.linalg.norm(away[3:]) < many * SIGMA[3])
 
 
 def agreeing_pose(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.geometry import se3
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
@@ -60,7 +60,7 @@ class TrackResult:
 
 @dataclass
 class Entry:
-    """A tracked frame in terms of a keyframe, so that it moves when the keyframe is adjusted."""
+    """A tracked frame in terms of the keyframe it was tracked against, so that it moves when that is adjusted."""
 
     timestamp: float
     keyframe: int
@@ -100,12 +100,16 @@ class History:
         entries = [entry for entry in self.entries if entry.part == part]
         if not entries:
             return Trajectory()
-        poses = np.array([track_map.pose_of(entry.keyframe) for entry in entries])
-        relative = np.array([entry.cam_from_keyframe for entry in entries]).reshape(-1, 7)
-        world = se3.inverse(se3.compose(relative, poses))
+        entries.sort(key=lambda entry: entry.timestamp)
         times = np.array([entry.timestamp for entry in entries])
-        order = np.argsort(times, kind="stable")
-        return Trajectory(times[order], world[order])
+        near = np.array([entry.keyframe for entry in entries])
+        poses = np.array([track_map.pose_of(entry.keyframe) for entry in entries])
+        poses = se3.compose(np.array([entry.cam_from_keyframe for entry in entries]), poses)
+        number = {keyframe.timestamp: keyframe.index for keyframe in track_map.keyframes}
+        own = np.array([number.get(time, -1) for time in times.tolist()])
+        rows = np.flatnonzero(own >= 0)
+        adjusted = np.array([track_map.pose_of(k) for k in own[rows]]).reshape(-1, 7)
+        return Trajectory(times, se3.inverse(_as_adjusted(times, poses, near, own, adjusted)))
 
     def milliseconds(self) -> dict[str, dict[str, float]]:
         """Return median, 95th percentile and number of the times of each stage."""
@@ -117,6 +121,39 @@ class History:
             }
             for stage, seconds in self.seconds.items()
         }
+
+
+def _as_adjusted(times: FloatArray, poses: FloatArray, near: IntArray, own: IntArray, adjusted: FloatArray):
+    """Put frames that became keyframes where these are now; frames between them move along, in proportion to time.
+
+    Parameters
+    ----------
+    times, poses : (n,), (n, 7)
+        Frames in order of time, as they were tracked.
+    near : (n,) int
+        The keyframe that each was tracked against.
+    own : (n,) int
+        The keyframe that it became, or -1.
+    adjusted : (k, 7)
+        Poses of those that became keyframes.
+    """
+    rows = np.flatnonzero(own >= 0)
+    if not len(rows):
+        return poses
+    moved = se3.log(se3.compose(adjusted, se3.inverse(poses[rows])))
+    after = np.searchsorted(rows, np.arange(len(times)), side="right")
+    first, second = np.maximum(after - 1, 0), np.minimum(after, len(rows) - 1)
+    # What was tracked against the keyframe before has not moved there; what was tracked against an older one has, like
+    # that keyframe itself.
+    known = (after > 0) & (near[rows[first]] == near) & (own[rows[first]] != near)
+    start = np.where(known[:, None], moved[first], 0.0)
+    known = (after < len(rows)) & (near[rows[second]] == near)
+    end = np.where(known[:, None], moved[second], start)
+    gap = times[rows[second]] - times[rows[first]]
+    share = np.where((after > 0) & (gap > 0), (times - times[rows[first]]) / np.where(gap > 0, gap, 1.0), 0.0)[:, None]
+    out = se3.compose(se3.exp((1.0 - share) * start + share * end), poses)
+    out[rows] = adjusted
+    return out
 
 
 class Stopwatch:

@@ -116,7 +116,7 @@ def pose_from_matches(
             np.ascontiguousarray(places), np.ascontiguousarray(pixel - 0.5), camera.matrix_opencv, np.zeros(0),
             iterationsCount=500, reprojectionError=error, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
         )  # fmt: skip
-    except cv2.error:  # places that coincide are refused so
+    except cv2.error:  # its last step asserts that the inliers, not known before, are spread well
         return None
     if not found or inliers is None or len(inliers) < min_inliers or not np.isfinite(shift).all():
         return None

@@ -57,20 +57,12 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera) -> Scene:
         points=Points(
             point_ids + 1, track_map.points.xyz[point_ids], np.full((len(point_ids), 3), 128), np.zeros(len(point_ids))
         ),
-        point_observations=PointObservations(image_of, point_idx, pixels[keep], _counted(image_of)),
+        point_observations=PointObservations.numbered(image_of, point_idx, pixels[keep]),
         lines=Lines.through(segments, line_ids + 1) if len(line_ids) else Lines(),
         line_observations=LineObservations(image["lines"], line_idx, np.concatenate([m.lines.ends for m in measured])),
         planes=Planes(plane_ids + 1, hesse),
         relations=Relations(line_on_plane=np.column_stack([rows, on_plane[rows]])),
     )
-
-
-def _counted(image: np.ndarray) -> np.ndarray:
-    """Number the rows of each image from zero; rows of one image stand together."""
-    if not len(image):
-        return np.zeros(0, np.int64)
-    starts = np.searchsorted(image, image, side="left")
-    return np.arange(len(image)) - starts
 
 
 __all__ = ["map_to_scene"]

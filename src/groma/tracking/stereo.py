@@ -23,6 +23,10 @@ BLOCK = 13
 LARGEST_SHARE = 0.12
 #: A refined column may be this far from where it was expected, pixels; and this far out of its row.
 MAX_SHIFT, MAX_ROW = 2.5, 1.5
+#: Where to ask for a disparity beside a pixel that has none, nearest first (n, 2), pixels.
+_AROUND = np.array(
+    sorted(((v, u) for v in (-6, -3, 0, 3, 6) for u in (-6, -3, 0, 3, 6)), key=lambda at: at[0] ** 2 + at[1] ** 2)
+)
 
 Disparities = npt.NDArray[np.float32]
 
@@ -35,8 +39,11 @@ def dense_disparities(left: GrayImage, right: GrayImage) -> Disparities:
     matcher = cv2.StereoBM.create(numDisparities=count, blockSize=BLOCK)
     matcher.setUniquenessRatio(15)
     matcher.setTextureThreshold(8)
-    found = matcher.compute(left, right).astype(np.float32) / 16.0
-    return np.where(found > 0.5, found, np.float32(0.0))
+    # OpenCV leaves out the columns at the left whose counterpart could be outside, and rounds sixteenths of a pixel up.
+    wide = [cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
+    found = (matcher.compute(wide[0], wide[1])[:, count:].astype(np.float32) - 0.5) / 16.0
+    column = np.arange(left.shape[1], dtype=np.float32)
+    return np.where((found > 0.5) & (found < column - BLOCK // 2), found, np.float32(0.0))
 
 
 def match_columns(
@@ -53,9 +60,11 @@ def match_columns(
     unknown = ~np.isfinite(guess)
     if coarse is not None and unknown.any():
         height, width = left.shape
-        row = np.clip(pixels[unknown, 1].astype(np.int64), 0, height - 1)
-        column = np.clip(pixels[unknown, 0].astype(np.int64), 0, width - 1)
-        found = coarse[row, column]
+        # Beside a corner often one side alone is told apart: the nearest of the surroundings then.
+        row = np.clip(pixels[unknown, 1].astype(np.int64) + _AROUND[:, :1], 0, height - 1)
+        column = np.clip(pixels[unknown, 0].astype(np.int64) + _AROUND[:, 1:], 0, width - 1)
+        near = coarse[row, column]
+        found = near[(near > 0).argmax(axis=0), np.arange(near.shape[1])]
         guess[unknown] = np.where(found > 0, pixels[unknown, 0] - found, np.nan)
     rows = np.flatnonzero(np.isfinite(guess))
     start = np.column_stack([guess[rows], pixels[rows, 1]])

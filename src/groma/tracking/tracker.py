@@ -23,7 +23,7 @@ from groma.io.sequences.frame import Frame, SequenceCamera
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
 from groma.solver.report import SolveReport
-from groma.tracking.belief import Belief, is_near
+from groma.tracking.belief import Belief, is_near, score_of
 from groma.tracking.camera import TrackCamera, back
 from groma.tracking.checks import FrameChecks
 from groma.tracking.coarse_alignment import TURN_SIGMA, turned, turned_prediction
@@ -123,7 +123,7 @@ class Tracker:
         if not self.map.keyframes:
             return self._start(data, began, watch)
         predicted, prior_sigma = self._motion.predict(present.pose, frame.timestamp)
-        estimate, doubtful, found = None, None, None
+        estimate, doubtful, found, trusted = None, None, None, False
         followed = Followed.nothing()
         assert present.data is not None
         if self._lost_for <= NEAR_FRAMES:
@@ -133,8 +133,10 @@ class Tracker:
                 self.map, self.camera, self.options, present.data, data, present.followed, present.pose, predicted,
                 prior_sigma, watch,
             )  # fmt: skip
-            if estimate is not None and not self._belief.trusts(self.map, data, estimate):
-                doubtful, estimate = estimate, None
+            if estimate is not None:
+                trusted = self._belief.trusts(self.map, data, estimate)
+                if not trusted or self._belief.is_surprised(estimate, predicted, prior_sigma):
+                    doubtful, estimate = estimate, None
         if estimate is None:
             before = present.pose
             if self._lost_for == 0 and present.frames_since_keyframe > 0:
@@ -145,10 +147,11 @@ class Tracker:
                 mapper.make_keyframe(present, watch)
             with watch("find"):
                 found = self._find(data, predicted, prior_sigma, doubtful)
-            if found is not None:
+            if found is not None and not (trusted and doubtful is not None and score_of(doubtful) >= found.score):
                 estimate, followed = found.estimate, Followed(promote(self.map, found, data), found.lines)
-            elif doubtful is not None and self._belief.confirms(self.map, data, doubtful):
+            elif doubtful is not None and (trusted or self._belief.confirms(self.map, data, doubtful)):
                 # The new keyframe may have moved the map.
+                found = None
                 moved = se3.compose(se3.inverse(before[None]), present.pose[None])
                 estimate = replace(doubtful, pose=se3.compose(doubtful.pose[None], moved)[0])
             else:
