@@ -151,3 +151,24 @@ def test_few_steps_where_points_lie_on_lines():
     start = holistic(1000, noise_px=1.0, seed=2, views="near").start
     result = adjust(start, AdjustOptions(loss="none", max_iterations=10))
     assert result.report.solve.converged
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: adjust("model"), r"takes a groma\.Scene; got str.*read_scene"),
+        (lambda: AdjustOptions(point_sigma_px=0.0), "point_sigma_px must be a positive number"),
+        (lambda: AdjustOptions(line_sigma_px=float("nan")), "line_sigma_px must be a positive number"),
+    ],
+)
+def test_what_is_not_a_scene_or_a_noise_is_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_a_report_prints_its_main_figures():
+    report = adjust(without_relations(holistic(8, seed=0).start), AdjustOptions(max_iterations=3)).report
+    text = str(report).splitlines()
+    assert text[0].startswith(f"{report.num_images} images, {report.num_points} points, {report.num_lines} lines")
+    assert text[1].startswith("points: ") and text[2].startswith("lines: ")
+    assert report.termination.sentence in text[3] and len(text) < 12

@@ -62,8 +62,7 @@ def track(
     from groma.errors import InputError
 
     console = Console(quiet, verbose, json_target, threads)
-    _output.check_output(output, force)
-    _output.check_json(json_target, force)
+    _output.check_outputs(force, output, json_target=json_target)
     if kind not in (None, "rgbd", "stereo", "mono"):
         raise InputError(f"--kind must be rgbd, stereo or mono; got {kind!r}.")
 

@@ -82,22 +82,31 @@ class AdjustOptions:
     #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss or with lines (1 where
     #: points are tied to lines and there is no loss), else 0.
     landmark_steps: int | None = None
+    #: Threads; None takes one for small problems and all cores for large ones.
     threads: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("point_sigma_px", "line_sigma_px", "structure_sigma_px"):
+            if not 0.0 < getattr(self, name) < float("inf"):
+                raise InputError(f"{name} must be a positive number of pixels; got {getattr(self, name)}.")
 
 
 @dataclass(frozen=True)
 class Progress:
     """What a progress callback gets after every step."""
 
+    #: Steps tried so far, and the most there may be.
     iteration: int
     max_iterations: int
+    #: The cost after this step.
     cost: float
 
 
 @dataclass(frozen=True)
 class AdjustReport:
-    """Outcome of :func:`adjust` in the terms of the scene."""
+    """Outcome of :func:`adjust` in the terms of the scene; as a string, its main figures."""
 
+    #: What took part.
     num_images: int
     num_points: int
     num_lines: int
@@ -105,6 +114,7 @@ class AdjustReport:
     num_observations: int
     #: Root mean square residual by kind of landmark, pixels: {kind: {before, after}}, without the loss.
     rmse_px: dict[str, dict[str, float]]
+    #: How the solver got there.
     solve: SolveReport
     #: Sentences for the user.
     warnings: tuple[str, ...]
@@ -113,6 +123,17 @@ class AdjustReport:
     stages: tuple[dict[str, Any], ...] = ()
     #: Relations between landmarks by kind: how many held, and how many the loss gave up, which the scene then drops.
     relations: dict[str, dict[str, int]] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        counts = {"images": self.num_images, "points": self.num_points, "lines": self.num_lines}
+        counts |= {"planes": self.num_planes, "observations": self.num_observations}
+        rows = [", ".join(f"{number:,} {name}" for name, number in counts.items() if number)]
+        rows += [
+            f"{kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms)"
+            for kind, rmse in self.rmse_px.items()
+            if None not in rmse.values()
+        ]
+        return "\n".join([*rows, str(self.solve), *(f"warning: {sentence}" for sentence in self.warnings)])
 
     @property
     def termination(self) -> Termination:
@@ -195,6 +216,11 @@ def adjust(
         If the scene has nothing to adjust, or an option is not known.
     """
     options = options or AdjustOptions()
+    if not isinstance(scene, Scene):
+        raise InputError(
+            f"adjust takes a groma.Scene; got {type(scene).__name__}. Read one with groma.read_scene(path), or turn a "
+            "pycolmap.Reconstruction into one with groma.io.from_pycolmap(reconstruction)."
+        )
     stages = _stages(scene, options)
     assembly = assemble(scene, _assembly_options(scene, options, stages[-1]))
     if not assembly.problem.factors:
