@@ -28,6 +28,7 @@ from groma.factors._factor import Factor, Ref
 from groma.geometry import line3, quaternion
 from groma.pipelines._assemble import LINE_FACTORS, disassemble
 from groma.problem.problem import Problem
+from groma.problem.residuals import squared_norms
 from groma.problem.variables import Variables
 from groma.scene import Scene
 from groma.solver.options import SolverOptions
@@ -125,10 +126,7 @@ def _line_costs(problem: Problem, factors: list[Factor]) -> tuple[FloatArray, In
     total = np.zeros(len(problem.variables["lines"]))
     count = np.zeros(len(total), dtype=np.int64)
     for factor in factors:
-        ambients = tuple(problem.variables[ref.group].ambient() for _, ref in factor.references())
-        residual = np.empty((len(factor), factor.residual_size))
-        factor.residuals(factor.prepare(ambients), 0, len(factor), residual)
-        squared = (residual**2).sum(axis=1) * np.asarray(factor.sqrt_information) ** 2
+        squared = squared_norms(factor, problem.variables)
         total += np.bincount(_line_of(factor), weights=factor.loss.evaluate(squared)[0], minlength=len(total))
         count += np.bincount(_line_of(factor), minlength=len(total))
     return total, count

@@ -11,6 +11,7 @@ from groma._typing import BoolArray
 from groma.factors.losses import Trivial
 from groma.pipelines._structure_factors import RELATION_FACTORS
 from groma.problem.problem import Problem
+from groma.problem.residuals import squared_norms
 from groma.scene import Scene
 
 #: A relation whose weight under its loss is less than this part of full weight was given up.
@@ -34,10 +35,7 @@ def drop_failed_relations(scene: Scene, problem: Problem) -> tuple[Scene, dict[s
             continue
         failed: BoolArray = np.zeros(len(factor), dtype=bool)
         if not isinstance(factor.loss, Trivial):
-            ambients = tuple(problem.variables[ref.group].ambient() for _, ref in factor.references())
-            residual = np.empty((len(factor), factor.residual_size))
-            factor.residuals(factor.prepare(ambients), 0, len(factor), residual)
-            squared = (residual**2).sum(axis=1) * np.asarray(factor.sqrt_information) ** 2
+            squared = squared_norms(factor, problem.variables)
             failed = np.asarray(factor.loss.evaluate(squared)[1] < LEAST_WEIGHT)
         outcome[name] = {"held": int((~failed).sum()), "dropped": int(failed.sum())}
         if failed.any():

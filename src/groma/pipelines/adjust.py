@@ -20,6 +20,7 @@ from groma.pipelines._relation_outcome import drop_failed_relations
 from groma.pipelines._stage_reports import combined, stage_entries, with_costs_at, with_loss
 from groma.pipelines._structure_factors import SURFACE_SIGMA_PX
 from groma.problem.problem import Problem
+from groma.problem.residuals import residuals_of
 from groma.scene import Scene
 from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
@@ -391,9 +392,8 @@ def squared_residuals_px(assembly: Assembly, weighted: bool = False) -> dict[str
         kind = "points" if factor.type_name in POINT_FACTORS else "lines" if factor.type_name in LINE_FACTORS else None
         if kind is None or len(factor) == 0:
             continue
-        ambients = tuple(problem.variables[ref.group].ambient() for _, ref in factor.references())
-        residual = np.empty((len(factor), factor.residual_size))
-        factor.residuals(factor.prepare(ambients), 0, len(factor), residual)
         unit = factor.sqrt_information if weighted else assembly.pixels_of_residual.get(number, 1.0)
-        parts.setdefault(kind, []).append((residual**2).sum(axis=1) * np.asarray(unit) ** 2)
+        parts.setdefault(kind, []).append(
+            (residuals_of(factor, problem.variables) ** 2).sum(axis=1) * np.asarray(unit) ** 2
+        )
     return {kind: np.concatenate(squares) for kind, squares in parts.items()}
