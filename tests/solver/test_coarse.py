@@ -77,5 +77,22 @@ def test_conjugate_gradients_with_clusters_solve_the_system(small_clusters):
         assert np.linalg.norm(got - expected) < 1e-5 * np.linalg.norm(expected)
 
 
+def test_coarse_system_is_kept_while_the_cameras_stand(small_clusters):
+    layout, system, states = reduced(num_cameras=12, num_points=40, views=4)
+    space = _coarse.coarse_space(layout)
+    S = system.S[space.kept_class, space.kept_class]
+    space.follow(states)
+    space.factorize(S)
+    first = space._factor
+    space.factorize(2.0 * S)
+    assert space._factor is first
+    group = layout.kept[space.kept_class].members[0].group
+    moved = states[group].copy()
+    moved[:, 4:] += 0.2
+    space.follow({**states, group: moved})
+    space.factorize(S)
+    assert space._factor is not first
+
+
 def test_few_cameras_have_no_clusters():
     assert _coarse.coarse_space(lay_out(scene_problem())) is None

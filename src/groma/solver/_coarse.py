@@ -36,6 +36,8 @@ MAX_CLUSTERS = 64
 MIN_CLUSTERS = 4
 #: Added to the diagonal of the coarse system, relative: a camera alone cannot tell all seven motions apart.
 JITTER = 1e-10
+#: The coarse system is kept while the motions have changed by less than this share of the largest since it was formed.
+SAME_MOTIONS = 3e-3
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 
@@ -121,29 +123,29 @@ class CoarseSpace:
         rows, columns = layout.blocks[kept_class, kept_class]
         self._cluster = _clusters(rows, columns, self._kept.count)
         self.count = int(self._cluster.max()) + 1
+        self._state: FloatArray | None = None
         self._P = np.zeros(0)
         self._factor: FloatArray | None = None
         (self._potrf, self._potrs) = get_lapack_funcs(("potrf", "potrs"), (np.zeros((1, 1)),))
 
     def follow(self, states: Mapping[str, FloatArray]) -> None:
-        """Take the motions of the clusters at these states."""
-        member = self._kept.members[0]
-        group = self._layout.problem.variables[member.group]
-        P = np.zeros((self._kept.count, self._kept.width, 7))
-        state = states[member.group]
-        P[:, : member.dof] = gauge_directions(group.manifold, state).transpose(1, 2, 0)
-        free = group.free_coordinates()
-        if free is not None:
-            P[:, : member.dof] *= free[:, :, None]
-        self._P = P.reshape(-1)
+        """Take notice of the states at which the next systems are formed."""
+        self._state = states[self._kept.members[0].group]
 
     def factorize(self, S: FloatArray) -> None:
-        """Form and factorise P^T S P; before :meth:`follow`, or where that fails, there is no correction."""
-        self._factor = None
-        if not len(self._P):
+        """Form and factorise P^T S P, unless the cameras have hardly moved since it was done.
+
+        Before :meth:`follow`, or where the factorisation fails, there is no correction.
+        """
+        if self._state is None:
             return
+        w = self._kept.width
+        P = self._motions()
+        if self._factor is not None and np.abs(P - self._P).max() < SAME_MOTIONS * np.abs(P).max():
+            return
+        self._P = P
         rows, columns = self._layout.blocks[self.kept_class, self.kept_class]
-        n, w = self.count, self._kept.width
+        n = self.count
         A = np.zeros(n * n * 49)
         Q = np.empty(w * 7)
         _coarse_matrix(S.reshape(-1), rows, columns, self._cluster, self._P, A, Q, width(w), _MODES)
@@ -153,6 +155,17 @@ class CoarseSpace:
         A[np.diag_indices(7 * n)] += JITTER * diagonal + np.where(diagonal > 0.0, 0.0, 1.0)
         factor, info = self._potrf(A, lower=1, clean=0, overwrite_a=1)
         self._factor = factor if info == 0 else None
+
+    def _motions(self) -> FloatArray:
+        """Return P, flat: how each camera moves with its cluster."""
+        member = self._kept.members[0]
+        group = self._layout.problem.variables[member.group]
+        P = np.zeros((self._kept.count, self._kept.width, 7))
+        P[:, : member.dof] = gauge_directions(group.manifold, self._state).transpose(1, 2, 0)
+        free = group.free_coordinates()
+        if free is not None:
+            P[:, : member.dof] *= free[:, :, None]
+        return P.reshape(-1)
 
     def correct(self, r: FloatArray, z: FloatArray) -> None:
         """Add the coarse part of the preconditioned residual ``r`` to ``z``."""

@@ -28,6 +28,8 @@ class Dogleg:
         self._reduction = reduction
         #: Reported in place of a damping: the inverse of the radius.
         self.damping = damping
+        #: What the trust region holds back of the decrease is not known; where it does not, nothing.
+        self.withheld = 0.0
         self._radius = 0.0
         self._newton: Step | None = None
 
@@ -68,6 +70,7 @@ class Dogleg:
         """Return the dogleg step for the present radius and the decrease of the quadratic model."""
         with self._reduction.watch("backsubstitute"):
             step = self._point()
+            self.withheld = 0.0 if step is self._newton else np.inf
             self._proposed = self._length(step)
             equations, system = self._reduction.equations, self._reduction.system
             decrease = -gradient(equations).dot(step) - 0.5 * curvature(equations, system, step)

@@ -28,6 +28,8 @@ class LevenbergMarquardt:
     def __init__(self, reduction: Reduction, damping: float) -> None:
         self._reduction = reduction
         self.damping = damping
+        #: Of the last step: what the damping holds back of the decrease, to first order.
+        self.withheld = 0.0
         self._growth = 2.0
 
     def linearize(self, states: States, inputs: list[tuple]) -> float:
@@ -47,13 +49,16 @@ class LevenbergMarquardt:
             return None
         with self._reduction.watch("backsubstitute"):
             step = Step(kept, system.landmark_steps(kept))
-            total = self.damping * system.landmark_squares - system.landmark_slope
+            damped = self.damping * system.landmark_squares
+            total = -system.landmark_slope
             for c, delta in enumerate(kept):
                 diagonal = np.maximum(system.diagonal(c).reshape(-1), MIN_DIAGONAL)
-                total += self.damping * float((diagonal * delta) @ delta) - float(system.equations.g_kept[c] @ delta)
+                damped += self.damping * float((diagonal * delta) @ delta)
+                total -= float(system.equations.g_kept[c] @ delta)
             if isinstance(linear, ConjugateGradients):
                 total += sum(float(r @ d) for r, d in zip(linear.residual, kept, strict=True))
-        return step, 0.5 * total
+        self.withheld = damped
+        return step, 0.5 * (total + damped)
 
     def accept(self, gain_ratio: float) -> None:
         """Lower the damping after an accepted step."""

@@ -71,11 +71,56 @@ def _multiply(blocks, rows, columns, same_class, x_row, x_column, y_row, y_colum
 
 
 @loop
+def _invert(blocks, out, block_width):
+    """Write the inverses of the first symmetric blocks to ``out``, flat; return whether all are positive definite."""
+    n = len(block_width)
+    L, inverse = np.zeros((n, n)), np.zeros((n, n))
+    for p in range(out.shape[0] // (n * n)):
+        for j in range(n):
+            for i in range(j, n):
+                total = blocks[p, j, i]
+                for k in range(j):
+                    total -= L[i, k] * L[j, k]
+                if i > j:
+                    L[i, j] = total / L[j, j]
+                elif total > 0.0:
+                    L[j, j] = np.sqrt(total)
+                else:
+                    return False
+        for j in range(n):
+            inverse[j, j] = 1.0 / L[j, j]
+            for i in range(j + 1, n):
+                total = 0.0
+                for k in range(j, i):
+                    total -= L[i, k] * inverse[k, j]
+                inverse[i, j] = total / L[i, i]
+        for i in range(n):
+            for j in range(i, n):
+                total = 0.0
+                for k in range(j, n):
+                    total += inverse[k, i] * inverse[k, j]
+                out[(p * n + i) * n + j] = total
+                out[(p * n + j) * n + i] = total
+    return True
+
+
+@loop
 def _apply_blocks(blocks, x, y, block_width):
     """Add the product of diagonal blocks with x to y."""
     w = len(block_width)
     for i in range(x.shape[0] // w):
         add_matvec(y, i * w, blocks, i * w * w, x, i * w, block_width, block_width)
+
+
+@loop
+def _advance(x, r, p, Sp, b, alpha):
+    """X += alpha p and r -= alpha Sp; return the value of the quadratic model at x, -(x b + x r) / 2."""
+    total = 0.0
+    for i in range(x.shape[0]):
+        x[i] += alpha * p[i]
+        r[i] -= alpha * Sp[i]
+        total += x[i] * (b[i] + r[i])
+    return -0.5 * total
 
 
 # ----------------------------------------------------------------------------------------------------------- Public
@@ -250,7 +295,7 @@ class ConjugateGradients:
 
     name = "pcg"
     #: Stop when one more iteration improves the quadratic model by less than this share of its mean improvement.
-    model_tolerance = 0.05
+    model_tolerance = 0.02
     #: ... and, where other blocks than cameras are kept, when the residual has fallen to this share. Planes converge in
     #: two phases, and the model seems to stand still between them.
     mixed_tolerance = 0.01
@@ -275,11 +320,10 @@ class ConjugateGradients:
         r_parts, z_parts = _split(layout, r), _split(layout, z)
         inverses = []
         for c, kept in enumerate(layout.kept):
-            try:
-                inverse = np.linalg.inv(blocks[c, c][: kept.count]).reshape(-1)
-            except np.linalg.LinAlgError:
+            inverse, block_width = np.empty(kept.count * kept.width**2), width(kept.width)
+            if not _invert(blocks[c, c], inverse, block_width):
                 return None
-            inverses.append((inverse, r_parts[c], z_parts[c], width(kept.width)))
+            inverses.append((inverse, r_parts[c], z_parts[c], block_width))
         if coarse is not None:
             coarse.factorize(blocks[coarse.kept_class, coarse.kept_class])
         products = _products(layout, blocks, _split(layout, p), _split(layout, Sp))
@@ -308,14 +352,10 @@ class ConjugateGradients:
                 if k == 1:
                     return None
                 break
-            alpha = rz / curvature
-            x += alpha * p
-            r -= alpha * Sp
-            # value of the quadratic model, as in Nash and Sofer, "Assessing a search direction within a
-            # truncated-Newton method", 1990
-            value = -0.5 * float(x @ b + x @ r)
+            # as in Nash and Sofer, "Assessing a search direction within a truncated-Newton method", 1990
+            value = _advance(x, r, p, Sp, b, rz / curvature)
             self.num_iterations = k
-            slow = k * (value - model) / value < self.model_tolerance
+            slow = k * (model - value) < -self.model_tolerance * value
             if slow and not mixed:
                 break
             model = value

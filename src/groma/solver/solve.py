@@ -46,7 +46,7 @@ from groma.solver.report import (
 )
 from groma.solver.schur import ReducedSystem
 from groma.solver.steps import States, gradient, largest, size_of
-from groma.solver.termination import Termination
+from groma.solver.termination import Termination, cost_converged
 
 #: From this many factors on, all cores are used unless the caller says otherwise.
 FACTORS_FOR_THREADS = 50_000
@@ -150,7 +150,7 @@ def _solve_jointly(
         report.termination = Termination.NOT_FINITE
         return states
     share = cost / max(1, sum(len(layout_.factor) for layout_ in layout.factors))
-    termination = None
+    termination, fell = None, 0.0
     while termination is None:
         slope = largest(gradient(equations))
         if slope <= options.gradient_tolerance:
@@ -160,6 +160,7 @@ def _solve_jointly(
             termination = Termination.MAX_ITERATIONS
             break
         report.iterations += 1
+        fell_before, fell = fell, 0.0
         damping = strategy.damping
         trial = try_step(equations, strategy, watch, states, cost)
         # a factor that became degenerate counts nothing; without its share put back, steps would hide what they spoil
@@ -178,10 +179,11 @@ def _solve_jointly(
                 with watch("backsubstitute"):
                     trial = refiner.refine(equations, trial)
         if trial is not None and accepted:
-            decrease, old_cost, costs = cost - trial.cost, cost, trial.costs
-            states, cost, inputs, hidden = trial.states, trial.cost, trial.inputs, trial.num_hidden
+            fell, withheld = (cost - trial.cost) / cost, strategy.withheld / cost
+            states, cost, costs = trial.states, trial.cost, trial.costs
+            inputs, hidden = trial.inputs, trial.num_hidden
             strategy.accept(trial.gain_ratio)
-            if decrease <= options.function_tolerance * old_cost:
+            if cost_converged(fell, fell_before, trial.gain_ratio, withheld, options.function_tolerance):
                 termination = Termination.COST_CONVERGED
             elif trial.length <= options.step_tolerance * size_of(states):
                 termination = Termination.STEP_CONVERGED

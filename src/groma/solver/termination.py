@@ -12,7 +12,7 @@ class Termination(Enum):
     COST_CONVERGED = (
         "cost_converged",
         True,
-        "Converged: the cost hardly falls any more (by less than function_tolerance in a step).",
+        "Converged: the cost hardly falls any more (by less than function_tolerance in a step, taken or foreseen).",
     )
     GRADIENT_CONVERGED = (
         "gradient_converged",
@@ -57,3 +57,35 @@ class Termination(Enum):
         self.key = key
         self.converged = converged
         self.sentence = sentence
+
+
+def cost_converged(decrease: float, previous: float, gain_ratio: float, withheld: float, tolerance: float) -> bool:
+    r"""Whether the cost has converged after an accepted step: it fell, or would fall next, by too little to go on.
+
+    What the next step will bring is known well enough without taking it. Steps shrink by the ratio they have shrunk
+    by, or by what the quadratic model was wrong, whichever is more; and what the damping has held back,
+    :math:`\lambda\,\delta^\top D\,\delta`, is still to come. With d the decrease, :math:`d_0` the one before and
+    :math:`\varrho` the gain ratio,
+
+    .. math:: d_1 \approx d \max(d / d_0,\ |1 - \varrho|) + \lambda\,\delta^\top D\,\delta .
+
+    That holds near the minimum, where convergence is quadratic or better than its history: d itself must be at most
+    :math:`\sqrt{\text{tolerance}}`.
+
+    Parameters
+    ----------
+    decrease, previous
+        Decrease of the cost in this step, and in the step before, relative to the costs before them; the latter is 0
+        where there was none, or where it was refused.
+    gain_ratio
+        Actual over predicted decrease.
+    withheld
+        What the damping holds back, relative to the cost.
+    tolerance
+        The relative decrease that does not matter.
+    """
+    if decrease <= tolerance:
+        return True
+    if previous <= 0.0 or decrease > tolerance**0.5:
+        return False
+    return decrease * max(decrease / previous, abs(1.0 - gain_ratio)) + withheld <= tolerance
