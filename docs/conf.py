@@ -6,6 +6,8 @@ import re
 import sys
 from pathlib import Path
 
+from docutils import nodes
+from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.ext.napoleon.docstring import NumpyDocstring
 
@@ -49,7 +51,33 @@ html_theme = "furo"
 html_title = f"groma {release}"
 exclude_patterns = ["_build"]
 
+#: What an array type is made of, and a name that Python defers, where the aliases above do not reach: inside others.
+_ARRAY = re.compile(
+    r"~?(?:numpy\.)?ndarray\[tuple\[~?(?:typing\.)?Any, \.\.\.\], ~?(?:numpy\.)?dtype\[~?(?:numpy\.)?(\w+)\]\]"
+)
+_DEFERRED = re.compile(r"~?(?:[\w.]+\.)?TypeAliasForwardRef\('(\w+)'\)")
+_SHORT = {"float64": "FloatArray", "integer": "IntArray", "bool": "BoolArray", "bool_": "BoolArray"}
 _PIPES = re.compile(r"(`[^`]*`)|(?<!\\)\|([^|\s][^|]*?)\|")
+
+
+def _short(text: str) -> str:
+    text = _ARRAY.sub(lambda match: _SHORT.get(match[1], f"NDArray[{match[1]}]"), text)
+    return _DEFERRED.sub(lambda match: match[1], text)
+
+
+def _shorten_signature(
+    app: Sphinx, what: str, name: str, obj: object, options: object, signature: str | None, returns: str | None
+) -> tuple[str | None, str | None]:
+    """Let signatures say FloatArray, or ``NDArray[uint8]``, wherever an array type stands."""
+    return signature and _short(signature), returns and _short(returns)
+
+
+def _shorten_attributes(app: Sphinx, doctree: nodes.document) -> None:
+    """Do the same for the types of attributes, which are no signatures."""
+    for annotation in doctree.findall(addnodes.desc_annotation):
+        text = annotation.astext()
+        if _short(text) != text:
+            annotation.children = [nodes.Text(_short(text))]
 
 
 def _escape_signs(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
@@ -72,6 +100,8 @@ def _parse_attribute_as_text(self: NumpyDocstring) -> list[str]:
 
 
 def setup(app: Sphinx) -> None:
-    """Register the two above."""
+    """Register the four above."""
+    app.connect("autodoc-process-signature", _shorten_signature)
+    app.connect("doctree-read", _shorten_attributes)
     NumpyDocstring._parse_attribute_docstring = _parse_attribute_as_text
     app.connect("autodoc-process-docstring", _escape_signs)

@@ -7,6 +7,7 @@ import groma
 from groma.geometry import Euclidean
 from groma.geometry.line_charts import LINE_CHARTS
 from groma.geometry.pose_charts import PoseLeft
+from groma.problem.residuals import jacobians_of, residuals_of
 
 # Three cameras, five lines, and a segment of every line in every image: all at random, nothing fits.
 rng = np.random.default_rng(0)
@@ -27,24 +28,7 @@ factor = groma.LineReprojection(
 )
 
 
-def linearize(factor, variables):
-    """Return the residuals (N, m) and, for each variable, the Jacobian (N, m, d) by its minimal increment."""
-    references = factor.references()
-    groups = [variables[ref.group] for _, ref in references]
-    # One record per factor: the blocks side by side, in factor coordinates, and the residual in the last column.
-    begin = np.cumsum([0, *(group.manifold.factor_columns for group in groups)])
-    record = np.zeros((len(factor), factor.residual_size, begin[-1] + 1))
-    inputs = factor.prepare(tuple(group.ambient() for group in groups))
-    factor.linearize(inputs, 0, len(factor), tuple(begin[:-1].tolist()), record)
-    blocks = {}
-    for number, ((slot, ref), group) in enumerate(zip(references, groups, strict=True)):
-        block = record[:, :, begin[number] : begin[number + 1]]
-        basis = group.manifold.basis(group.state)  # of the chart; None is the identity
-        blocks[slot.name] = block if basis is None else block @ basis[ref.index]
-    return record[:, :, -1], blocks
-
-
-residuals, jacobians = linearize(factor, variables)
+residuals, jacobians = residuals_of(factor, variables), jacobians_of(factor, variables)
 print("residuals", residuals.shape, {name: block.shape for name, block in jacobians.items()})
 
 # The same by central differences through the charts.
@@ -55,7 +39,7 @@ for slot, ref in factor.references():
         delta = np.zeros((len(group.state), group.manifold.dof))
         delta[:, k] = step
         sides = [
-            linearize(factor, {**variables, ref.group: groma.Variables(group.manifold, moved)})[0]
+            residuals_of(factor, {**variables, ref.group: groma.Variables(group.manifold, moved)})
             for moved in (group.manifold.retract(group.state, sign * delta) for sign in (1, -1))
         ]
         difference = (sides[0] - sides[1]) / (2 * step)

@@ -6,7 +6,9 @@ the right form and not for the printed one.
 """
 
 import re
+import runpy
 import shlex
+import sys
 from pathlib import Path
 
 import pytest
@@ -42,6 +44,19 @@ def options_of(words: list[str]) -> tuple[str, set[str]]:
         # As in "groma evaluate poses|lines EST REF".
         name, command = f"{name} {word}", command.commands[word.split("|")[0]]
     return name, {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+
+
+def test_array_types_have_short_names_in_the_reference(monkeypatch):
+    pytest.importorskip("sphinx")
+    pytest.importorskip("myst_parser")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # the settings change both, for themselves
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    short = runpy.run_path(str(DOCS / "conf.py"))["_short"]
+    pixels = "ndarray[tuple[Any, ...], dtype[uint8]]"
+    deferred = "~numpy.ndarray[tuple[~typing.Any, ...], ~numpy.dtype[~numpy.float64]]"
+    assert short(f"(image: {pixels} | None) -> {deferred}") == "(image: NDArray[uint8] | None) -> FloatArray"
+    assert short("list[TypeAliasForwardRef('IntArray')]") == "list[IntArray]"
+    assert short("dict[str, float]") == "dict[str, float]"
 
 
 def test_there_are_commands_in_the_pages():

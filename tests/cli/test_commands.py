@@ -3,16 +3,23 @@
 
 import json
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import groma
-from groma.cli._counts import counted
+from groma import _numba_cache
+from groma._counted import counted
+from groma.cli._compilation import Compilation, compilation_time, spent
+from groma.cli._diagnosis import why_steps_ran_out
+from groma.cli._mapping import last_loss
 from groma.cli.main import run
 from groma.errors import ProblemError
+from groma.factors.losses import Cauchy, GemanMcClure, Huber
 from groma.io import read_scene, write_scene
+from groma.pipelines.adjust import LAST_SCALE_SIGMAS, AdjustOptions
 from groma.scene import Relations, compare, synthetic
 
 pytestmark = pytest.mark.kernels
@@ -132,7 +139,6 @@ def test_a_map_is_diagnosed_at_its_own_noise(scenes):
     from types import SimpleNamespace
 
     from groma.cli._mapping import _diagnosis
-    from groma.pipelines.adjust import AdjustOptions
 
     scene = read_scene(scenes / "truth.npz").replace(relations=Relations())  # these have a noise of their own
     weakness = []
@@ -292,6 +298,60 @@ def test_planes_that_match_nothing_have_no_errors(scenes, here, capsys):
     assert "holds no planes" in said.err
 
 
+def test_the_time_to_load_compiled_code_stands_apart(scenes, here, capsys):
+    assert run(["adjust", str(scenes / "points.npz"), "--max-iterations", "2", "--json", "r.json"]) == 0
+    seconds = json.loads((here / "r.json").read_text())["seconds"]
+    assert 0.0 <= seconds["compilation"] <= seconds["total"]
+    assert f"2 steps in {max(seconds['total'] - seconds['compilation'], 0.0):.2f} s" in capsys.readouterr().out
+
+
+def test_compilation_is_measured():
+    numba = pytest.importorskip("numba")
+    if numba.config.DISABLE_JIT:
+        pytest.skip("nothing is compiled")
+    with compilation_time() as nothing:
+        pass
+    with compilation_time() as something:
+        numba.njit(lambda x: x + 1.0)(1.0)
+    assert nothing == Compilation(0.0, False) and something.seconds > 0.0
+    assert spent(1.5, 1.25, compiled=False) == "0.25 s, and 1.25 s to load compiled code"
+    assert spent(1.5, 1.25, compiled=True) == "0.25 s, and 1.25 s to compile"
+    assert spent(1.5, 0.0, compiled=False) == "1.50 s"
+
+
+def test_compiling_is_told_from_loading(monkeypatch):
+    for name, told in (("loaded", False), ("compiled", True), ("unsaved", True)):
+        with compilation_time() as compilation:
+            monkeypatch.setattr(_numba_cache.counts, name, getattr(_numba_cache.counts, name) + 1)
+        assert compilation.compiled == told
+
+
+def test_steps_that_run_out_along_what_is_open_say_so(here, capsys):
+    """Three cameras with calibrations of their own and 19 observations: the steps follow a valley of calibrations."""
+    source = str(Path(__file__).parents[1] / "data" / "bal" / "dubrovnik-3-7-pre.txt")
+    assert run(["adjust", source, "--max-iterations", "30", "--json", "r.json", "--report", "p.html"]) == 0
+    report = json.loads((here / "r.json").read_text())
+    assert report["termination"] == "max_iterations"
+    ran_out = [
+        text for text in report["warnings"] if "ran out where the data leave cameras or calibrations open" in text
+    ]
+    assert len(ran_out) == 1
+    assert f"warning: {ran_out[0]}" in capsys.readouterr().err
+    assert ran_out[0] in (here / "p.html").read_text()
+    # Who asks for three steps gets three; and nothing is said where everything is determined.
+    assert run(["adjust", source, "--max-iterations", "3", "--json", "-"]) == 0
+    assert "ran out" not in str(json.loads(capsys.readouterr().out)["warnings"])
+    slow = {"termination": "max_iterations", "history": report["history"], "diagnosis": {"num_open_directions": 0}}
+    assert why_steps_ran_out(slow) == []
+    assert why_steps_ran_out(slow | {"diagnosis": {"num_open_directions": 2}}) == ran_out
+
+
+def test_a_map_is_diagnosed_with_its_last_loss():
+    assert last_loss(AdjustOptions(loss="cauchy", loss_scale=4.0)) == Cauchy(4.0)
+    assert last_loss(AdjustOptions(loss="huber")) == Huber(1.0)
+    assert last_loss(AdjustOptions()) == GemanMcClure(LAST_SCALE_SIGMAS)
+
+
 def test_counts_are_words():
     assert [counted(count, "images") for count in (0, 1, 22106)] == ["0 images", "1 image", "22,106 images"]
 
@@ -314,6 +374,14 @@ def test_convert(scenes, here, name, capsys):
     assert run(["convert", str(scenes / "points.npz"), name, "--json", "-"]) == 0
     numbers = json.loads(capsys.readouterr().out)
     assert numbers["num_points"] == read_scene(here / name).num_points
+
+
+def test_geometry_holds_no_photographs(scenes, here, capsys):
+    scene = read_scene(scenes / "start.npz")
+    for name in ("out.ply", "out.obj"):
+        assert run(["convert", str(scenes / "start.npz"), name]) == 0
+        said = capsys.readouterr().out
+        assert said == f"Wrote {name}: {scene.num_points} points, {scene.num_lines} lines, 1 plane\n"
 
 
 def test_evaluate_poses(scenes, here, capsys):

@@ -158,6 +158,7 @@ def test_only_a_few_frames_are_read_ahead_and_threads_end(tum):
     [
         ("50 51 32 24", [50, 51, 32.5, 24.5]),
         ([50, 51, 32, 24], [50, 51, 32.5, 24.5]),
+        ([[50, 0, 32], [0, 51, 24], [0, 0, 1]], [50, 51, 32.5, 24.5]),
         ("1 PINHOLE 64 48 50 51 32 24", [50, 51, 32, 24]),
         ("SIMPLE_PINHOLE 64 48 50 32 24", [50, 50, 32, 24]),
         (SequenceCamera("PINHOLE", np.array([50.0, 51, 32, 24]), 64, 48), [50, 51, 32, 24]),
@@ -186,11 +187,45 @@ def test_matrix_file(tum):
         ("1 PINHOLE 640 480 500 500 320 240", "for images of"),
         ("-50 51 32 24", "positive"),
         ("missing.txt", "Cannot read"),
+        ("PINHOLE 64 48 a 51 32 24", "not a camera"),
+        ("PINHOLE wide 48 50 51 32 24", "not a camera"),
+        ([50, [51], 32, 24], "not a camera"),
     ],
 )
 def test_cameras_that_are_refused(tum, camera, words):
     with pytest.raises(InputError, match=words):
         open_sequence(tum, camera=camera)
+
+
+def test_a_camera_takes_lists_and_keeps_an_array_of_its_own():
+    params = np.array([50.0, 51.0, 32.0, 24.0])
+    camera = SequenceCamera("PINHOLE", params, 64, 48)
+    params[0] = 0.0
+    assert camera.params[0] == 50.0
+    np.testing.assert_array_equal(SequenceCamera("PINHOLE", [50, 51, 32, 24], 64, 48).params, camera.params)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ("PINHOLE", [50, 51, 32], 64, 48),
+            r"PINHOLE takes 4 finite numbers \(fx, fy, cx, cy\); got \[50.0",
+        ),
+        (("PINHOLE", [50, 51, 32, 24, 0], 64, 48), "takes 4 finite numbers"),
+        (("OPENCV", [50, 51, 32, 24], 64, 48), "takes 8 finite numbers"),
+        (("PINHOLE", [50, np.nan, 32, 24], 64, 48), "takes 4 finite numbers"),
+        (("PINHOLE", None, 64, 48), "takes 4 finite numbers"),
+        (("PINHOLE", "wide", 64, 48), "could not convert"),
+        (("PINHOLE", [50, -51, 32, 24], 64, 48), "focal lengths must be positive"),
+        (("CIRCLE", [50, 51, 32, 24], 64, 48), "must be one of"),
+        (("PINHOLE", [50, 51, 32, 24], 64, 0), "width and height must be positive"),
+        (("PINHOLE", [50, 51, 32, 24], 64, 48, 0.0), "baseline must be positive"),
+    ],
+)
+def test_a_camera_of_a_sequence_is_checked(arguments, words):
+    with pytest.raises(InputError, match=words):
+        SequenceCamera(*arguments)
 
 
 def blob_image(pixels, size):

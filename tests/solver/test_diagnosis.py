@@ -380,3 +380,19 @@ def test_a_camera_with_wrong_pixels_stands_out():
     assert found[0].indices == (3,)
     assert "image 3.png" in found[0].sentence
     assert "Wrong matches" in found[0].sentence
+
+
+def test_large_counts_have_separators_and_names_have_none():
+    """Of 1,300 points, 1,100 are seen once; point 1500 is a name, not a count."""
+    cloud = np.random.default_rng(2).uniform(-1.5, 1.5, (1300, 3))
+    pairs = [(k, 0) for k in range(1100)] + [(k, c) for k in range(1100, 1300) for c in range(3)]
+    diagnosis = diagnose(problem_of(RING, cloud, point_obs=pairs, held=True), lambda group, i: f"point {1500 + i}")
+    found = [finding for finding in diagnosis.findings if finding.kind == "point_seen_once"]
+    assert "1,100 of 1,300 points are seen by one camera only" in found[0].sentence
+    assert "(points 1500, 1501, 1502, 1503, 1504 and 1,095 more)" in found[0].sentence
+
+
+def test_what_helps_one_landmark_is_said_of_one():
+    pairs = [(0, 0)] + [(k, c) for k in range(1, 40) for c in range(6)]
+    diagnosis = diagnose(problem_of(RING, CLOUD, point_obs=pairs, held=True))
+    assert "Point 0 is seen by one camera only: its depth is open. Drop it or add views." in diagnosis.sentences

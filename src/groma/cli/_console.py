@@ -39,12 +39,10 @@ class Console:
         if not self.quiet:
             print(f"warning: {text}", file=sys.stderr, flush=True)
 
-    def announce_compilation(self) -> bool:
+    def announce_compilation(self) -> None:
         """Say so when kernels are about to be compiled for the first time, because it takes a while."""
-        fresh = not _cache_is_filled()
-        if fresh:
+        if not _cache_is_filled():
             self.say("First run: compiling for this machine. Later runs start at once.")
-        return fresh
 
     def progress(self) -> "Progress":
         """Return a progress line; silent when not on a terminal."""

@@ -3,13 +3,10 @@
 
 from typing import TYPE_CHECKING
 
+from groma._counted import counted
+
 if TYPE_CHECKING:
     from groma.scene import Scene
-
-
-def counted(count: int, plural: str) -> str:
-    """Return for example ``22,106 points`` or ``1 image``."""
-    return f"{count:,} {plural.removesuffix('s') if count == 1 else plural}"
 
 
 def counts_of(scene: "Scene") -> dict[str, int]:
@@ -23,10 +20,10 @@ def counts_of(scene: "Scene") -> dict[str, int]:
     }
 
 
-def sentence_of(scene: "Scene") -> str:
-    """Return for example ``16 images, 22,106 points, 83,718 observations``."""
-    return ", ".join(
-        counted(count, name.removeprefix("num_"))
-        for name, count in counts_of(scene).items()
-        if count or name == "num_images"
-    )
+def sentence_of(scene: "Scene", geometry: bool = False) -> str:
+    """Return for example ``16 images, 22,106 points, 83,718 observations``; of ``geometry`` without the photographs."""
+    counts = {name.removeprefix("num_"): count for name, count in counts_of(scene).items()}
+    if geometry:
+        counts = {kind: counts[kind] for kind in ("points", "lines", "planes")}
+    said = [counted(count, kind) for kind, count in counts.items() if count or kind == "images"]
+    return ", ".join(said) or "nothing"

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 #: Scenes of more images are diagnosed only when asked for.
 MANY_IMAGES = 300
+#: An adjustment creeps if, after so many accepted steps, one lowers the cost by less than this share.
+CREEPING_STEPS, CREEPING = 10, 0.2
 
 
 def diagnosis_of(
@@ -41,6 +43,24 @@ def diagnosis_of(
     except Exception as error:  # whatever it is, the result of the command is worth more
         console.warn(f"What the data determine could not be found out: {error}")
         return None
+
+
+def why_steps_ran_out(numbers: Mapping[str, Any]) -> list[str]:
+    """Return a sentence for an adjustment that crept along what is open of cameras and calibrations to its last step.
+
+    Along what the data leave open the cost is nearly flat and bent, so steps follow it for long; neither more of them
+    nor a robust loss would make a result that can be relied on.
+    """
+    diagnosis = numbers.get("diagnosis")
+    if numbers["termination"] != "max_iterations" or diagnosis is None or not diagnosis["num_open_directions"]:
+        return []
+    costs = [step["cost"] for step in numbers["history"] if step["accepted"]]
+    if len(costs) < CREEPING_STEPS or costs[-1] < (1.0 - CREEPING) * costs[-2]:
+        return []
+    return [
+        "The steps ran out where the data leave cameras or calibrations open: along these the cost falls slowly, and "
+        "wherever more steps end is one result of many. Hold them, or add data."
+    ]
 
 
 def say_diagnosis(diagnosis: Mapping[str, Any] | None, console: Console) -> None:

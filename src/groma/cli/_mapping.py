@@ -13,13 +13,16 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from groma._counted import counted
 from groma.cli import _output
 from groma.cli._interrupt import INTERRUPTED
 from groma.errors import OutputError
 
 if TYPE_CHECKING:
     from groma.cli._console import Console
+    from groma.factors.losses import Loss
     from groma.frontend.external import ExternalMatches
+    from groma.pipelines.adjust import AdjustOptions
     from groma.pipelines.map import MapOptions, MapResult
     from groma.scene import Scene
     from groma.solver.diagnosis import Diagnosis
@@ -73,12 +76,9 @@ def map_and_write(
     from groma.cli._contributions import describe_contributions
     from groma.cli._diagnosis import diagnosis_of, say_diagnosis
     from groma.cli._interrupt import interruptible
-    from groma.io import write_geometry, write_scene
     from groma.pipelines._stages import has_stages, remove_stages, system_reason
     from groma.pipelines.contributions import contributions as find_contributions
     from groma.pipelines.map import map_images
-    from groma.viz._page_tables import contributions_card
-    from groma.viz.report import write_report
 
     console.announce_compilation()
     work = output.with_name(output.name + ".work")
@@ -94,31 +94,14 @@ def map_and_write(
             flush=True,
         )
         raise typer.Exit(INTERRUPTED) from None
-    scene = result.scene
-    diagnosis = diagnosis_of(scene, lambda: _diagnosis(result), console, diagnose)
+    diagnosis = diagnosis_of(result.scene, lambda: _diagnosis(result), console, diagnose)
     numbers: dict[str, Any] = _numbers(result) | {"diagnosis": diagnosis} | (judge(result) if judge is not None else {})
     if contributions:
         entries = find_contributions(result.before, result.adjusted_with, truth)
         numbers["contributions"] = [entry.to_dict() for entry in entries]
     try:
         with _output.atomic_output(output, force, work) as draft:
-            write_scene(scene, draft, format="colmap")
-            write_scene(scene, draft / "scene.npz")
-            write_geometry(scene, draft)
-            write_report(
-                draft / "report.html",
-                result.before,
-                scene,
-                result.report,
-                images,
-                title,
-                fates=result.fates,
-                explanation=result.explanation,
-                warnings=result.warnings,
-                diagnosis=diagnosis,
-                cards=contributions_card(numbers.get("contributions")),
-            )
-            _output.write_json(str(draft / "summary.json"), numbers)
+            _write_results(draft, result, numbers, images, title)
     except OutputError as error:
         raise OutputError(
             f"Cannot write {output}: {system_reason(error)}. Finished stages are kept in {work}: the same command goes "
@@ -135,6 +118,31 @@ def map_and_write(
     for sentence in result.warnings:
         console.warn(sentence)
     return numbers
+
+
+def _write_results(folder: Path, result: MapResult, numbers: dict[str, Any], images: Path, title: str) -> None:
+    """Write everything that the folder of a map holds."""
+    from groma.io import write_geometry, write_scene
+    from groma.viz._page_tables import contributions_card
+    from groma.viz.report import write_report
+
+    write_scene(result.scene, folder, format="colmap")
+    write_scene(result.scene, folder / "scene.npz")
+    write_geometry(result.scene, folder)
+    write_report(
+        folder / "report.html",
+        result.before,
+        result.scene,
+        result.report,
+        images,
+        title,
+        fates=result.fates,
+        explanation=result.explanation,
+        warnings=result.warnings,
+        diagnosis=numbers["diagnosis"],
+        cards=contributions_card(numbers.get("contributions")),
+    )
+    _output.write_json(str(folder / "summary.json"), numbers)
 
 
 def _numbers(result: MapResult) -> dict[str, Any]:
@@ -154,10 +162,8 @@ def _numbers(result: MapResult) -> dict[str, Any]:
 
 
 def _diagnosis(result: MapResult) -> Diagnosis:
-    """Diagnose a map at the noise and with the kind of loss of its last adjustment."""
-    from groma.factors.losses import GemanMcClure
+    """Diagnose a map at the noise and with the loss of its last adjustment."""
     from groma.pipelines._assemble import AssemblyOptions
-    from groma.pipelines.adjust import LAST_SCALE_SIGMAS
     from groma.pipelines.diagnosis import diagnose_scene
 
     told = result.adjusted_with
@@ -167,13 +173,22 @@ def _diagnosis(result: MapResult) -> Diagnosis:
         structure_sigma_px=told.structure_sigma_px,
         refine_poses=told.refine_poses,
         refine_intrinsics=bool(told.refine_intrinsics),
-        loss=GemanMcClure(LAST_SCALE_SIGMAS),
+        loss=last_loss(told),
     )
     return diagnose_scene(result.scene, assembly)
 
 
+def last_loss(told: AdjustOptions) -> Loss:
+    """Return the loss that an adjustment of photographs ends with."""
+    from groma.factors.losses import GemanMcClure, loss
+    from groma.pipelines.adjust import LAST_SCALE_SIGMAS
+
+    if told.loss == "auto":
+        return GemanMcClure(LAST_SCALE_SIGMAS)
+    return loss(told.loss, 1.0 if told.loss_scale is None else told.loss_scale)
+
+
 def _sentences(result: MapResult, verbose: bool = False) -> list[str]:
-    from groma.cli._counts import counted
     from groma.cli._numbers import describe_relations
 
     scene = result.scene

@@ -4,7 +4,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from groma.cli._counts import counted
+from groma._counted import counted
+from groma.cli._compilation import spent
 
 _SIGMAS = (
     ("centres", "center", ""),
@@ -14,9 +15,11 @@ _SIGMAS = (
     ("line directions", "line_direction_deg", "°"),
     ("plane normals", "plane_normal_deg", "°"),
 )
+#: Times in reports that are not of one stage.
+_NO_STAGES = ("total", "compilation")
 
 
-def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, fresh: bool = False) -> list[str]:
+def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, compiled: bool = False) -> list[str]:
     """Return what a reader wants to know after an adjustment, most important first.
 
     Parameters
@@ -27,8 +30,8 @@ def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, f
         Why the solver stopped.
     verbose : bool
         Add the relations between landmarks and the seconds per stage.
-    fresh : bool
-        Say that the time includes compilation.
+    compiled : bool
+        Whether code was compiled, and not only loaded.
     """
     kinds = ("images", "points", "lines", "planes", "observations")
     lines = [", ".join(counted(numbers[f"num_{kind}"], kind) for kind in kinds if numbers.get(f"num_{kind}"))]
@@ -40,12 +43,12 @@ def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, f
     if grew and numbers["final_cost"] < numbers["initial_cost"]:
         lines.append("  The rms counts wrong matches in full and may grow; the robust cost, which doubts them, fell.")
     seconds = numbers["seconds"]
-    compiled = " (with compilation)" if fresh else ""
-    lines.append(f"  {counted(numbers['iterations'], 'steps')} in {seconds['total']:.2f} s{compiled}. {sentence}")
+    time = spent(seconds["total"], seconds.get("compilation", 0.0), compiled)
+    lines.append(f"  {counted(numbers['iterations'], 'steps')} in {time}. {sentence}")
     if verbose:
         lines += describe_relations(numbers.get("relations") or {})
-        stages = ", ".join(f"{name} {value:.3f} s" for name, value in seconds.items() if name != "total")
-        lines.append(f"  stages: {stages}")
+        stages = ", ".join(f"{name} {value:.3f} s" for name, value in seconds.items() if name not in _NO_STAGES)
+        lines.append(f"  stages: {stages} (compiled code included)")
     return lines
 
 

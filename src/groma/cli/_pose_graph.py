@@ -4,8 +4,9 @@
 from pathlib import Path
 from typing import Any
 
+from groma._counted import counted
+from groma.cli._compilation import compilation_time, spent
 from groma.cli._console import Console
-from groma.cli._counts import counted
 from groma.errors import InputError
 
 
@@ -43,8 +44,8 @@ def adjust_pose_graph_file(
 
     graph = read_g2o(source)
     settings = PoseGraphOptions(**options)
-    fresh = console.announce_compilation()
-    with console.progress() as progress:
+    console.announce_compilation()
+    with compilation_time() as compilation, console.progress() as progress:
         result = adjust_pose_graph(graph, settings, progress)
     if output is not None:
         write_g2o(result.graph, output, force)
@@ -52,9 +53,8 @@ def adjust_pose_graph_file(
     parts = int(graph.parts().max()) + 1
     console.say(f"{counted(len(graph.poses), 'poses')}, {counted(len(graph.motions), 'motions')} between them")
     console.say(f"  {'cost':<16}{report.initial_cost:>10.5g}     ->{report.final_cost:>9.5g}")
-    compiled = " (with compilation)" if fresh else ""
-    seconds = report.seconds["total"]
-    console.say(f"  {counted(report.iterations, 'steps')} in {seconds:.2f} s{compiled}. {report.termination.sentence}")
+    time = spent(report.seconds["total"], compilation.seconds, compilation.compiled)
+    console.say(f"  {counted(report.iterations, 'steps')} in {time}. {report.termination.sentence}")
     if len(result.doubtful):
         console.say(f"  {counted(len(result.doubtful), 'motions')} beyond the scale of the loss")
     warnings = list(report.warnings)
@@ -75,7 +75,7 @@ def adjust_pose_graph_file(
         "termination": report.termination.key,
         "converged": report.converged,
         "linear_solver": report.linear_solver,
-        "seconds": dict(report.seconds),
+        "seconds": {**report.seconds, "compilation": compilation.seconds},
         "chi_square": {"before": float(result.chi_square_before.sum()), "after": float(result.chi_square.sum())},
         "doubtful_motions": [
             [int(ids[graph.motions.first_idx[row]]), int(ids[graph.motions.second_idx[row]])] for row in result.doubtful

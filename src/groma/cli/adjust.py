@@ -2,19 +2,15 @@
 """``groma adjust``: bundle adjustment of a COLMAP model, a BAL file or a groma archive; of a pose graph, too."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from groma.cli import _options
-from groma.errors import InputError, ProblemError
-
-if TYPE_CHECKING:
-    from groma.pipelines.adjust import AdjustResult
-    from groma.scene import Scene
+from groma.cli._adjusting import CovarianceGauge, Wanted, adjust_and_write
+from groma.errors import InputError
 
 LinearSolver = Literal["auto", "dense", "sparse", "pcg"]
-CovarianceGauge = Literal["auto", "inner", "held"]
 
 
 def adjust(
@@ -145,13 +141,7 @@ def adjust(
         _output.write_json(json_target, numbers_of_graph, force)
         return
 
-    from groma.cli._contributions import describe_contributions
-    from groma.cli._diagnosis import diagnosis_of, say_diagnosis
-    from groma.cli._numbers import describe, describe_uncertainty
-    from groma.io import check_target, read_scene, structures_of, write_scene
     from groma.pipelines.adjust import AdjustOptions
-    from groma.pipelines.adjust import adjust as run_adjust
-    from groma.pipelines.diagnosis import diagnose_scene
 
     chosen = {
         "loss_scale": loss_scale,
@@ -171,77 +161,16 @@ def adjust(
         linear_solver=linear_solver,
         **{name: value for name, value in chosen.items() if value is not None},  # type: ignore[arg-type]
     )
-    before = read_scene(source)
-    if output is not None:
-        check_target(before, output)
-    true = None if truth is None else read_scene(truth)
-    fresh = console.announce_compilation()
-    with console.progress() as progress:
-        result = run_adjust(before, options, progress)
-    numbers: dict[str, Any] = result.report.to_dict()
-    if contributions:
-        from groma.pipelines.contributions import contributions as find_contributions
-
-        numbers["contributions"] = [entry.to_dict() for entry in find_contributions(before, options, true)]
-    numbers["diagnosis"] = diagnosis_of(
-        result.scene, lambda: diagnose_scene(result.scene, problem=result.problem), console, diagnosis
+    wanted = Wanted(
+        output=output,
+        page=page,
+        covariance=covariance,
+        gauge=covariance_gauge,
+        sigma0=sigma0,
+        diagnosis=diagnosis,
+        contributions=contributions,
+        truth=truth,
+        json_target=json_target,
+        force=force,
     )
-
-    if output is not None:
-        write_scene(result.scene, output, force=force, like=structures_of(source))
-    if page is not None:
-        _write_page(page, before, result, numbers, f"Adjustment of {source.absolute().name}", force)
-    failure = None
-    if covariance is not None:
-        try:
-            numbers["uncertainty"] = _write_covariances(covariance, result, covariance_gauge, sigma0, force)
-        except ProblemError as error:  # raised at the end, when all else is written and said
-            failure = error
-    said = describe(numbers, result.report.termination.sentence, verbose=console.verbose, fresh=fresh)
-    said += describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else []
-    said += describe_contributions(numbers.get("contributions", []))
-    for line in said:
-        console.say(line)
-    say_diagnosis(numbers["diagnosis"], console)
-    for sentence in result.report.warnings:
-        console.warn(sentence)
-    for path in (output, page, covariance if failure is None else None):
-        if path is not None:
-            console.say(f"Wrote {path}")
-    if output is None and page is None and covariance is None and json_target is None:
-        console.say("No -o given: the adjusted scene was not written.")
-    _output.write_json(json_target, {**numbers, "warnings": list(result.report.warnings)}, force)
-    if failure is not None:
-        raise failure
-
-
-def _write_page(
-    page: Path, before: "Scene", result: "AdjustResult", numbers: dict[str, Any], title: str, force: bool
-) -> None:
-    """Write the HTML page of an adjustment."""
-    from groma.cli import _output
-    from groma.viz._page_tables import contributions_card
-    from groma.viz.report import write_report
-
-    with _output.atomic_output(page, force) as draft:
-        write_report(
-            draft,
-            before,
-            result.scene,
-            result.report,
-            title=title,
-            diagnosis=numbers["diagnosis"],
-            cards=contributions_card(numbers.get("contributions")),
-        )
-
-
-def _write_covariances(
-    path: Path, result: "AdjustResult", gauge: CovarianceGauge, sigma0: float, force: bool
-) -> dict[str, Any]:
-    """Write the covariances of an adjusted scene and return their summary."""
-    from groma.cli._covariance import write_covariances
-    from groma.pipelines.uncertainty import uncertainty
-
-    found = uncertainty(result.scene, gauge=gauge, sigma0=sigma0, problem=result.problem)
-    write_covariances(path, result.scene, found, force)
-    return found.to_dict()
+    adjust_and_write(console, source, options, wanted)

@@ -37,5 +37,5 @@ def convert(
 
     scene = read_scene(source)
     write_scene(scene, target, force=force, like=structures_of(source))
-    console.say(f"Wrote {target}: {sentence_of(scene)}")
+    console.say(f"Wrote {target}: {sentence_of(scene, geometry=target.suffix.lower() in ('.ply', '.obj'))}")
     _output.write_json(json_target, {"input": str(source), "output": str(target), **counts_of(scene)}, force)

@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 import typer
 
+from groma._counted import counted
 from groma.cli import _options, _output
 from groma.cli._console import Console
-from groma.cli._counts import counted
 from groma.cli._input import check_inputs
 from groma.errors import InputError
 
@@ -198,8 +198,8 @@ def trajectory(
     )
     applied = {"se3": "rotation and translation", "sim3": f"similarity of scale {scores.similarity.scale:.6g}"}
     console.say(
-        f"{counted(scores.num_poses, 'poses')} associated of {scores.num_estimate} and {scores.num_reference}, path of "
-        f"{scores.path_length:.6g} m; alignment: {applied.get(align, 'none')}"
+        f"{counted(scores.num_poses, 'poses')} associated of {scores.num_estimate:,} and {scores.num_reference:,}, "
+        f"path of {scores.path_length:.6g} m; alignment: {applied.get(align, 'none')}"
     )
     step = f"{rpe_delta:g} {rpe_unit.removesuffix('s') if rpe_delta == 1 else rpe_unit}"
     row("absolute, position", scores.ate, "m")

@@ -2,12 +2,15 @@
 """``groma selfcheck``: every derivative, and the covariances, checked on this machine."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from groma.cli import _options
 from groma.errors import InputError
+
+if TYPE_CHECKING:
+    from groma.cli._console import Console
 
 
 def selfcheck(
@@ -49,7 +52,7 @@ def selfcheck(
         raise typer.Exit(1)
 
 
-def _check_derivatives(console, golden: Path | None, seed: int) -> tuple[bool, dict]:
+def _check_derivatives(console: "Console", golden: Path | None, seed: int) -> tuple[bool, dict[str, Any]]:
     from groma.factors._selfcheck import selfcheck as run_selfcheck
 
     outcome = run_selfcheck(golden, seed)
@@ -62,7 +65,7 @@ def _check_derivatives(console, golden: Path | None, seed: int) -> tuple[bool, d
     return outcome.passed, outcome.to_dict()
 
 
-def _check_covariances(console, runs: int, seed: int) -> tuple[bool, dict]:
+def _check_covariances(console: "Console", runs: int, seed: int) -> tuple[bool, dict[str, Any]]:
     from groma.pipelines.consistency import consistency
 
     outcome = consistency(runs, seed)

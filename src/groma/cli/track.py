@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
+from groma._counted import counted
 from groma.cli import _options
 
 if TYPE_CHECKING:
@@ -173,11 +174,9 @@ def _scores(result: "TrackResult", frames: "Sequence") -> "tuple[TrajectoryScore
 
 def _tell(console: "Console", result: "TrackResult", scores: dict[str, Any], warnings: list[str]) -> None:
     statistics = result.statistics
-    statuses = ", ".join(f"{count} {status}" for status, count in sorted(statistics["frames"].items()))
-    console.say(
-        f"Frames: {statuses}; {statistics['keyframes']} keyframes, {statistics['points']:,} points, "
-        f"{statistics['lines']:,} lines, {statistics['planes']} planes, {statistics['loops']} loops"
-    )
+    statuses = ", ".join(f"{count:,} {status}" for status, count in sorted(statistics["frames"].items()))
+    kinds = ("keyframes", "points", "lines", "planes", "loops")
+    console.say(f"Frames: {statuses}; {', '.join(counted(statistics[kind], kind) for kind in kinds)}")
     total = statistics["milliseconds"].get("total")
     if total:
         console.say(f"Time per frame: median {total['median']:.1f} ms, 95 % below {total['p95']:.1f} ms")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """``groma warmup``: compile everything once, so that no later command waits for the compiler."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -47,7 +47,7 @@ def warmup(
             "No folder for compiled functions can be written, so nothing would be kept. Set NUMBA_CACHE_DIR to one."
         )
     missing = wanted if again else tuple(name for name in wanted if not _warmup.is_ready(name))
-    numbers = {"parts": list(wanted), "compiled": 0, "loaded": 0, "unsaved": 0}
+    numbers: dict[str, Any] = {"parts": list(wanted), "compiled": 0, "loaded": 0, "unsaved": 0}
     if missing:
         with console.stages() as progress:
             numbers |= _warmup.run(missing, progress)
@@ -61,7 +61,7 @@ def warmup(
         raise typer.Exit(1)
 
 
-def _sentences(numbers: dict, ran: bool) -> list[str]:
+def _sentences(numbers: dict[str, Any], ran: bool) -> list[str]:
     parts = ", ".join(numbers["parts"])
     if not ran:
         return [f"Everything is there for {parts} ({numbers['seconds']:.1f} s).", f"Folder: {numbers['folder']}"]

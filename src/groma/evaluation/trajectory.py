@@ -24,6 +24,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.evaluation.alignment import align_poses
+from groma.evaluation.poses import rotation_angle
 from groma.geometry import quaternion, se3
 from groma.io.trajectories import Trajectory
 from groma.scene import Similarity
@@ -89,7 +90,7 @@ class TrajectoryScores:
     errors: FloatArray = field(repr=False)
 
     def to_dict(self) -> dict[str, object]:
-        """Plain Python for JSON, without the arrays."""
+        """Return the scores for a machine-readable report, without the arrays."""
         result: dict[str, object] = {}
         for name in ("ate", "rotation_deg", "rpe_translation", "rpe_rotation_deg"):
             spread: Spread | None = getattr(self, name)
@@ -160,7 +161,7 @@ def score_trajectory(
     aligned = apply_similarity(similarity, poses)
 
     errors = np.linalg.norm(aligned[:, 4:] - truth[:, 4:], axis=1)
-    angles = _angles(quaternion.multiply(quaternion.conjugate(truth[:, :4]), aligned[:, :4]))
+    angles = rotation_angle(aligned[:, :4], truth[:, :4])
     first, second = _steps(times, aligned[:, 4:], float(rpe_delta), rpe_unit)
     translation, rotation = _relative_errors(aligned, truth, first, second)
     drift, turn, lengths, path = _drift(aligned, truth)
@@ -205,8 +206,7 @@ def associate(
     """
     a, b = np.asarray(first, float), np.asarray(second, float)
     if len(b) > len(a):
-        i, j = _nearest(a, b, max_time_difference)
-        return i, j
+        return _nearest(a, b, max_time_difference)
     j, i = _nearest(b, a, max_time_difference)
     return i, j
 
@@ -251,11 +251,6 @@ def _no_match(estimate: Trajectory, reference: Trajectory, limit: float) -> str:
     )
 
 
-def _angles(turns: FloatArray) -> FloatArray:
-    """Angles of rotations (N, 4), radians, accurate near zero."""
-    return 2.0 * np.arctan2(np.linalg.norm(turns[:, :3], axis=1), np.abs(turns[:, 3]))
-
-
 def _steps(times: FloatArray, centers: FloatArray, delta: float, unit: StepUnit) -> tuple[IntArray, IntArray]:
     """Return the first and last poses of steps that do not overlap."""
     if unit == "frames":
@@ -284,9 +279,7 @@ def _relative_errors(
     ours = se3.compose(se3.inverse(poses[first]), poses[second])
     theirs = se3.compose(se3.inverse(truth[first]), truth[second])
     # The rotation before it does not change the length of the translation.
-    return np.linalg.norm(ours[:, 4:] - theirs[:, 4:], axis=1), _angles(
-        quaternion.multiply(quaternion.conjugate(theirs[:, :4]), ours[:, :4])
-    )
+    return np.linalg.norm(ours[:, 4:] - theirs[:, 4:], axis=1), rotation_angle(ours[:, :4], theirs[:, :4])
 
 
 def _drift(poses: FloatArray, truth: FloatArray) -> tuple[float | None, float | None, tuple[float, ...], float]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Residuals of a group of factors at the states of a problem, outside of a solve."""
+"""Residuals and Jacobians of a group of factors at the states of a problem, outside of a solve."""
 
 from __future__ import annotations
 
@@ -24,6 +24,43 @@ def residuals_of(factor: Factor, variables: Mapping[str, Variables]) -> FloatArr
     return residuals
 
 
+def jacobians_of(factor: Factor, variables: Mapping[str, Variables]) -> dict[str, FloatArray]:
+    r"""Return the derivatives of :func:`residuals_of` by the minimal increments of the variables.
+
+    .. math:: J = \left.\frac{\partial\, r(x \boxplus \delta)}{\partial \delta}\right|_{\delta = 0},
+
+    where :math:`\boxplus` is ``retract`` of the chart of each group.
+
+    Parameters
+    ----------
+    factor : Factor
+        N factors of one type with m residuals each.
+    variables : mapping
+        The groups of variables that it refers to, such as ``Problem.variables``.
+
+    Returns
+    -------
+    dict
+        For every slot of the factor that is present ("pose", "point", ...), in their order, the blocks (N, m, dof):
+        the derivative of each residual by the variable that it refers to. Like the residuals, they are not whitened
+        and without the loss; variables held constant have theirs too; degenerate factors have zeros. Where two slots
+        refer to the same variable, its derivative is the sum of both blocks.
+    """
+    references = factor.references()
+    groups = [variables[ref.group] for _, ref in references]
+    begin = np.cumsum([0, *(group.manifold.factor_columns for group in groups)])
+    record = np.zeros((len(factor), factor.residual_size, begin[-1] + 1))
+    if len(factor):
+        inputs = factor.prepare(tuple(group.ambient() for group in groups))
+        factor.linearize(inputs, 0, len(factor), tuple(begin[:-1].tolist()), record)
+    blocks: dict[str, FloatArray] = {}
+    for (slot, ref), group, first, end in zip(references, groups, begin[:-1], begin[1:], strict=True):
+        basis = group.manifold.basis(group.state)  # from factor coordinates to the chart; None is the identity
+        block = record[:, :, first:end]
+        blocks[slot.name] = block.copy() if basis is None else block @ basis[ref.index]
+    return blocks
+
+
 def squared_norms(factor: Factor, variables: Mapping[str, Variables]) -> FloatArray:
     r"""Return :math:`\lVert \Sigma^{-1/2} r \rVert^2` (N,) of a group of factors, without the loss."""
     residuals = residuals_of(factor, variables)
@@ -34,4 +71,4 @@ def squared_norms(factor: Factor, variables: Mapping[str, Variables]) -> FloatAr
     return np.einsum("ni,ni->n", residuals, residuals) * information**2
 
 
-__all__ = ["residuals_of", "squared_norms"]
+__all__ = ["jacobians_of", "residuals_of", "squared_norms"]

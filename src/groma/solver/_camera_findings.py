@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from groma._counted import counted
 from groma._typing import BoolArray, FloatArray
 from groma.solver._findings import Finding, few
 from groma.solver._inspection import Inspection
@@ -31,12 +32,12 @@ def camera_findings(inspection: Inspection, reported: set[tuple[str, int]]) -> l
         found = [
             _suspicious(
                 inspection, "camera_residuals", name, seen & (rms > LARGE * usual) & (rms > 1.5),
-                rms / max(usual, 1e-300), "residuals {:.0f} times the usual",
+                rms / max(usual, 1e-300), "residuals {:,.0f} times the usual",
                 "Wrong matches, or a wrong pose or calibration.",
             ),
             _suspicious(
                 inspection, "camera_few_observations", name, little & ~known, rows,
-                f"{{:.0f}} measured numbers; usual are {typical:.0f}", "Add matches.",
+                f"{{:,.0f}} measured numbers; usual are {typical:,.0f}", "Add matches.",
             ),
             _faint(inspection, name, known | little),
         ]  # fmt: skip
@@ -55,7 +56,7 @@ def _faint(inspection: Inspection, name: str, known: BoolArray) -> Finding | Non
     usual = float(np.median(sigma[free]))
     return _suspicious(
         inspection, "camera_faint", name, ~known & free & (sigma > FAINT * usual), sigma / usual,
-        "{:.0f} times less certain than the rest", "What it sees is little, far away or all on one side.",
+        "{:,.0f} times less certain than the rest", "What it sees is little, far away or all on one side.",
     )  # fmt: skip
 
 
@@ -67,7 +68,7 @@ def _suspicious(
         return None
     bad = bad[np.argsort(-np.abs(amount[bad] - np.median(amount)), kind="stable")]
     what = few([f"{inspection.names(name, int(i))} ({words.format(amount[i])})" for i in bad], 3)
-    text = f"{len(bad)} camera{'s' if len(bad) > 1 else ''} stand{'s' if len(bad) == 1 else ''} out: {what}. {remedy}"
+    text = f"{counted(len(bad), 'cameras')} stand{'s' if len(bad) == 1 else ''} out: {what}. {remedy}"
     return Finding(kind, "warning", text, name, tuple(map(int, bad)), {"worst": float(amount[bad[0]])})
 
 

@@ -45,7 +45,7 @@ def few(parts: list[str], most: int = 5) -> str:
     """Return the first of a list in words, and how many more there are."""
     if len(parts) <= most:
         return listing(parts)
-    return f"{', '.join(parts[:most])} and {len(parts) - most} more"
+    return f"{', '.join(parts[:most])} and {len(parts) - most:,} more"
 
 
 def first_upper(text: str) -> str:

@@ -59,12 +59,14 @@ def landmark_findings(
             return
         names = [inspection.names(name, int(i)) for i in bad[:1]]
         if len(bad) == 1:
-            text = f"{first_upper(names[0])} {one}"
+            text, remedy = f"{first_upper(names[0])} {one}", _of_one(remedy)
         elif len(bad) > max(MOST * len(which), 1):
-            text = f"{'All' if len(bad) == len(which) else 'Nearly all'} {kind}s ({len(bad)} of {len(which)}) {many}"
+            text = (
+                f"{'All' if len(bad) == len(which) else 'Nearly all'} {kind}s ({len(bad):,} of {len(which):,}) {many}"
+            )
         else:
             listed = few([inspection.names(name, int(i)).removeprefix(f"{kind} ") for i in bad])
-            text = f"{len(bad)} of {len(which)} {kind}s {many} ({kind}s {listed})"
+            text = f"{len(bad):,} of {len(which):,} {kind}s {many} ({kind}s {listed})"
         values = {"share": len(bad) / len(which), "weakest": float(weakness[bad].max())}
         findings.append(Finding(code, severity, f"{text}. {remedy}", name, tuple(int(i) for i in bad), values))
 
@@ -175,9 +177,16 @@ def _only_turning(kind: str, seen: Observers, rest: BoolArray, shaky: BoolArray)
     return f"{text} Add images taken from elsewhere.", spread
 
 
+def _of_one(remedy: str) -> str:
+    """Return a remedy for several landmarks as one for a single landmark."""
+    for several, single in (("them", "it"), ("their", "its"), ("they count", "it counts")):
+        remedy = remedy.replace(several, single)
+    return remedy
+
+
 def _so_many(kind: str, affected: int, count: int) -> str:
     """Return "all 80 points" or "43 of 80 points"."""
-    return f"all {count} {kind}s" if affected == count else f"{affected} of {count} {kind}s"
+    return f"all {count:,} {kind}s" if affected == count else f"{affected:,} of {count:,} {kind}s"
 
 
 def _spread(places: FloatArray) -> float:

@@ -44,10 +44,10 @@ def separate_parts(inspection: Inspection) -> list[Finding]:
         sizes = np.bincount(label[first[c] : first[c + 1]][seen])
         sizes = np.sort(sizes[sizes > 0])[::-1]
         if len(sizes) > 1:
+            of = few([f"{n:,}" for n in sizes])
             text = (
-                f"The cameras fall into {len(sizes)} groups that share no landmark (of "
-                f"{few([str(n) for n in sizes])} cameras): each can move, turn and scale on its own. Add matches "
-                "between them."
+                f"The cameras fall into {len(sizes):,} groups that share no landmark (of {of} cameras): each can move, "
+                "turn and scale on its own. Add matches between them."
             )
             findings.append(Finding("separate_parts", "problem", text, group, values={"parts": float(len(sizes))}))
     return findings
@@ -174,7 +174,7 @@ def _whole_modes(inspection: Inspection, excursions: dict[str, FloatArray], whol
         if inspection.problem.variables[name].manifold.kind == "intrinsics":
             words = parameter_names(inspection, name) or tuple(f"parameter {k}" for k in range(len(size)))
             parameters += [words[k] for k in np.flatnonzero(size > SHARE) if words[k] not in parameters]
-    ways = f"in {count} ways" if count > 1 else "in one way"
+    ways = f"in {count:,} ways" if count > 1 else "in one way"
     if parameters:
         text = (
             f"The calibration ({listing(parameters)}) and the shape of the scene make up for each other {ways}: many "

@@ -7,6 +7,7 @@ from collections import defaultdict
 
 import numpy as np
 
+from groma._counted import counted
 from groma._typing import FloatArray
 from groma.cameras import model
 from groma.solver._findings import Finding, few, first_upper
@@ -99,7 +100,7 @@ def _others(inspection: Inspection, name: str, found: list[tuple[int, FloatArray
 
 def _many(inspection: Inspection, code: str, name: str, found: list[tuple[int, FloatArray]], words: str) -> Finding:
     indices = tuple(i for i, _ in found)
-    text = f"{len(found)} {words} ({few([inspection.names(name, i) for i in indices])})."
+    text = f"{len(found):,} {words} ({few([inspection.names(name, i) for i in indices])})."
     return Finding(code, "problem", text, name, indices)
 
 
@@ -136,7 +137,7 @@ def _landmarks_on(inspection: Inspection, name: str, i: int) -> str:
             if mine and other and len(refs) == 2:
                 found |= set(other[0].index[mine[0].index == i].tolist())
         if found:
-            parts.append(f"{len(found)} {kind}{'s' if len(found) > 1 else ''}")
+            parts.append(counted(len(found), f"{kind}s"))
     return listing(parts) if parts else ""
 
 

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from groma._counted import counted
 from groma._typing import BoolArray, FloatArray
 from groma.problem._parallel import Workers
 from groma.problem.lay_out import lay_out
@@ -154,7 +155,7 @@ def _diagnosis(inspection: Inspection, begin: float) -> Diagnosis:
     findings.sort(key=lambda finding: order[finding.severity])
     if words:
         text = (
-            f"The scene as a whole is free in {free} way{'s' if free > 1 else ''}: {listing(words)}. No residual "
+            f"The scene as a whole is free in {counted(free, 'ways')}: {listing(words)}. No residual "
             "changes; hold cameras or add priors where the frame matters."
         )
         findings.append(Finding("free_motions", "note", text, values={"count": float(free)}))

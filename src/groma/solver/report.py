@@ -86,7 +86,7 @@ class SolveReport:
             f"{self.termination.sentence}",
             f"cost {self.initial_cost:.6e} -> {self.final_cost:.6e} in {self.iterations} steps, "
             f"{self.seconds.get('total', 0.0):.3f} s ({self.linear_solver}, {self.threads} thread(s))",
-            f"{self.num_factors} factors, {self.num_residuals} residuals, {self.num_unknowns} unknowns",
+            f"{self.num_factors:,} factors, {self.num_residuals:,} residuals, {self.num_unknowns:,} unknowns",
         ]
         return "\n".join(
             rows + [f"warning: {text}" for text in self.warnings] + [f"note: {text}" for text in self.notes]
@@ -154,15 +154,15 @@ def warn_of_oddities(report: SolveReport) -> None:
     """Put into words what may be wrong."""
     for name, count in report.num_degenerate.items():
         report.warnings.append(
-            f"{count} factor(s) of type {name!r} could not be evaluated (degenerate geometry) and were left out."
+            f"{count:,} factor(s) of type {name!r} could not be evaluated (degenerate geometry) and were left out."
         )
     if report.num_underdetermined_landmarks:
         report.warnings.append(
-            f"{report.num_underdetermined_landmarks} landmark(s) have a direction that the observations do not "
+            f"{report.num_underdetermined_landmarks:,} landmark(s) have a direction that the observations do not "
             "determine; it was left where it was."
         )
     if report.num_residuals < report.num_unknowns:
         report.warnings.append(
-            f"There are fewer residuals ({report.num_residuals}) than unknowns ({report.num_unknowns}): the result is "
+            f"There are fewer residuals ({report.num_residuals:,}) than unknowns ({report.num_unknowns:,}): the result is "
             "one of many. Hold variables constant, add priors or add observations."
         )

@@ -141,7 +141,7 @@ def convergence(history: Sequence[Any], stages: Sequence[Mapping[str, Any]] = ()
         name = "after" if row["accepted"] else "rejected"
         body.append(
             f'<circle class="{name}" cx="{x:.1f}" cy="{y:.1f}" r="4"><title>step {row["iteration"]}: cost '
-            f"{row['cost']:.6g}{'' if row['accepted'] else ', rejected'}</title></circle>"
+            f"{row['cost']:.6g}{'' if row['accepted'] else ', refused'}</title></circle>"
         )
     body.append(line(_LEFT, bottom, WIDTH - _RIGHT, bottom, "axis"))
     body.append(text((_LEFT + WIDTH) / 2, HEIGHT - 5, "step"))

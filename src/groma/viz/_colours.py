@@ -3,11 +3,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.scene.patches import PALETTE
+
+if TYPE_CHECKING:
+    from groma.scene import Scene
 
 Colours = npt.NDArray[np.uint8]
 
@@ -31,6 +36,16 @@ def ramp(share: npt.ArrayLike) -> Colours:
 def of_group(group: IntArray) -> Colours:
     """Colours (..., 3) of groups 0, 1, ...; they repeat after eight; negative numbers are grey."""
     return np.where((group >= 0)[..., None], PALETTE[group % len(PALETTE)], GREY)
+
+
+def of_lines(scene: Scene) -> Colours:
+    """Colours (L, 3) of lines by the direction that they share with others; where none is shared, by their own."""
+    along = scene.relations.line_along_direction
+    if not len(along):
+        return of_direction(scene.lines.plucker[:, 3:])
+    group = np.full(scene.num_lines, -1)
+    group[along[:, 0]] = along[:, 1]
+    return of_group(group)
 
 
 def of_direction(vectors: FloatArray) -> Colours:

@@ -77,7 +77,7 @@ class Drawable:
     @cached_property
     def rms_by_image(self) -> FloatArray:
         """(N,) root mean square residual of each image, pixels; zero where nothing was measured."""
-        return _rms_by_group(self.lengths, self.residual_image, len(self.image_names))
+        return rms_by_group(self.lengths, self.residual_image, len(self.image_names))
 
 
 def drawable(scene: Scene) -> Drawable:
@@ -105,13 +105,14 @@ def drawable(scene: Scene) -> Drawable:
         residual_kind=np.repeat([0, 1], [count for _, count in kinds]),
         residual_kinds=tuple(name for name, _ in kinds),
         num_observations=scene.num_observations,
-        point_errors=_rms_by_group(
+        point_errors=rms_by_group(
             np.linalg.norm(point_residuals, axis=1), points.point_idx, len(scene.points), empty=np.nan
         ),
     )
 
 
-def _rms_by_group(lengths: FloatArray, group: IntArray, size: int, empty: float = 0.0) -> FloatArray:
+def rms_by_group(lengths: FloatArray, group: IntArray, size: int, empty: float = 0.0) -> FloatArray:
+    """Return the root mean square (size,) of the known lengths (M,) of each group; ``empty`` where there are none."""
     known = np.isfinite(lengths)
     count = np.bincount(group[known], minlength=size)
     total = np.bincount(group[known], lengths[known] ** 2, minlength=size)

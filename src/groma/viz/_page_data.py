@@ -46,7 +46,7 @@ def scene_data(scenes: Sequence[Scene], states: Sequence[Drawable]) -> dict[str,
             for one, shown, errors, far in zip(scenes, states, point_errors, line_errors, strict=True)
         ],
         "colours": pack_bytes(after.colours[keep]) if after.colours is not None else "",
-        "line_colours": pack_bytes(_direction_colours(scene)[lines]),
+        "line_colours": pack_bytes(_colours.of_lines(scene)[lines]),
         "shared_directions": bool(len(scene.relations.line_along_direction)),
         "line_views": pack(numbers[-1].num_images[lines].astype(float)),
         "corners": [len(patch) for patch in after.patches],
@@ -76,15 +76,6 @@ def _patches_of(scene: Scene, after: Drawable) -> list[FloatArray]:
         patch - (patch @ plane[:3] + plane[3])[:, None] * plane[:3]
         for patch, plane in zip(after.patches, scene.planes.hesse, strict=True)
     ]
-
-
-def _direction_colours(scene: Scene) -> _colours.Colours:
-    along = scene.relations.line_along_direction
-    if not len(along):
-        return _colours.of_direction(scene.lines.plucker[:, 3:])
-    group = np.full(scene.num_lines, -1)
-    group[along[:, 0]] = along[:, 1]
-    return _colours.of_group(group)
 
 
 def _middle(scene: Drawable) -> FloatArray:

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._counted import counted
+from groma._typing import FloatArray, IntArray
 from groma.scene.patches import PALETTE, patch_area, patch_groups
 from groma.viz import _charts, _colours, _digits
+from groma.viz._statistics import images_of
 
 if TYPE_CHECKING:
     from groma.scene import Scene
@@ -54,7 +56,7 @@ def counts_of(scene: Scene, shown: Drawable) -> list[tuple[str, int]]:
 
 def words(counts: Sequence[tuple[str, int]]) -> str:
     """Return counts as an enumeration."""
-    return ", ".join(f"{count:,} {name if count != 1 else name[:-1]}" for name, count in counts if count)
+    return ", ".join(counted(count, name) for name, count in counts if count)
 
 
 def tiles(scene: Scene, before: Drawable | None, after: Drawable, numbers: Mapping[str, Any] | None) -> str:
@@ -265,13 +267,7 @@ def _plane_table(scene: Scene, after: Drawable) -> str:
         )
         places = np.concatenate([scene.points.xyz[points], scene.lines.segments[lines].reshape(-1, 3)])
         far = places @ hesse[:3] + hesse[3]
-        rows.append(
-            [
-                f"{scene.planes.ids[plane]}",
-                f"{len(points):,}",
-                f"{len(lines):,}",
-            ]
-        )
+        rows.append([f"{scene.planes.ids[plane]}", f"{len(points):,}", f"{len(lines):,}"])
         areas.append(patch_area(after.patches[plane]) if len(places) >= 3 else float("nan"))
         far_off.append(_rms(far))
     for row, area, far in zip(rows, _digits.even(areas), _digits.even(far_off), strict=True):
@@ -324,18 +320,14 @@ def _table(head: list[str], rows: list[list[str]], marks: Sequence[str] = ()) ->
 # ------------------------------------------------------------------------------------------------------- Statistics
 
 
-def _track_lengths(scene: Scene) -> dict[str, Any]:
+def _track_lengths(scene: Scene) -> dict[str, IntArray]:
     """Return the number of images of each landmark that is observed at all, by kind."""
-    found = {}
-    for kind, seen, landmark in (
-        ("points", scene.point_observations, scene.point_observations.point_idx),
-        ("lines", scene.line_observations, scene.line_observations.line_idx),
-    ):
-        pairs = np.unique(landmark * max(scene.num_images, 1) + seen.image_idx)
-        counts = np.bincount(pairs // max(scene.num_images, 1))
-        if (counts > 0).any():
-            found[kind] = counts[counts > 0]
-    return found
+    points, lines = scene.point_observations, scene.line_observations
+    counts = {
+        "points": images_of(points.point_idx, points.image_idx, scene.num_points),
+        "lines": images_of(lines.line_idx, lines.image_idx, scene.num_lines),
+    }
+    return {kind: count[count > 0] for kind, count in counts.items() if count.any()}
 
 
 def _of_kind(shown: Drawable, kind: int) -> FloatArray:

@@ -12,6 +12,7 @@ import numpy as np
 from groma._typing import BoolArray
 from groma.scene.patches import patch_groups, triangle_fans
 from groma.viz import _colours, _view_arrays, _view_words
+from groma.viz._pack import thin
 from groma.viz._pictures import ImageFiles, image_file, read_picture
 from groma.viz._view_content import LINE_MODES, REACH, ViewContent
 
@@ -62,6 +63,7 @@ class SceneView:
         self._drawn_points: tuple[int, str] | None = None
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         server.gui.set_panel_label("groma")
+        server.gui.main_panel.dock_right()
         server.scene.set_up_direction("+z")
         server.initial_camera.fov = OPENING
         server.initial_camera.position = content.start_position
@@ -186,7 +188,7 @@ class SceneView:
 
     def _add_cameras(self) -> None:
         content = self.content
-        self._camera_images = _view_arrays.even(content.scene.num_images, MAX_CAMERAS)
+        self._camera_images = thin(content.scene.num_images, MAX_CAMERAS)
         self._pictures: list[Any] = []
         many = len(self._camera_images) > _MANY_CAMERAS
         self._camera_scale = _view_arrays.camera_scale(content.camera_centers)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.viz._drawable import drawable
+from groma.viz._drawable import drawable, rms_by_group
 
 if TYPE_CHECKING:
     from groma.scene import Scene
@@ -55,15 +55,18 @@ def line_statistics(scene: Scene, shown: Drawable | None = None) -> LineStatisti
     seen = scene.line_observations
     ends = shown.residuals[shown.residual_kind == shown.residual_kinds.index("line ends")].reshape(-1, 2, 2)
     squares = 0.5 * np.einsum("mei,mei->m", ends, ends)
-    size = scene.num_lines
-    known = np.isfinite(squares)
-    count = np.bincount(seen.line_idx[known], minlength=size)
-    total = np.bincount(seen.line_idx[known], squares[known], minlength=size)
-    pairs = np.unique(seen.line_idx * max(scene.num_images, 1) + seen.image_idx)
+    far = np.sqrt(squares)
     return LineStatistics(
         length=np.linalg.norm(scene.lines.segments[:, 1] - scene.lines.segments[:, 0], axis=1),
-        num_images=np.bincount(pairs // max(scene.num_images, 1), minlength=size),
-        residual_px=np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan),
+        num_images=images_of(seen.line_idx, seen.image_idx, scene.num_lines),
+        residual_px=rms_by_group(far, seen.line_idx, scene.num_lines, empty=np.nan),
         end_residuals=ends,
-        observation_residual_px=np.sqrt(squares),
+        observation_residual_px=far,
     )
+
+
+def images_of(landmark_idx: IntArray, image_idx: IntArray, num_landmarks: int) -> IntArray:
+    """Return how many different images observe each landmark; one may observe a landmark more than once."""
+    width = int(image_idx.max(initial=0)) + 1
+    pairs = np.unique(landmark_idx.astype(np.int64) * width + image_idx)
+    return np.bincount(pairs // width, minlength=num_landmarks)

@@ -5,14 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import FloatArray
 from groma.viz._colours import Colours
 from groma.viz._view_content import REACH
-
-
-def even(count: int, limit: int) -> IntArray:
-    """Return at most ``limit`` of the numbers below ``count``, evenly spaced."""
-    return np.arange(count) if count <= limit else np.linspace(0, count - 1, limit).astype(np.int64)
 
 
 def by_end(colours: Colours) -> Colours:

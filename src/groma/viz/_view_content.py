@@ -20,6 +20,7 @@ from groma.scene.similarity import Similarity
 from groma.viz import _colours
 from groma.viz._colours import Colours
 from groma.viz._drawable import drawable
+from groma.viz._framing import upward
 from groma.viz._statistics import LineStatistics, line_statistics
 
 if TYPE_CHECKING:
@@ -84,13 +85,11 @@ class ViewContent:
             return _by_number(numbers.residual_px, " px", from_zero=True)
         if mode == "number of images":
             return _by_number(numbers.num_images.astype(float), " images")
-        along = self.scene.relations.line_along_direction
-        if len(along):
-            group = np.full(len(self.segments), -1)
-            group[along[:, 0]] = along[:, 1]
-            return LineColours(_colours.of_group(group), meaning="One colour per shared direction; others grey.")
-        vectors = self.scene.lines.plucker[:, 3:]
-        return LineColours(_colours.of_direction(vectors), meaning="Red along x, green along y, blue along z.")
+        shared = len(self.scene.relations.line_along_direction) > 0
+        meaning = (
+            "One colour per shared direction; others grey." if shared else "Red along x, green along y, blue along z."
+        )
+        return LineColours(_colours.of_lines(self.scene), meaning=meaning)
 
     def pick(self, origin: FloatArray, direction: FloatArray, tolerance: float, shown: BoolArray) -> int | None:
         """Return the line under a ray, or None.
@@ -228,12 +227,8 @@ def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:
     if len(centers):
         reach = max(reach, float(np.median(np.linalg.norm(centers - middle, axis=1))))
     scale = REACH / reach if reach > 0 else 1.0
-    axes = quaternion.to_matrix(scene.cam_from_world[:, :4])
-    up = -axes[:, 1].sum(axis=0) if len(axes) else np.zeros(3)
-    if np.linalg.norm(up) < 0.3 * max(len(axes), 1):
-        up = np.array([0.0, 0.0, 1.0])  # cameras all around: no common up
-    up = up / float(np.linalg.norm(up))
-    away = centers.mean(axis=0) - middle if len(axes) else np.array([1.0, 1.0, 0.0])
+    up = upward(quaternion.to_matrix(scene.cam_from_world[:, :4])[:, 1])
+    away = centers.mean(axis=0) - middle if len(centers) else np.array([1.0, 1.0, 0.0])
     away = away - (away @ up) * up
     if np.linalg.norm(away) < 0.15 * reach:
         # Cameras around the scene: look from where the first one stands.

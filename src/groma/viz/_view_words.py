@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from groma._counted import counted
 from groma.viz import _colours
+from groma.viz._pack import thin
 from groma.viz._page_tables import words
 from groma.viz._pictures import ImageFiles, image_file, read_picture
-from groma.viz._view_arrays import even
 from groma.viz.overlays import observation_crop, residual_top
 
 if TYPE_CHECKING:
@@ -67,9 +68,10 @@ def describe_line(content: ViewContent, line: int, images: ImageFiles | None = N
     on = ", ".join(str(scene.planes.ids[plane]) for plane in planes[planes[:, 0] == line, 1])
     lines = [
         f"<b>Line {scene.lines.ids[line]}</b>: length {numbers.length[line]:.4g}, "
-        f"{numbers.num_images[line]} images, {_px(numbers.residual_px[line])} rms" + (f", on plane {on}" if on else "")
+        f"{counted(int(numbers.num_images[line]), 'images')}, {_px(numbers.residual_px[line])} rms"
+        + (f", on plane {on}" if on else "")
     ]
-    for row in order[even(len(order), MAX_CROPS)]:
+    for row in order[thin(len(order), MAX_CROPS)]:
         lines.append(
             _crop(content, int(row), images, _colours.css(_colours.ramp(numbers.observation_residual_px[row] / top)))
         )

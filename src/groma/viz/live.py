@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from groma._counted import counted
 from groma._typing import FloatArray
 from groma.errors import GromaError
 from groma.geometry import quaternion, se3
@@ -22,6 +23,7 @@ from groma.io import read_scene
 from groma.io.trajectories import read_tum
 from groma.scene.patches import patch_groups, plane_patches, triangle_fans
 from groma.viz import _colours, _view_arrays
+from groma.viz._pack import thin
 from groma.viz.viewer import _silence, _stop
 
 if TYPE_CHECKING:
@@ -61,6 +63,7 @@ class LiveView:
         self.scene: Scene | None = None
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         server.gui.set_panel_label("groma: a running track")
+        server.gui.main_panel.dock_right()
         # The world is the first camera, whose y points down.
         server.scene.set_up_direction("-y")
         self._words = server.gui.add_markdown("")
@@ -122,7 +125,7 @@ class LiveView:
             )  # fmt: skip
             self._segments("/lines", scene.lines.segments.astype(np.float32), _LINES, 2.0)
             self.server.scene.remove_by_name("/keyframes")
-            for row in _view_arrays.even(len(world), _MOST_CAMERAS):
+            for row in thin(len(world), _MOST_CAMERAS):
                 self._camera(f"/keyframes/{row}", world[row], _KEYFRAMES, 1.0)
             self._draw_planes(scene)
         if not self._placed:
@@ -179,10 +182,8 @@ class LiveView:
                 lines = f"**Nothing new for {silence:.0f} s.** The track may have been stopped."
         if self.scene is not None:
             scene = self.scene
-            lines += (
-                f"\n\n{self.num_frames:,} frames, {scene.num_images} keyframes\n\n{scene.num_points:,} points, "
-                f"{scene.num_lines:,} lines, {scene.num_planes} planes"
-            )
+            lines += f"\n\n{counted(self.num_frames, 'frames')}, {counted(scene.num_images, 'keyframes')}\n\n"
+            lines += ", ".join(counted(getattr(scene, f"num_{kind}"), kind) for kind in ("points", "lines", "planes"))
         if self._words.content != lines:
             self._words.content = lines
 

@@ -33,7 +33,7 @@ _SAMPLES = 17
 _STYLE = """<style>
 .overlays > div { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(480px, 100%), 1fr)); gap: 14px; }
 .overlays figure { margin: 0; } .overlays figcaption { font-size: 13px; opacity: .75; overflow-wrap: anywhere; }
-.overlays svg { display: block; width: 100%; height: auto; border-radius: 8px; background: #33363b; }
+.overlays svg { display: block; width: 100%; height: auto; overflow: hidden; border-radius: 8px; background: #33363b; }
 .overlays path { fill: none; stroke-linecap: round; vector-effect: non-scaling-stroke; }
 .overlays .projected { stroke: #fff; stroke-width: 1; opacity: .85; }
 .overlays .observed { stroke-width: 2.2; } .overlays .observed:hover { stroke-width: 5; }

@@ -18,9 +18,9 @@ import numpy.typing as npt
 
 from groma import cameras
 from groma._typing import FloatArray
-from groma.errors import FileFormatError, GromaError, InputError
+from groma.errors import FileFormatError, InputError
 from groma.io._reading import reading
-from groma.io.sequences.frame import SequenceCamera
+from groma.io.sequences.frame import SequenceCamera, checked_params
 
 #: What callers may pass as a camera: a value, numbers, a line, or the name of a file.
 CameraLike = SequenceCamera | Numbers[float] | str | os.PathLike[str]
@@ -102,9 +102,9 @@ def calibration_of(camera: CameraLike) -> Calibration:
         If it is neither numbers, nor a line, nor a readable file that holds one.
     """
     if isinstance(camera, SequenceCamera):
-        return _checked(camera.model, np.asarray(camera.params, float), (camera.width, camera.height), "camera")
+        return Calibration(camera.model, camera.params, (camera.width, camera.height))
     if not isinstance(camera, (str, os.PathLike)):
-        return _from_numbers(np.asarray(camera, float), "camera")
+        return from_opencv(camera)
     text = os.fspath(camera)
     if isinstance(camera, str) and not Path(camera).is_file() and len(camera.split()) >= 4:
         return _from_text(camera, "camera")
@@ -126,8 +126,12 @@ def find_calibration(folder: Path) -> Calibration | None:
 
 
 def from_opencv(numbers: npt.ArrayLike, size: tuple[int, int] | None = None) -> Calibration:
-    """Return the calibration for fx, fy, cx, cy and none, four or five coefficients k1, k2, p1, p2, k3 of OpenCV."""
-    calibration = _from_numbers(np.asarray(numbers, float), "camera")
+    """Return the calibration for a 3x3 matrix, or fx, fy, cx, cy and none, 4 or 5 coefficients k1, k2, p1, p2, k3."""
+    try:
+        array = np.asarray(numbers, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"camera is not a camera ({error}); {_HELP}.") from error
+    calibration = _from_numbers(array[[0, 1, 0, 1], [0, 1, 2, 2]] if array.shape == (3, 3) else array, "camera")
     return Calibration(calibration.model, calibration.params, size)
 
 
@@ -136,14 +140,14 @@ def _from_text(text: str, source: str) -> Calibration:
     lines = [words for words in lines if words]
     if not lines:
         raise FileFormatError(f"{source} holds no camera; {_HELP}.")
-    for skip in (0, 1):  # with or without the number of the camera
-        words = lines[0][skip:]
-        if len(words) > 3 and words[0][:1].isalpha():
-            if len(lines) > 1:
-                raise FileFormatError(f"{source} holds {len(lines)} cameras; expected one. Remove the others.")
-            size, params = (int(words[1]), int(words[2])), np.array([float(word) for word in words[3:]])
-            return _checked(words[0], params, size, source)
     try:
+        for skip in (0, 1):  # with or without the number of the camera
+            words = lines[0][skip:]
+            if len(words) > 3 and words[0][:1].isalpha():
+                if len(lines) > 1:
+                    raise FileFormatError(f"{source} holds {len(lines)} cameras; expected one. Remove the others.")
+                size, params = (int(words[1]), int(words[2])), np.array([float(word) for word in words[3:]])
+                return _checked(words[0], params, size, source)
         numbers = np.array([float(word) for words in lines for word in words])
     except ValueError as error:
         raise FileFormatError(f"{source} is not a camera ({error}); {_HELP}.") from error
@@ -164,18 +168,7 @@ def _from_numbers(numbers: FloatArray, source: str) -> Calibration:
 
 
 def _checked(model: str, params: FloatArray, size: tuple[int, int] | None, source: str) -> Calibration:
-    try:
-        known = cameras.model(model)
-    except GromaError as error:
-        raise InputError(f"{source}: {error}") from error
-    if params.shape != (known.num_parameters,) or not np.isfinite(params).all():
-        raise InputError(
-            f"{source}: {model} takes {known.num_parameters} finite numbers ({', '.join(known.parameter_names)}); "
-            f"got {params.tolist()}."
-        )
-    if not (params[list(known.focal_indices)] > 0).all():
-        raise InputError(f"{source}: focal lengths must be positive; got {params.tolist()}.")
-    return Calibration(model, params, size)
+    return Calibration(model, checked_params(model, params, source), size)
 
 
 __all__ = [

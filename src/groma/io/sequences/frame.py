@@ -10,7 +10,9 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from groma import cameras
 from groma._typing import FloatArray
+from groma.errors import GromaError, InputError
 from groma.io.trajectories import Trajectory
 
 #: What the frames of a sequence hold: a depth image, a second rectified image, or neither.
@@ -47,6 +49,35 @@ class SequenceCamera:
     #: Distance of the right camera from the left, metres; None without a right camera.
     baseline: float | None = None
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "params", checked_params(self.model, self.params, "camera"))
+        if not (self.width > 0 and self.height > 0):
+            raise InputError(f"camera: width and height must be positive pixels; got {self.width} x {self.height}.")
+        if self.baseline is not None and not 0.0 < self.baseline < float("inf"):
+            raise InputError(f"camera: the baseline must be positive metres, or None; got {self.baseline}.")
+
+
+def checked_params(model: str, params: npt.ArrayLike, source: str) -> FloatArray:
+    """Return the parameters of a camera model as an array (k,).
+
+    Raises
+    ------
+    InputError
+        If the model is unknown, or takes other parameters; ``source`` says where they are from.
+    """
+    try:
+        known, numbers = cameras.model(model), np.array(params, np.float64)
+    except (GromaError, TypeError, ValueError) as error:
+        raise InputError(f"{source}: {error}") from error
+    if numbers.shape != (known.num_parameters,) or not np.isfinite(numbers).all():
+        raise InputError(
+            f"{source}: {model} takes {known.num_parameters} finite numbers ({', '.join(known.parameter_names)}); "
+            f"got {numbers.tolist()}."
+        )
+    if not (numbers[list(known.focal_indices)] > 0).all():
+        raise InputError(f"{source}: focal lengths must be positive; got {numbers.tolist()}.")
+    return numbers
+
 
 @runtime_checkable
 class Sequence(Protocol):
@@ -64,4 +95,4 @@ class Sequence(Protocol):
     def __iter__(self) -> Iterator[Frame]: ...
 
 
-__all__ = ["Frame", "Kind", "Sequence", "SequenceCamera"]
+__all__ = ["Frame", "Kind", "Sequence", "SequenceCamera", "checked_params"]
