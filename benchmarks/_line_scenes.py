@@ -117,6 +117,10 @@ SCENES: dict[str, Callable[[Path], LineScene]] = {
     "boxes-rough": lambda data: boxes(
         "boxes-rough", BoxSettings(seed=34, texture=15.0, width=640, height=480, focal=560.0)
     ),
+    "boxes-strong": lambda data: boxes("boxes-strong", BoxSettings(seed=42, texture=20.0)),
+    "boxes-strong-small": lambda data: boxes(
+        "boxes-strong-small", BoxSettings(seed=43, texture=20.0, width=640, height=480, focal=560.0)
+    ),
     "boxes-small": lambda data: boxes("boxes-small", BoxSettings(seed=5, width=640, height=480, focal=560.0)),
     "boxes-random": lambda data: boxes("boxes-random", BoxSettings(seed=115, cameras="random")),
     "boxes-random-small": lambda data: boxes(

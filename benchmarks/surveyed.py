@@ -11,11 +11,11 @@ scene is mapped once with the defaults of ``groma map``; its last adjustment is 
 points alone, with lines, and with lines and planes. *Squares* is plain least squares of the points.
 
 Two more columns say how far the comparison can be believed. *Predicted* is the standard deviation of the camera centres
-after adjusting the points, as photographs with such noise would give it. *Misfit* is how much worse the surveyed poses
-fit the photographs than the adjusted ones do: twice the difference of the robust costs of the points, over the degrees
-of freedom of the poses. Perfect poses would give about one. Where it is hundreds, survey and photographs, with this
-calibration, contradict each other, and no adjustment of these photographs could come as near to the survey as its own
-noise would allow.
+after adjusting points, and points and lines, as photographs with such noise would give it. *Misfit* is how much worse
+the surveyed poses fit the photographs than the adjusted ones do: twice the difference of the robust costs of the
+points, over the degrees of freedom of the poses. Perfect poses would give about one. Where it is hundreds, survey and
+photographs, with this calibration, contradict each other, and no adjustment of these photographs could come as near to
+the survey as its own noise would allow.
 
 With ``--scales`` the last adjustment, of everything, is repeated with these scales of its loss, in standard deviations
 of the noise, instead.
@@ -52,7 +52,7 @@ from groma.factors import Ref
 from groma.factors.position_prior import PositionPrior
 from groma.pipelines._assemble import AssemblyOptions, assemble, disassemble
 from groma.pipelines._noise import noise_px
-from groma.pipelines.adjust import squared_residuals_px
+from groma.pipelines._pixel_residuals import squared_residuals_px
 from groma.pipelines.map import MapOptions, MapResult, map_images
 from groma.pipelines.uncertainty import position_sigma, uncertainty
 from groma.problem.problem import Problem
@@ -80,19 +80,24 @@ def scores(scene: Scene, survey: Scene) -> str:
     return f"{1e3 * found.center_rmse:.2f} / {1e3 * found.center_max:.1f} / {found.rotation_deg_mean:.3f}"
 
 
-def misfit(scene: Scene, survey: Scene, sigma_px: float) -> tuple[float, float]:
-    """Predicted deviation of the centres (survey units) and excess of the cost at the surveyed poses per freedom."""
+def predicted(scene: Scene, survey: Scene, options: groma.AdjustOptions) -> float:
+    """Standard deviation of the centres (survey units) that the covariance of an adjustment tells."""
+    found = groma.adjust(scene, options)
+    sigma = position_sigma(uncertainty(found.scene, problem=found.problem).centers)
+    return evaluate_poses(found.scene, survey).alignment.scale * float(np.sqrt(np.mean(sigma**2)))
+
+
+def misfit(scene: Scene, survey: Scene, sigma_px: float) -> float:
+    """Excess of the cost at the surveyed poses per freedom."""
     alone = {"lines": False, "planes": False, "point_sigma_px": sigma_px, "loss": "cauchy", "loss_scale": MISFIT_LOSS}
     free = groma.adjust(scene, groma.AdjustOptions(**alone))
     row = {name: k for k, name in enumerate(survey.images.names)}
     at = [row[name] for name in scene.images.names]
     survey_from_scene = align_points(free.scene.cam_centers_in_world, survey.cam_centers_in_world[at])
-    predicted = position_sigma(uncertainty(free.scene, problem=free.problem).centers)
     placed = free.scene.transformed(survey_from_scene).with_poses(survey.cam_from_world[at])
     held = groma.adjust(placed, groma.AdjustOptions(**alone, refine_poses=False))
     freedom = 6 * scene.num_images - 7
-    excess = 2.0 * (held.report.solve.final_cost - free.report.solve.final_cost) / freedom
-    return survey_from_scene.scale * float(np.sqrt(np.mean(predicted**2))), excess
+    return 2.0 * (held.report.solve.final_cost - free.report.solve.final_cost) / freedom
 
 
 def tell_kinds(folder: Path, start: Scene, survey: Scene, result: MapResult) -> None:
@@ -102,8 +107,13 @@ def tell_kinds(folder: Path, start: Scene, survey: Scene, result: MapResult) -> 
     for kinds in KINDS.values():
         options = replace(result.adjusted_with, **kinds)
         cells.append(scores(groma.adjust(result.before, options).scene, survey))
-    predicted, excess = misfit(result.before, survey, result.sigma_px["points"])
-    print(f"| {folder.name} | " + " | ".join(cells) + f" | {1e3 * predicted:.2f} | {excess:.0f} |", flush=True)
+    scene = result.before.replace(relations=Relations())
+    told = [
+        f"{1e3 * predicted(scene, survey, replace(result.adjusted_with, **kinds)):.2f}"
+        for kinds in (KINDS["points"], KINDS["+ lines"])
+    ]
+    excess = misfit(result.before, survey, result.sigma_px["points"])
+    print(f"| {folder.name} | " + " | ".join(cells) + f" | {' / '.join(told)} | {excess:.0f} |", flush=True)
 
 
 def tell_scales(folder: Path, survey: Scene, result: MapResult, scales: list[float]) -> None:

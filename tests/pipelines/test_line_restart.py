@@ -53,6 +53,20 @@ def test_no_line_is_triangulated_anew_at_the_truth(scenes):
     assert len(renew_lines(truth, _problem(truth))[1]) == 0
 
 
+def test_a_line_that_fits_badly_where_it_is_keeps_its_ends(scenes):
+    """Its second start ends at the same place, by another last step."""
+    truth, _ = scenes
+    table = truth.line_observations
+    segment = table.segment.copy()
+    rows = np.flatnonzero(table.line_idx == BAD)
+    segment[rows] += np.random.default_rng(0).normal(0.0, 4.0, (len(rows), 4))
+    noisy = truth.replace(line_observations=table.replace(segment=segment))
+    settled = noisy.with_lines(renew_lines(noisy, _problem(noisy))[0].variables["lines"].ambient())
+    better, renewed = renew_lines(settled, _problem(settled))
+    assert len(renewed) == 0
+    assert _sine(better.variables["lines"].ambient()[BAD], settled.lines.plucker[BAD]) < 1e-3
+
+
 def test_second_start_counts_under_relations_too(scenes):
     """Points on lines are factors of both starts, at the same places."""
     truth, wrong = scenes

@@ -313,6 +313,18 @@ def test_a_run_killed_at_every_kind_of_moment_ends_like_an_undisturbed_one(tmp_p
     assert read_scene(tmp_path / "out.npz").num_lines > 20
 
 
+def test_lines_are_mapped_again_while_the_poses_move(tmp_path, corner, monkeypatch):
+    images, scene = corner
+    moved = [0.2, 0.1, 0.2]
+    monkeypatch.setattr(mapping, "moved_px", lambda *_: moved.pop(0))
+    result = map_images(images, tmp_path / "work", scene, MapOptions(find_planes=False, threads=1))
+    assert moved == [0.2]
+    stages = {path.name.rpartition("-")[0] for path in (tmp_path / "work").glob("*.npz")}
+    assert {"joint", "final-lines", "joint-2", "final-lines-2"} <= stages
+    assert "joint-3" not in stages
+    assert result.scene.num_lines > 20
+
+
 @posix
 @pytest.mark.slow
 @pytest.mark.timeout(3600)

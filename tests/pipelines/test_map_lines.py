@@ -1,12 +1,11 @@
-"""Lines mapped from segments: wireframes with exact truth, degenerate motion, matches, distortion, ends, empty maps."""
-
-from dataclasses import dataclass
+# SPDX-License-Identifier: BSD-3-Clause
+"""Lines mapped from segments: wireframes with exact truth, degenerate motion, matches, distortion, empty maps."""
 
 import cv2
 import numpy as np
 import pytest
+from _wireframe import Wireframe, arc, distance_to_truth, random_lines, true_lines, wireframe
 
-from groma import cameras as camera_models
 from groma.errors import InputError
 from groma.frontend import ExternalMatches, LsdDetector
 from groma.frontend.matches import LineMatches
@@ -26,114 +25,10 @@ from groma.pipelines.map_lines import (
     map_lines,
     wide_baseline_matches,
 )
-from groma.scene import Cameras, PointObservations, Points, Scene
+from groma.scene import Cameras, Scene
 from groma.scene.similarity import Similarity
 
 pytestmark = pytest.mark.kernels
-
-WIDTH, HEIGHT = 800, 600
-
-
-@dataclass(frozen=True)
-class Wireframe:
-    scene: Scene
-    segments: list[Segments]
-    #: Per image, the true line of each segment; -1 for clutter.
-    truth: list[np.ndarray]
-    lines: np.ndarray  # (L, 2, 3)
-
-    def matches(self, i: int, j: int) -> LineMatches:
-        known = {n: k for k, n in enumerate(self.truth[j]) if n >= 0}
-        pairs = [(k, known[n]) for k, n in enumerate(self.truth[i]) if n in known]
-        return LineMatches(np.array(pairs, np.int64).reshape(-1, 2), np.ones(len(pairs)))
-
-
-def look_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Pose (7,) of a camera that looks at a target, world z up."""
-    z = (target - center) / np.linalg.norm(target - center)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    return np.concatenate([quaternion.from_matrix(R[None])[0], -R @ center])
-
-
-def wireframe(
-    centers: np.ndarray,
-    lines: np.ndarray,
-    rng: np.random.Generator,
-    sigma: float = 0.2,
-    num_clutter: int = 0,
-    model: str = "PINHOLE",
-    params: tuple = (700.0, 700.0, 400.0, 300.0),
-    num_points: int = 150,
-    targets: np.ndarray | None = None,
-) -> Wireframe:
-    camera = camera_models.model(model)
-    targets = np.zeros_like(centers) if targets is None else targets
-    poses = np.array([look_at(c, t) for c, t in zip(centers, targets, strict=True)])
-    xyz = rng.uniform(-1.2, 1.2, (num_points, 3))
-    segments, truth, seen = [], [], []
-    for i, pose in enumerate(poses):
-
-        def project(points, pose=pose):
-            points = quaternion.rotate(np.broadcast_to(pose[:4], (len(points), 4)), points) + pose[4:]
-            return camera.project(np.array(params), points)
-
-        # Each image sees another part of each line.
-        part = np.column_stack([rng.uniform(0.0, 0.15, len(lines)), rng.uniform(0.85, 1.0, len(lines))])
-        ends = [project(lines[:, 0] + part[:, k : k + 1] * (lines[:, 1] - lines[:, 0])) for k in (0, 1)]
-        ends = np.hstack(ends) + rng.normal(0.0, sigma, (len(lines), 4))
-        inside = np.isfinite(ends).all(1) & (ends > 0).all(1) & (ends < [WIDTH, HEIGHT] * 2).all(1)
-        inside &= np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]) > 20.0
-        angle, length = rng.uniform(0, 2 * np.pi, num_clutter), rng.uniform(20, 80, num_clutter)
-        start = rng.uniform(100, 500, (num_clutter, 2))
-        clutter = np.hstack([start, start + length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])])
-        order = rng.permutation(inside.sum() + num_clutter)
-        segments.append(Segments.from_ends(np.vstack([ends[inside], clutter])[order], max(sigma, 0.05)))
-        truth.append(np.concatenate([np.flatnonzero(inside), np.full(num_clutter, -1)])[order])
-        pixel = project(xyz)
-        good = np.flatnonzero(np.isfinite(pixel).all(1) & (pixel > 0).all(1) & (pixel < [WIDTH, HEIGHT]).all(1))
-        seen.append((np.full(len(good), i), good, pixel[good]))
-    tables = {}
-    if num_points:
-        image, point, pixel = (np.concatenate(column) for column in zip(*seen, strict=True))
-        tables["points"] = Points.at(xyz)
-        tables["point_observations"] = PointObservations(image, point, pixel, point)
-    cameras = Cameras(np.array([1]), (model,), np.array([params]), np.array([WIDTH]), np.array([HEIGHT]))
-    names = [f"{i}.png" for i in range(len(poses))]
-    return Wireframe(
-        Scene.from_images(cameras, names, np.zeros(len(poses), int), poses, **tables), segments, truth, lines
-    )
-
-
-def arc(count: int, step: float = 0.12, radius: float = 4.0, rise: float = 0.25) -> np.ndarray:
-    """Camera centres on an arc, going up and down."""
-    a = step * (np.arange(count) - 0.5 * (count - 1))
-    return np.column_stack([radius * np.sin(a), -radius * np.cos(a), rise * np.sin(2.3 * np.arange(count))])
-
-
-def random_lines(count: int, rng: np.random.Generator) -> np.ndarray:
-    middle, along = rng.uniform(-0.9, 0.9, (count, 3)), rng.normal(size=(count, 3))
-    along *= rng.uniform(0.2, 0.5, (count, 1)) / np.linalg.norm(along, axis=1, keepdims=True)
-    return np.stack([middle - along, middle + along], axis=1)
-
-
-def true_lines(world: Wireframe, line_map: LineMap) -> np.ndarray:
-    """The true line of each mapped line; -2 where its observations disagree."""
-    owners = np.array(
-        [world.truth[i][s] for i, s in zip(line_map.image_idx, line_map.segment_idx, strict=True)], np.int64
-    )
-    out = np.full(line_map.num_lines, -2)
-    for n in range(line_map.num_lines):
-        mine = np.unique(owners[line_map.line_idx == n])
-        out[n] = mine[0] if len(mine) == 1 else -2
-    return out
-
-
-def distance_to_truth(world: Wireframe, line_map: LineMap, line: int, true: int) -> float:
-    a, b = world.lines[true]
-    d = (b - a) / np.linalg.norm(b - a)
-    return np.linalg.norm(np.cross(line_map.segments[line] - a, d), axis=1).max()
 
 
 @pytest.fixture(scope="module")
@@ -398,113 +293,6 @@ def test_nothing_is_changed(world):
     before = [s.ends.copy() for s in world.segments]
     map_lines(world.scene, world.segments)
     assert all(np.array_equal(a, s.ends) for a, s in zip(before, world.segments, strict=True))
-
-
-def flipped(world: Wireframe, images: range) -> list[Segments]:
-    """The world's segments, those of some images run the other way."""
-    turned = list(world.segments)
-    for i in images:
-        turned[i] = Segments.from_ends(world.segments[i].ends[:, [2, 3, 0, 1]], 0.2)
-    return turned
-
-
-def test_an_edge_whose_darker_side_changes_is_one_line():
-    rng = np.random.default_rng(21)
-    world = wireframe(arc(12), random_lines(12, rng), rng)
-    found = map_lines(world.scene, flipped(world, range(6, 12)), options=MapLinesOptions(use_points=False))
-    true = true_lines(world, found)
-    assert (true >= 0).all()
-    assert len(np.unique(true)) == len(true) >= 10
-    assert np.median(found.num_images) > 8
-
-
-def test_an_edge_that_bent_poses_show_twice_is_one_line():
-    rng = np.random.default_rng(24)
-    world = wireframe(arc(12), random_lines(12, rng), rng)
-    poses = world.scene.cam_from_world
-    poses[6:, 5] += 0.03  # five pixels
-    found = map_lines(world.scene.with_poses(poses), flipped(world, range(6, 12)))
-    true = true_lines(world, found)
-    assert (true >= 0).all()
-    repeated = len(true) - len(np.unique(true))
-    assert len(np.unique(true)) >= 9
-    assert repeated <= 3
-
-
-def test_two_edges_of_a_bar_stay_two_lines():
-    rng = np.random.default_rng(22)
-    lines = random_lines(8, rng)
-    across = np.cross(lines[:, 1] - lines[:, 0], [0.0, 1.0, 0.0])
-    across *= 0.025 / np.linalg.norm(across, axis=1, keepdims=True)  # four pixels
-    world = wireframe(arc(10), np.concatenate([lines, lines + across[:, None]]), rng)
-    found = map_lines(world.scene, world.segments)
-    true = true_lines(world, found)
-    assert np.isin(np.arange(16), true).sum() >= 14
-    assert (true >= 0).mean() > 0.9
-
-
-def shown_whole(world: Wireframe, rng: np.random.Generator, along: float, run_on: np.ndarray) -> list[Segments]:
-    """All images see the whole lines, with errors along them, and the second end ``run_on`` (C,) pixels further out."""
-    segments = []
-    for pose, further in zip(world.scene.cam_from_world, run_on, strict=True):
-        local = world.lines @ quaternion.to_matrix(pose[None, :4])[0].T + pose[4:]
-        pixel = (700.0 * local[..., :2] / local[..., 2:] + [400.0, 300.0]).reshape(-1, 4)
-        unit = pixel[:, 2:] - pixel[:, :2]
-        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-        error = rng.normal([0.0, further], along, (len(pixel), 2))
-        segments.append(Segments.from_ends(pixel + error.repeat(2, 1) * np.hstack([unit, unit]), 0.05))
-    return segments
-
-
-def pixels_beyond(world: Wireframe, found: LineMap) -> np.ndarray:
-    """(L, 2) how far both ends of mapped lines lie beyond those of the true lines, about, in pixels."""
-    nearest = np.linalg.norm(found.segments.mean(1)[:, None] - world.lines.mean(1), axis=-1).argmin(1)
-    true = world.lines[nearest]
-    unit = (true[:, 1] - true[:, 0]) / np.linalg.norm(true[:, 1] - true[:, 0], axis=1, keepdims=True)
-    at = np.sort(((found.segments - true.mean(1)[:, None]) * unit[:, None]).sum(-1), axis=1)
-    half = 0.5 * np.linalg.norm(true[:, 1] - true[:, 0], axis=1)
-    return np.column_stack([-at[:, 0] - half, at[:, 1] - half]) * 700.0 / 4.0
-
-
-def test_ends_are_where_most_images_see_them():
-    rng = np.random.default_rng(23)
-    world = wireframe(arc(12), random_lines(12, rng), rng)
-    found = map_lines(world.scene, shown_whole(world, rng, 1.0, np.zeros(12)))
-    assert found.num_lines >= 10
-    assert abs(np.median(pixels_beyond(world, found))) < 0.8  # pixels; the outermost but one of twelve lies 1.1 out
-
-
-@pytest.mark.parametrize("number", [2, 6])
-def test_few_images_that_run_on_do_not_make_a_line_longer(number):
-    rng = np.random.default_rng(25)
-    world = wireframe(arc(12), random_lines(12, rng), rng)
-    run_on = np.zeros(12)
-    run_on[3 : 3 + number] = 40.0
-    found = map_lines(world.scene, shown_whole(world, rng, 0.5, run_on))
-    assert found.num_lines >= 10
-    first, second = np.median(pixels_beyond(world, found), axis=0)
-    assert abs(first) < 1.5
-    assert abs(second - (0.0 if number == 2 else 40.0)) < (1.5 if number == 2 else 8.0)  # foreshortened in places
-
-
-@pytest.mark.parametrize(("apart", "stays"), [(0.95, False), (5.0, True)])
-def test_a_line_that_repeats_another_beside_it_is_dropped(apart, stays):
-    rng = np.random.default_rng(26)
-    lines = random_lines(12, rng)
-    world = wireframe(arc(14), lines, rng, sigma=0.03)
-    # Four images show two of the lines beside where they are, and nothing there.
-    segments = list(world.segments)
-    for i in range(4):
-        ends = segments[i].ends.copy()
-        for k in np.flatnonzero((world.truth[i] == 0) | (world.truth[i] == 1)):
-            unit = ends[k, 2:] - ends[k, :2]
-            unit /= np.linalg.norm(unit)
-            ends[k] += np.tile(apart * np.array([-unit[1], unit[0]]), 2)
-        segments[i] = Segments.from_ends(ends, 0.05)
-    found = map_lines(world.scene, segments)
-    repeated = len(found.lines) - len(np.unique(true_lines(world, found)))
-    assert repeated == (2 if stays else 0)
-    assert (found.fate_counts()[Fate.REPEATED] == 0) == stays
 
 
 def test_lines_of_texture():

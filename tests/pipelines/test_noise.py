@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Noise from residuals: its size, noise of one size left alone, and points whose noise differs told apart."""
+"""Noise from residuals: its size, noise of one size left alone, points whose noise differs told apart.
+
+And segments: how the errors of their ends are correlated, and that lines are measured where they are independent.
+And by how much an adjustment moves what the images see.
+"""
 
 import numpy as np
 import pytest
 
 import groma
+from groma.errors import InputError
 from groma.evaluation import evaluate_poses
-from groma.pipelines._noise import noise_px, with_point_noise
-from groma.scene import Relations, synthetic
+from groma.pipelines._assemble import AssemblyOptions, assemble
+from groma.pipelines._noise import line_end_correlation, moved_px, noise_px, with_point_noise
+from groma.pipelines._pixel_residuals import squared_residuals_px
+from groma.problem.residuals import residuals_of
+from groma.scene import Relations, Similarity, synthetic
 
 pytestmark = pytest.mark.kernels
 
@@ -88,3 +96,66 @@ def test_scenes_that_tell_nothing_are_returned():
     assert with_point_noise(exact) is exact
     small = synthetic.holistic(4, noise_px=1.0, seed=0).truth
     assert with_point_noise(small) is small
+
+
+def lines_with(correlation, seed=0, num_images=30):
+    """A scene of lines whose segments have ends with correlated noise, as fits to the pixels of an edge do."""
+    made = synthetic.holistic(num_images, noise_px=0.0, seed=seed)
+    truth, rng = made.truth.replace(relations=Relations()), np.random.default_rng(seed)
+    table = truth.line_observations
+    first, second = table.segment[:, :2], table.segment[:, 2:]
+    normal = (second - first)[:, ::-1] * [-1.0, 1.0]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    shift, turn = rng.normal(size=(2, len(table), 1)) * NOISE
+    shift, turn = shift * np.sqrt((1 + correlation) / 2), turn * np.sqrt((1 - correlation) / 2)
+    noisy = np.hstack([first + (shift - turn) * normal, second + (shift + turn) * normal])
+    start = made.start.replace(relations=Relations(), line_observations=table.replace(segment=noisy))
+    return truth, start
+
+
+@pytest.mark.parametrize("correlation", [-0.5, 0.0, 0.5])
+def test_correlation_of_the_ends_of_segments_and_its_noise(correlation):
+    truth, start = lines_with(correlation, num_images=60)
+    options = groma.AdjustOptions(loss="none", points=False, planes=False, refine_poses=False)
+    scene = groma.adjust(start.with_poses(truth.cam_from_world), options).scene
+    found = line_end_correlation(scene)
+    assert found == pytest.approx(correlation, abs=0.15)
+    assert noise_px(scene, "lines", found) == pytest.approx(NOISE, rel=0.15)
+
+
+@pytest.mark.parametrize("correlation", [-0.5, 0.5])
+def test_lines_are_measured_where_errors_are_independent(correlation):
+    truth, start = lines_with(correlation, num_images=60)
+    exact = truth.replace(line_observations=start.line_observations)
+    problem = assemble(exact, AssemblyOptions(points=False, line_sigma_px=NOISE, line_end_correlation=correlation))
+    (factor,) = problem.problem.factors
+    whitened = residuals_of(factor, problem.problem.variables) * np.asarray(factor.sqrt_information)[:, None]
+    np.testing.assert_allclose(np.cov(whitened.T), np.eye(2), atol=0.2)
+
+
+@pytest.mark.parametrize("correlation", [-0.5, 0.4])
+def test_reported_distances_are_those_of_the_ends(correlation):
+    scene = lines_with(0.0)[1]
+    at_ends, elsewhere = (
+        squared_residuals_px(assemble(scene, AssemblyOptions(points=False, line_end_correlation=number)))["lines"]
+        for number in (0.0, correlation)
+    )
+    np.testing.assert_allclose(elsewhere, at_ends, rtol=1e-6, atol=1e-9)
+
+
+def test_a_correlation_of_one_is_refused():
+    with pytest.raises(InputError, match="line_end_correlation must be between -1 and 1"):
+        AssemblyOptions(line_end_correlation=1.0)
+
+
+def test_few_lines_tell_no_correlation():
+    assert line_end_correlation(lines_with(-0.5, num_images=6)[1]) == 0.0
+    assert line_end_correlation(scene_with(varied)[1].points_only()) == 0.0
+
+
+def test_what_images_see_does_not_move_with_the_frame():
+    truth, start, _ = scene_with(varied)
+    turned = truth.transformed(Similarity(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3])))
+    assert moved_px(truth, turned, 0.1) < 1e-9
+    assert moved_px(truth, start, 0.5) > 1.0
+    assert moved_px(truth, start, 0.1) > moved_px(truth, start, 0.5)

@@ -10,7 +10,7 @@ import groma.solver.schur as schur_module
 import groma.solver.solve as solve_module
 from groma.errors import ProblemError
 from groma.factors import PointOnLine, PointReprojection, VectorPrior
-from groma.factors._factor import Ref
+from groma.factors._factor import Example, Factor, Ref, Slot
 from groma.factors.losses import Cauchy, Truncated
 from groma.geometry._manifold import Euclidean
 from groma.geometry.pose_charts import POSE_CHARTS
@@ -257,3 +257,44 @@ def test_what_a_landmark_becomes_does_not_depend_on_the_others():
     together, alone = (solve(Problem(problem.variables, [f]), options)["points"] for f in (factor, few))
     np.testing.assert_allclose(together[:10], alone[:10], rtol=1e-12)
     np.testing.assert_array_equal(alone[10:], problem.variables["points"].state[10:])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Bowl(Factor):
+    """r = (x, 3 + b x^2 / 2): at zero the curvature is 1 + 3 b, and Gauss-Newton takes it for 1."""
+
+    variable: Ref
+    bend: float = 1.0
+    slots = (Slot("variable", "vector"),)
+    type_name = "bowl"
+
+    @property
+    def residual_size(self) -> int:
+        return 2
+
+    def linearize(self, inputs, begin, end, columns, record):
+        x = inputs[0][self.variable.index[begin:end], 0]
+        if columns[0] >= 0:
+            record[:, :, columns[0]] = np.stack([np.ones_like(x), self.bend * x], axis=1)
+        record[:, :, -1] = np.stack([x, 3.0 + 0.5 * self.bend * x**2], axis=1)
+        return 0
+
+    @classmethod
+    def example(cls, rng) -> Example:
+        raise NotImplementedError
+
+
+def test_a_variable_does_not_jump_over_its_minimum_for_ever():
+    """Full steps treble the distance from the minimum. They are shortened by what the first one finds."""
+    x = np.array([[0.1], [0.2], [-0.3]])
+    problem = Problem({"x": Variables(Euclidean(1), x)}, [_Bowl(variable=Ref("x", np.arange(3)))])
+    solution = solve(problem, SolverOptions(initial_damping=1e-6, function_tolerance=1e-9))
+    np.testing.assert_allclose(solution["x"], 0.0, atol=1e-4)
+    assert solution.report.iterations <= 6
+
+
+def test_a_step_that_may_be_longer_is_not_given_up_where_the_longest_is_too_long():
+    """At 1 the cost bends down and the step is 0.3. Eight times that is beyond the minimum at 2, and costs more."""
+    problem = Problem({"x": Variables(Euclidean(1), np.ones((1, 1)))}, [_Bowl(variable=Ref("x", [0]), bend=-0.5)])
+    solution = solve(problem, SolverOptions(max_iterations=1, eliminate=()))
+    np.testing.assert_allclose(solution["x"], 1.85, atol=0.01)

@@ -170,6 +170,7 @@ def _diagnosis(result: MapResult) -> Diagnosis:
     assembly = AssemblyOptions(
         point_sigma_px=told.point_sigma_px,
         line_sigma_px=told.line_sigma_px,
+        line_end_correlation=told.line_end_correlation,
         structure_sigma_px=told.structure_sigma_px,
         refine_poses=told.refine_poses,
         refine_intrinsics=bool(told.refine_intrinsics),

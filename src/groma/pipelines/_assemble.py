@@ -20,6 +20,7 @@ from groma.factors.line_reprojection import LineReprojection
 from groma.factors.losses import Loss, Trivial
 from groma.factors.point_reprojection import PointReprojection
 from groma.geometry import quaternion, se3
+from groma.geometry._algebra import unit
 from groma.geometry._manifold import Euclidean
 from groma.geometry.line_charts import LINE_CHARTS
 from groma.geometry.plane_charts import PLANE_CHARTS
@@ -66,6 +67,9 @@ class AssemblyOptions:
     point_sigma_px: float = 1.0
     #: The same of an end point of a segment, across it.
     line_sigma_px: float = 1.0
+    #: Correlation of the errors of a segment's two ends, across it. Lines are measured where errors are independent:
+    #: nearer to the middle of the segment if it is negative, as where a line was fitted to the pixels of an edge.
+    line_end_correlation: float = 0.0
     #: How well points and lines keep to their planes and lines, as a length in the images, pixels.
     structure_sigma_px: float = SURFACE_SIGMA_PX
     #: Relations between landmarks as distances (``metric``, weighted by ``structure_sigma_px``) or as differences of
@@ -91,6 +95,8 @@ class AssemblyOptions:
         ):
             if getattr(self, name) not in known:
                 raise InputError(f"{name} must be one of {', '.join(sorted(known))}; got {getattr(self, name)!r}.")
+        if not abs(self.line_end_correlation) < 1.0:
+            raise InputError(f"line_end_correlation must be between -1 and 1; got {self.line_end_correlation}.")
 
 
 @dataclass(frozen=True)
@@ -102,6 +108,8 @@ class Assembly:
     notes: tuple[str, ...]
     #: What a residual of 1 is in the image, pixels, by number of the factor group: 1 unless it is listed here.
     pixels_of_residual: dict[int, FloatArray] = field(default_factory=dict)
+    #: How far from the middle of segments lines are measured, in half lengths.
+    reach: float = 1.0
 
 
 def assemble(scene: Scene, options: AssemblyOptions) -> Assembly:
@@ -144,28 +152,31 @@ def assemble(scene: Scene, options: AssemblyOptions) -> Assembly:
             factors += wireframe_factors(scene, sigma_px, options.loss, _camera_refs, _by_model)
     used = {ref.group for factor in factors for _, ref in factor.references()}
     problem = Problem({k: v for k, v in variables.items() if k in used}, factors)
-    return Assembly(problem, tuple(notes), pixels_of_residual)
+    return Assembly(problem, tuple(notes), pixels_of_residual, _reach(options))
 
 
 def disassemble(scene: Scene, problem: Problem) -> Scene:
     """Return the scene with the states of a solved problem."""
     states = {name: group.state for name, group in problem.variables.items()}
-    if "frames" in states:
-        scene = scene.with_rig_poses(states["frames"], states.get("sensors"))
     params = scene.cameras.params.copy()
     for name, members in _cameras_by_model(scene).items():
         group = f"intrinsics/{name}"
         if group in states:
             params[members, : states[group].shape[1]] = states[group]
-    scene = scene.with_params(params)
+    tables: dict[str, object] = {"cameras": scene.cameras.replace(params=params)}
+    if "frames" in states:
+        tables["frames"] = scene.frames.replace(rig_from_world=states["frames"])
+    if "sensors" in states:
+        tables["sensors"] = scene.sensors.replace(cam_from_rig=states["sensors"])
     if "points" in states:
-        scene = scene.with_points(problem.variables["points"].ambient())
+        tables["points"] = scene.points.replace(xyz=problem.variables["points"].ambient())
+    if "directions" in states:
+        tables["directions"] = scene.directions.replace(vectors=states["directions"])
+    scene = scene.replace(**tables)
     if "lines" in states:
         scene = scene.with_lines(problem.variables["lines"].ambient())
     if "planes" in states:
         scene = scene.with_planes(problem.variables["planes"].ambient())
-    if "directions" in states:
-        scene = scene.replace(directions=scene.directions.replace(vectors=states["directions"]))
     return scene
 
 
@@ -290,7 +301,8 @@ def _point_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> 
 
 def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]):
     """Yield factors of lines, and the pixels of a residual of 1 where it is not measured in pixels."""
-    table = scene.line_observations
+    table, reach = scene.line_observations, _reach(options)
+    sigma = options.line_sigma_px * np.sqrt(1.0 + options.line_end_correlation) * table.sigma
     for name, rows, camera in _by_model(scene, table.image_idx):
         model = camera_model(name)
         line = Ref("lines", table.line_idx[rows])
@@ -300,8 +312,8 @@ def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]):
                 camera_model=name,
                 line=line,
                 intrinsics=Ref(f"intrinsics/{name}", camera),
-                segments=table.segment.take(rows, axis=0),
-                sqrt_information=1.0 / (options.line_sigma_px * table.sigma[rows]),
+                segments=np.hstack(_nearer(table.segment[rows, :2], table.segment[rows, 2:], reach)),
+                sqrt_information=1.0 / sigma[rows],
                 loss=options.loss,
                 **poses,
             )
@@ -317,12 +329,34 @@ def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]):
             )
         focal = params[:, list(model.focal_indices)].mean(axis=1)
         kept = rows[good]
+        first, second = _nearer(first[good], second[good], reach)
+        if reach != 1.0:
+            first, second = unit(first), unit(second)
         in_radians = LineBearing(
             line=Ref("lines", table.line_idx[kept]),
-            start_bearings=first[good],
-            end_bearings=second[good],
-            sqrt_information=focal[good] / (options.line_sigma_px * table.sigma[kept]),
+            start_bearings=first,
+            end_bearings=second,
+            sqrt_information=focal[good] / sigma[kept],
             loss=options.loss,
             **_camera_refs(scene, table.image_idx[kept]),
         )
         yield in_radians, focal[good]
+
+
+def _reach(options: AssemblyOptions) -> float:
+    r"""Where on a segment, from its middle in half lengths, errors are independent.
+
+    The mean of the two ends' errors has the variance :math:`(1+\rho)\sigma^2/2` and half of their difference
+    :math:`(1-\rho)\sigma^2/2`, independent of each other; so at :math:`\pm s` with
+    :math:`s^2 = (1+\rho)/(1-\rho)` errors are independent too, of the variance :math:`(1+\rho)\sigma^2`. A line fitted
+    to many pixels has :math:`\rho = -1/2`: its places are those of the quadrature of Gauss.
+    """
+    return float(np.sqrt((1.0 + options.line_end_correlation) / (1.0 - options.line_end_correlation)))
+
+
+def _nearer(first: FloatArray, second: FloatArray, reach: float) -> tuple[FloatArray, FloatArray]:
+    """The two places on segments that are so far from their middles, in half lengths."""
+    if reach == 1.0:
+        return first, second
+    middle, half = 0.5 * (first + second), 0.5 * reach * (second - first)
+    return middle - half, middle + half

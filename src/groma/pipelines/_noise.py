@@ -11,6 +11,10 @@ mistakes. With :math:`q_{ij}` the squared norm of a residual of two coordinates,
 Logarithms tell the two apart: :math:`\log q` varies by :math:`\psi_1(1) + \psi_1(\nu_w / 2)` within the points, and
 their levels by :math:`\psi_1(\nu_b / 2)`, where :math:`\psi_1` is the trigamma function. The variances follow by
 expectation maximisation. Noise of one size gives an infinite :math:`\nu_b`, and all points the same variance.
+
+The two ends of a segment are not independent. A line fitted to the many pixels of an edge knows its middle better than
+its ends, whose errors then have a correlation of -1/2; an edge that is not quite where it is seen from elsewhere, as
+on a rounded corner, is off as a whole. Which of the two prevails is told by the residuals.
 """
 
 from __future__ import annotations
@@ -23,7 +27,8 @@ from scipy.special import polygamma
 from groma._typing import FloatArray, IntArray
 from groma.pipelines._assemble import AssemblyOptions, assemble
 from groma.pipelines._landmark_noise import project_points
-from groma.pipelines.adjust import squared_residuals_px
+from groma.pipelines._pixel_residuals import squared_residuals_px
+from groma.problem.residuals import residuals_of
 from groma.scene import Scene
 
 #: Residuals smaller than this are not believed, pixels: synthetic scenes may have none.
@@ -39,21 +44,59 @@ _LEAST_SQUARE = 1e-4
 #: Half the degrees of freedom lie between these.
 _SHAPES = (0.5, 1e4)
 _STEPS = 20
+#: Beyond this, a correlation of the two ends of segments is not believed.
+_MOST_CORRELATED = 0.8
 
 
-def noise_px(scene: Scene, kind: Literal["points", "lines"]) -> float:
+def noise_px(scene: Scene, kind: Literal["points", "lines"], end_correlation: float = 0.0) -> float:
     """Return the standard deviation of the usual coordinate of one kind of landmark, robustly, pixels.
 
     The median of the squared norm of two Gaussian coordinates is 1.386 variances; fitted landmarks take their share.
-    The observations' own standard deviations are relative to what is returned.
+    The observations' own standard deviations are relative to what is returned. For lines it is that of an end point,
+    given how the errors of the two ends are correlated.
     """
-    assembly = assemble(scene, AssemblyOptions(points=kind == "points", lines=kind == "lines", planes=False))
+    options = AssemblyOptions(
+        points=kind == "points", lines=kind == "lines", planes=False, line_end_correlation=end_correlation
+    )
+    assembly = assemble(scene, options)
     squares = squared_residuals_px(assembly, weighted=True).get(kind)
     if squares is None or len(squares) < _FEWEST:
         return _UNKNOWN_PX
     unknowns = 3 * scene.num_points if kind == "points" else 4 * scene.num_lines
     share = 1.0 - min(unknowns / (2 * len(squares)), 0.8)
     return max(float(np.sqrt(np.median(squares) / _MEDIAN / share)), MIN_SIGMA_PX)
+
+
+def line_end_correlation(scene: Scene) -> float:
+    """Return the correlation of the errors of segments' two ends across them, robustly, from the residuals.
+
+    Segments of lines that few images see follow their line and are left out; where no others are, it is zero.
+    """
+    problem = assemble(scene, AssemblyOptions(points=False, planes=False)).problem
+    images = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
+    ends = [np.zeros((0, 2))]
+    for factor in problem.factors:
+        told = images[factor.line.index] >= _MANY_VIEWS  # type: ignore[attr-defined]
+        ends.append((residuals_of(factor, problem.variables) * np.asarray(factor.sqrt_information)[:, None])[told])
+    first, second = np.concatenate(ends).T
+    if len(first) < _MANY_POINTS:
+        return 0.0
+    shift, turn = np.median(np.abs(first + second)) ** 2, np.median(np.abs(first - second)) ** 2
+    return float(np.clip((shift - turn) / max(shift + turn, 1e-300), -_MOST_CORRELATED, _MOST_CORRELATED))
+
+
+def moved_px(before: Scene, after: Scene, share: float) -> float:
+    """Return the distance in the images, pixels, by which this share of the points' observations moved at least.
+
+    Both scenes have the same observations; what counts is where their points are seen, so the frame does not matter.
+    """
+    table = before.point_observations
+    first, second = (
+        project_points(scene, table.image_idx, scene.points.xyz[table.point_idx])[0] for scene in (before, after)
+    )
+    away = np.linalg.norm(second - first, axis=1)
+    away = away[np.isfinite(away)]
+    return float(np.quantile(away, 1.0 - share)) if len(away) else 0.0
 
 
 def with_point_noise(scene: Scene) -> Scene:
@@ -107,4 +150,4 @@ def _inverse_trigamma(value: float) -> float:
     return float(np.interp(value, polygamma(1, shapes), shapes))
 
 
-__all__ = ["noise_px", "with_point_noise"]
+__all__ = ["line_end_correlation", "moved_px", "noise_px", "with_point_noise"]

@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
 from groma.pipelines._assemble import LINE_FACTORS, POINT_FACTORS, Assembly, AssemblyOptions, assemble, disassemble
+from groma.pipelines._line_clusters import settle_clusters
 from groma.pipelines._line_restart import renew_lines, with_seen_ends
 from groma.pipelines._line_slips import without_slips
+from groma.pipelines._pixel_residuals import squared_residuals_px
 from groma.pipelines._relation_outcome import drop_failed_relations
 from groma.pipelines._stage_reports import combined, stage_entries, with_costs_at, with_loss
 from groma.pipelines._structure_factors import SURFACE_SIGMA_PX
 from groma.problem.problem import Problem
-from groma.problem.residuals import residuals_of
 from groma.scene import Scene
 from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
@@ -66,6 +66,8 @@ class AdjustOptions:
     #: the scene are relative to it. Losses are scaled in these units.
     point_sigma_px: float = 1.0
     line_sigma_px: float = 1.0
+    #: Correlation of the errors of a segment's two ends: see :class:`groma.pipelines._assemble.AssemblyOptions`.
+    line_end_correlation: float = 0.0
     #: How relations between landmarks are measured: ``metric`` or ``pixels``, and how well they hold if metric: see
     #: :class:`groma.pipelines._assemble.AssemblyOptions`.
     structure_form: str = "metric"
@@ -260,8 +262,8 @@ def adjust(
         reports.append(solution.report)
         if stopped:
             break
-        if not last:
-            problem, renewed = renew_lines(scene, problem, options.threads)
+        for renew in () if last else (renew_lines, settle_clusters):
+            problem, renewed = renew(scene, problem, options.threads)
             moved.append(renewed)
         if not isinstance(loss, Trivial):
             problem, renewed = without_slips(problem, options.threads)
@@ -357,6 +359,7 @@ def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss) -> Assem
         gauge=options.gauge,
         point_sigma_px=options.point_sigma_px,
         line_sigma_px=options.line_sigma_px,
+        line_end_correlation=options.line_end_correlation,
         structure_form=options.structure_form,
         structure_sigma_px=options.structure_sigma_px,
         loss=loss,
@@ -367,33 +370,3 @@ def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss) -> Assem
 def _rmse_px(assembly: Assembly) -> dict[str, float]:
     """Root mean square of the reprojection residuals by kind, unweighted and without the loss, pixels."""
     return {kind: float(np.sqrt(np.mean(squares))) for kind, squares in squared_residuals_px(assembly).items()}
-
-
-def squared_residuals_px(assembly: Assembly, weighted: bool = False) -> dict[str, FloatArray]:
-    """Return the squared norm of every reprojection residual by kind of landmark.
-
-    A point has one residual of two coordinates, a segment one of the distances of its two ends.
-
-    Parameters
-    ----------
-    assembly : Assembly
-        A problem made from a scene, at any state.
-    weighted : bool
-        In standard deviations instead of pixels.
-
-    Returns
-    -------
-    dict
-        For ``points`` and ``lines``, if there are: (N,) float64, pixels squared, or variances.
-    """
-    parts: dict[str, list[FloatArray]] = {}
-    problem = assembly.problem
-    for number, factor in enumerate(problem.factors):
-        kind = "points" if factor.type_name in POINT_FACTORS else "lines" if factor.type_name in LINE_FACTORS else None
-        if kind is None or len(factor) == 0:
-            continue
-        unit = factor.sqrt_information if weighted else assembly.pixels_of_residual.get(number, 1.0)
-        parts.setdefault(kind, []).append(
-            (residuals_of(factor, problem.variables) ** 2).sum(axis=1) * np.asarray(unit) ** 2
-        )
-    return {kind: np.concatenate(squares) for kind, squares in parts.items()}

@@ -8,7 +8,8 @@ Stages, each saved when it is finished, so that an interrupted run goes on where
 2. ``segments``   line segments in every image, one image at a time;
 3. ``lines``      3D lines from the segments;
 4. ``joint``      poses, points and lines adjusted together, each point weighted by its own noise, the lines by theirs;
-                  then the lines are mapped once more with the better poses;
+                  then the lines are mapped once more with the better poses, and all this again while that moves
+                  the poses by more than the lines allow for;
 5. ``structure``  planes, common directions, and what lies on what;
 6. ``adjusted``   everything adjusted together.
 """
@@ -19,6 +20,7 @@ import dataclasses
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from groma._version import __version__
@@ -29,7 +31,7 @@ from groma.frontend.matches import LineMatches
 from groma.frontend.segments import Segments
 from groma.io.colmap_sfm import PointModelOptions, reconstruct_points
 from groma.pipelines._image_segments import detect_segments, given_segments
-from groma.pipelines._noise import noise_px, with_point_noise
+from groma.pipelines._noise import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.pipelines._photographs import check_images, check_names, image_files, read_gray
 from groma.pipelines._stages import Stages, digest, digest_files
 from groma.pipelines._unused import without_unused
@@ -45,6 +47,9 @@ LOSS_SIGMAS = 6.0
 #: Scale of the Cauchy loss of the last adjustment, which starts close. Relative to the noise of their own point,
 #: residuals are nearly Gaussian; the distribution of Student that fits them best bends at 4 to 5.
 LAST_LOSS_SIGMAS = 4.0
+#: Poses move too much for the lines that were mapped with them if this share of the points moves in the images by more
+#: than :attr:`MapLinesOptions.noise`. The lines are then mapped again, at most so many times in all after the first.
+MOVED_SHARE, MAX_ROUNDS = 0.1, 4
 
 #: Called with the name of a stage, what is done and what there is to do.
 StageProgress = Callable[[str, int, int], None]
@@ -188,28 +193,20 @@ def _mapped(
     )
     line_map = store.line_map("lines", lambda: map_lines(points, segments, matches, options.lines, say))
     lined = line_map.add_to(points, segments)
-    sigma = {"points": noise_px(lined, "points"), "lines": noise_px(lined, "lines")}
-    weighted = dataclasses.replace(
-        robust, point_sigma_px=sigma["points"], line_sigma_px=sigma["lines"], loss_scale=LOSS_SIGMAS
-    )
-    if options.refine_poses and lined.num_lines:
-        first = lined
-        joint = store.scene(
-            "joint", lambda: _adjusted(first, weighted, options, say, "adjusting points and lines").scene
-        )
+    weighted = _weighted(robust, lined)
+    for turn in range(MAX_ROUNDS if options.refine_poses and lined.num_lines else 0):
+        tag, first = f"-{turn + 1}" if turn else "", lined
+        joint = store.scene(f"joint{tag}", partial(_jointly, first, weighted, options, say))
         table = joint.point_observations
         joint = with_point_noise(joint.replace(point_observations=table.replace(sigma=given_sigma)))
         # The lines as mapped are good starts, and only the adjusted ones tell the noise of the segments.
-        sigma = {"points": noise_px(joint, "points"), "lines": noise_px(joint, "lines")}
-        line_map = store.line_map("final-lines", lambda: map_lines(joint, segments, matches, options.lines, say))
+        weighted = _weighted(robust, joint)
+        line_map = store.line_map(f"final-lines{tag}", partial(map_lines, joint, segments, matches, options.lines, say))
         lined = line_map.add_to(joint, segments)
-        weighted = dataclasses.replace(
-            weighted,
-            point_sigma_px=sigma["points"],
-            line_sigma_px=sigma["lines"],
-            loss="cauchy",
-            loss_scale=LAST_LOSS_SIGMAS,
-        )
+        if lined.num_lines == 0 or moved_px(first, joint, MOVED_SHARE) <= options.lines.noise:
+            break
+    if options.refine_poses and lined.num_lines:
+        weighted = dataclasses.replace(weighted, loss="cauchy", loss_scale=LAST_LOSS_SIGMAS)
     if options.find_planes:
         flat = lined
         weighted = dataclasses.replace(weighted, structure_sigma_px=options.structure.surface_sigma_px)
@@ -226,7 +223,7 @@ def _mapped(
         before=before,
         report=result.report,
         adjusted_with=weighted,
-        sigma_px=sigma,
+        sigma_px={"points": weighted.point_sigma_px, "lines": weighted.line_sigma_px},
         explanation=explain(line_map),
         fates={fate.name.lower(): count for fate, count in line_map.fate_counts().items()},
         warnings=(*warnings, *result.report.warnings),
@@ -293,6 +290,22 @@ def _measured(folder: Path, points: Scene, robust: AdjustOptions, options: MapOp
     )
     weighted = dataclasses.replace(robust, point_sigma_px=found.sigma_px)
     return _adjusted(found.scene, weighted, options, say, "adjusting points again").scene
+
+
+def _weighted(robust: AdjustOptions, scene: Scene) -> AdjustOptions:
+    """Options that weigh points and lines by the noise they have in a scene."""
+    correlation = line_end_correlation(scene)
+    return dataclasses.replace(
+        robust,
+        point_sigma_px=noise_px(scene, "points"),
+        line_sigma_px=noise_px(scene, "lines", correlation),
+        line_end_correlation=correlation,
+        loss_scale=LOSS_SIGMAS,
+    )
+
+
+def _jointly(scene: Scene, weighted: AdjustOptions, options: MapOptions, say: StageProgress) -> Scene:
+    return _adjusted(scene, weighted, options, say, "adjusting points and lines").scene
 
 
 def _adjusted(scene: Scene, adjust_options: AdjustOptions, options: MapOptions, say: StageProgress, stage: str):

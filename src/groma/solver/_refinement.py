@@ -31,14 +31,20 @@ class LandmarkRefiner:
             for name, group in layout.problem.variables.items()
         }
         factors = [f for f in layout.problem.factors if any(ref.group in groups for _, ref in f.references())]
-        self._outer, self._groups, self._steps = layout, groups, steps
+        self._outer, self._groups, self._steps, self._workers = layout, groups, steps, workers
+        self._of_all: LandmarkRefiner | None = None
         self._blocks = IndependentBlocks(lay_out(Problem(held, factors), tuple(groups)), workers, 1e-6)
 
     def refine(self, equations: NormalEquations, trial: Trial, instead: States | None = None) -> Trial:
         """Return the trial with better landmarks.
 
-        Landmarks start from the trial, or from the states ``instead`` where those cost less with the new cameras.
+        Landmarks start from the trial, or from the states ``instead`` where those cost less with the new cameras. Those
+        are for a step that would be refused: whatever landmarks are to blame, all that are eliminated then take part.
         """
+        every = [e.group for e in self._outer.eliminated]
+        if instead is not None and len(self._groups) < len(every):
+            self._of_all = self._of_all or LandmarkRefiner(self._outer, self._workers, every, self._steps)
+            return self._of_all.refine(equations, trial, instead)
         inner = to_original_order(self._outer, trial.states)
         self._blocks.reset()
         costs = self._blocks.costs(inner)

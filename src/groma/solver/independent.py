@@ -26,8 +26,9 @@ from groma.solver.termination import Termination
 #: A variable whose damping exceeds this has reached its minimum to machine precision.
 MAX_DAMPING = 1e12
 MIN_DAMPING = 1e-15
-#: A gain ratio above this means the cost falls faster than the quadratic model says, and a longer step may do better.
-STRETCH_GAIN_RATIO = 1.5
+#: A gain ratio above this means the cost falls faster than the quadratic model says, and a longer step may do better;
+#: one below the other, that it is more bent than the model says, and a shorter step may.
+STRETCH_GAIN_RATIO, SHORTEN_GAIN_RATIO = 1.5, 0.5
 MAX_STRETCH = 8.0
 
 
@@ -98,7 +99,7 @@ class IndependentBlocks:
             manifold = self.layout.problem.variables[group.group].manifold
             moved[group.group] = manifold.retract(states[group.group], delta)
         new_costs = self.costs(moved, costs)
-        self._stretch(states, costs, moved, new_costs, deltas, promised)
+        self._rescale(states, costs, moved, new_costs, deltas, promised)
         unfinished, squared_length = 0, 0.0
         for e, group in enumerate(self.layout.eliminated):
             better = new_costs[e] < costs[e]
@@ -124,27 +125,39 @@ class IndependentBlocks:
                 V, g, self.damping[e], 1, chunk.begin, chunk.end, self._N[e], self._h[e], dof
             )
 
-    def _stretch(self, states: States, costs, moved: States, new_costs, deltas, promised) -> None:
-        """Lengthen the steps whose cost fell faster than promised; ``moved``, its costs and steps are updated.
+    def _rescale(self, states: States, costs, moved: States, new_costs, deltas, promised) -> None:
+        r"""Try other lengths for steps whose cost fell otherwise than promised; ``moved``, costs and steps are updated.
 
-        The reason and the formula are those of the joint solve: robust losses bend the cost down.
+        If the curvature along a step is c times the model's, the gain ratio is 2 - c, and the minimum lies at 1 / c
+        times the step. Robust losses bend the cost down (c < 1). A line seen along its length, or anything else that is
+        bent and has large residuals, may bend it up: from c = 2 on, full steps jump over the minimum to where the cost
+        is higher, for ever. Damping helps little there, because the diagonal says nothing of such a direction.
         """
         factors = []
         for e in range(len(deltas)):
-            ratio = (costs[e] - new_costs[e]) / np.maximum(promised[e], 1e-300)
-            factors.append(np.where(ratio > STRETCH_GAIN_RATIO, 1.0 / np.maximum(2.0 - ratio, 1.0 / MAX_STRETCH), 1.0))
+            decrease = costs[e] - new_costs[e]
+            ratio = decrease / np.maximum(promised[e], 1e-300)
+            counts = self._open[e] & (np.maximum(np.abs(decrease), promised[e]) > self._tolerance * costs[e])
+            wrong = counts & ((ratio > STRETCH_GAIN_RATIO) | (ratio < SHORTEN_GAIN_RATIO))
+            factors.append(np.where(wrong, 1.0 / np.clip(2.0 - ratio, 1.0 / MAX_STRETCH, MAX_STRETCH), 1.0))
+
+        def concerned(chunk: Chunk) -> bool:
+            e = chunk.eliminated
+            return e is not None and bool((factors[e][chunk.begin : chunk.end] != 1.0).any())
+
         if all((factor == 1.0).all() for factor in factors):
             return
-        longer = dict(moved)
+        other = dict(moved)
         for e, group in enumerate(self.layout.eliminated):
             manifold = self.layout.problem.variables[group.group].manifold
-            longer[group.group] = manifold.retract(states[group.group], factors[e][:, None] * deltas[e])
-        longer_costs = self.costs(longer, costs)
+            other[group.group] = manifold.retract(states[group.group], factors[e][:, None] * deltas[e])
+        other_costs = [np.zeros(e.count) for e in self.layout.eliminated]
+        self.equations.cost(self.equations.prepare(other), other_costs, concerned)
         for e, group in enumerate(self.layout.eliminated):
-            better = longer_costs[e] < new_costs[e]
-            moved[group.group] = np.where(better[:, None], longer[group.group], moved[group.group])
+            better = (factors[e] != 1.0) & (other_costs[e] < new_costs[e])
+            moved[group.group] = np.where(better[:, None], other[group.group], moved[group.group])
             deltas[e] = np.where(better[:, None], factors[e][:, None] * deltas[e], deltas[e])
-            new_costs[e] = np.where(better, longer_costs[e], new_costs[e])
+            new_costs[e] = np.where(better, other_costs[e], new_costs[e])
 
 
 def solve_independently(

@@ -163,6 +163,6 @@ def warn_of_oddities(report: SolveReport) -> None:
         )
     if report.num_residuals < report.num_unknowns:
         report.warnings.append(
-            f"There are fewer residuals ({report.num_residuals:,}) than unknowns ({report.num_unknowns:,}): the result is "
-            "one of many. Hold variables constant, add priors or add observations."
+            f"There are fewer residuals ({report.num_residuals:,}) than unknowns ({report.num_unknowns:,}): the result "
+            "is one of many. Hold variables constant, add priors or add observations."
         )
