@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.factors._factor import Factor, Ref
 from groma.pipelines._assemble import LINE_FACTORS, POINT_FACTORS
-from groma.pipelines._line_restart import STEPS, SUSPICIOUS, _triangulated, _went_elsewhere, _with_cameras
+from groma.pipelines._line_restart import STEPS, SUSPICIOUS, triangulated_anew, went_elsewhere, with_cameras
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
 from groma.problem.variables import Variables
@@ -54,7 +54,7 @@ def settle_clusters(scene: Scene, problem: Problem, threads: int | None = None) 
     lines = chosen["lines"]
     if len(lines) == 0:
         return problem, nothing
-    triangulated, found = _triangulated(_with_cameras(scene, problem), lines)
+    triangulated, found = triangulated_anew(with_cameras(scene, problem), lines)
     second = {group: variables[group].state[members] for group, members in chosen.items()}
     second["lines"][found] = variables["lines"].manifold.from_ambient(triangulated[found])
     rows = [np.flatnonzero(doubtful[label]) for label in labels]
@@ -76,7 +76,7 @@ def settle_clusters(scene: Scene, problem: Problem, threads: int | None = None) 
         states[group][members] = np.where(better[cluster[group][members]][:, None], other, first)
     moved = problem.with_states(states)
     before, after = (p.variables["lines"].ambient()[lines] for p in (problem, moved))
-    return moved, lines[_went_elsewhere(scene.lines.segments[lines], before, after)]
+    return moved, lines[went_elsewhere(scene.lines.segments[lines], before, after)]
 
 
 def _clusters(ties: list[Factor], variables: Mapping[str, Variables]) -> tuple[dict[str, IntArray], int]:

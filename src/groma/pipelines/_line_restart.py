@@ -74,10 +74,10 @@ def renew_lines(scene: Scene, problem: Problem, threads: int | None = None) -> t
     first[chosen[better]] = other[better]
     moved = problem.with_states({"lines": first})
     before, after = (p.variables["lines"].ambient()[chosen] for p in (problem, moved))
-    return moved, chosen[_went_elsewhere(scene.lines.segments[chosen], before, after)]
+    return moved, chosen[went_elsewhere(scene.lines.segments[chosen], before, after)]
 
 
-def _went_elsewhere(segments: FloatArray, before: FloatArray, after: FloatArray) -> BoolArray:
+def went_elsewhere(segments: FloatArray, before: FloatArray, after: FloatArray) -> BoolArray:
     """Whether the places of segments (n, 2, 3) on lines before (n, 6) are far from the lines after; also if unknown."""
     feet = line3.closest_point(before[:, None], segments)
     away = line3.distance_to_point(after[:, None], feet).max(axis=1)
@@ -123,11 +123,11 @@ def _second_starts(scene: Scene, problem: Problem, factors: list[Factor]) -> tup
     chosen = np.flatnonzero(enough & (per_view > SUSPICIOUS * max(usual, 1e-12)))
     if len(chosen) == 0:
         return chosen, np.zeros((0, 6))
-    triangulated, found = _triangulated(_with_cameras(scene, problem), chosen)
+    triangulated, found = triangulated_anew(with_cameras(scene, problem), chosen)
     return chosen[found], triangulated[found]
 
 
-def _with_cameras(scene: Scene, problem: Problem) -> Scene:
+def with_cameras(scene: Scene, problem: Problem) -> Scene:
     """Return the scene with the cameras of the problem."""
     landmarks = ("points", "lines", "planes", "directions")
     cameras = {name: group for name, group in problem.variables.items() if name not in landmarks}
@@ -145,7 +145,7 @@ def _line_costs(problem: Problem, factors: list[Factor]) -> tuple[FloatArray, In
     return total, count
 
 
-def _triangulated(scene: Scene, lines: IntArray) -> tuple[FloatArray, BoolArray]:
+def triangulated_anew(scene: Scene, lines: IntArray) -> tuple[FloatArray, BoolArray]:
     """Return Plücker lines (n, 6) where the planes of their views meet best, and which of them are finite."""
     table = scene.line_observations
     rows = np.flatnonzero(np.isin(table.line_idx, lines))
