@@ -140,7 +140,7 @@ class CoarseSpace:
         if self._state is None:
             return
         w = self._kept.width
-        P = self._motions()
+        P = self._motions(self._state)
         if self._factor is not None and np.abs(P - self._P).max() < SAME_MOTIONS * np.abs(P).max():
             return
         self._P = P
@@ -156,12 +156,12 @@ class CoarseSpace:
         factor, info = self._potrf(A, lower=1, clean=0, overwrite_a=1)
         self._factor = factor if info == 0 else None
 
-    def _motions(self) -> FloatArray:
+    def _motions(self, state: FloatArray) -> FloatArray:
         """Return P, flat: how each camera moves with its cluster."""
         member = self._kept.members[0]
         group = self._layout.problem.variables[member.group]
         P = np.zeros((self._kept.count, self._kept.width, 7))
-        P[:, : member.dof] = gauge_directions(group.manifold, self._state).transpose(1, 2, 0)
+        P[:, : member.dof] = gauge_directions(group.manifold, state).transpose(1, 2, 0)
         free = group.free_coordinates()
         if free is not None:
             P[:, : member.dof] *= free[:, :, None]
