@@ -2,6 +2,7 @@
 """Joint adjustment of points, lines, planes and a wireframe by groma and by LIMAP 2, on the same files.
 
     python benchmarks/holistic.py --python-limap PYTHON [--images 100 200 500] [--views random near] [--seeds 3]
+        [--kinds points lines]
     python benchmarks/holistic.py --python-limap PYTHON --accuracy     # ten scenes of 100 images, as published
     python benchmarks/holistic.py --weights                            # metric relations over four decades of weights
 
@@ -122,12 +123,12 @@ class Runs:
         return sorted({row[name] for row in self.rows})
 
 
-def one_scene(images: int, views: str, seed: int, pythons: dict[str, str], kept: Runs) -> list[dict]:
+def one_scene(images: int, views: str, seed: int, kinds: list[str], pythons: dict[str, str], kept: Runs) -> list[dict]:
     """Run all contestants on one scene, in turn; leave out what is in ``kept``."""
     where = {"images": images, "views": views, "seed": seed}
     due = [
         {**where, "kind": kind, "contestant": contestant}
-        for kind in KINDS
+        for kind in kinds
         for contestant in pythons
         if not kept.of(**where, kind=kind, contestant=contestant)
     ]
@@ -300,6 +301,7 @@ def main() -> int:
     parser.add_argument("--keep-limap", action="store_true", help="take LIMAP's runs from the results, where there are")
     parser.add_argument("--images", type=int, nargs="+", default=[100, 200])
     parser.add_argument("--views", nargs="+", choices=("random", "near"), default=["random"])
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), help="what is adjusted")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--timeout", type=int, default=_workshop.TIMEOUT, help="longest a run may take, seconds")
     parser.add_argument("--programs", nargs="+", choices=("groma", "limap"), default=["groma", "limap"])
@@ -326,7 +328,7 @@ def main() -> int:
         for views in arguments.views:
             for seed in range(arguments.seeds):
                 kept = Runs(runs.of(contestant="limap") if arguments.keep_limap else [])
-                for run in one_scene(images, views, seed, pythons, kept):
+                for run in one_scene(images, views, seed, arguments.kinds, pythons, kept):
                     runs.add(run)
                 path.write_text(json.dumps({"machine": machine(), "runs": runs.rows}, indent=1) + "\n")
             here = Runs(runs.of(images=images, views=views))

@@ -295,7 +295,7 @@ class ConjugateGradients:
 
     name = "pcg"
     #: Stop when one more iteration improves the quadratic model by less than this share of its mean improvement.
-    model_tolerance = 0.02
+    model_tolerance = 0.025
     #: ... and, where other blocks than cameras are kept, when the residual has fallen to this share. Planes converge in
     #: two phases, and the model seems to stand still between them.
     mixed_tolerance = 0.01
