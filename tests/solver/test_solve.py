@@ -291,10 +291,3 @@ def test_a_variable_does_not_jump_over_its_minimum_for_ever():
     solution = solve(problem, SolverOptions(initial_damping=1e-6, function_tolerance=1e-9))
     np.testing.assert_allclose(solution["x"], 0.0, atol=1e-4)
     assert solution.report.iterations <= 6
-
-
-def test_a_step_that_may_be_longer_is_not_given_up_where_the_longest_is_too_long():
-    """At 1 the cost bends down and the step is 0.3. Eight times that is beyond the minimum at 2, and costs more."""
-    problem = Problem({"x": Variables(Euclidean(1), np.ones((1, 1)))}, [_Bowl(variable=Ref("x", [0]), bend=-0.5)])
-    solution = solve(problem, SolverOptions(max_iterations=1, eliminate=()))
-    np.testing.assert_allclose(solution["x"], 1.85, atol=0.01)

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from groma.problem.linearization import NormalEquations
 from groma.solver.dogleg import Dogleg
 from groma.solver.independent import MAX_STRETCH
@@ -61,20 +59,14 @@ def try_step(
 
 
 def stretched(equations: NormalEquations, states: States, trial: Trial) -> Trial:
-    r"""Try multiples of an accepted step, and return the better trial.
+    r"""Try a multiple of an accepted step, and return the better trial.
 
     Robust losses bend the cost down, so reweighted least squares overestimates the curvature. If the curvature along
     the step is the fraction c of the model's, the gain ratio is 2 - c and the minimum lies at 1 / c times the step.
-    Where the cost bends the other way the minimum is not known: the longest multiple is tried, and where that is too
-    long, its root.
     """
     factor = min(1.0 / max(2.0 - trial.gain_ratio, 1.0 / MAX_STRETCH), MAX_STRETCH)
-    while factor > 1.5:
-        moved = retract(equations.layout, states, trial.step.blend(factor, trial.step, 0.0))
-        inputs = equations.prepare(moved)
-        cost = equations.cost(inputs)
-        if cost < trial.cost:
-            better = {"states": moved, "inputs": inputs, "cost": cost}
-            return replace(trial, **better, costs=equations.costs, hidden=equations.hidden)
-        factor = float(np.sqrt(factor))
-    return trial
+    moved = retract(equations.layout, states, trial.step.blend(factor, trial.step, 0.0))
+    inputs = equations.prepare(moved)
+    cost = equations.cost(inputs)
+    better = {"states": moved, "inputs": inputs, "cost": cost, "costs": equations.costs, "hidden": equations.hidden}
+    return replace(trial, **better) if cost < trial.cost else trial
