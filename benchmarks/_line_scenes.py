@@ -130,6 +130,13 @@ SCENES: dict[str, Callable[[Path], LineScene]] = {
     "boxes-wide": lambda data: boxes("boxes-wide", BoxSettings(seed=106, width=640, height=480, focal=480.0)),
     "boxes-few": lambda data: boxes("boxes-few", BoxSettings(seed=119, num_images=12)),
     "boxes-many": lambda data: boxes("boxes-many", BoxSettings(seed=121, num_images=48)),
+    "boxes-held-small": lambda data: boxes(
+        "boxes-held-small", BoxSettings(seed=401, texture=10.0, width=640, height=480, focal=560.0)
+    ),
+    "boxes-held-random": lambda data: boxes("boxes-held-random", BoxSettings(seed=403, texture=12.0, cameras="random")),
+    "boxes-held-many": lambda data: boxes(
+        "boxes-held-many", BoxSettings(seed=404, num_images=48, texture=10.0, width=640, height=480, focal=560.0)
+    ),
     "pavilion": lambda data: pavilion("pavilion", data / "pavilion_chair"),
     "fountain": lambda data: strecha("fountain", data / "strecha_fountain_p11"),
     "herz-jesus": lambda data: strecha("herz-jesus", data / "strecha_herz_jesus_p8"),

@@ -27,10 +27,8 @@ from groma.frontend import Segments
 from groma.frontend.matches import LineMatches
 from groma.geometry import quaternion, segment2
 from groma.pipelines._neighbors import covisible_neighbors
-from groma.pipelines._noise import noise_px
-from groma.pipelines.adjust import AdjustOptions, adjust
-from groma.pipelines.find_structure import StructureOptions, find_structure
-from groma.pipelines.map import LOSS_SIGMAS
+from groma.pipelines._stages import Stages
+from groma.pipelines.map import MapOptions, adjust_points, map_segments
 from groma.pipelines.map_lines import MapLinesOptions, map_lines, wide_baseline_matches
 from groma.scene import Scene
 
@@ -103,23 +101,26 @@ def run_groma(task: Task) -> list[LineSet]:
 
 
 def _run_groma(task: Task, name: str, options: MapLinesOptions) -> list[LineSet]:
-    map_lines(task.source.scene, task.segments, task.matches or None, options)  # kernels into memory
-    start = time.process_time()
-    found = map_lines(task.source.scene, task.segments, task.matches or None, options)
-    seconds = time.process_time() - start
-    track = np.column_stack([found.line_idx, found.image_idx, found.segment_idx])
-    mapped = LineSet(f"{name}, no joint adjustment", task.matching, found.segments, track, seconds)
-    if not found.num_lines:
-        return [mapped]
-    lined = found.add_to(task.source.scene, task.segments)
-    structure = StructureOptions()
-    weighted = AdjustOptions(
-        refine_poses=False, threads=1, loss_scale=LOSS_SIGMAS, point_sigma_px=noise_px(lined, "points"),
-        line_sigma_px=noise_px(lined, "lines"), structure_sigma_px=structure.surface_sigma_px,
-    )  # fmt: skip
-    adjusted = adjust(find_structure(lined, structure), weighted).scene
-    seconds = time.process_time() - start
-    return [mapped, LineSet(name, task.matching, adjusted.lines.segments, track, seconds)]
+    settings = MapOptions(lines=options, refine_poses=False, threads=1)
+    matches = task.matches or None
+    with tempfile.TemporaryDirectory() as work, Stages(Path(work), task.source.name) as store:
+        points = adjust_points(task.source.scene, settings, store, _silent)
+        map_lines(points, task.segments, matches, options)  # kernels into memory
+        start = time.process_time()
+        found = map_lines(points, task.segments, matches, options)
+        seconds = time.process_time() - start
+        track = np.column_stack([found.line_idx, found.image_idx, found.segment_idx])
+        mapped = LineSet(f"{name}, no joint adjustment", task.matching, found.segments, track, seconds)
+        if not found.num_lines:
+            return [mapped]
+        start = time.process_time()
+        result = map_segments(points, task.segments, matches, settings, store, _silent)
+        seconds = time.process_time() - start
+    return [mapped, LineSet(name, task.matching, result.scene.lines.segments, track, seconds)]
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    """Nobody watches."""
 
 
 def run_limap(task: Task, python: str) -> list[LineSet]:

@@ -8,7 +8,8 @@ and anything that grows faster than the number of images shows.
     python benchmarks/map_scaling.py IMAGES --model MODEL --copies 1 2 4 8
 
 Each size runs in a process of its own, with one thread unless told otherwise. Columns: images, points, lines, planes,
-seconds of processor time in all and per image, peak memory; then the same seconds of every stage per image.
+seconds of processor time in all and per image, peak memory; then the same seconds of every stage per image, and the
+peak memory up to the end of every stage, MB.
 """
 
 import argparse
@@ -67,11 +68,12 @@ def measure(images, model, copies, threads):
     from groma.pipelines.map import MapOptions, map_images
 
     scene = repeat(read_scene(model).points_only(), copies)
-    seconds, last = {}, ["reading", time.process_time()]
+    seconds, peaks, last = {}, {}, ["reading", time.process_time()]
 
     def progress(stage, done, total):
         now = time.process_time()
         seconds[last[0]] = seconds.get(last[0], 0.0) + now - last[1]
+        peaks[last[0]] = peak_mb()
         last[:] = stage, now
 
     with tempfile.TemporaryDirectory() as folder:
@@ -89,9 +91,15 @@ def measure(images, model, copies, threads):
         "lines": result.scene.num_lines,
         "planes": result.scene.num_planes,
         "seconds": total,
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_mb": peak_mb(),
         "stages": seconds,
+        "peaks": peaks,
     }
+
+
+def peak_mb():
+    """Return the largest memory that this process has had, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def main():
@@ -123,6 +131,9 @@ def main():
     for stage in rows[-1]["stages"]:
         values = " ".join(f"{row['stages'].get(stage, 0.0) / row['images']:8.4f}" for row in rows[1:])
         print(f"{stage:32s} {values}")
+    print("\npeak memory up to the end of a stage, MB")
+    for stage in rows[-1]["peaks"]:
+        print(f"{stage:32s} " + " ".join(f"{row['peaks'].get(stage, 0.0):8.0f}" for row in rows[1:]))
 
 
 if __name__ == "__main__":

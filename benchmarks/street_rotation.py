@@ -6,8 +6,9 @@
 
 SEQUENCE is a folder of the KITTI layout with ``poses.txt``. SIFT features of two frames give the rotation twice: by the
 essential matrix, and by a perspective pose from points of the stereo pair. With pycolmap, all frames of the left camera
-are adjusted together as well. Printed are differences in degrees, and the rotation of the reference from frame to frame
-at the start.
+are adjusted together as well. Printed are differences in degrees, the rotation of the reference from frame to frame at
+the start, and the errors of the paths of TRACK (stereo) and of COLMAP (scale aligned), whole and from the twelfth pose
+on.
 """
 
 import sys
@@ -86,7 +87,7 @@ class Street:
 
 
 def by_adjustment(street: Street, folder: Path) -> np.ndarray:
-    """Rotations (N, 3, 3) of all frames, cam_from_world: features, matches and adjustment by COLMAP, camera held."""
+    """cam_from_world (N, 3, 4) of all frames: features, matches and adjustment by COLMAP, camera held."""
     K = street.K
     pycolmap.set_random_seed(0)
     reader = pycolmap.ImageReaderOptions(
@@ -105,8 +106,8 @@ def by_adjustment(street: Street, folder: Path) -> np.ndarray:
     options.mapper.abs_pose_min_num_inliers = 20
     made = pycolmap.incremental_mapping(database, images, folder / "model", options=options)
     model = max(made.values(), key=lambda one: one.num_reg_images())
-    found = {int(Path(image.name).stem): image.cam_from_world().rotation.matrix() for image in model.images.values()}
-    return np.array([found.get(k, np.full((3, 3), np.nan)) for k in range(max(found) + 1)])
+    found = {int(Path(image.name).stem): image.cam_from_world().matrix() for image in model.images.values()}
+    return np.array([found.get(k, np.full((3, 4), np.nan)) for k in range(max(found) + 1)])
 
 
 def angle(first, second) -> float:
@@ -124,10 +125,36 @@ def tracked(path: Path, times):
     return quaternion.to_matrix(track.world_from_cam[nearest, :4])
 
 
+def print_path(name: str, estimate, reference, align: str) -> None:
+    """Print the errors of a path, whole and without its first eleven poses."""
+    from groma.evaluation.trajectory import score_trajectory
+
+    for begin, part in ((0, "whole"), (11, "from the twelfth pose on")):
+        of = [one.take(np.flatnonzero(one.timestamps >= reference.timestamps[begin])) for one in (estimate, reference)]
+        found = score_trajectory(*of, align)
+        print(
+            f"| {name}, {part} | {100 * found.ate.rmse:.1f} cm | {found.drift_percent:.2f} % | "
+            f"{found.drift_deg_per_metre:.4f} |",
+            flush=True,
+        )
+
+
+def as_path(times, cam_from_world):
+    """A trajectory of poses (N, 3, 4); those that are not finite are left out."""
+    from groma.geometry import quaternion
+    from groma.io.trajectories import Trajectory
+
+    rows = np.flatnonzero(np.isfinite(cam_from_world).all(axis=(1, 2)))
+    turn = np.swapaxes(cam_from_world[rows, :, :3], 1, 2)
+    center = -np.einsum("nij,nj->ni", turn, cam_from_world[rows, :, 3])
+    return Trajectory(times[rows], np.hstack([quaternion.from_matrix(turn), center]))
+
+
 def main() -> None:
     street = Street(Path(sys.argv[1]))
     reference = np.loadtxt(street.folder / "poses.txt").reshape(-1, 3, 4)[:, :, :3]
-    groma = tracked(Path(sys.argv[2]) / "trajectory.txt", np.loadtxt(street.folder / "times.txt"))
+    times = np.loadtxt(street.folder / "times.txt")
+    groma = tracked(Path(sys.argv[2]) / "trajectory.txt", times)
     columns = ["essential matrix, reference", "stereo, reference", "essential matrix, stereo", "groma, reference",
                "groma, essential matrix"]  # fmt: skip
     adjusted = None
@@ -141,12 +168,21 @@ def main() -> None:
         truth, ours = reference[j].T @ reference[i], groma[j].T @ groma[i]
         pairs = [(essential, truth), (stereo, truth), (essential, stereo), (ours, truth), (ours, essential)]
         if adjusted is not None:
-            colmap = adjusted[j] @ adjusted[i].T
+            colmap = adjusted[j, :, :3] @ adjusted[i, :, :3].T
             pairs += [(colmap, truth), (ours, colmap)]
         print(f"| {i} and {j} | " + " | ".join(f"{angle(*pair):.2f}" for pair in pairs) + " |", flush=True)
     print("\nThe reference from frame to frame, degrees about x, y, z:")
     for i in range(14):
         print(i, np.degrees(cv2.Rodrigues(reference[i + 1].T @ reference[i])[0].ravel()).round(3))
+
+    from groma.io import read_trajectory
+    from groma.io.trajectories import read_tum
+
+    path = read_trajectory(street.folder / "poses.txt", "kitti", times)
+    print("\n| path | position error | translation error | rotation, degrees a metre |\n|---|--:|--:|--:|")
+    print_path("groma", read_tum(Path(sys.argv[2]) / "trajectory.txt"), path, "se3")
+    if adjusted is not None:
+        print_path("COLMAP", as_path(times, adjusted), path, "sim3")
 
 
 if __name__ == "__main__":

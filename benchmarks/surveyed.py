@@ -3,6 +3,7 @@
 
     python benchmarks/surveyed.py SCENE ...
     python benchmarks/surveyed.py SCENE ... --scales 1 3 5 7
+    python benchmarks/surveyed.py SCENE ... --subsets 10
     python benchmarks/surveyed.py SCENE ... --limits
     python benchmarks/surveyed.py SCENE ... --noise --rendered 1 2 3
 
@@ -20,6 +21,10 @@ the survey as its own noise would allow.
 With ``--scales`` the last adjustment, of everything, is repeated with these scales of its loss, in standard deviations
 of the noise, instead.
 
+With ``--subsets`` the last adjustment is repeated for so many random choices of half of the images or more, all
+connected; scenes of fewer than ten images are left out one image at a time. Means over the choices, and in how many
+lines, and planes in addition, brought the centres nearer.
+
 With ``--limits`` a row says how near the survey these photographs can come at all:
 
 - *one among surveyed*: each camera in turn is placed by its photograph while all others stay at their surveyed poses;
@@ -31,9 +36,9 @@ With ``--limits`` a row says how near the survey these photographs can come at a
 - *tails*: degrees of freedom of Student's distribution of the points' residuals, with one noise for all points and with
   each point's own.
 
-With ``--noise`` the last adjustment is repeated with one noise for all points, and with each point's own, by points and
-by everything. ``--rendered`` adds rooms of boxes, rendered with these seeds and reconstructed from the pictures, whose
-cameras are known exactly.
+With ``--noise`` the last adjustment is repeated with one noise for all points, with each point's own, and with that and
+the errors that neighbours share, by points and by everything. ``--rendered`` adds rooms of boxes, rendered with these
+seeds and reconstructed from the pictures, whose cameras are known exactly.
 """
 
 import argparse
@@ -44,6 +49,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from _renderings import BoxSettings, render_boxes
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 import groma
 from groma.evaluation import evaluate_poses
@@ -51,8 +58,9 @@ from groma.evaluation.alignment import align_points
 from groma.factors import Ref
 from groma.factors.position_prior import PositionPrior
 from groma.pipelines._assemble import AssemblyOptions, assemble, disassemble
-from groma.pipelines._noise import noise_px
+from groma.pipelines._noise import noise_px, with_point_noise
 from groma.pipelines._pixel_residuals import squared_residuals_px
+from groma.pipelines._unused import without_unused
 from groma.pipelines.map import MapOptions, MapResult, map_images
 from groma.pipelines.uncertainty import position_sigma, uncertainty
 from groma.problem.problem import Problem
@@ -66,7 +74,10 @@ KINDS = {
     "+ lines": {"planes": False},
     "+ planes": {},
 }
-NOISES = ["points, one noise", "points, own noise", "all, one noise", "all, own noise"]
+NOISES = [f"{kind}, {noise}" for kind in ("points", "all") for noise in ("one noise", "own", "own and shared")]
+SUBSETS = [*KINDS, "lines help", "planes help"]
+#: Points that an image of a subset shares with another at least, and images a scene needs for random subsets.
+SHARED_POINTS, MANY_IMAGES = 60, 10
 LIMITS = ["one among surveyed", "at 2, 3, 5 sigma", "calibrated", "k1, k2", "gain", "tails"]
 #: Twice the logarithm of the likelihood that a result nearer the survey may cost.
 PRICES = (4.0, 9.0, 25.0)
@@ -126,13 +137,46 @@ def tell_scales(folder: Path, survey: Scene, result: MapResult, scales: list[flo
 
 
 def tell_noise(name: str, survey: Scene, result: MapResult) -> None:
-    """Print a row: the centres with one noise for all points, and with each point's own."""
+    """Print a row: the centres with one noise for all points, with each point's own, and with shared errors too."""
     one, cells = with_one_noise(result.before), []
+    own = one.replace(point_observations=with_point_noise(with_one_noise(result.scene)).point_observations)
     plain = replace(result.adjusted_with, point_sigma_px=noise_px(with_one_noise(result.scene), "points"))
+    weighings = ((one, plain), (own, result.adjusted_with), (result.before, result.adjusted_with))
     for kinds in (KINDS["points"], KINDS["+ planes"]):
-        for scene, options in ((one, plain), (result.before, result.adjusted_with)):
-            cells.append(scores(groma.adjust(scene, replace(options, **kinds)).scene, survey))
+        cells += [scores(groma.adjust(scene, replace(options, **kinds)).scene, survey) for scene, options in weighings]
     print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
+def tell_subsets(folder: Path, survey: Scene, result: MapResult, count: int) -> None:
+    """Print a row: the centres' error over subsets of the images, and how often lines and planes help."""
+    found = []
+    for images in subsets(result.before, count):
+        scene = without_unused(result.before.subset(images, min_observations=2))[0]
+        options = [replace(result.adjusted_with, **kinds) for kinds in KINDS.values()]
+        found.append([evaluate_poses(groma.adjust(scene, one).scene, survey).center_rmse for one in options])
+    table = 1e3 * np.array(found)
+    better = [int((table[:, k + 1] < table[:, k]).sum()) for k in (0, 1)]
+    cells = [*(f"{mean:.2f}" for mean in table.mean(axis=0)), *(f"{wins} of {len(table)}" for wins in better)]
+    print(f"| {folder.name} | " + " | ".join(cells) + " |", flush=True)
+
+
+def subsets(scene: Scene, count: int) -> list[np.ndarray]:
+    """Images of random subsets in which all are connected by common points; of few images, all but one."""
+    every = np.arange(scene.num_images)
+    if len(every) < MANY_IMAGES:
+        return [np.delete(every, k) for k in every]
+    table, rng = scene.point_observations, np.random.default_rng(0)
+    seen = csr_array((np.ones(len(table)), (table.image_idx, table.point_idx)), (len(every), scene.num_points))
+    common = (seen @ seen.T).toarray() >= SHARED_POINTS
+    found: list[np.ndarray] = []
+    for _ in range(1000 * count):
+        size = int(rng.integers((len(every) + 1) // 2, 2 * len(every) // 3 + 1))
+        chosen = np.sort(rng.permutation(len(every))[:size])
+        if connected_components(common[np.ix_(chosen, chosen)])[0] == 1:
+            found.append(chosen)
+        if len(found) == count:
+            break
+    return found
 
 
 def tell_rendered(seed: int) -> None:
@@ -247,14 +291,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", type=Path)
     parser.add_argument("--scales", nargs="+", type=float, metavar="S", help="scales of the last loss to compare")
+    parser.add_argument("--subsets", type=int, metavar="N", help="the same over so many subsets of the images")
     parser.add_argument("--limits", action="store_true", help="how near the survey these photographs can come")
-    parser.add_argument("--noise", action="store_true", help="one noise for all points, and each point's own")
+    parser.add_argument("--noise", action="store_true", help="one noise for all, each point's own, shared errors")
     parser.add_argument("--rendered", nargs="+", type=int, metavar="SEED", default=[], help="rooms of boxes too")
     arguments = parser.parse_args()
     print("centres: rms / largest, thousandths of the survey's unit; rotations: mean, degrees\n")
     columns = ["start", "squares", *KINDS, "predicted", "misfit"]
     if arguments.scales:
         columns = [f"{scale:g}" for scale in arguments.scales]
+    if arguments.subsets:
+        columns = SUBSETS
     if arguments.limits:
         columns = LIMITS
     if arguments.noise or arguments.rendered:
@@ -266,6 +313,8 @@ def main() -> None:
             result = map_images(folder / "images", work, start, MapOptions())
         if arguments.scales:
             tell_scales(folder, survey, result, arguments.scales)
+        elif arguments.subsets:
+            tell_subsets(folder, survey, result, arguments.subsets)
         elif arguments.noise or arguments.rendered:
             tell_noise(folder.name, survey, result)
         elif arguments.limits:

@@ -53,7 +53,7 @@ exclude_patterns = ["_build"]
 
 #: What an array type is made of, and a name that Python defers, where the aliases above do not reach: inside others.
 _ARRAY = re.compile(
-    r"~?(?:numpy\.)?ndarray\[tuple\[~?(?:typing\.)?Any, \.\.\.\], ~?(?:numpy\.)?dtype\[~?(?:numpy\.)?(\w+)\]\]"
+    r"~?(?:numpy\.)?ndarray\[tuple\[~?(?:typing\.)?Any, (?:\.\.\.|…)\], ~?(?:numpy\.)?dtype\[~?(?:numpy\.)?(\w+)\]\]"
 )
 _DEFERRED = re.compile(r"~?(?:[\w.]+\.)?TypeAliasForwardRef\('(\w+)'\)")
 _SHORT = {"float64": "FloatArray", "integer": "IntArray", "bool": "BoolArray", "bool_": "BoolArray"}
@@ -73,11 +73,12 @@ def _shorten_signature(
 
 
 def _shorten_attributes(app: Sphinx, doctree: nodes.document) -> None:
-    """Do the same for the types of attributes, which are no signatures."""
-    for annotation in doctree.findall(addnodes.desc_annotation):
-        text = annotation.astext()
-        if _short(text) != text:
-            annotation.children = [nodes.Text(_short(text))]
+    """Do the same for the types of attributes and for what a name stands for, which are no signatures."""
+    for kind in (addnodes.desc_annotation, nodes.paragraph):
+        for part in list(doctree.findall(kind)):
+            text = part.astext()
+            if (kind is addnodes.desc_annotation or text.startswith("alias of")) and _short(text) != text:
+                part.children = [nodes.Text(_short(text))]
 
 
 def _escape_signs(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Planes: the fit and its covariance, the search among clutter, connectedness, segments, membership by mixture."""
+"""Planes: fit and covariance, search among clutter and in large scenes, connectedness, segments, membership."""
 
 from dataclasses import replace
 
@@ -84,6 +84,45 @@ def test_coplanar_walls_far_apart_are_two_planes():
     found = find_planes(points, noise_of(points))
     assert len(found) == 2
     assert sorted(found.support) == pytest.approx([190, 190], abs=12)
+
+
+def room(rng):
+    """Points and segments of three large walls, of sixteen small faces, and of clutter."""
+    points = [wall(rng, 3000, axis, 0.0, size=8.0) for axis in range(3)]
+    for corner in np.ndindex(4, 4):
+        low = 1.2 + 1.6 * np.array(corner)
+        points.append(wall(rng, 60, 2, rng.uniform(0.6, 5.0), size=1.4, shift=low))
+    ends = [np.insert(rng.uniform(0, 8, (8, 2, 2)), axis, 0.0, axis=2) for axis in range(3)]
+    segments = np.concatenate([*ends, rng.uniform(1, 7, (20, 2, 3))])
+    return np.concatenate([*points, rng.uniform(0.5, 8, (400, 3))]), segments + rng.normal(0, SIGMA, segments.shape)
+
+
+def test_the_same_planes_alone_and_beside_copies():
+    """A scene has the planes it has: what else there is far away takes none, and adds none."""
+    points, segments = room(np.random.default_rng(9))
+    alone = np.zeros(0)
+    for copies in (1, 4):
+        # Copies are coplanar with each other: what is on one wall must not be taken for a part of another.
+        shifts = np.array([[k % 2, k // 2, 0] for k in range(copies)]) * 400.0
+        many = np.concatenate([points + shift for shift in shifts])
+        lines = np.concatenate([segments + shift for shift in shifts])
+        noise = np.broadcast_to(SIGMA**2 * np.eye(3), (len(lines), 2, 3, 3))
+        found = find_planes(many, noise_of(many), lines, noise)
+        middle = np.array([np.median(place, axis=0)[:2] for place in found.places])
+        of_copy = (middle > 200.0) @ [1, 2]
+        for k in range(copies):
+            support = np.sort(found.support[of_copy == k])
+            alone = support if copies == 1 else alone
+            assert 16 <= len(support) <= 19  # of 19; a face may be hidden in clutter
+            assert support[-3:] == pytest.approx(alone[-3:], abs=30)
+
+
+def test_many_planes_are_found():
+    """No number is too large: eleven by eleven patches at heights of their own."""
+    rng = np.random.default_rng(9)
+    patches = [wall(rng, 40, 2, rng.uniform(0, 30), size=2.0, shift=(4.0 * i, 4.0 * j)) for i, j in np.ndindex(11, 11)]
+    points = np.concatenate(patches)
+    assert 118 <= len(find_planes(points, noise_of(points))) <= 121
 
 
 @pytest.mark.kernels

@@ -174,6 +174,7 @@ def test_colour_and_other_types_agree_with_grey():
         gray[..., None],
         cv2.cvtColor(gray, cv2.COLOR_GRAY2BGRA),
         gray.astype(np.uint16) * 257,
+        np.round(gray * (4095 / 255)).astype(np.uint16),
         gray / 255.0,
         gray.astype(np.float32),
         np.asfortranarray(gray),

@@ -110,6 +110,7 @@ def test_every_kind_of_image_is_read_as_it_is_stored(tmp_path):
     kinds = {
         "a.png": grey,
         "b.jpg": colour,
+        "c12.png": np.round(grey * (4095 / 255)).astype(np.uint16),
         "c16.png": grey.astype(np.uint16) * 257,
         "d16.tif": colour.astype(np.uint16) * 257,
         "e float.tif": colour.astype(np.float32) / 255,
@@ -205,6 +206,18 @@ def test_two_runs_in_one_folder_are_refused(tmp_path):
     assert not (tmp_path / "work").exists()
 
 
+def test_the_lock_is_found_before_anything_is_said(tmp_path, corner, monkeypatch, capsys):
+    images, _ = corner
+    monkeypatch.chdir(tmp_path)
+    command = ["map", str(images), "-o", "out", "--model", str(images.parent / "model.npz")]
+    with Stages(tmp_path / "out.work", "key"):
+        (tmp_path / "out.work" / "points-0123456789ab.npz").write_text("of the other run")
+        assert run(command) == 1
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1
+    assert said.err.startswith(f"groma: Another run (process {os.getpid()}) works in out.work. Wait")
+
+
 def test_a_place_that_cannot_be_written_is_said(tmp_path, model, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="Cannot keep finished stages in"), Stages(tmp_path / "file", "key"):
@@ -244,6 +257,14 @@ def test_a_full_disk_ends_the_command_in_one_line_and_loses_nothing(tmp_path, co
     assert run(command) == 0
     assert capsys.readouterr().out.startswith("Going on from the finished stages in out.work")
     assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_model_with_two_images_of_one_name_is_refused(tmp_path, model):
+    names = list(model.images.names)
+    names[1] = names[0]
+    twice = model.replace(images=model.images.replace(names=tuple(names)))
+    with pytest.raises(InputError, match=f"more than one image named {names[0]!r}"):
+        check_names(tmp_path, sorted(set(names)), twice)
 
 
 def test_a_damaged_database_of_points_is_made_again(tmp_path, corner):

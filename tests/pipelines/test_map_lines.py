@@ -13,12 +13,14 @@ from groma.frontend.segments import Segments
 from groma.geometry import quaternion
 from groma.pipelines._line_directions import depth_ratios
 from groma.pipelines._line_proposals import Proposer, angles_about_baseline
+from groma.pipelines._line_tracks import Tracks
 from groma.pipelines._line_views import build_views
 from groma.pipelines._neighbors import covisible_neighbors
 from groma.pipelines.map_lines import (
     Fate,
     LineMap,
     MapLinesOptions,
+    _is_sure,
     explain,
     external_matches,
     flow_matches,
@@ -307,3 +309,17 @@ def test_lines_of_texture():
     strong = {n for n in true_lines(world, every) if 0 <= n < 22}
     assert {n for n in true_lines(world, found) if n >= 0} == strong
     assert any(n >= 22 for n in true_lines(world, every))
+
+
+def test_far_lines_must_be_known_as_well_as_usual_ones(world):
+    tracks = Tracks(build_views(world.scene, world.segments, 12.0, 0.15, 2.0))
+    tracks.X, tracks.line_of = world.lines.copy(), np.concatenate(world.truth)
+    tracks.X[0] *= 1e3 / np.linalg.norm(tracks.X[0].mean(0))
+    seen = np.bincount(tracks.line_of[tracks.line_of >= 0], minlength=len(tracks.X)) > 0
+    assert seen[0]
+    tracks.unchecked = np.zeros(len(tracks.X))
+    distance = np.linalg.norm(tracks.X.mean(1)[:, None] - tracks.views.center, axis=2)
+    usual = float(np.median(distance.mean(1)[seen]))
+    for relative, known in ((0.009, True), (0.02, False)):
+        tracks.uncertainty = np.full(len(tracks.X), relative * usual)
+        assert _is_sure(tracks, MapLinesOptions())[0] == known

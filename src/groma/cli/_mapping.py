@@ -76,12 +76,13 @@ def map_and_write(
     from groma.cli._contributions import describe_contributions
     from groma.cli._diagnosis import diagnosis_of, say_diagnosis
     from groma.cli._interrupt import interruptible
-    from groma.pipelines._stages import has_stages, remove_stages, system_reason
+    from groma.pipelines._stages import check_free, has_stages, remove_stages, system_reason
     from groma.pipelines.contributions import contributions as find_contributions
     from groma.pipelines.map import map_images
 
-    console.announce_compilation()
     work = output.with_name(output.name + ".work")
+    check_free(work)
+    console.announce_compilation()
     if has_stages(work):
         console.say(f"Going on from the finished stages in {work}, as far as they fit.")
     try:
@@ -163,8 +164,10 @@ def _numbers(result: MapResult) -> dict[str, Any]:
 
 def _diagnosis(result: MapResult) -> Diagnosis:
     """Diagnose a map at the noise and with the loss of its last adjustment."""
-    from groma.pipelines._assemble import AssemblyOptions
+    from groma.pipelines._assemble import AssemblyOptions, assemble
+    from groma.pipelines._stage_reports import with_loss
     from groma.pipelines.diagnosis import diagnose_scene
+    from groma.problem.problem import Problem
 
     told = result.adjusted_with
     assembly = AssemblyOptions(
@@ -174,9 +177,10 @@ def _diagnosis(result: MapResult) -> Diagnosis:
         structure_sigma_px=told.structure_sigma_px,
         refine_poses=told.refine_poses,
         refine_intrinsics=bool(told.refine_intrinsics),
-        loss=last_loss(told),
     )
-    return diagnose_scene(result.scene, assembly)
+    problem, ended_with = assemble(result.scene, assembly).problem, last_loss(told)
+    factors = [with_loss(factor, ended_with, told.line_loss_width) for factor in problem.factors]
+    return diagnose_scene(result.scene, problem=Problem(problem.variables, factors))
 
 
 def last_loss(told: AdjustOptions) -> Loss:

@@ -12,7 +12,12 @@ Json = Annotated[
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")]
-Threads = Annotated[int | None, typer.Option("--threads", min=1, metavar="N", help="Use at most N threads.")]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        "--threads", min=1, metavar="N", help="Use at most N threads. Default: one per core, where that pays."
+    ),
+]
 Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Seed of the random numbers.")]
 Force = Annotated[bool, typer.Option("--force", "-f", help="Replace what is there.")]
 Contributions = Annotated[

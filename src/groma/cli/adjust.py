@@ -30,11 +30,12 @@ def adjust(
         typer.Option(
             metavar="NAME",
             help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron or truncated. auto: robust "
-            "(Cauchy) for what comes from matching, none for BAL files.",
+            "(Cauchy, then Geman-McClure) for what comes from matching, none for BAL files.",
         ),
     ] = "auto",
     loss_scale: Annotated[
-        float | None, typer.Option(metavar="S", help="Scale of the loss, in units of the noise (pixels for images).")
+        float | None,
+        typer.Option(metavar="S", help="Scale of the loss, in units of the noise (pixels for images). Default: 1."),
     ] = None,
     refine_intrinsics: Annotated[
         bool | None,
@@ -52,15 +53,24 @@ def adjust(
     points: Annotated[bool, typer.Option("--points/--no-points", help="Use points.")] = True,
     lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Use lines.")] = True,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Use planes.")] = True,
-    max_iterations: Annotated[int | None, typer.Option(min=0, metavar="N", help="Stop after N steps.")] = None,
+    max_iterations: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Stop after N steps. Default: 50, for pose graphs 100.")
+    ] = None,
     linear_solver: Annotated[LinearSolver, typer.Option(help="How each step is solved.")] = "auto",
     line_chart: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="cartesian, orthonormal_left, orthonormal_right, free_left, free_right."),
+        typer.Option(
+            metavar="NAME",
+            help="How lines move: cartesian (default), orthonormal_left, orthonormal_right, free_left or free_right.",
+        ),
     ] = None,
     gauge: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="auto, free, or first_camera to hold the first camera and the scale."),
+        typer.Option(
+            metavar="NAME",
+            help="free; first_camera, to hold the first camera and the scale; or auto (default): free, unless distances"
+            " between landmarks are in scene units.",
+        ),
     ] = None,
     page: Annotated[
         Path | None, typer.Option("--report", metavar="FILE", help="Also write an HTML page: before and after.")

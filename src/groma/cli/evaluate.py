@@ -142,7 +142,7 @@ def planes(
             raise InputError("--threshold is for a reference of points. For planes pass --max-angle and --max-offset.")
         found = evaluate_planes(scene, read_scene(reference), max_angle, max_offset)
         planes_there = counted(found.num_planes, "planes")
-        console.say(f"{len(found.matches)} of {planes_there} match {found.num_reference} of the reference")
+        console.say(f"{len(found.matches):,} of {planes_there} match {found.num_reference:,} of the reference")
         console.say(f"  precision   {_percent(found.precision)}, recall {_percent(found.recall)}")
         if len(found.matches):
             console.say(f"  normals     {found.normal_deg_mean:.4g} deg mean, {found.normal_deg_max:.4g} max")

@@ -11,14 +11,19 @@ from groma.errors import InputError
 
 
 def map_(
-    images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of photographs.")],
+    images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of photographs, and of folders of them.")],
     output: Annotated[
         Path,
         typer.Option("--output", "-o", metavar="OUT", help="Folder for the results."),
     ],
     model: Annotated[
         Path | None,
-        typer.Option("--model", metavar="COLMAP", help="Poses, cameras and points; without it they are reconstructed."),
+        typer.Option(
+            "--model",
+            metavar="MODEL",
+            help="Poses, cameras and points: a COLMAP model, an archive (.npz) or the OUT of a map. Without it they "
+            "are reconstructed.",
+        ),
     ] = None,
     camera_model: Annotated[
         str, typer.Option(metavar="NAME", help="Without --model: lens model to estimate, by COLMAP's name.")

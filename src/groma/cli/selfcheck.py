@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from groma._counted import counted
 from groma.cli import _options
 from groma.errors import InputError
 
@@ -61,7 +62,7 @@ def _check_derivatives(console: "Console", golden: Path | None, seed: int) -> tu
         mark = "" if row.passed else "   FAILED"
         console.say(f"{row.factor:<28}{row.block:<34}{row.against:<12}{row.cases:>6}{row.worst:>18.2e}{mark}")
     failures = sum(not row.passed for row in outcome.rows)
-    console.say(f"{len(outcome.rows)} comparisons, {failures} failed.")
+    console.say(f"{counted(len(outcome.rows), 'comparisons')}, {failures:,} failed.")
     return outcome.passed, outcome.to_dict()
 
 

@@ -26,7 +26,11 @@ def track(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")],
     camera: Annotated[
         str | None,
-        typer.Option("--camera", metavar="CAMERA", help="File or numbers: fx fy cx cy [k1 k2 p1 p2 [k3]]."),
+        typer.Option(
+            "--camera",
+            metavar="CAMERA",
+            help="File or numbers: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: what the sequence says.",
+        ),
     ] = None,
     kind: Annotated[
         str | None, typer.Option("--kind", metavar="KIND", help="rgbd, stereo or mono; told by the files otherwise.")
@@ -36,14 +40,19 @@ def track(
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Find planes in depth images.")] = True,
     loops: Annotated[bool, typer.Option("--loops/--no-loops", help="Close loops.")] = True,
     max_frames: Annotated[
-        int | None, typer.Option("--max-frames", min=1, metavar="N", help="Stop after N frames.")
+        int | None, typer.Option("--max-frames", min=1, metavar="N", help="Stop after N frames. Default: all.")
     ] = None,
     stride: Annotated[int, typer.Option("--stride", min=1, metavar="N", help="Take every N-th frame.")] = 1,
     max_depth: Annotated[
         float, typer.Option("--max-depth", min=0.1, metavar="M", help="Ignore depths beyond, metres.")
     ] = 6.0,
     depth_scale: Annotated[
-        float | None, typer.Option("--depth-scale", metavar="S", help="Depth in files per metre, e.g. 5000.")
+        float | None,
+        typer.Option(
+            "--depth-scale",
+            metavar="S",
+            help="Depth in files per metre. Default: that of the layout (TUM 5000, else 1000).",
+        ),
     ] = None,
     force: _options.Force = False,
     threads: _options.Threads = None,

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from groma._counted import counted
 from groma.cli import _options
 
 
@@ -55,7 +56,7 @@ def warmup(
     for sentence in _sentences(numbers, bool(missing)):
         console.say(sentence)
     if numbers["unsaved"]:
-        console.warn(f"{numbers['unsaved']} functions could not be written; is the disk full?")
+        console.warn(f"{counted(numbers['unsaved'], 'functions')} could not be written; is the disk full?")
     _output.write_json(json_target, numbers, force)
     if numbers["unsaved"]:
         raise typer.Exit(1)
@@ -66,7 +67,7 @@ def _sentences(numbers: dict[str, Any], ran: bool) -> list[str]:
     if not ran:
         return [f"Everything is there for {parts} ({numbers['seconds']:.1f} s).", f"Folder: {numbers['folder']}"]
     return [
-        f"Compiled {numbers['compiled']} functions for {parts} in {numbers['seconds']:.1f} s; "
-        f"{numbers['loaded']} were there.",
+        f"Compiled {counted(numbers['compiled'], 'functions')} for {parts} in {numbers['seconds']:.1f} s; "
+        f"{numbers['loaded']:,} were there.",
         f"Folder: {numbers['folder']}",
     ]

@@ -1,18 +1,37 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Candidates of :mod:`groma.estimators.plane_search`: planes of neighbouring features, and of near segments."""
+"""Candidates of :mod:`groma.estimators.plane_search`: planes of neighbouring features, and of near segments.
+
+Their number grows with the features, and each looks only at what is near: a scene has the same candidates whether it
+stands alone or is part of a larger one.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
 
+from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
-from groma.geometry._algebra import dot, norm, unit
+from groma.estimators._plane_loops import BALL, height_kernel, least_axis_kernel, variance_kernel
+from groma.geometry._algebra import dot, norm
 
-#: Most candidates of each kind.
-_MAX_CANDIDATES = 1536
+#: Neighbours that make a candidate, and that improve it; the one whose distance is the spacing.
+_NEIGHBOURS, RANK = 32, 8
+#: Features for each that is a seed, in large scenes; small ones have as many seeds at least.
+_FEATURES_PER_SEED, _FEWEST_SEEDS = 4, 1536
+#: Most seeds at one feature.
+_REPEATED = 4
+#: Rounds in which a candidate is improved on its neighbourhood.
+_ROUNDS = 3
+#: Nearest segments that a segment is paired with, and pairs of it that become candidates.
+_NEAR_SEGMENTS, _PAIRS = 24, 2
+#: Features that score a candidate, at most.
+_MOST_FOLLOWED = 8192
+#: Pairs looked at together.
+_CHUNK = 16384
 
 
 @dataclass(frozen=True)
@@ -29,10 +48,35 @@ class Features:
     spacing: FloatArray
     #: (N, 6) covariances as vectors whose product with :func:`squares` of a normal is the variance along it.
     packed: FloatArray
+    #: (N, n) the nearest features of each, itself first.
+    neighbours: IntArray
+    #: (N,) all features, those near each other together, and the balls (B, 5) that hold ``BALL`` of them each: center,
+    #: radius, a bound of the variances.
+    order: IntArray
+    balls: FloatArray
 
     def spread(self, normal: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
         """Standard deviations along a normal."""
         return np.sqrt(np.maximum(self.packed[rows] @ squares(normal), 1e-300))
+
+
+def features_of(places: FloatArray, noise: FloatArray, partner: IntArray, carrier: IntArray) -> Features:
+    """Return places (N, 3) of points and segment ends with their covariances (N, 3, 3), and what is near what."""
+    near = min(_NEIGHBOURS, len(places))
+    tree = KDTree(places)
+    distance, neighbours = tree.query(places, k=near)
+    spacing = np.maximum(distance[:, min(RANK, near - 1)], 1e-12)
+    order = np.asarray(tree.indices, dtype=np.int64)
+    first = np.arange(0, len(order), BALL)
+    number = np.diff(np.append(first, len(order)))
+    center = np.add.reduceat(places[order], first) / number[:, None]
+    radius = np.maximum.reduceat(norm(places[order] - np.repeat(center, number, axis=0)), first)
+    variance = np.maximum.reduceat(np.trace(noise, axis1=1, axis2=2)[order], first)
+    balls = np.column_stack([center, radius, variance])
+    packed = np.ascontiguousarray(noise[:, *np.triu_indices(3)])
+    return Features(
+        places, noise, partner, carrier, spacing, packed, np.asarray(neighbours, dtype=np.int32), order, balls
+    )  # fmt: skip
 
 
 def squares(normal: FloatArray) -> FloatArray:
@@ -41,53 +85,206 @@ def squares(normal: FloatArray) -> FloatArray:
     return np.stack([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z], axis=-1)
 
 
-def from_neighbours(features: Features, neighbours: IntArray, gate: float, rng: np.random.Generator) -> FloatArray:
-    """Candidates (H, 4) from a feature and two of its neighbours, improved on the neighbourhood."""
-    count = min(_MAX_CANDIDATES, 4 * len(neighbours))
-    seed = rng.permutation(np.repeat(np.arange(len(neighbours)), -(-count // len(neighbours))))[:count]
-    patch = neighbours[seed]
-    choice = rng.integers(1, patch.shape[1], (count, 2))
-    corner = features.places[np.column_stack([seed, np.take_along_axis(patch, choice, 1)])]
-    normal = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
-    valid = norm(normal) > 0.5
-    normal, center, patch = normal[valid], corner[valid, 0], patch[valid]
-    around, noise = features.places[patch], features.covariances[patch]
-    for _ in range(3):
-        height = np.einsum("hki,hi->hk", around - center[:, None], normal)
-        variance = np.einsum("hi,hkij,hj->hk", normal, noise, normal)
-        weight = np.where(height**2 < 4.0 * gate * variance, 1.0, 0.0) / (variance + height**2)
-        weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
-        enough = (weight > 0).sum(axis=1) >= 4
-        middle = np.einsum("hk,hki->hi", weight, around)
-        away = around - middle[:, None]
-        _, axes = np.linalg.eigh(np.einsum("hk,hki,hkj->hij", weight, away, away))
-        normal = np.where(enough[:, None], axes[:, :, 0], normal)
-        center = np.where(enough[:, None], middle, center)
-    return np.column_stack([normal, -dot(normal, center)])
+@loop
+def _through_neighbours(places, packed, neighbours, seed, choice, gate, rounds, planes):
+    """Planes (H, 4) through seeds and two of their neighbours each, improved on all of them; all zero where none is."""
+    A, V, n = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    weight = np.empty(neighbours.shape[1])
+    for h in range(len(seed)):
+        home = seed[h]
+        c0, c1, c2 = places[home, 0], places[home, 1], places[home, 2]
+        a, b = neighbours[home, choice[h, 0]], neighbours[home, choice[h, 1]]
+        u0, u1, u2 = places[a, 0] - c0, places[a, 1] - c1, places[a, 2] - c2
+        v0, v1, v2 = places[b, 0] - c0, places[b, 1] - c1, places[b, 2] - c2
+        n[0], n[1], n[2] = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+        size = math.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+        planes[h] = 0.0
+        if not size > 0.0:
+            continue
+        n /= size
+        for _ in range(rounds):
+            total = m0 = m1 = m2 = 0.0
+            enough = 0
+            for k in range(len(weight)):
+                i = neighbours[home, k]
+                height = (places[i, 0] - c0) * n[0] + (places[i, 1] - c1) * n[1] + (places[i, 2] - c2) * n[2]
+                variance = max(variance_kernel(packed[i], n[0], n[1], n[2]), 1e-300)
+                weight[k] = 0.0
+                if height * height < 4.0 * gate * variance:
+                    weight[k] = 1.0 / (variance + height * height)
+                    enough += 1
+                    total += weight[k]
+                    m0 += weight[k] * places[i, 0]
+                    m1 += weight[k] * places[i, 1]
+                    m2 += weight[k] * places[i, 2]
+            if enough < 4:
+                break
+            c0, c1, c2 = m0 / total, m1 / total, m2 / total
+            A[:] = 0.0
+            for k in range(len(weight)):
+                i = neighbours[home, k]
+                x, y, z, p = places[i, 0] - c0, places[i, 1] - c1, places[i, 2] - c2, weight[k] / total
+                A[0, 0] += p * x * x
+                A[0, 1] += p * x * y
+                A[0, 2] += p * x * z
+                A[1, 1] += p * y * y
+                A[1, 2] += p * y * z
+                A[2, 2] += p * z * z
+            A[1, 0], A[2, 0], A[2, 1] = A[0, 1], A[0, 2], A[1, 2]
+            least = least_axis_kernel(A, V)
+            n[0], n[1], n[2] = V[0, least], V[1, least], V[2, least]
+        planes[h, 0], planes[h, 1], planes[h, 2] = n[0], n[1], n[2]
+        planes[h, 3] = -(n[0] * c0 + n[1] * c1 + n[2] * c2)
 
 
-def from_segments(features: Features, num_points: int, gate: float) -> tuple[FloatArray, int]:
-    """Candidates (H, 4) from pairs of near segments that are coplanar within their noise, and how many were tried."""
+def from_neighbours(features: Features, gate: float, rng: np.random.Generator) -> tuple[FloatArray, IntArray]:
+    """Candidates (H, 4) from a feature and two of its neighbours, improved on the neighbourhood; their homes (H,)."""
+    number, near = features.neighbours.shape
+    count = max(number // _FEATURES_PER_SEED, min(_FEWEST_SEEDS, _REPEATED * number))
+    seed = rng.permutation(np.repeat(np.arange(number), -(-count // number)))[:count]
+    choice = rng.integers(1, near, (count, 2))
+    planes = np.empty((count, 4))
+    _through_neighbours(
+        features.places, features.packed, features.neighbours, seed, choice, gate, _ROUNDS, planes
+    )  # fmt: skip
+    valid = planes[:, :3].any(axis=1)
+    return planes[valid], seed[valid]
+
+
+def from_segments(features: Features, num_points: int, gate: float) -> tuple[FloatArray, IntArray, int]:
+    """Candidates (H, 4) from near segments that are coplanar within their noise, their homes, and how many were tried.
+
+    Of the pairs of a segment, those that fix their plane best.
+    """
     ends = features.places[num_points:].reshape(-1, 2, 3)
     if len(ends) < 2:
-        return np.zeros((0, 4)), 0
+        return np.zeros((0, 4)), np.zeros(0, np.int64), 0
     middle = ends.mean(axis=1)
-    count = min(12 if len(ends) > 200 else 50, len(ends))
+    count = min(_NEAR_SEGMENTS + 1, len(ends))
     near = np.asarray(KDTree(middle).query(middle, k=count)[1], dtype=np.int64)
     first, second = np.repeat(np.arange(len(ends)), count - 1), near[:, 1:].ravel()
     once = np.unique(np.column_stack([np.minimum(first, second), np.maximum(first, second)]), axis=0)
     once = once[once[:, 0] != once[:, 1]]
-    four = ends[once].reshape(-1, 4, 3)
+    parts = [_coplanar(features, num_points, once[k : k + _CHUNK], gate) for k in range(0, len(once), _CHUNK)]
+    pairs, planes, worth = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.lexsort((-worth, pairs[:, 0]))
+    owner = pairs[order, 0]
+    chosen = np.sort(order[np.arange(len(order)) - np.searchsorted(owner, owner) < _PAIRS])
+    return planes[chosen], num_points + 2 * pairs[chosen, 0], len(once)
+
+
+def _coplanar(
+    features: Features, num_points: int, pairs: IntArray, gate: float
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Those of some pairs (M, 2) of segments that span a plane, the planes (M, 4), and how well each is fixed (M,)."""
+    corner = (num_points + 2 * pairs[:, [0, 0, 1, 1]]) + np.array([0, 1, 0, 1])
+    four = features.places[corner]
     center = four.mean(axis=1)
     away = four - center[:, None]
     values, axes = np.linalg.eigh(np.einsum("hki,hkj->hij", away, away))
     normal = axes[:, :, 0]
-    noise = features.covariances[num_points:].reshape(-1, 2, 3, 3)[once].reshape(-1, 4, 3, 3)
-    variance = np.einsum("hi,hkij,hj->hk", normal, noise, normal).mean(axis=1)
+    variance = np.einsum("hkc,hc->hk", features.packed[corner], squares(normal)).mean(axis=1)
     flat = values[:, 0] < 2.0 * gate * variance
     # Two segments on one line leave the plane open.
     flat &= values[:, 1] > 25.0 * np.maximum(values[:, 0], variance)
-    chosen = np.flatnonzero(flat)
-    if len(chosen) > _MAX_CANDIDATES:
-        chosen = chosen[np.argsort(-values[chosen, 1] / variance[chosen], kind="stable")[:_MAX_CANDIDATES]]
-    return np.column_stack([normal, -dot(normal, center)])[chosen], len(once)
+    planes = np.column_stack([normal, -dot(normal, center)])
+    return pairs[flat], planes[flat], values[flat, 1] / variance[flat]
+
+
+@kernel
+def _lies_on(i, places, packed, labels, plane, gate):
+    height = height_kernel(places[i], plane)
+    variance = max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300)
+    return labels[i] < 0 and height * height < gate * variance
+
+
+@loop
+def scores_loop(
+    places, packed, spacing, partner, neighbours, labels, gate, reach, planes, homes, which, stamp, number, queue,
+    support, score,
+):  # fmt: skip
+    """For some candidates, how many free features lie on them around their homes (M,), and their information (M,).
+
+    What lies on the plane is followed from neighbour to neighbour, until ``queue`` is full. Each feature adds the
+    logarithm of the extent of all that was found over its own noise, less near the gate. ``stamp`` (N,) holds numbers
+    up to ``number``; higher ones are written.
+    """
+    for w in range(len(which)):
+        number += 1
+        plane, home = planes[which[w]], homes[which[w]]
+        count = begin = 0
+        for m in range(neighbours.shape[1]):
+            i = neighbours[home, m]
+            stamp[i] = number
+            if count < len(queue) and _lies_on(i, places, packed, labels, plane, gate):
+                queue[count] = i
+                count += 1
+        while begin < count < len(queue):
+            i = queue[begin]
+            begin += 1
+            for m in range(-1, neighbours.shape[1]):
+                j = partner[i] if m < 0 else neighbours[i, m]
+                if stamp[j] == number:
+                    continue
+                if m >= 0:
+                    x, y, z = places[j, 0] - places[i, 0], places[j, 1] - places[i, 1], places[j, 2] - places[i, 2]
+                    if x * x + y * y + z * z > (reach * max(spacing[i], spacing[j])) ** 2:
+                        continue
+                stamp[j] = number
+                if count < len(queue) and _lies_on(j, places, packed, labels, plane, gate):
+                    queue[count] = j
+                    count += 1
+        support[w], score[w] = count, 0.0
+        if count == 0:
+            continue
+        c0 = c1 = c2 = spread = 0.0
+        for k in range(count):
+            i = queue[k]
+            c0 += places[i, 0] / count
+            c1 += places[i, 1] / count
+            c2 += places[i, 2] / count
+        for k in range(count):
+            i = queue[k]
+            x, y, z = places[i, 0] - c0, places[i, 1] - c1, places[i, 2] - c2
+            spread += 2.0 * (x * x + y * y + z * z) / count  # of a disc, the square of its radius
+        for k in range(count):
+            i = queue[k]
+            height = height_kernel(places[i], plane)
+            variance = gate * max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300)
+            if spread > variance:
+                score[w] += (1.0 - height * height / variance) * 0.5 * math.log(spread / variance)
+
+
+class Scores:
+    """Scores of candidates where they are at home.
+
+    Parameters
+    ----------
+    features : Features
+        Points and segment ends.
+    planes : (H, 4) float64
+        Candidates.
+    homes : (H,) int
+        The feature that each was drawn at.
+    gate : float
+        Squared distance over variance up to which a feature lies on a plane.
+    reach : float
+        Longest link between features, as a multiple of their spacing.
+    """
+
+    def __init__(self, features: Features, planes: FloatArray, homes: IntArray, gate: float, reach: float) -> None:
+        self._features, self._planes, self._homes = features, planes, homes
+        self._gate, self._reach = gate, reach
+        self._stamp, self._number = np.zeros(len(features.places), np.int64), 0
+        self._queue = np.empty(_MOST_FOLLOWED, np.int64)
+
+    def of(self, which: IntArray, labels: IntArray) -> tuple[IntArray, FloatArray]:
+        """Support (M,) and score (M,) of some candidates among the features without a label."""
+        features, support, score = self._features, np.empty(len(which), np.int64), np.empty(len(which))
+        scores_loop(
+            features.places, features.packed, features.spacing, features.partner, features.neighbours, labels,
+            self._gate, self._reach, self._planes, self._homes, which, self._stamp, self._number, self._queue, support,
+            score,
+        )  # fmt: skip
+        self._number += len(which)
+        return support, score

@@ -10,13 +10,14 @@ from scipy import stats
 from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators._plane_candidates import Features
+from groma.estimators._plane_candidates import RANK, Features
 from groma.estimators._plane_loops import (
     ball_loop,
+    connected_part_loop,
     fit_loop,
     heights_loop,
-    largest_part_loop,
     layer_loop,
+    near_free_loop,
     near_loop,
     nearest_rows_loop,
 )
@@ -29,11 +30,12 @@ from groma.geometry._algebra import norm, perpendicular
 BAND = 8.0
 #: Links between inliers, as a multiple of the distance to the eighth neighbour.
 LINK = 3.0
-RANK = 8
 #: Rounds of refinement of a candidate on its growing support.
 _GROW_STEPS = 10
 #: Rounds with the probability of membership as the weight.
 _POLISH_STEPS = 3
+#: A plane is given up when its share is below this part of the least; the later rounds do not bring so much.
+_HOPELESS = 0.5
 #: Rounds of a fit in which the variances are taken from the last normal.
 _FIT_ROUNDS = 10
 
@@ -58,8 +60,6 @@ class Grower:
     ----------
     features : Features
         Points and segment ends.
-    neighbours : (N, n) int
-        The nearest features of each, itself first.
     gate : float
         Squared distance over variance up to which a feature lies on a plane.
     log_tried : float
@@ -68,25 +68,28 @@ class Grower:
         What counts as a plane.
     """
 
-    def __init__(
-        self, features: Features, neighbours: IntArray, gate: float, log_tried: float, options: PlaneOptions
-    ) -> None:
-        self._features, self._neighbours = features, neighbours
+    def __init__(self, features: Features, gate: float, log_tried: float, options: PlaneOptions) -> None:
+        self._features = features
         self._gate, self._log_tried, self._options = gate, log_tried, options
         count = len(features.places)
-        self._mark = np.full(count, -1)
+        self._mark, self._held = np.full(count, -1), np.zeros(count, np.int64)
         self._room, self._layer = np.empty(count, np.int64), np.empty(count, np.int64)
 
-    def grow(self, plane: FloatArray, labels: IntArray) -> tuple[Grown | None, FloatArray, IntArray]:
-        """Refine a candidate on its largest connected part and judge it: what is kept, where it went, its support."""
+    def grow(self, plane: FloatArray, home: int, labels: IntArray) -> tuple[Grown | None, FloatArray, IntArray]:
+        """Refine a candidate where it is connected, and judge it: what is kept, where it went, its support.
+
+        It grows from the neighbourhood of its ``home``, a feature: what lies on the same plane far away is another's.
+        """
         features, gate, options = self._features, self._gate, self._options
-        free = np.flatnonzero(labels < 0)
-        rows, weight = np.zeros(0, np.int64), np.zeros(0)
+        free = None
+        rows, weight = features.neighbours[home], np.zeros(0)
         for step in range(_GROW_STEPS):
             if step == 1:  # what is far away stays away
-                free = self._near(free, plane, 50.0 * gate)
+                free = self._near_free(labels, plane, 50.0 * gate)
             # The first rounds reach farther: the candidate is not yet exact.
-            rows, independent = self._largest_part(self._near(free, plane, (4.0 if step < 2 else 1.0) * gate))
+            limit = (4.0 if step < 2 else 1.0) * gate
+            near = self._near_free(labels, plane, limit) if free is None else self._near(free, plane, limit)
+            rows, independent = self._part(near, rows)
             if independent < options.min_support:
                 return None, plane, rows
             height, spread = self._heights(rows, plane)
@@ -108,7 +111,9 @@ class Grower:
         support, layer, share = features.places[rows], rows, np.zeros(1)
         for _ in range(_POLISH_STEPS):
             # Judged against all that is near, taken or not: what lies on a plane beside this one speaks against it.
-            layer = self._layer[: layer_loop(features.places, plane, band, self._layer)].copy()
+            layer = self._layer[
+                : layer_loop(features.places, features.order, features.balls, plane, band, self._layer)
+            ].copy()
             joined = np.isin(layer, rows, assume_unique=True, kind="table")
             others = layer[~joined]
             joined[~joined] = connected_to(support, features.places[others], features.spacing[others], plane)
@@ -117,7 +122,7 @@ class Grower:
             height = np.abs(height)
             probability, share = inlier_probability(height, spread, np.zeros(len(layer), np.int64), np.array([band]))
             weight = np.where(height < 3.0 * spread, probability, 0.0)
-            if np.count_nonzero(weight) < 3:
+            if share[0] < _HOPELESS * options.min_share or np.count_nonzero(weight) < 3:
                 return None, plane, rows
             # Membership as the weight: all of the plane where it is clean, its densest part where it is not.
             plane = self._fitted(layer, weight)
@@ -130,6 +135,14 @@ class Grower:
         # The whole layer is taken out: relief so near to a plane cannot be told from it.
         taken = np.union1d(rows, layer[labels[layer] < 0])
         return Grown(fit, float(share[0]), band, alarm, rows, taken), plane, rows
+
+    def _near_free(self, labels: IntArray, plane: FloatArray, limit: float) -> IntArray:
+        """Features without a label whose squared distance is within so many variances."""
+        features = self._features
+        count = near_free_loop(
+            features.places, features.packed, labels, features.order, features.balls, plane, limit, self._room
+        )  # fmt: skip
+        return self._room[:count].copy()
 
     def _near(self, rows: IntArray, plane: FloatArray, limit: float) -> IntArray:
         """Those of some features whose squared distance is within so many variances."""
@@ -150,25 +163,27 @@ class Grower:
         )  # fmt: skip
         return plane
 
-    def _largest_part(self, rows: IntArray) -> tuple[IntArray, int]:
-        """Largest part of some features that is connected in space, and how many of it no segment carries there."""
+    def _part(self, rows: IntArray, held: IntArray) -> tuple[IntArray, int]:
+        """Part of some features that is connected in space, with most of those held; how many no segment carries."""
         features, count = self._features, min(RANK + 1, len(rows))
         if count < 3:
             return rows, 0
         nearest, distance = np.empty((len(rows), count), np.int64), np.empty((len(rows), count))
         short = np.empty(len(rows), np.int64)
         missing = nearest_rows_loop(
-            features.places, rows, self._neighbours, self._mark, nearest, distance, short
+            features.places, rows, features.neighbours, self._mark, nearest, distance, short
         )  # fmt: skip
         if missing:  # the others among their neighbours do not lie on the plane
             places, short = features.places[rows], short[:missing]
             tree = KDTree(places, balanced_tree=False, compact_nodes=False)
             distance[short], nearest[short] = tree.query(places[short], k=count)
         out, count_of = np.empty(len(rows), np.int64), np.empty(2, np.int64)
-        largest_part_loop(
-            rows, nearest, distance, LINK, features.spacing, features.partner, features.carrier, self._mark, out,
-            count_of,
+        self._held[held] = 1
+        connected_part_loop(
+            rows, nearest, distance, LINK, features.spacing, features.partner, features.carrier, self._held,
+            self._mark, out, count_of,
         )  # fmt: skip
+        self._held[held] = 0
         return out[: count_of[0]], int(count_of[1])
 
     def _log10_false_alarms(self, plane: FloatArray, rows: IntArray) -> float:
@@ -178,8 +193,8 @@ class Grower:
         radius = float(np.quantile(norm(features.places[rows] - center), 0.9))
         found = np.zeros(2)
         ball_loop(
-            features.places, features.packed, features.carrier, rows, center, radius, plane, self._gate, self._mark,
-            found,
+            features.places, features.packed, features.carrier, features.order, features.balls, rows, center, radius,
+            plane, self._gate, self._mark, found,
         )  # fmt: skip
         if found[0] == 0:
             return self._log_tried

@@ -2,7 +2,9 @@
 """Loops of the plane search over points with packed covariances: fit, selection by distance, connected parts.
 
 Covariances are packed as (xx, xy, xz, yy, yz, zz). ``rows`` are the points that take part, in arrays of all points.
-``mark`` arrays have an entry per point, -1 on entry and again on return.
+``mark`` arrays have an entry per point, -1 on entry and again on return. ``order`` lists all points, near ones
+together; each ``BALL`` of them share a row of ``balls``: center, radius, and a bound of the variances. Balls that a
+plane does not come near are passed over, so that the loops look at what is near it, not at the whole scene.
 """
 
 from __future__ import annotations
@@ -13,23 +15,25 @@ import numpy as np
 
 from groma._numba import kernel, loop
 
+#: Points in a ball.
+BALL = 64
 #: Sweeps of Jacobi rotations: convergence is quadratic, four are enough.
 _SWEEPS = 12
 
 
 @kernel
-def _variance(c, n0, n1, n2):
+def variance_kernel(c, n0, n1, n2):
     """Variance along a normal."""
     return n0 * (n0 * c[0] + 2.0 * (n1 * c[1] + n2 * c[2])) + n1 * (n1 * c[3] + 2.0 * n2 * c[4]) + n2 * n2 * c[5]
 
 
 @kernel
-def _height(p, plane):
+def height_kernel(p, plane):
     return p[0] * plane[0] + p[1] * plane[1] + p[2] * plane[2] + plane[3]
 
 
 @kernel
-def _least_axis(A, V):
+def least_axis_kernel(A, V):
     """Column of V that is the eigenvector of the least eigenvalue of a symmetric A (3, 3), which is overwritten."""
     for i in range(3):
         for j in range(3):
@@ -78,7 +82,7 @@ def fit_loop(places, packed, rows, weight, iterations, plane, center, precision)
             if step == 0:
                 variance = (packed[i, 0] + packed[i, 3] + packed[i, 5]) / 3.0
             else:
-                variance = _variance(packed[i], n0, n1, n2)
+                variance = variance_kernel(packed[i], n0, n1, n2)
             p = weight[k] / max(variance, tiny)
             precision[k] = p
             total += p
@@ -100,7 +104,7 @@ def fit_loop(places, packed, rows, weight, iterations, plane, center, precision)
             s22 += p * z * z
         A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2] = s00, s01, s02, s11, s12, s22
         A[1, 0], A[2, 0], A[2, 1] = s01, s02, s12
-        least = _least_axis(A, V)
+        least = least_axis_kernel(A, V)
         last = abs(n0 * V[0, least] + n1 * V[1, least] + n2 * V[2, least]) > 1.0 - 1e-15
         n0, n1, n2 = V[0, least], V[1, least], V[2, least]
     sign = n0
@@ -121,21 +125,45 @@ def near_loop(places, packed, rows, plane, limit, out):
     n0, n1, n2 = plane[0], plane[1], plane[2]
     for k in range(len(rows)):
         i = rows[k]
-        height = _height(places[i], plane)
-        if height * height < limit * max(_variance(packed[i], n0, n1, n2), 1e-300):
+        height = height_kernel(places[i], plane)
+        if height * height < limit * max(variance_kernel(packed[i], n0, n1, n2), 1e-300):
             out[count] = i
             count += 1
     return count
 
 
 @loop
-def layer_loop(places, plane, band, out):
+def near_free_loop(places, packed, labels, order, balls, plane, limit, out):
+    """As :func:`near_loop`, of all points without a label."""
+    count = 0
+    n0, n1, n2 = plane[0], plane[1], plane[2]
+    for b in range(len(balls)):
+        height = abs(height_kernel(balls[b], plane)) - balls[b, 3]
+        if height > 0.0 and height * height >= limit * balls[b, 4]:
+            continue
+        for k in range(b * BALL, min((b + 1) * BALL, len(order))):
+            i = order[k]
+            if labels[i] >= 0:
+                continue
+            height = height_kernel(places[i], plane)
+            if height * height < limit * max(variance_kernel(packed[i], n0, n1, n2), 1e-300):
+                out[count] = i
+                count += 1
+    return count
+
+
+@loop
+def layer_loop(places, order, balls, plane, band, out):
     """Write the points nearer to a plane than ``band``; return how many."""
     count = 0
-    for i in range(len(places)):
-        if abs(_height(places[i], plane)) < band:
-            out[count] = i
-            count += 1
+    for b in range(len(balls)):
+        if abs(height_kernel(balls[b], plane)) - balls[b, 3] >= band:
+            continue
+        for k in range(b * BALL, min((b + 1) * BALL, len(order))):
+            i = order[k]
+            if abs(height_kernel(places[i], plane)) < band:
+                out[count] = i
+                count += 1
     return count
 
 
@@ -144,8 +172,8 @@ def heights_loop(places, packed, rows, plane, height, spread):
     """Signed distances (M,) of rows from a plane, and their standard deviations (M,)."""
     for k in range(len(rows)):
         i = rows[k]
-        height[k] = _height(places[i], plane)
-        spread[k] = math.sqrt(max(_variance(packed[i], plane[0], plane[1], plane[2]), 1e-300))
+        height[k] = height_kernel(places[i], plane)
+        spread[k] = math.sqrt(max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300))
 
 
 @loop
@@ -177,8 +205,10 @@ def nearest_rows_loop(places, rows, neighbours, mark, nearest, distance, short):
 
 
 @loop
-def largest_part_loop(rows, nearest, distance, reach, spacing, partner, carrier, mark, out, count_of):
-    """Write the largest connected part of rows; ``count_of`` (2,): its size, and without what segments carry.
+def connected_part_loop(rows, nearest, distance, reach, spacing, partner, carrier, held, mark, out, count_of):
+    """Write the connected part of rows with most of what is ``held``.
+
+    ``count_of`` (2,) gets its size, and without what segments carry.
 
     ``nearest``, ``distance`` (M, n): neighbours of each row, itself first, as positions in ``rows``, and ``mark`` the
     position of each row. Two are linked if they are nearer than ``reach`` times the larger of their spacings, and if
@@ -208,11 +238,13 @@ def largest_part_loop(rows, nearest, distance, reach, spacing, partner, carrier,
     size = np.zeros(number, np.int64)
     for k in range(number):
         parent[k] = parent[parent[k]]  # parents come before their children
-        size[parent[k]] += 1
+        size[parent[k]] += held[rows[k]]
     best = 0
     for k in range(1, number):
         if size[k] > size[best]:
             best = k
+    if number == 0 or size[best] == 0:
+        best = -1
     for k in range(number):
         mark[rows[k]] = k if parent[k] == best else -1
     count = independent = 0
@@ -229,7 +261,7 @@ def largest_part_loop(rows, nearest, distance, reach, spacing, partner, carrier,
 
 
 @loop
-def ball_loop(places, packed, carrier, rows, center, radius, plane, gate, mark, out):
+def ball_loop(places, packed, carrier, order, balls, rows, center, radius, plane, gate, mark, out):
     """Support in a ball, out[0], and how much would be in the layer by chance, out[1]; carried points do not count."""
     squared = radius * radius
     for k in range(len(rows)):
@@ -238,17 +270,22 @@ def ball_loop(places, packed, carrier, rows, center, radius, plane, gate, mark, 
         if x * x + y * y + z * z < squared:
             mark[i] = 0
     inside, chance = 0, 0.0
-    for i in range(len(places)):
-        carried = carrier[i] >= 0
-        support = mark[i] >= 0 and not (carried and mark[carrier[i]] >= 0)
-        if carried and not support:
+    for b in range(len(balls)):
+        x, y, z = balls[b, 0] - center[0], balls[b, 1] - center[1], balls[b, 2] - center[2]
+        if x * x + y * y + z * z > (radius + balls[b, 3]) ** 2:
             continue
-        x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
-        if not x * x + y * y + z * z < squared:
-            continue
-        inside += support
-        spread = math.sqrt(max(_variance(packed[i], plane[0], plane[1], plane[2]), 1e-300))
-        chance += min(math.sqrt(gate) * spread / max(radius, 1e-300), 1.0)
+        for k in range(b * BALL, min((b + 1) * BALL, len(order))):
+            i = order[k]
+            carried = carrier[i] >= 0
+            support = mark[i] >= 0 and not (carried and mark[carrier[i]] >= 0)
+            if carried and not support:
+                continue
+            x, y, z = places[i, 0] - center[0], places[i, 1] - center[1], places[i, 2] - center[2]
+            if not x * x + y * y + z * z < squared:
+                continue
+            inside += support
+            spread = math.sqrt(max(variance_kernel(packed[i], plane[0], plane[1], plane[2]), 1e-300))
+            chance += min(math.sqrt(gate) * spread / max(radius, 1e-300), 1.0)
     for k in range(len(rows)):
         mark[rows[k]] = -1
     out[0], out[1] = inside, chance

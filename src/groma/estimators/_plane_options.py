@@ -18,8 +18,6 @@ class PlaneOptions:
     min_share: float = 0.2
     #: Expected number of planes found where there are none.
     max_false_alarms: float = 1e-4
-    #: Most planes.
-    max_planes: int = 100
     #: Where the random choice of candidates begins.
     seed: int = 0
 

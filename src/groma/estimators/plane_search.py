@@ -2,8 +2,8 @@
 r"""Several planes in uncertain points and segments, found one after the other.
 
 The search draws planes from neighbours in space (and from pairs of segments that are nearly coplanar), improves each on
-its neighbourhood, scores all of them at once on all features, and takes planes out one after the other. A plane is the
-largest part of its inliers that is connected in space: links between inliers are no longer than the distances at which
+its neighbourhood, scores it by what lies on it there, and takes planes out one after the other, the best first. A plane
+is a part of its inliers that is connected in space: links between inliers are no longer than the distances at which
 points have their neighbours there anyway. It is kept if
 
 * it has enough support, and its normal is known to ``max_tilt``;
@@ -11,35 +11,33 @@ points have their neighbours there anyway. It is kept if
 * it stands out: of what is in the layer around it, a good share lies on it. Relief without a flat part has no plane.
 
 A segment takes part with its two end points; points on it count no more once it is there.
+
+Everything is local: the number of candidates grows with the features, and each is scored, grown and judged where it was
+drawn. A scene has about the same planes whether it stands alone or is part of a larger one, and the time grows hardly
+faster than the features.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from heapq import heapify, heappop, heappush
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
-from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.estimators._plane_candidates import Features, from_neighbours, from_segments, squares
-from groma.estimators._plane_growth import BAND, RANK, Grower, Grown, connected_to
+from groma.estimators._plane_candidates import Scores, features_of, from_neighbours, from_segments
+from groma.estimators._plane_growth import BAND, LINK, Grower, Grown, connected_to
 from groma.estimators._plane_options import PlaneOptions
-from groma.geometry._algebra import norm, vectors
+from groma.geometry._algebra import vectors
 
-#: Neighbours that make a candidate, and that improve it.
-_NEIGHBOURS = 32
-#: Features that score candidates.
-_MAX_SCORED = 6000
+#: Failures one after the other, of ever weaker candidates, after which the search ends: so many at least, and one for
+#: so many candidates.
+_PATIENCE, _CANDIDATES_PER_FAILURE = 100, 64
 #: A candidate is the same as a plane tried before if it passes its support within so many standard deviations.
 _SAME = 2.0
-#: Candidates with less than this part of the best score are not looked at.
-_LEAST_SCORE = 1e-3
-#: Failures one after the other, of ever weaker candidates, after which the search ends.
-_PATIENCE = 100
 
 
 @dataclass(frozen=True)
@@ -160,47 +158,50 @@ def _extract(
 ) -> list[Grown]:
     """Take planes out one after the other; ``labels`` is filled."""
     rng = np.random.default_rng(options.seed)
-    near = min(_NEIGHBOURS, len(places))
-    distance, found_near = KDTree(places).query(places, k=near)
-    neighbours = np.asarray(found_near, dtype=np.int64)
-    packed = np.ascontiguousarray(noise[:, *np.triu_indices(3)])
-    features = Features(places, noise, partner, carrier, np.maximum(distance[:, min(RANK, near - 1)], 1e-12), packed)
+    features = features_of(places, noise, partner, carrier)
     gate = float(stats.chi2.ppf(options.level, 1))
-    extent = float(np.median(norm(places - np.median(places, axis=0)))) + 1e-300
-    first = from_neighbours(features, neighbours, gate, rng)
-    second, num_pairs = from_segments(features, num_points, gate)
-    candidates = np.concatenate([first, second])
-    scored = np.arange(len(places))
-    if len(scored) > _MAX_SCORED:
-        scored = np.sort(rng.choice(len(places), _MAX_SCORED, replace=False))
-    score = _score(features, candidates, scored, gate, extent)
+    first, first_homes = from_neighbours(features, gate, rng)
+    second, second_homes, num_pairs = from_segments(features, num_points, gate)
+    candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])
+    scores = Scores(features, candidates, homes, gate, LINK)
+    support, score = scores.of(np.arange(len(candidates)), labels)
     log_tried = np.log10(10.0 * (len(first) + num_pairs) + 1.0)  # a refined candidate stands for about ten
     found: list[Grown] = []
-    alive, total = (
-        (score > 0.0).sum(axis=1) * (len(places) / len(scored)) >= 0.5 * options.min_support,
-        score.sum(axis=1),
-    )
-    grower = Grower(features, neighbours, gate, float(log_tried), options)
+    # With less information than the test of false alarms asks for, a candidate has little hope.
+    least_score = np.log(10.0) * (log_tried - np.log10(options.max_false_alarms))
+    alive = (support >= 0.5 * options.min_support) & (score >= least_score)
+    queue = [(-float(score[k]), int(k)) for k in np.flatnonzero(alive)]
+    heapify(queue)
+    grower = Grower(features, gate, float(log_tried), options)
     failures = 0
-    while failures < _PATIENCE and alive.any() and len(found) < options.max_planes:
-        progress(len(alive) - int(alive.sum()), len(alive))
-        best = int(np.argmax(np.where(alive, total, -1.0)))
-        if total[best] <= _LEAST_SCORE * total.max(initial=1.0):
-            break
-        grown, plane, rows = grower.grow(candidates[best], labels)
+    patience = max(_PATIENCE, len(candidates) // _CANDIDATES_PER_FAILURE)
+    at = np.argsort(homes, kind="stable")
+    first_at = np.searchsorted(homes[at], np.arange(len(places) + 1))
+    while queue and failures < patience:
+        progress(len(candidates) - len(queue), len(candidates))
+        _, best = heappop(queue)
+        if not alive[best]:
+            continue
+        # Scores only fall while planes are taken out: one that is still the best need not be compared again.
+        support, score = scores.of(np.array([best]), labels)
+        if support[0] < 0.5 * options.min_support or score[0] < least_score:
+            continue
+        if queue and -score[0] > queue[0][0] + 1e-9 * score[0]:
+            heappush(queue, (-float(score[0]), best))
+            continue
         alive[best] = False
         failures += 1
+        grown, plane, rows = grower.grow(candidates[best], int(homes[best]), labels)
         if grown is not None:
             failures = 0
             labels[grown.taken] = len(found)
-            gone = labels[scored] == len(found)
             found.append(grown)
-            total -= score[:, gone].sum(axis=1)
-            score[:, gone] = 0.0
         if len(rows):
             # Candidates that would end at the same plane are not tried again.
+            around = np.unique(features.neighbours[rows])
+            left = at[_ranges(first_at[around], first_at[around + 1])]
+            left = left[alive[left]]
             some = features.places[rows[:: max(1, len(rows) // 64)]]
-            left = np.flatnonzero(alive)
             alive[left] = _median_above(
                 np.abs(some @ candidates[left, :3].T + candidates[left, 3]),
                 _SAME * float(np.median(features.spread(plane[:3], rows))),
@@ -208,21 +209,10 @@ def _extract(
     return found
 
 
-def _score(
-    features: Features, candidates: FloatArray, rows: IntArray, gate: float, extent: float
-) -> npt.NDArray[np.float32]:
-    """Information (H, N) that each feature gives to each candidate: less near the gate, less for uncertain features."""
-    normal = candidates[:, :3]
-    packed = features.packed[rows]
-    out = np.empty((len(candidates), len(rows)), dtype=np.float32)
-    places = features.places[rows]
-    for begin in range(0, len(candidates), 256):
-        part = slice(begin, begin + 256)
-        variance = squares(normal[part]) @ packed.T
-        squared = (normal[part] @ places.T + candidates[part, 3:]) ** 2 / np.maximum(variance, 1e-300)
-        information = np.maximum(0.5 * np.log(extent**2 / (gate * np.maximum(variance, 1e-300))), 0.0)
-        out[part] = np.maximum(1.0 - squared / gate, 0.0) * information
-    return out
+def _ranges(begin: IntArray, end: IntArray) -> IntArray:
+    """Numbers from each begin to before its end, one after the other."""
+    count = end - begin
+    return np.repeat(begin - np.cumsum(count) + count, count) + np.arange(int(count.sum()))
 
 
 def _median_above(values: FloatArray, limit: float) -> BoolArray:

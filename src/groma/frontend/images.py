@@ -11,6 +11,8 @@ from groma.errors import InputError, ShapeError
 
 GrayImage = npt.NDArray[np.uint8]
 
+_FULL_12_BITS = 4095
+
 
 def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
     """Grey 8-bit image (H, W), contiguous.
@@ -19,7 +21,8 @@ def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
     ----------
     image : (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) uint8, uint16, bool or float
         Grey, or colour in OpenCV's order blue, green, red (, alpha). Floats are grey levels from 0 to 1 where nothing
-        exceeds 1, otherwise 0 to 255; 16 bits are divided by 257.
+        exceeds 1, otherwise 0 to 255; 16 bits are divided by 257, or, where nothing exceeds 12 bits, as many cameras
+        store them, taken as 12.
 
     Raises
     ------
@@ -37,7 +40,8 @@ def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
     if image.dtype == np.bool_:
         image = image.astype(np.uint8) * 255
     elif image.dtype == np.uint16:
-        image = np.round(image.astype(np.float64) / 257.0).astype(np.uint8)
+        full = _FULL_12_BITS if image.max() <= _FULL_12_BITS else 65535
+        image = np.round(image.astype(np.float64) * (255.0 / full)).astype(np.uint8)
     elif np.issubdtype(image.dtype, np.floating):
         levels = image.astype(np.float64)
         if not np.isfinite(levels).all():

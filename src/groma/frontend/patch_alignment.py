@@ -30,6 +30,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
@@ -233,7 +234,7 @@ class Templates:
     """Patches cut about keypoints."""
 
     #: (P, 17, 17) float32, smoothed grey levels.
-    levels: np.ndarray
+    levels: npt.NDArray[np.float32]
     #: (P, 2) the keypoint relative to the centre of the middle pixel, pixels; NaN where the image ends too near.
     fractions: FloatArray
 
@@ -255,12 +256,13 @@ class Alignment:
         return np.isfinite(self.correlation)
 
 
-def smoothed(image: GrayImage) -> np.ndarray:
+def smoothed(image: GrayImage) -> npt.NDArray[np.float32]:
     """Return the grey levels as templates are cut from and aligned to: float32, slightly smoothed."""
-    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING, borderType=cv2.BORDER_REPLICATE)
+    levels = image.astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(levels, (0, 0), SMOOTHING, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
-def cut_templates(smooth_image: np.ndarray, pixels: FloatArray) -> Templates:
+def cut_templates(smooth_image: npt.NDArray[np.float32], pixels: FloatArray) -> Templates:
     """Cut a template about each keypoint (N, 2) of an image made by :func:`smoothed`.
 
     The template is copied, not interpolated; the keypoint lies between its pixels.
@@ -273,7 +275,11 @@ def cut_templates(smooth_image: np.ndarray, pixels: FloatArray) -> Templates:
 
 
 def align_templates(
-    smooth_image: np.ndarray, templates: Templates, template_index: IntArray, pixels: FloatArray, shapes: FloatArray
+    smooth_image: npt.NDArray[np.float32],
+    templates: Templates,
+    template_index: IntArray,
+    pixels: FloatArray,
+    shapes: FloatArray,
 ) -> Alignment:
     """Align templates to an image.
 

@@ -29,20 +29,43 @@ _INT = struct.Struct("<I")
 def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "text"]]:
     """Return the folder of the model at ``path``, ``path/sparse`` or ``path/sparse/0``, and its form.
 
+    Of several models in ``path/sparse``, as COLMAP makes them where photographs do not hang together, it is the one
+    with most images.
+
     Raises
     ------
     FileFormatError
         If none of them holds a complete model.
     """
     root = existing(path)
-    for place in (root, root / "sparse", root / "sparse" / "0"):
-        for suffix, form in ((".bin", "binary"), (".txt", "text")):
-            if all((place / f"{name}{suffix}").is_file() for name in _FILES):
-                return place, form  # type: ignore[return-value]
+    parts = sorted((p for p in (root / "sparse").glob("[0-9]*") if p.name.isdecimal()), key=lambda p: int(p.name))
+    models = [place for place in parts if _form(place) is not None]
+    if len(models) > 1:
+        models = [max(models, key=_num_images)]
+    for place in (root, root / "sparse", *models):
+        form = _form(place)
+        if form is not None:
+            return place, form
     raise FileFormatError(
         f"{root} holds no COLMAP model: expected cameras, images and points3D, all .bin or all .txt, there, in sparse "
         f"or in sparse/0. {_remedy(root)}"
     )
+
+
+def _form(place: Path) -> Literal["binary", "text"] | None:
+    """Return the form of the model in a folder; None where there is none."""
+    forms: tuple[tuple[str, Literal["binary", "text"]], ...] = ((".bin", "binary"), (".txt", "text"))
+    return next((form for end, form in forms if all((place / f"{name}{end}").is_file() for name in _FILES)), None)
+
+
+def _num_images(place: Path) -> int:
+    """Return how many images a model promises, without reading it."""
+    if _form(place) == "binary":
+        with (place / "images.bin").open("rb") as file:
+            head = file.read(_COUNT.size)
+        return int(_COUNT.unpack(head)[0]) if len(head) == _COUNT.size else 0
+    with (place / "images.txt").open("rb") as file:
+        return sum(not line.startswith(b"#") for line in file) // 2
 
 
 def _remedy(root: Path) -> str:

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from groma import cameras as camera_models
+from groma._counted import counted
 from groma.errors import GromaError, InputError, OutputError
 from groma.io._quiet import quiet
 from groma.io.colmap import from_pycolmap
@@ -38,6 +39,11 @@ _BLOCK = 8
 #: Bytes that must be free before work is handed to pycolmap, whose threads end the process where they find a full disk:
 #: in any case, for the features of an image, for the matches of a pair.
 _ROOM, _IMAGE_ROOM, _PAIR_ROOM = 8 << 20, 4 << 20, 1 << 18
+#: Degrees under which the rays of the first two images should meet; the second where the first finds none. A camera
+#: that drives forward has no wide angles, and pycolmap lowers what it is given only twice by half.
+FIRST_PAIR_ANGLES = (16.0, 4.0)
+#: Matches per image from which overlap and texture are not what is missing.
+FEW_MATCHES = 100
 
 Progress = Callable[[str, int, int], None]
 
@@ -123,19 +129,30 @@ def reconstruct_points(
         _enter_images(pycolmap, database, Path(images), names, options)
         _find_features(pycolmap, database, Path(images), names, options, say)
         _match(pycolmap, database, names, options, say)
-        models = _reconstruct(pycolmap, database, Path(images), folder, len(names), options, say)
+        models = []
+        for angle in FIRST_PAIR_ANGLES:
+            models = models or _reconstruct(pycolmap, database, Path(images), folder, len(names), options, angle, say)
     if not models:
         with _opened(pycolmap, database) as content:
             features, matches = content.num_keypoints(), content.num_inlier_matches()
         raise InputError(
-            f"No reconstruction came out of the {len(names)} images in {images}: {features} points were found in them "
-            f"and {matches} matches between them. "
-            + ("They show no texture. " if features == 0 else "They overlap too little, or show too little texture. ")
-            + "Take more images with more overlap, from places some steps apart, or pass a model with --model."
+            f"No reconstruction came out of the {counted(len(names), 'images')} in {images}: {features:,} points "
+            f"were found in them and {matches:,} matches between them. "
+            f"{_why_none(features, matches, len(names))} "
+            "Take more images with more overlap, from places some steps apart, or pass a model with --model."
         )
     # Of equally many images the one with more points, so that the choice does not depend on an order.
     best = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
     return from_pycolmap(best)
+
+
+def _why_none(features: int, matches: int, count: int) -> str:
+    """Say why nothing could be reconstructed."""
+    if features == 0:
+        return "They show no texture."
+    if matches < FEW_MATCHES * count:
+        return "They overlap too little, or show too little texture."
+    return "They match, but no two show depth: the camera only turned, or moved too little for its distance."
 
 
 # ------------------------------------------------------------------------------------------------------------ stages
@@ -244,12 +261,20 @@ def pair_blocks(count: int) -> Iterator[list[tuple[int, int]]]:
 
 
 def _reconstruct(
-    pycolmap: Any, database: Path, images: Path, work: Path, count: int, options: PointModelOptions, say: Progress
+    pycolmap: Any,
+    database: Path,
+    images: Path,
+    work: Path,
+    count: int,
+    options: PointModelOptions,
+    angle: float,
+    say: Progress,
 ) -> list[Any]:
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.num_threads = 1  # with more, sums depend on which thread is first, and so do the points kept
     for part in (pipeline, pipeline.mapper, pipeline.triangulation):
         part.random_seed = options.seed
+    pipeline.mapper.init_min_tri_angle = angle
     if options.camera_params is not None:
         pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False
         pipeline.mapper.abs_pose_refine_focal_length = pipeline.mapper.abs_pose_refine_extra_params = False

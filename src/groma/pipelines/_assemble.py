@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.cameras import model as camera_model
 from groma.errors import InputError
@@ -180,6 +181,21 @@ def disassemble(scene: Scene, problem: Problem) -> Scene:
     return scene
 
 
+def at_places_of(problem: Problem, scene: Scene) -> Problem:
+    """Return the problem with frames and landmarks where a scene has them: the same one, its world moved."""
+    variables = dict(problem.variables)
+    for name in variables.keys() & {"frames", "points", "lines", "planes"}:
+        group = variables[name]
+        if name == "frames":
+            state = scene.frames.rig_from_world
+        elif name == "points":
+            state = _point_variables(scene).state
+        else:
+            state = group.manifold.from_ambient(scene.lines.plucker if name == "lines" else scene.planes.hesse)
+        variables[name] = group.with_state(state)
+    return Problem(variables, problem.factors)
+
+
 # --------------------------------------------------------------------------------------------------------- cameras
 
 
@@ -280,7 +296,7 @@ def _point_factors(scene: Scene, options: AssemblyOptions, notes: list[str]) -> 
         sees_behind = np.array([camera_model(name).sees_behind for name in scene.cameras.models])
         keep = (depth > 0) | sees_behind[scene.images.camera_idx][table.image_idx]
         if not keep.all():
-            notes.append(f"{int((~keep).sum())} observation(s) of points behind their camera were left out.")
+            notes.append(f"Left out: {counted(int((~keep).sum()), 'observations')} of points behind their camera.")
     table = table.take(np.flatnonzero(keep)) if not keep.all() else table
     factors: list[Factor] = []
     for name, rows, camera in _by_model(scene, table.image_idx):
@@ -324,9 +340,7 @@ def _line_factors(scene: Scene, options: AssemblyOptions, notes: list[str]):
         second = model.unproject(params, table.segment[rows, 2:])
         good = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
         if not good.all():
-            notes.append(
-                f"{int((~good).sum())} segment(s) lie outside the range of the {name} model and were left out."
-            )
+            notes.append(f"Left out: {counted(int((~good).sum()), 'segments')} outside the range of the {name} model.")
         focal = params[:, list(model.focal_indices)].mean(axis=1)
         kept = rows[good]
         first, second = _nearer(first[good], second[good], reach)

@@ -31,11 +31,12 @@ class Fate(IntEnum):
     OUTLIER = 9
     #: Its line is seen in fewer than ``min_images`` images.
     FEW_IMAGES = 10
-    #: Its line is too uncertain for its distance, or would be without one of its images.
+    #: Its line is too uncertain for its distance, or for the usual one, or would be without one of its images.
     UNCERTAIN = 11
     #: No segment of its line is as long as ``min_longest``.
     SHORT_LINE = 12
-    #: Its line is made of segments of a kind that is seldom found again: ``min_repeatability``.
+    #: Its line is made of segments of a kind that is seldom found again, or few of the images that should show it do:
+    #: ``min_repeatability``.
     TEXTURE = 13
     #: A line of more images explains what the images of its line show.
     REPEATED = 14
@@ -57,7 +58,7 @@ WORDS = {
     Fate.UNCERTAIN: "lay on lines too uncertain for their distance",
     Fate.SHORT_LINE: "lay on lines that only short segments show",
     Fate.REPEATED: "lay on lines where an image cannot tell them from a line that more images see",
-    Fate.TEXTURE: "lay on lines of short, weak segments, of which few are found again: texture, most likely",
+    Fate.TEXTURE: "lay on lines of short, weak segments that few of the images show that should: texture, most likely",
 }
 
 #: What would help.
@@ -65,8 +66,9 @@ REMEDIES = {
     Fate.TOO_SHORT: "a smaller least length (--min-length), or larger images",
     Fate.NO_NEIGHBOR: "photographs that overlap more, or a model with more points",
     Fate.NO_MATCH: "a model with the right poses, calibration and image size; sharp photographs",
-    Fate.DEGENERATE: "photographs from another height or side: the camera moved along these lines",
-    Fate.NO_SUPPORT: "better poses and calibration (--refine-intrinsics): an error of a few pixels leaves no agreement",
+    Fate.DEGENERATE: "photographs from another height or side: the camera moved along these lines, or hardly",
+    Fate.NO_SUPPORT: "more photographs of the same parts; or, where points do not fit, better poses and calibration "
+    "(--refine-intrinsics): an error of a few pixels leaves no agreement",
     Fate.AMBIGUOUS: "more photographs, or matches from elsewhere (--line-matches): the structure repeats itself",
     Fate.NOT_LINKED: "more photographs of the same parts",
     Fate.OUTLIER: "better poses and calibration (--refine-intrinsics)",

@@ -35,15 +35,21 @@ TOP_QUANTILE = 0.9
 _STEPS = 50
 
 
-def repeatability(length: FloatArray, strength: FloatArray, eligible: BoolArray, mapped: BoolArray) -> FloatArray:
-    """(S,) probability that a segment of such length and strength is part of a line; learned from the eligible ones."""
-    features = np.zeros((len(length), 3))
+def features_of(eligible: BoolArray, *kinds: FloatArray) -> FloatArray:
+    """(S, 1 + n) one, and the logarithms of n arrays (S,), each standardised over the eligible segments."""
+    features = np.zeros((len(eligible), 1 + len(kinds)))
     features[:, 0] = 1.0
-    for column, values in ((1, length), (2, strength)):
+    for column, values in enumerate(kinds, 1):
         logs = np.log(np.maximum(values, 1e-12))
         spread = float(logs[eligible].std()) if eligible.any() else 0.0
         if spread > 1e-6:  # segments from elsewhere may all have one strength
             features[:, column] = np.clip((logs - logs[eligible].mean()) / spread, -10.0, 10.0)
+    return features
+
+
+def repeatability(length: FloatArray, strength: FloatArray, eligible: BoolArray, mapped: BoolArray) -> FloatArray:
+    """(S,) probability that a segment of such length and strength is part of a line; learned from the eligible ones."""
+    features = features_of(eligible, length, strength)
     rows, target = features[eligible], mapped[eligible].astype(np.float64)
     weights, prior = np.zeros(3), np.diag([1e-9, 1.0, 1.0])
     for _ in range(_STEPS):
@@ -91,4 +97,4 @@ def found_again(
     return mean >= asked
 
 
-__all__ = ["found_again", "repeatability"]
+__all__ = ["features_of", "found_again", "repeatability"]

@@ -32,14 +32,17 @@ class MapLinesOptions:
     min_overlap: float = 0.3
     #: Largest relative standard deviation of the depth of a two-view proposal.
     max_relative_sigma: float = 0.03
-    #: Largest standard deviation of a line's end points over their distance from the cameras.
+    #: Largest standard deviation of a line's end points over their distance from the cameras, or over the usual
+    #: distance of a line where that is less.
     max_uncertainty: float = 0.012
-    #: The same when any one image of the line is left out: beyond it, a wrong match in that image would go unnoticed.
+    #: The same, over the line's own distance, when any one image of the line is left out: beyond it, a wrong match in
+    #: that image would go unnoticed.
     max_unchecked: float = 0.04
     #: A place is ambiguous if another one has more than this share of its support.
     max_rival: float = 0.95
     #: Least share of the segments of a line's kind that are part of a line: see :mod:`groma.pipelines._line_kinds`.
-    #: Where less of the whole scene is found again, more is asked. 0 keeps the lines of texture.
+    #: Where less of the whole scene is found again, more is asked. 0 keeps the lines of texture, also those that
+    #: :mod:`groma.pipelines._line_evidence` finds.
     min_repeatability: float = 0.4
     #: Use lines through known points as further proposals.
     use_points: bool = True

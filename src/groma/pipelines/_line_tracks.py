@@ -274,7 +274,7 @@ class Tracks:
     ) -> tuple[IntArray, FloatArray]:
         """Lines and segments on them (M, 2), in the images of the lines and their neighbours; and squared distances."""
         views = self.views
-        reach = _images_near_lines(self.line_of, views.image_idx, neighbors)
+        reach = images_near_lines(self.line_of, views.image_idx, neighbors)
         hits, distances = [np.empty((0, 2), np.int64)], [np.empty(0)]
         room, value = np.empty((4096, 2), np.int64), np.empty(4096)
         for i in range(len(views.camera)):
@@ -332,7 +332,7 @@ class Tracks:
         return merged
 
 
-def _images_near_lines(line_of: IntArray, image_idx: IntArray, neighbors: list[IntArray]) -> list[IntArray]:
+def images_near_lines(line_of: IntArray, image_idx: IntArray, neighbors: list[IntArray]) -> list[IntArray]:
     """Lines to look for in each image: those seen in it or in a neighbour."""
     num_images = len(neighbors)
     rows = np.flatnonzero(line_of >= 0)

@@ -8,6 +8,7 @@ camera of a model has the size of the stored image.
 from __future__ import annotations
 
 import posixpath
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -56,7 +57,7 @@ def read_gray(path: Path) -> GrayImage:
     if content[:2] == b"\xff\xd8" and content.rfind(_END_OF_IMAGE) < content.rfind(_START_OF_SCAN):
         # Decoders fill what is missing with grey. A preview inside the file has both marks, so the last ones count.
         raise InputError(f"{path} ends in the middle of the picture (JPEG without its end). Copy it again.")
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image = _decoded(content, flags)
     if image is None:  # kinds that are not turned into grey while they are read: floating point TIFF
         image = _decoded(content, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -84,14 +85,19 @@ def _decoded(content: bytes, flags: int) -> np.ndarray | None:
 
 def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
     """Check that every image of a model is among the files; where only the folder differs, say which to pass."""
+    again = next((name for name, number in Counter(scene.images.names).items() if number > 1), None)
+    if again is not None:
+        raise InputError(
+            f"The model has more than one image named {again!r}; images are found by name. Rename or remove the others."
+        )
     files = set(names)
     missing = [name for name in scene.images.names if name not in files]
     if not missing:
         return
-    number = f"{len(missing)} of the {scene.num_images} images of the model are not"
+    number = f"{len(missing):,} of the {scene.num_images:,} images of the model are not"
     if len(missing) == scene.num_images:
-        number = f"None of the {scene.num_images} images of the model is"
-    there = "there is 1 image," if len(names) == 1 else f"there are {len(names)} images, for example"
+        number = f"None of the {scene.num_images:,} images of the model is"
+    there = "there is 1 image," if len(names) == 1 else f"there are {len(names):,} images, for example"
     raise InputError(
         f"{number} in {folder}, for example {missing[0]!r}; {there} {names[0]!r}. "
         + _suggestion(folder, names, missing)

@@ -57,9 +57,9 @@ def spacings(points: FloatArray, segments: FloatArray) -> tuple[FloatArray, Floa
 
 
 def on_planes(
-    marks: Landmarks, found: PlaneSet, level: float, least: float
+    marks: Landmarks, found: PlaneSet, level: float, least: tuple[float, float]
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Pairs (point, plane) and (line, plane), and their probabilities."""
+    """Pairs (point, plane) and (line, plane), and their probabilities, which have to exceed the least of their kind."""
     num = len(found)
     points, lines = [_nothing()], [_nothing()]
     gates = stats.chi2.ppf(level, [1, 2])
@@ -78,9 +78,9 @@ def on_planes(
         lines.append(_with_plane(rows, k, *_line_heights(marks, rows, plane, covariance), gates[1]))
     competing = np.arccos(np.clip(np.abs(found.planes[:, :3] @ found.planes[:, :3].T), 0.0, 1.0)) < _COMPETING
     results = []
-    for table in (np.concatenate(points), np.concatenate(lines)):
+    for table, enough in zip((np.concatenate(points), np.concatenate(lines)), least, strict=True):
         probability, _ = inlier_probability(table[:, 2], table[:, 3], table[:, 1].astype(np.int64), found.band)
-        passed = (table[:, 4] < table[:, 5]) & (probability > least)
+        passed = (table[:, 4] < table[:, 5]) & (probability > enough)
         pairs, probability = table[passed, :2].astype(np.int64), probability[passed]
         kept = _best_of_competing(pairs, probability, competing, num)
         results.append((pairs[kept], probability[kept]))

@@ -178,6 +178,18 @@ def has_stages(folder: Path) -> bool:
     return any(entry.name != _LOCK and not entry.name.startswith(".") for entry in folder.glob("*"))
 
 
+def check_free(folder: Path) -> None:
+    """Refuse a folder in which another process works, and one that cannot be written; it need not be there.
+
+    Raises
+    ------
+    OutputError
+        If another process works in it, or nothing can be kept there.
+    """
+    if folder.is_dir():
+        _locked(folder).close()
+
+
 def remove_stages(folder: Path) -> None:
     """Remove the folder of finished stages, unless another process works in it."""
     try:
@@ -327,4 +339,4 @@ def _parted(array: Any, counts: IntArray) -> list[Any]:
     return np.split(array, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
-__all__ = ["Stages", "digest", "digest_files", "has_stages", "remove_stages", "system_reason"]
+__all__ = ["Stages", "check_free", "digest", "digest_files", "has_stages", "remove_stages", "system_reason"]

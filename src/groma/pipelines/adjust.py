@@ -9,10 +9,19 @@ from typing import Any
 
 import numpy as np
 
+from groma._counted import counted
 from groma.errors import InputError
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
-from groma.pipelines._assemble import LINE_FACTORS, POINT_FACTORS, Assembly, AssemblyOptions, assemble, disassemble
+from groma.pipelines._assemble import (
+    LINE_FACTORS,
+    POINT_FACTORS,
+    Assembly,
+    AssemblyOptions,
+    assemble,
+    at_places_of,
+    disassemble,
+)
 from groma.pipelines._line_clusters import settle_clusters
 from groma.pipelines._line_restart import renew_lines, with_seen_ends
 from groma.pipelines._line_slips import without_slips
@@ -22,6 +31,7 @@ from groma.pipelines._stage_reports import combined, stage_entries, with_costs_a
 from groma.pipelines._structure_factors import SURFACE_SIGMA_PX
 from groma.problem.problem import Problem
 from groma.scene import Scene
+from groma.scene.local_frame import local_frame
 from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
 from groma.solver.solve import solve
@@ -50,6 +60,8 @@ class AdjustOptions:
     #: Where the loss begins to bend, in standard deviations (pixels by default); None takes 1, and 2 in the second
     #: stage of ``auto``.
     loss_scale: float | None = None
+    #: The loss of segments of lines bends so many times later.
+    line_loss_width: float = 1.0
     #: Move the cameras; False adjusts the landmarks alone.
     refine_poses: bool = True
     #: Estimate focal lengths and distortion; None: for BAL problems only.
@@ -92,6 +104,8 @@ class AdjustOptions:
         for name in ("point_sigma_px", "line_sigma_px", "structure_sigma_px"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise InputError(f"{name} must be a positive number of pixels; got {getattr(self, name)}.")
+        if not 0.0 < self.line_loss_width < float("inf"):
+            raise InputError(f"line_loss_width must be a positive number; got {self.line_loss_width}.")
 
 
 @dataclass(frozen=True)
@@ -130,7 +144,7 @@ class AdjustReport:
     def __str__(self) -> str:
         counts = {"images": self.num_images, "points": self.num_points, "lines": self.num_lines}
         counts |= {"planes": self.num_planes, "observations": self.num_observations}
-        rows = [", ".join(f"{number:,} {name}" for name, number in counts.items() if number)]
+        rows = [", ".join(counted(number, kind) for kind, number in counts.items() if number)]
         rows += [
             f"{kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms)"
             for kind, rmse in self.rmse_px.items()
@@ -224,12 +238,22 @@ def adjust(
             f"adjust takes a groma.Scene; got {type(scene).__name__}. Read one with groma.read_scene(path), or turn a "
             "pycolmap.Reconstruction into one with groma.io.from_pycolmap(reconstruction)."
         )
+    near = local_frame(scene)
+    if near is None:
+        return _adjusted(scene, options, progress)
+    result = _adjusted(scene.transformed(near), options, progress)
+    back = result.scene.transformed(near.inverse())
+    return replace(result, scene=back, problem=result.problem and at_places_of(result.problem, back))
+
+
+def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
+    """Adjust a scene that is near the origin of its world."""
     stages = _stages(scene, options)
     assembly = assemble(scene, _assembly_options(scene, options, stages[-1]))
     if not assembly.problem.factors:
         raise InputError(
-            f"There is nothing to adjust: the scene has {scene.num_images} images, "
-            f"{scene.num_point_observations} point and {scene.num_line_observations} line observations, and the "
+            f"There is nothing to adjust: the scene has {counted(scene.num_images, 'images')}, "
+            f"{scene.num_point_observations:,} point and {scene.num_line_observations:,} line observations, and the "
             "options leave none of them. Check the input and --no-points / --no-lines."
         )
     problem, reports, moved = assembly.problem, [], []
@@ -256,7 +280,9 @@ def adjust(
 
         if last and number:
             loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
-        staged = Problem(problem.variables, [with_loss(factor, loss) for factor in problem.factors])
+        staged = Problem(
+            problem.variables, [with_loss(factor, loss, options.line_loss_width) for factor in problem.factors]
+        )
         solution = solve(staged, solver_options, tell)
         problem = solution.problem
         reports.append(solution.report)
@@ -270,7 +296,7 @@ def adjust(
             moved.append(renewed)
             if last and problem is not solution.problem:
                 reports[-1] = with_costs_at(reports[-1], problem)
-    report = combined(reports, assembly.problem, stages)
+    report = combined(reports, assembly.problem, stages, options.line_loss_width)
     adjusted, relations = drop_failed_relations(disassemble(scene, problem), problem)
     if any(map(len, moved)):
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))

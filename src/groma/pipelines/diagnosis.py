@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from groma.pipelines._assemble import AssemblyOptions, assemble
+from groma.pipelines._assemble import AssemblyOptions, assemble, at_places_of
 from groma.problem.problem import Problem
 from groma.scene import Scene
+from groma.scene.local_frame import local_frame
 from groma.solver.diagnosis import Diagnosis, diagnose
 
 
@@ -30,6 +31,10 @@ def diagnose_scene(
     Diagnosis
         Cameras are called by the names of their images, landmarks by their identifiers.
     """
+    near = local_frame(scene)
+    if near is not None:
+        scene = scene.transformed(near)
+        problem = None if problem is None else at_places_of(problem, scene)
     problem = assemble(scene, options or AssemblyOptions()).problem if problem is None else problem
     first_image = {int(frame): k for k, frame in reversed(list(enumerate(scene.images.frame_idx)))}
     ids = {"points": scene.points.ids, "lines": scene.lines.ids, "planes": scene.planes.ids}

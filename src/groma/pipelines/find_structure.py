@@ -48,13 +48,16 @@ class StructureOptions:
     level: float = 0.95
     #: Least probability that a related landmark is no clutter.
     min_probability: float = 0.7
+    #: The same for lines on planes and along directions. A wrong relation bends a whole line, and these probabilities
+    #: are too high: errors that the images share, such as those of an edge that is a groove, are in no covariance.
+    min_line_probability: float = 0.9
     #: Landmarks seen in fewer images take no part: nothing checks their matches.
     min_views: int = 3
     #: Landmarks whose reprojection error is so many times the usual one take no part.
     max_misfit: float = 3.0
-    #: How well points and lines keep to what they lie on, as a length in the images, pixels: walls are not flat, and
-    #: what was measured very well would show it. Added to the noise of points and lines; an adjustment gives relations
-    #: the same slack.
+    #: How well points and lines keep to what they lie on at worst, as a length in the images, pixels: walls are not
+    #: flat, and what was measured very well would show it. Added to the noise of points and lines. How well they really
+    #: do, which an adjustment has to know, is told by what was found: :mod:`groma.pipelines._surface_noise`.
     surface_sigma_px: float = SURFACE_SIGMA_PX
     #: Standard deviations of points and of segment end points, pixels; None: from the residuals.
     point_sigma_px: float | None = None
@@ -136,17 +139,17 @@ def detect_structure(
     Parameters and errors as for :func:`find_structure`.
     """
     options = options or StructureOptions()
-    if not (0.0 < options.level < 1.0 and 0.0 <= options.min_probability < 1.0):
+    level, least, least_line = options.level, options.min_probability, options.min_line_probability
+    if not (0.0 < level < 1.0 and 0.0 <= least < 1.0 and 0.0 <= least_line < 1.0):
         raise InputError(
-            f"level must lie between 0 and 1 and min_probability from 0 to below 1; got {options.level} and "
-            f"{options.min_probability}. Usual values are 0.95 and 0.7."
+            "level must lie between 0 and 1, min_probability and min_line_probability from 0 to below 1; got "
+            f"{level}, {least} and {least_line}. Usual values are 0.95, 0.7 and 0.9."
         )
     report = progress or (lambda stage, done, total: None)
     report("finding planes", 0, 1)
     marks = _landmarks(scene, options)
     good_points, good_lines = np.flatnonzero(marks.point_usable), np.flatnonzero(marks.line_usable)
     segments = marks.segments[good_lines]
-    level, least = options.level, options.min_probability
     on_line, p_on = _relations.on_lines(marks, level, least)
     line_of_point, position = np.full(len(marks.points), -1), np.full(len(marks.segments) + 1, -1)
     line_of_point[on_line[:, 0]] = on_line[:, 1]
@@ -167,14 +170,16 @@ def detect_structure(
         _unit_directions(scene)[good_lines], turning[good_lines], options.directions, candidates
     )
     report("finding what lies on what", 0, 1)
-    point_plane, line_plane, p_point, p_line = _relations.on_planes(marks, planes, level, least)
+    point_plane, line_plane, p_point, p_line = _relations.on_planes(marks, planes, level, (least, least_line))
     kept = np.bincount(point_plane[:, 1], minlength=len(planes)) + 2 * np.bincount(
         line_plane[:, 1], minlength=len(planes)
     )
     planes, new = _only(planes, kept >= (options.planes.min_support + 1) // 2)
     stays_point, stays_line = new[point_plane[:, 1]] >= 0, new[line_plane[:, 1]] >= 0
     point_plane, line_plane = _renumbered(point_plane, new), _renumbered(line_plane, new)
-    along, p_along = _relations.along_directions(marks, directions, options.directions.parallel_sigma, level, least)
+    along, p_along = _relations.along_directions(
+        marks, directions, options.directions.parallel_sigma, level, least_line
+    )
     shared = np.bincount(along[:, 1], minlength=len(directions)) >= _FEWEST_PARALLEL
     directions, new = _only_directions(directions, shared)
     stays_along, along = new[along[:, 1]] >= 0, _renumbered(along, new)

@@ -10,15 +10,16 @@ Stages, each saved when it is finished, so that an interrupted run goes on where
 4. ``joint``      poses, points and lines adjusted together, each point weighted by its own noise, the lines by theirs;
                   then the lines are mapped once more with the better poses, and all this again while that moves
                   the poses by more than the lines allow for;
-5. ``structure``  planes, common directions, and what lies on what;
-6. ``adjusted``   everything adjusted together.
+5. ``structure``  planes, common directions, and what lies on what, and how closely;
+6. ``adjusted``   everything adjusted together; observations that share errors with many others weigh less.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -33,13 +34,16 @@ from groma.io.colmap_sfm import PointModelOptions, reconstruct_points
 from groma.pipelines._image_segments import detect_segments, given_segments
 from groma.pipelines._noise import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.pipelines._photographs import check_images, check_names, image_files, read_gray
+from groma.pipelines._shared_noise import with_shared_noise
 from groma.pipelines._stages import Stages, digest, digest_files
+from groma.pipelines._surface_noise import surface_noise_px
 from groma.pipelines._unused import without_unused
 from groma.pipelines.adjust import AdjustOptions, AdjustReport, adjust
 from groma.pipelines.find_structure import StructureOptions, find_structure
-from groma.pipelines.map_lines import MapLinesOptions, explain, map_lines
+from groma.pipelines.map_lines import MapLinesOptions, MatchProvider, explain, map_lines
 from groma.pipelines.refine_points import PointRefinementOptions, refine_points
 from groma.scene import Scene
+from groma.scene.local_frame import local_frame
 
 #: Scale of the first loss in standard deviations of the estimated noise. Matches of SIFT have a narrow core and heavy
 #: tails that are still right.
@@ -47,6 +51,9 @@ LOSS_SIGMAS = 6.0
 #: Scale of the Cauchy loss of the last adjustment, which starts close. Relative to the noise of their own point,
 #: residuals are nearly Gaussian; the distribution of Student that fits them best bends at 4 to 5.
 LAST_LOSS_SIGMAS = 4.0
+#: Segments were tested one by one when lines were mapped. What is left are hardly mistakes, but noise of uneven size,
+#: and where it is large because the poses are off it must be felt: their loss bends so many times later.
+LINE_LOSS_WIDTH = 3.0
 #: Poses move too much for the lines that were mapped with them if this share of the points moves in the images by more
 #: than :attr:`MapLinesOptions.noise`. The lines are then mapped again, at most so many times in all after the first.
 MOVED_SHARE, MAX_ROUNDS = 0.1, 4
@@ -147,6 +154,9 @@ def map_images(
     found = PointModelOptions(options.camera_model, options.camera_params, options.seed, options.threads)
     if model is not None:  # of a finished map: its lines and planes are found anew
         model = model.points_only()
+    near = None if model is None else local_frame(model)
+    if model is not None and near is not None:
+        model = model.transformed(near)
     _check_number(folder, names, model, options.lines.min_images)
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
@@ -156,7 +166,11 @@ def map_images(
             lambda: reconstruct_points(folder, store.place("sfm"), names, found, say) if model is None else model,
             dataclasses.replace(found, threads=None),
         )
-        return _mapped(folder, names, start, store, options, say, line_matches, model is not None)
+        result = _mapped(folder, names, start, store, options, say, line_matches, model is not None)
+    if near is None:
+        return result
+    scene, start, before = (part.transformed(near.inverse()) for part in (result.scene, result.start, result.before))
+    return dataclasses.replace(result, scene=scene, start=start, before=before)
 
 
 def _mapped(
@@ -169,19 +183,10 @@ def _mapped(
     line_matches: ExternalMatches | None,
     model_given: bool,
 ) -> MapResult:
-    robust = AdjustOptions(refine_intrinsics=options.refine_intrinsics, threads=options.threads)
-    points = store.scene(
-        "points",
-        lambda: _adjusted(start, robust, options, say, "adjusting points").scene,
-        options.refine_poses,
-        options.refine_intrinsics,
-    )
+    points = adjust_points(start, options, store, say)
     if options.refine_points:
         raw = points
-        points = store.scene("measured", lambda: _measured(folder, raw, robust, options, say), options.refine_points)
-    # Each point's noise is estimated from the given standard deviations, not from an estimate before.
-    given_sigma = points.point_observations.sigma
-    points = with_point_noise(points)
+        points = store.scene("measured", lambda: _measured(folder, raw, options, say), options.refine_points)
     matches = _by_index(line_matches, start)
     given = None if line_matches is None else digest(line_matches)
     # From here on every stage depends on all options.
@@ -191,8 +196,40 @@ def _mapped(
         dataclasses.replace(options, threads=None),
         given,
     )
-    line_map = store.line_map("lines", lambda: map_lines(points, segments, matches, options.lines, say))
-    lined = line_map.add_to(points, segments)
+    result = map_segments(points, segments, matches, options, store, say)
+    say("done", 1, 1)
+    left_out = _not_in_model(names, start, given=model_given)
+    return dataclasses.replace(result, start=start, warnings=(*left_out, *result.warnings))
+
+
+def adjust_points(start: Scene, options: MapOptions, store: Stages, say: StageProgress) -> Scene:
+    """Return a model whose poses and points are adjusted with robust losses: stage ``points``."""
+    return store.scene(
+        "points",
+        lambda: _adjusted(start, _robust(options), options, say, "adjusting points").scene,
+        options.refine_poses,
+        options.refine_intrinsics,
+    )
+
+
+def map_segments(
+    points: Scene,
+    segments: list[Segments],
+    matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
+    options: MapOptions,
+    store: Stages,
+    say: StageProgress,
+) -> MapResult:
+    """Map lines and planes from segments and an adjusted model of points: the stages from ``lines`` on.
+
+    No file of an image is read; ``start`` of the result is ``points``.
+    """
+    robust = _robust(options)
+    # Each point's noise is estimated from the given standard deviations, not from an estimate before.
+    given_sigma = points.point_observations.sigma
+    noisy = with_point_noise(points)
+    line_map = store.line_map("lines", lambda: map_lines(noisy, segments, matches, options.lines, say))
+    lined = line_map.add_to(noisy, segments)
     weighted = _weighted(robust, lined)
     for turn in range(MAX_ROUNDS if options.refine_poses and lined.num_lines else 0):
         tag, first = f"-{turn + 1}" if turn else "", lined
@@ -205,28 +242,29 @@ def _mapped(
         lined = line_map.add_to(joint, segments)
         if lined.num_lines == 0 or moved_px(first, joint, MOVED_SHARE) <= options.lines.noise:
             break
-    if options.refine_poses and lined.num_lines:
-        weighted = dataclasses.replace(weighted, loss="cauchy", loss_scale=LAST_LOSS_SIGMAS)
+    if lined.num_lines:
+        weighted = dataclasses.replace(
+            weighted, loss="cauchy", loss_scale=LAST_LOSS_SIGMAS, line_loss_width=LINE_LOSS_WIDTH
+        )
     if options.find_planes:
         flat = lined
-        weighted = dataclasses.replace(weighted, structure_sigma_px=options.structure.surface_sigma_px)
         lined = store.scene("structure", lambda: find_structure(flat, options.structure, progress=say))
+        weighted = dataclasses.replace(weighted, structure_sigma_px=surface_noise_px(lined, options.structure))
+    independent = math.sqrt(1.0 + weighted.line_end_correlation)
+    lined = with_shared_noise(lined, weighted.point_sigma_px, weighted.line_sigma_px * independent)
     result = store.adjusted("adjusted", lambda: _adjusted(lined, weighted, options, say, "adjusting everything"))
     scene, before = without_unused(result.scene, lined)
-    say("done", 1, 1)
-    warnings = [*_not_in_model(names, start, given=model_given)]
-    if lined.num_lines == 0:
-        warnings.append("No line was mapped; see what became of the segments.")
+    missing = [] if lined.num_lines else ["No line was mapped; see what became of the segments."]
     return MapResult(
         scene=scene,
-        start=start,
+        start=points,
         before=before,
         report=result.report,
         adjusted_with=weighted,
         sigma_px={"points": weighted.point_sigma_px, "lines": weighted.line_sigma_px},
         explanation=explain(line_map),
         fates={fate.name.lower(): count for fate, count in line_map.fate_counts().items()},
-        warnings=(*warnings, *result.report.warnings),
+        warnings=(*missing, *result.report.warnings),
     )
 
 
@@ -279,7 +317,7 @@ def _segments(
     return detect_segments(folder, scene, LsdDetector(min_length=options.min_segment_length), say)
 
 
-def _measured(folder: Path, points: Scene, robust: AdjustOptions, options: MapOptions, say: StageProgress) -> Scene:
+def _measured(folder: Path, points: Scene, options: MapOptions, say: StageProgress) -> Scene:
     """Points measured again in the photographs, and adjusted with the noise they have then."""
     found = refine_points(
         points,
@@ -288,8 +326,12 @@ def _measured(folder: Path, points: Scene, robust: AdjustOptions, options: MapOp
         PointRefinementOptions(threads=options.threads),
         lambda done, total: say("measuring points", done, total),
     )
-    weighted = dataclasses.replace(robust, point_sigma_px=found.sigma_px)
+    weighted = dataclasses.replace(_robust(options), point_sigma_px=found.sigma_px)
     return _adjusted(found.scene, weighted, options, say, "adjusting points again").scene
+
+
+def _robust(options: MapOptions) -> AdjustOptions:
+    return AdjustOptions(refine_intrinsics=options.refine_intrinsics, threads=options.threads)
 
 
 def _weighted(robust: AdjustOptions, scene: Scene) -> AdjustOptions:

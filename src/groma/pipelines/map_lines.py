@@ -7,8 +7,9 @@ Stages, each on all images before the next begins:
 2. for every segment, proposals of its place from every neighbour, and the one that most neighbours agree on
    (:mod:`groma.pipelines._line_places`), one image at a time;
 3. tracks: link, refine, recover, merge, trim (:mod:`groma.pipelines._line_tracks`), and join what was mapped more than
-   once (:mod:`groma.pipelines._line_merge`). Lines of segments of a kind that is seldom found again, as texture gives
-   them, are dropped (:mod:`groma.pipelines._line_kinds`), and so are lines that repeat another one beside it
+   once (:mod:`groma.pipelines._line_merge`). Lines of texture are dropped: those of segments of a kind that is seldom
+   found again (:mod:`groma.pipelines._line_kinds`), and those that few of the images show that should
+   (:mod:`groma.pipelines._line_evidence`); and so are lines that repeat another one beside it
    (:mod:`groma.pipelines._line_ghosts`).
 
 Every segment ends with a :class:`Fate` (:mod:`groma.pipelines._line_fates`), so that the question why a line is missing
@@ -26,8 +27,8 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
-from groma.pipelines._distinct import num_distinct
 from groma.pipelines._line_directions import depth_ratios
+from groma.pipelines._line_evidence import edge_odds, num_expected
 from groma.pipelines._line_fates import UNKNOWN, Fate
 from groma.pipelines._line_ghosts import not_ghosts
 from groma.pipelines._line_kinds import found_again
@@ -47,8 +48,8 @@ if TYPE_CHECKING:
     from groma.frontend.segments import Segments
 
 
-#: Segments whose deviation is that many times the usual one make no line by themselves.
-MAX_BLUR = 2.8
+#: Log odds to be an edge below which a line is dropped: texture with a probability of 95 %.
+TEXTURE_ODDS = float(np.log(0.05 / 0.95))
 #: Segments that no neighbour or geometry lets become part of a line say nothing about others of their kind.
 _IMPOSSIBLE = (Fate.TOO_SHORT, Fate.NO_NEIGHBOR, Fate.DEGENERATE)
 
@@ -117,7 +118,8 @@ def map_lines(
     fate[~views.usable] = Fate.TOO_SHORT
     lap("proposals")
     strength = np.concatenate([np.zeros(0), *(one.strength for one in segments)])
-    tracks = _build_tracks(views, strength, neighbors, places, options, fate, report)
+    size = np.column_stack([scene.cameras.width, scene.cameras.height])[scene.images.camera_idx]
+    tracks = _build_tracks(views, strength, size, neighbors, places, options, fate, report)
     lap("tracks")
     return _result(tracks, neighbors, places, fate, seconds)
 
@@ -125,6 +127,7 @@ def map_lines(
 def _build_tracks(
     views: LineViews,
     strength: FloatArray,
+    size: IntArray,
     neighbors: list[IntArray],
     places: Choice,
     options: MapLinesOptions,
@@ -132,9 +135,7 @@ def _build_tracks(
     report: Callable[[str, int, int], None],
 ) -> Tracks:
     """Lines from places; updates the fates."""
-    tracks = Tracks(views)
-    # Segments that were fitted badly run over two edges or along a curve, and do so alike in several images.
-    sharp = views.sigma <= MAX_BLUR * np.median(views.sigma[views.usable]) if views.usable.any() else views.usable
+    tracks, sigma = Tracks(views), views.sigma
     center = views.center[views.image_idx]
     safe = np.where(places.found[:, None], places.q, 1.0)
     points = center[:, None] + views.ray / safe[:, :, None]
@@ -172,11 +173,8 @@ def _build_tracks(
     # What was sure stays so when it is joined to another line, whose noise then counts too.
     sure = np.bincount(tracks.line_of[rows], settled[rows], len(tracks.X)) > 0
     sure |= _is_sure(tracks, options)
-    sure &= _num_sharp(tracks, sharp) >= min(3, options.min_images)
     fate[tracks.keep(sure)] = Fate.UNCERTAIN
-    possible = views.usable & ~np.isin(fate, _IMPOSSIBLE)
-    repeated = found_again(views.length, strength, tracks.line_of, possible, len(tracks.X), options.min_repeatability)
-    fate[tracks.keep(repeated)] = Fate.TEXTURE
+    fate[tracks.keep(_not_texture(tracks, strength, sigma, size, neighbors, fate, options))] = Fate.TEXTURE
     fate[tracks.keep(not_ghosts(tracks, _neighbors_of_neighbors(neighbors), options.min_images))] = Fate.REPEATED
     longest = np.zeros(len(tracks.X))
     rows = np.flatnonzero(tracks.line_of >= 0)
@@ -187,6 +185,28 @@ def _build_tracks(
     return tracks
 
 
+def _not_texture(
+    tracks: Tracks,
+    strength: FloatArray,
+    sigma: FloatArray,
+    size: IntArray,
+    neighbors: list[IntArray],
+    fate: IntArray,
+    options: MapLinesOptions,
+) -> BoolArray:
+    """(L,) lines of a kind that is found again, and seen where they should be."""
+    if options.min_repeatability <= 0.0 or not len(tracks.X):
+        return np.ones(len(tracks.X), bool)
+    length = tracks.views.length
+    possible = tracks.views.usable & ~np.isin(fate, _IMPOSSIBLE)
+    expected = num_expected(tracks, neighbors, size, options.min_length)
+    odds = edge_odds(
+        (length, strength, sigma), tracks.line_of, possible, tracks.num_images(), expected, options.min_images
+    )
+    again = found_again(length, strength, tracks.line_of, possible, len(tracks.X), options.min_repeatability)
+    return again & (odds >= TEXTURE_ODDS)
+
+
 def _neighbors_of_neighbors(neighbors: list[IntArray]) -> list[IntArray]:
     """Images that are neighbours, or have a neighbour in common."""
     none = np.empty(0, np.int64)
@@ -194,18 +214,16 @@ def _neighbors_of_neighbors(neighbors: list[IntArray]) -> list[IntArray]:
 
 
 def _is_sure(tracks: Tracks, options: MapLinesOptions) -> BoolArray:
-    """(L,) whether lines are known well enough for their distance, also without any one image."""
+    """(L,) whether lines are known well enough, also without any one image.
+
+    A line farther away than the usual one must be known as well as that one: a map is as good far away as it is near.
+    """
     distance = _distance(tracks)
-    sure = tracks.uncertainty <= options.max_uncertainty * distance
+    usual = float(np.median(distance)) if len(distance) else 0.0
+    sure = tracks.uncertainty <= options.max_uncertainty * np.minimum(distance, usual)
     if options.min_images > 2:
         sure &= tracks.unchecked <= options.max_unchecked * distance
     return sure
-
-
-def _num_sharp(tracks: Tracks, sharp: BoolArray) -> IntArray:
-    """(L,) number of images that show a line as a sharp segment."""
-    rows = np.flatnonzero((tracks.line_of >= 0) & sharp)
-    return num_distinct(tracks.line_of[rows], tracks.views.image_idx[rows], len(tracks.X))
 
 
 def _distance(tracks: Tracks) -> FloatArray:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from groma._counted import counted
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.factors._factor import Ref
@@ -95,7 +96,8 @@ def adjust_pose_graph(
     """
     options = options or PoseGraphOptions()
     if not len(graph.motions):
-        raise InputError(f"The graph has {len(graph.poses)} poses and no motions between them; nothing to adjust.")
+        poses = counted(len(graph.poses), "poses")
+        raise InputError(f"The graph has {poses} and no motions between them; nothing to adjust.")
     problem = pose_graph_problem(graph, options)
     settings = SolverOptions(
         max_iterations=options.max_iterations,

@@ -10,10 +10,11 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
-from groma.pipelines._assemble import AssemblyOptions, assemble, first_camera_gauge
+from groma.pipelines._assemble import AssemblyOptions, assemble, at_places_of, first_camera_gauge
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene
+from groma.scene.local_frame import local_frame
 from groma.solver.covariance import Covariances
 
 
@@ -42,7 +43,8 @@ class SceneUncertainty:
     #: Identifiers of what the data leave open, by kind: ``points``, ``lines``, ``planes``, ``directions``, and the rows
     #: of ``frames``. Their covariances are NaN, and all others are not affected.
     undetermined: dict[str, IntArray]
-    #: For joint covariances and derived quantities: groups are ``frames``, ``points``, ``lines``, ``planes``.
+    #: For joint covariances and derived quantities: groups are ``frames``, ``points``, ``lines``, ``planes``. Of a
+    #: scene far from the origin they are in :func:`groma.scene.local_frame.local_frame`.
     covariances: Covariances
 
     def to_dict(self) -> dict[str, Any]:
@@ -115,7 +117,20 @@ def uncertainty(
     """
     if gauge not in ("auto", "inner", "held"):
         raise InputError(f"gauge must be 'auto', 'inner' or 'held'; got {gauge!r}.")
-    options = options or AssemblyOptions()
+    options, near = options or AssemblyOptions(), local_frame(scene)
+    if near is None:
+        return _uncertainty(scene, options, gauge, sigma0, problem)
+    moved = scene.transformed(near)
+    found = _uncertainty(moved, options, gauge, sigma0, None if problem is None else at_places_of(problem, moved))
+    lines, planes = np.eye(6), np.eye(4)
+    lines[:3, 3:], planes[3, :3] = _hat(-near.translation[None])[0], near.translation
+    return replace(found, lines=lines @ found.lines @ lines.T, planes=planes @ found.planes @ planes.T)
+
+
+def _uncertainty(
+    scene: Scene, options: AssemblyOptions, gauge: str, sigma0: float, problem: Problem | None
+) -> SceneUncertainty:
+    """Return the covariances of a scene that is near the origin of its world."""
     if gauge == "auto":
         metric = options.planes and len(scene.relations) > 0 and options.structure_form == "metric"
         gauge = "held" if metric else "inner"

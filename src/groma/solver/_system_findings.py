@@ -149,6 +149,7 @@ def _excursions(inspection: Inspection, modes: Modes, size: FloatArray) -> dict[
     sigma = 1.0 / np.sqrt(np.maximum(modes.values, LEAST))
     steps = modes.vectors * (1.0 / size)[:, None]
     steps *= sigma
+    steps[np.concatenate(inspection.held[0])] = 0.0  # ones on the diagonal say nothing in any unit
     result = {}
     for c in inspection.layout.kept:
         if inspection.problem.variables[c.members[0].group].manifold.kind in ("point", "line"):

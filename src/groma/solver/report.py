@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from groma._counted import counted
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 from groma.problem.problem import Problem
@@ -85,7 +86,7 @@ class SolveReport:
         rows = [
             f"{self.termination.sentence}",
             f"cost {self.initial_cost:.6e} -> {self.final_cost:.6e} in {self.iterations} steps, "
-            f"{self.seconds.get('total', 0.0):.3f} s ({self.linear_solver}, {self.threads} thread(s))",
+            f"{self.seconds.get('total', 0.0):.3f} s ({self.linear_solver}, {counted(self.threads, 'threads')})",
             f"{self.num_factors:,} factors, {self.num_residuals:,} residuals, {self.num_unknowns:,} unknowns",
         ]
         return "\n".join(
@@ -154,12 +155,12 @@ def warn_of_oddities(report: SolveReport) -> None:
     """Put into words what may be wrong."""
     for name, count in report.num_degenerate.items():
         report.warnings.append(
-            f"{count:,} factor(s) of type {name!r} could not be evaluated (degenerate geometry) and were left out."
+            f"Left out: {counted(count, 'factors')} of type {name!r} that could not be evaluated (degenerate geometry)."
         )
     if report.num_underdetermined_landmarks:
         report.warnings.append(
-            f"{report.num_underdetermined_landmarks:,} landmark(s) have a direction that the observations do not "
-            "determine; it was left where it was."
+            "The observations leave a direction of "
+            f"{counted(report.num_underdetermined_landmarks, 'landmarks')} open; there nothing was moved."
         )
     if report.num_residuals < report.num_unknowns:
         report.warnings.append(

@@ -14,6 +14,8 @@ from groma.solver.linear import multiply
 from groma.solver.schur import MIN_DIAGONAL, ReducedSystem
 
 States = dict[str, FloatArray]
+#: About so many states of a group are looked at for the one of middle length.
+SAMPLE = 4096
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,16 @@ def retract(layout: Layout, states: States, step: Step) -> States:
 
 
 def size_of(states: States) -> float:
-    """Return the Euclidean length of all states together."""
-    return float(np.sqrt(sum(float(np.vdot(state, state)) for state in states.values()))) + 1e-12
+    """Return the Euclidean length of all states together, if each were as long as the middle one of its group.
+
+    A few points at a great distance, as wrong matches make them, would otherwise make every step look negligible.
+    """
+    squares = 0.0
+    for state in states.values():
+        rows = state[:: 1 + len(state) // SAMPLE]
+        if len(rows):
+            squares += len(state) * float(np.median(np.einsum("ij,ij->i", rows, rows)))
+    return float(np.sqrt(squares)) + 1e-12
 
 
 def gradient(equations: NormalEquations) -> Step:

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from groma._counted import counted
 from groma.errors import InputError, ShapeError
 from groma.io.sequences.frame import Frame
 from groma.tracking.camera import TrackCamera
@@ -59,7 +60,7 @@ class FrameChecks:
     def warnings(self) -> list[str]:
         """Sentences about all frames so far."""
         return [
-            f"{count} frame(s) {what}" + (" before." if what.endswith("one") else ".")
+            f"{counted(count, 'frames')} {what}" + (" before." if what.endswith("one") else ".")
             for what, count in self._counts.items()
         ]
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from groma._counted import counted
 from groma._typing import FloatArray, IntArray
 from groma.geometry import se3
 from groma.io.trajectories import Trajectory
@@ -151,11 +152,11 @@ def about_parts(breaks: list[tuple[float, float]], where: dict[int, tuple[int, i
     out = [f"The track was lost at {since:.3f} s; a new map was begun at {until:.3f} s." for since, until in breaks]
     joined = sum(root != part for part, (root, _) in where.items())
     if joined:
-        out.append(f"{joined} new map(s) were joined to an older one: a place was recognised.")
+        out.append(f"Joined to an older map, where a place was recognised: {counted(joined, 'new maps')}.")
     if others:
         out.append(
-            f"{len(others)} part(s) of the track ({', '.join(map(str, others))} frames) could not be joined to the "
-            "longest one. Each has a world of its own."
+            f"Not joined to the longest part of the track: {counted(len(others), 'parts')} "
+            f"({', '.join(f'{number:,}' for number in others)} frames), each in a world of its own."
         )
     return out
 
