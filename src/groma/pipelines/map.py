@@ -52,7 +52,8 @@ LOSS_SIGMAS = 6.0
 #: residuals are nearly Gaussian; the distribution of Student that fits them best bends at 4 to 5.
 LAST_LOSS_SIGMAS = 4.0
 #: Segments were tested one by one when lines were mapped. What is left are hardly mistakes, but noise of uneven size,
-#: and where it is large because the poses are off it must be felt: their loss bends so many times later.
+#: and where it is large because the poses are off it must be felt: while poses move, their loss bends so many times
+#: later.
 LINE_LOSS_WIDTH = 3.0
 #: Poses move too much for the lines that were mapped with them if this share of the points moves in the images by more
 #: than :attr:`MapLinesOptions.noise`. The lines are then mapped again, at most so many times in all after the first.
@@ -243,9 +244,8 @@ def map_segments(
         if lined.num_lines == 0 or moved_px(first, joint, MOVED_SHARE) <= options.lines.noise:
             break
     if lined.num_lines:
-        weighted = dataclasses.replace(
-            weighted, loss="cauchy", loss_scale=LAST_LOSS_SIGMAS, line_loss_width=LINE_LOSS_WIDTH
-        )
+        width = LINE_LOSS_WIDTH if options.refine_poses else 1.0
+        weighted = dataclasses.replace(weighted, loss="cauchy", loss_scale=LAST_LOSS_SIGMAS, line_loss_width=width)
     if options.find_planes:
         flat = lined
         lined = store.scene("structure", lambda: find_structure(flat, options.structure, progress=say))
