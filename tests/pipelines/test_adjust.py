@@ -172,14 +172,3 @@ def test_a_report_prints_its_main_figures():
     assert text[0].startswith(f"{report.num_images} images, {report.num_points} points, {report.num_lines} lines")
     assert text[1].startswith("points: ") and text[2].startswith("lines: ")
     assert report.termination.sentence in text[3] and len(text) < 12
-
-
-def test_the_loss_of_segments_may_bend_later():
-    options = AdjustOptions(loss="cauchy", loss_scale=2.0, line_loss_width=3.0, planes=False, max_iterations=3)
-    problem = adjust(holistic(6, seed=0).start, options).problem
-    assert problem is not None
-    scales = {factor.type_name: factor.loss.parameters[0] for factor in problem.factors}
-    assert scales["point_reprojection"] == 2.0
-    assert scales["line_reprojection"] == 6.0
-    with pytest.raises(InputError, match="line_loss_width must be a positive number"):
-        AdjustOptions(line_loss_width=0.0)

@@ -179,7 +179,7 @@ def _diagnosis(result: MapResult) -> Diagnosis:
         refine_intrinsics=bool(told.refine_intrinsics),
     )
     problem, ended_with = assemble(result.scene, assembly).problem, last_loss(told)
-    factors = [with_loss(factor, ended_with, told.line_loss_width) for factor in problem.factors]
+    factors = [with_loss(factor, ended_with) for factor in problem.factors]
     return diagnose_scene(result.scene, problem=Problem(problem.variables, factors))
 
 

@@ -7,9 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from groma.factors._factor import Factor
-from groma.factors.losses import Loss, Trivial
+from groma.factors.losses import Loss
 from groma.factors.losses import loss as make_loss
-from groma.pipelines._assemble import LINE_FACTORS
 from groma.pipelines._structure_factors import RELATION_FACTORS
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
@@ -20,13 +19,8 @@ from groma.solver.solve import solve
 RELATION_SCALES = {"cauchy": 2.0, "geman_mcclure": 4.0}
 
 
-def with_loss(factor: Factor, loss: Loss, line_width: float = 1.0) -> Factor:
-    """Return the factors under a loss, of segments of lines so many times as wide.
-
-    Relations between landmarks have a noise of their own, and the plain scale.
-    """
-    if factor.type_name in LINE_FACTORS and line_width != 1.0 and not isinstance(loss, Trivial):
-        loss = replace(loss, scale=line_width * float(loss.parameters[0]))
+def with_loss(factor: Factor, loss: Loss) -> Factor:
+    """Return the factors under a loss; relations between landmarks have a noise of their own, and the plain scale."""
     if factor.type_name in RELATION_FACTORS and loss.name in RELATION_SCALES:
         loss = make_loss(loss.name, RELATION_SCALES[loss.name])
     return factor if factor.loss == loss else replace(factor, loss=loss)
@@ -41,14 +35,14 @@ def stage_entries(stages: list[Loss], reports: list[SolveReport]) -> tuple[dict[
     return tuple(entries)
 
 
-def combined(reports: list[SolveReport], start: Problem, stages: list[Loss], line_width: float = 1.0) -> SolveReport:
+def combined(reports: list[SolveReport], start: Problem, stages: list[Loss]) -> SolveReport:
     """Return one report of all stages: costs under the last loss, times and steps summed."""
     last = reports[-1]
     if len(reports) == 1:
         return last
     loss, first = stages[len(reports) - 1], reports[0]
     if loss != stages[0]:
-        under_last = [with_loss(factor, loss, line_width) for factor in start.factors]
+        under_last = [with_loss(factor, loss) for factor in start.factors]
         first = solve(Problem(start.variables, under_last), SolverOptions(max_iterations=0)).report
     history: list[Iteration] = []
     for report in reports:

@@ -60,8 +60,6 @@ class AdjustOptions:
     #: Where the loss begins to bend, in standard deviations (pixels by default); None takes 1, and 2 in the second
     #: stage of ``auto``.
     loss_scale: float | None = None
-    #: The loss of segments of lines bends so many times later.
-    line_loss_width: float = 1.0
     #: Move the cameras; False adjusts the landmarks alone.
     refine_poses: bool = True
     #: Estimate focal lengths and distortion; None: for BAL problems only.
@@ -104,8 +102,6 @@ class AdjustOptions:
         for name in ("point_sigma_px", "line_sigma_px", "structure_sigma_px"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise InputError(f"{name} must be a positive number of pixels; got {getattr(self, name)}.")
-        if not 0.0 < self.line_loss_width < float("inf"):
-            raise InputError(f"line_loss_width must be a positive number; got {self.line_loss_width}.")
 
 
 @dataclass(frozen=True)
@@ -280,9 +276,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
 
         if last and number:
             loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
-        staged = Problem(
-            problem.variables, [with_loss(factor, loss, options.line_loss_width) for factor in problem.factors]
-        )
+        staged = Problem(problem.variables, [with_loss(factor, loss) for factor in problem.factors])
         solution = solve(staged, solver_options, tell)
         problem = solution.problem
         reports.append(solution.report)
@@ -296,7 +290,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
             moved.append(renewed)
             if last and problem is not solution.problem:
                 reports[-1] = with_costs_at(reports[-1], problem)
-    report = combined(reports, assembly.problem, stages, options.line_loss_width)
+    report = combined(reports, assembly.problem, stages)
     adjusted, relations = drop_failed_relations(disassemble(scene, problem), problem)
     if any(map(len, moved)):
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))

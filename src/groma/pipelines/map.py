@@ -51,10 +51,6 @@ LOSS_SIGMAS = 6.0
 #: Scale of the Cauchy loss of the last adjustment, which starts close. Relative to the noise of their own point,
 #: residuals are nearly Gaussian; the distribution of Student that fits them best bends at 4 to 5.
 LAST_LOSS_SIGMAS = 4.0
-#: Segments were tested one by one when lines were mapped. What is left are hardly mistakes, but noise of uneven size,
-#: and where it is large because the poses are off it must be felt: while poses move, their loss bends so many times
-#: later.
-LINE_LOSS_WIDTH = 3.0
 #: Poses move too much for the lines that were mapped with them if this share of the points moves in the images by more
 #: than :attr:`MapLinesOptions.noise`. The lines are then mapped again, at most so many times in all after the first.
 MOVED_SHARE, MAX_ROUNDS = 0.1, 4
@@ -244,8 +240,7 @@ def map_segments(
         if lined.num_lines == 0 or moved_px(first, joint, MOVED_SHARE) <= options.lines.noise:
             break
     if lined.num_lines:
-        width = LINE_LOSS_WIDTH if options.refine_poses else 1.0
-        weighted = dataclasses.replace(weighted, loss="cauchy", loss_scale=LAST_LOSS_SIGMAS, line_loss_width=width)
+        weighted = dataclasses.replace(weighted, loss="cauchy", loss_scale=LAST_LOSS_SIGMAS)
     if options.find_planes:
         flat = lined
         lined = store.scene("structure", lambda: find_structure(flat, options.structure, progress=say))
