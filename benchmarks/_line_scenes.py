@@ -12,9 +12,9 @@ import numpy as np
 from _renderings import BoxSettings, render_boxes
 from _workshop import CACHE
 
-from groma.frontend import LsdDetector, Segments
+from groma.features import LsdDetector, Segments
 from groma.io import read_scene
-from groma.io.colmap import from_pycolmap
+from groma.io.colmap.model import from_pycolmap
 from groma.scene import Scene
 
 

@@ -17,15 +17,15 @@ import time
 
 import numpy as np
 
-from groma.factors._factor import Ref
-from groma.factors.line_reprojection import LineReprojection
+from groma.factors.contract import Ref
+from groma.factors.observations.line_reprojection import LineReprojection
 from groma.geometry import quaternion
-from groma.geometry._manifold import Euclidean
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.pose_charts import POSE_CHARTS
-from groma.problem._parallel import Workers
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.geometry.manifold import Euclidean
 from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
+from groma.problem.parallel import Workers
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.independent import IndependentBlocks

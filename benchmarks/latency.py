@@ -55,7 +55,7 @@ def main() -> int:
 
     with tempfile.TemporaryDirectory() as cache:
         whole_process([*groma, "adjust", "--help"], cache)  # bytecode, which an installation brings along
-        whole_process([sys.executable, "-c", "import groma.io, groma.pipelines.adjust"], cache)
+        whole_process([sys.executable, "-c", "import groma.io, groma.adjustment.adjust"], cache)
         first = whole_process(adjust, cache)  # compiles the kernels: once
         units, following, importing, helping, frames, landmarks = [], [], [], [], [], []
         for _ in range(arguments.rounds):

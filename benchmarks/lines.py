@@ -23,13 +23,13 @@ from _workshop import CACHE, CONTESTANTS, RESULTS, ROOT, machine, run_program
 
 from groma import cameras as camera_models
 from groma.evaluation.lines import Distances, Geometry, places_on, score_lines
-from groma.frontend import Segments
-from groma.frontend.matches import LineMatches
+from groma.features import Segments
+from groma.features.matches import LineMatches
 from groma.geometry import quaternion, segment2
-from groma.pipelines._neighbors import covisible_neighbors
-from groma.pipelines._stages import Stages
-from groma.pipelines.map import MapOptions, adjust_points, map_segments
-from groma.pipelines.map_lines import MapLinesOptions, map_lines, wide_baseline_matches
+from groma.mapping.checkpoints import Stages
+from groma.mapping.lines.build import MapLinesOptions, map_lines, wide_baseline_matches
+from groma.mapping.lines.neighbors import covisible_neighbors
+from groma.mapping.map import MapOptions, adjust_points, map_segments
 from groma.scene import Scene
 
 #: ``all``: every segment of a neighbour is a candidate. ``wide``: groma's matches of surroundings and points.

@@ -65,7 +65,7 @@ def rotations(quaternions):
 def measure(images, model, copies, threads):
     """Map K copies; return the numbers of one row."""
     from groma.io import read_scene
-    from groma.pipelines.map import MapOptions, map_images
+    from groma.mapping.map import MapOptions, map_images
 
     scene = repeat(read_scene(model).points_only(), copies)
     seconds, peaks, last = {}, {}, ["reading", time.process_time()]

@@ -5,7 +5,7 @@
 
 The scene is an aerial block: photographs straight down on a grid, each point of the ground in about ten of them, 9 000
 points in a photograph, 0.5 px of noise. It is written part by part, so that it never is in memory. Every size is solved
-by :func:`groma.pipelines.adjust_parts.adjust_parts` in a process of its own; 50 million observations take 2 GB of disk.
+by :func:`groma.adjustment.parts.adjust_parts` in a process of its own; 50 million observations take 2 GB of disk.
 Reported are CPU time per step, peak memory of the process, bytes per observation, and the exponent of growth.
 """
 
@@ -96,7 +96,7 @@ def make(folder: Path, observations: float, seed: int = 0) -> int:
 
 def run(folder: Path, steps: int, threads: int) -> dict:
     """Adjust the parts of a folder in this process."""
-    from groma.pipelines.adjust_parts import adjust_parts
+    from groma.adjustment.parts import adjust_parts
     from groma.solver.options import SolverOptions
 
     options = SolverOptions(

@@ -53,16 +53,16 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 import groma
+from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble
+from groma.adjustment.pixel_residuals import squared_residuals_px
+from groma.adjustment.uncertainty import position_sigma, uncertainty
 from groma.evaluation import evaluate_poses
 from groma.evaluation.alignment import align_points
 from groma.factors import Ref
-from groma.factors.position_prior import PositionPrior
-from groma.pipelines._assemble import AssemblyOptions, assemble, disassemble
-from groma.pipelines._noise import noise_px, with_point_noise
-from groma.pipelines._pixel_residuals import squared_residuals_px
-from groma.pipelines._unused import without_unused
-from groma.pipelines.map import MapOptions, MapResult, map_images
-from groma.pipelines.uncertainty import position_sigma, uncertainty
+from groma.factors.priors.position_prior import PositionPrior
+from groma.mapping.map import MapOptions, MapResult, map_images
+from groma.mapping.noise.observations import noise_px, with_point_noise
+from groma.mapping.unused import without_unused
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Relations, Scene

@@ -20,16 +20,16 @@ class PackageReference(SphinxDirective):
         """Build the sections."""
         package = importlib.import_module(self.arguments[0])
         names = [package.__name__]
-        found = {module.name for module in pkgutil.iter_modules(getattr(package, "__path__", []))}
-        public = {name for name in found if not name.startswith("_")}
+        found = {module.name for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")}
         names += [f"{package.__name__}.{name}" for name in self.arguments[1:]]
-        names += [f"{package.__name__}.{name}" for name in sorted(public)]
-        return [self._section(name, first=position == 0) for position, name in enumerate(dict.fromkeys(names))]
+        names += sorted(name for name in found if "._" not in name)
+        return [self._section(name) for name in dict.fromkeys(names)]
 
-    def _section(self, name: str, first: bool) -> nodes.Node:
+    def _section(self, name: str) -> nodes.Node:
+        is_package = hasattr(importlib.import_module(name), "__path__")
         section = nodes.section(ids=[f"module-{name.replace('.', '-')}-section"])
         section += nodes.title(text=name)
-        lines = [f".. automodule:: {name}", "   :no-members:" if first else "   :members:", ""]
+        lines = [f".. automodule:: {name}", "   :no-members:" if is_package else "   :members:", ""]
         self.state.nested_parse(StringList(lines, source=f"<{name}>"), self.content_offset, section)
         return section
 

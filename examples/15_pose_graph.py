@@ -6,8 +6,8 @@ import numpy as np
 import groma
 from groma.factors import PoseBetween
 from groma.geometry import se3
-from groma.geometry.pose_charts import PoseLeft
-from groma.solver.covariance import Covariances
+from groma.geometry.charts.pose_charts import PoseLeft
+from groma.solver.covariance.marginals import Covariances
 
 # 24 poses cam_from_world on a circle, looking along it.
 count = 24

@@ -5,8 +5,8 @@ import numpy as np
 
 import groma
 from groma.geometry import Euclidean
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.pose_charts import PoseLeft
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.pose_charts import PoseLeft
 from groma.problem.residuals import jacobians_of, residuals_of
 
 # Three cameras, five lines, and a segment of every line in every image: all at random, nothing fits.

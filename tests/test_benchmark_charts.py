@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.pipelines.adjust import AdjustOptions
+from groma.adjustment.adjust import AdjustOptions
+from groma.geometry.charts.line_charts import LINE_CHARTS
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 

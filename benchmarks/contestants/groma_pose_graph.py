@@ -12,8 +12,8 @@ import numpy as np
 from _common import TOLERANCE, Clock, report
 
 import groma
+from groma.adjustment.pose_graph import PoseGraphOptions, pose_graph_problem
 from groma.io.g2o import read_g2o, write_g2o
-from groma.pipelines.pose_graph import PoseGraphOptions, pose_graph_problem
 from groma.scene.pose_graph import PoseGraph
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve

@@ -14,8 +14,8 @@ import argparse
 from _common import MAX_STEPS, TOLERANCE, Curve, report
 
 import groma
+from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.io import read_scene
-from groma.pipelines._assemble import AssemblyOptions, assemble
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 

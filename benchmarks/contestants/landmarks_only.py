@@ -8,7 +8,7 @@ import time
 import numpy as np
 from _common import report
 
-from groma.pipelines._assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.scene import synthetic
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve

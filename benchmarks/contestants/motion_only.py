@@ -8,13 +8,13 @@ import time
 import numpy as np
 from _common import report
 
-from groma.factors._factor import Ref
-from groma.factors.line_reprojection import LineReprojection
+from groma.factors.contract import Ref
 from groma.factors.losses import Huber
-from groma.factors.point_reprojection import PointReprojection
-from groma.geometry._manifold import Euclidean
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.pose_charts import POSE_CHARTS
+from groma.factors.observations.line_reprojection import LineReprojection
+from groma.factors.observations.point_reprojection import PointReprojection
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.options import SolverOptions

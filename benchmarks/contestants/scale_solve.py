@@ -15,8 +15,8 @@ from types import SimpleNamespace
 from _common import Clock, peak_memory_mib, report
 
 import groma.solver.solve as solve_module
+from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.io import read_scene
-from groma.pipelines._assemble import AssemblyOptions, assemble
 from groma.scene import Scene, synthetic
 from groma.solver import report as solver_report
 from groma.solver.options import SolverOptions

@@ -10,19 +10,21 @@ import zlib as _zlib  # noqa: F401  (before pycolmap, whose library hides Python
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+import groma._moved  # noqa: F401  (names the new place of modules that moved)
 from groma._version import __version__ as __version__
 
 if TYPE_CHECKING:
     from groma import (
+        adjustment,
         cameras,
         errors,
         estimators,
         evaluation,
         factors,
-        frontend,
+        features,
         geometry,
         io,
-        pipelines,
+        mapping,
         problem,
         scene,
         solver,
@@ -30,24 +32,24 @@ if TYPE_CHECKING:
         tracking,
         viz,
     )
+    from groma.adjustment.adjust import AdjustOptions, AdjustResult, adjust
+    from groma.adjustment.diagnosis import diagnose_scene as diagnose
+    from groma.adjustment.parts import adjust_parts, write_parts
+    from groma.adjustment.pose_graph import PoseGraphOptions, adjust_pose_graph
+    from groma.adjustment.uncertainty import uncertainty
     from groma.errors import FileFormatError, GromaError, InputError, OutputError, ProblemError, ShapeError
-    from groma.factors._factor import Ref
-    from groma.factors.line_bearing import LineBearing
-    from groma.factors.line_on_plane import LineOnPlane
-    from groma.factors.line_reprojection import LineReprojection
+    from groma.factors.contract import Ref
     from groma.factors.losses import loss
-    from groma.factors.plane_observation import PlaneObservation
-    from groma.factors.point_on_plane import PointOnPlane
-    from groma.factors.point_reprojection import PointReprojection
-    from groma.factors.pose_prior import PosePrior
+    from groma.factors.observations.line_bearing import LineBearing
+    from groma.factors.observations.line_reprojection import LineReprojection
+    from groma.factors.observations.plane_observation import PlaneObservation
+    from groma.factors.observations.point_reprojection import PointReprojection
+    from groma.factors.priors.pose_prior import PosePrior
+    from groma.factors.relations.line_on_plane import LineOnPlane
+    from groma.factors.relations.point_on_plane import PointOnPlane
     from groma.factors.user import factor
     from groma.io import read_scene, write_scene
-    from groma.pipelines.adjust import AdjustOptions, AdjustResult, adjust
-    from groma.pipelines.adjust_parts import adjust_parts, write_parts
-    from groma.pipelines.diagnosis import diagnose_scene as diagnose
-    from groma.pipelines.map import MapOptions, map_images
-    from groma.pipelines.pose_graph import PoseGraphOptions, adjust_pose_graph
-    from groma.pipelines.uncertainty import uncertainty
+    from groma.mapping.map import MapOptions, map_images
     from groma.problem.problem import Problem
     from groma.problem.variables import Variables
     from groma.scene import Scene
@@ -56,29 +58,29 @@ if TYPE_CHECKING:
     from groma.solver.solve import Solution, solve
     from groma.solver.termination import Termination
     from groma.tracking import Tracker, TrackOptions
-    from groma.viz.report import write_report
+    from groma.viz.report.page import write_report
 
 #: Where each public name lives, and after a colon its name there if that is another; with ``__all__`` and the imports
 #: above the only place to touch when one is added.
 _HOME = {
-    "AdjustOptions": "groma.pipelines.adjust",
-    "AdjustResult": "groma.pipelines.adjust",
+    "AdjustOptions": "groma.adjustment.adjust",
+    "AdjustResult": "groma.adjustment.adjust",
     "FileFormatError": "groma.errors",
     "GromaError": "groma.errors",
     "InputError": "groma.errors",
-    "LineBearing": "groma.factors.line_bearing",
-    "LineOnPlane": "groma.factors.line_on_plane",
-    "LineReprojection": "groma.factors.line_reprojection",
-    "MapOptions": "groma.pipelines.map",
+    "LineBearing": "groma.factors.observations.line_bearing",
+    "LineOnPlane": "groma.factors.relations.line_on_plane",
+    "LineReprojection": "groma.factors.observations.line_reprojection",
+    "MapOptions": "groma.mapping.map",
     "OutputError": "groma.errors",
-    "PlaneObservation": "groma.factors.plane_observation",
-    "PointOnPlane": "groma.factors.point_on_plane",
-    "PointReprojection": "groma.factors.point_reprojection",
-    "PoseGraphOptions": "groma.pipelines.pose_graph",
-    "PosePrior": "groma.factors.pose_prior",
+    "PlaneObservation": "groma.factors.observations.plane_observation",
+    "PointOnPlane": "groma.factors.relations.point_on_plane",
+    "PointReprojection": "groma.factors.observations.point_reprojection",
+    "PoseGraphOptions": "groma.adjustment.pose_graph",
+    "PosePrior": "groma.factors.priors.pose_prior",
     "Problem": "groma.problem.problem",
     "ProblemError": "groma.errors",
-    "Ref": "groma.factors._factor",
+    "Ref": "groma.factors.contract",
     "Scene": "groma.scene",
     "ShapeError": "groma.errors",
     "Solution": "groma.solver.solve",
@@ -88,30 +90,31 @@ _HOME = {
     "TrackOptions": "groma.tracking",
     "Tracker": "groma.tracking",
     "Variables": "groma.problem.variables",
-    "adjust": "groma.pipelines.adjust",
-    "adjust_parts": "groma.pipelines.adjust_parts",
-    "adjust_pose_graph": "groma.pipelines.pose_graph",
-    "diagnose": "groma.pipelines.diagnosis:diagnose_scene",
+    "adjust": "groma.adjustment.adjust",
+    "adjust_parts": "groma.adjustment.parts",
+    "adjust_pose_graph": "groma.adjustment.pose_graph",
+    "diagnose": "groma.adjustment.diagnosis:diagnose_scene",
     "factor": "groma.factors.user",
     "loss": "groma.factors.losses",
-    "map_images": "groma.pipelines.map",
+    "map_images": "groma.mapping.map",
     "read_scene": "groma.io",
     "solve": "groma.solver.solve",
-    "uncertainty": "groma.pipelines.uncertainty",
-    "write_parts": "groma.pipelines.adjust_parts",
-    "write_report": "groma.viz.report",
+    "uncertainty": "groma.adjustment.uncertainty",
+    "write_parts": "groma.adjustment.parts",
+    "write_report": "groma.viz.report.page",
     "write_scene": "groma.io",
 }
 _SUBPACKAGES = (
+    "adjustment",
     "cameras",
     "errors",
     "estimators",
     "evaluation",
     "factors",
-    "frontend",
+    "features",
     "geometry",
     "io",
-    "pipelines",
+    "mapping",
     "problem",
     "scene",
     "solver",
@@ -151,6 +154,7 @@ __all__ = [
     "adjust",
     "adjust_parts",
     "adjust_pose_graph",
+    "adjustment",
     "cameras",
     "diagnose",
     "errors",
@@ -158,12 +162,12 @@ __all__ = [
     "evaluation",
     "factor",
     "factors",
-    "frontend",
+    "features",
     "geometry",
     "io",
     "loss",
     "map_images",
-    "pipelines",
+    "mapping",
     "problem",
     "read_scene",
     "scene",

@@ -5,7 +5,7 @@ The tests of groma run these over everything that is registered; they are public
 live elsewhere. Each raises an ``AssertionError`` that shows what was expected and what came.
 
 >>> import numpy as np
->>> from groma.geometry.pose_charts import PoseLeft
+>>> from groma.geometry.charts.pose_charts import PoseLeft
 >>> check_manifold(PoseLeft(), rng=np.random.default_rng(0))
 """
 
@@ -20,17 +20,17 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.geometry import se3
-from groma.geometry._manifold import AMBIENT_SIZE, FACTOR_COLUMNS, Manifold
+from groma.geometry.manifold import AMBIENT_SIZE, FACTOR_COLUMNS, Manifold
 
 if TYPE_CHECKING:
-    from groma.cameras._check import check_camera
-    from groma.factors._check import check_factor
+    from groma.cameras.check import check_camera
+    from groma.factors.checks.check import check_factor
 
 #: Step of the differences through ``retract``: their truncation error is of order 1e-12, their rounding 1e-13.
 _STEP = 1e-3
 #: Size of the increments in the round trips, from rounding noise to a tenth of a radian.
 _MAGNITUDES = (1e-12, 1e-6, 1e-1)
-_HOME = {"check_camera": "groma.cameras._check", "check_factor": "groma.factors._check"}
+_HOME = {"check_camera": "groma.cameras.check", "check_factor": "groma.factors.checks.check"}
 
 
 def __getattr__(name: str) -> object:
@@ -50,7 +50,7 @@ def check_manifold(
     count: int = 20,
     tolerance: float = 1e-9,
 ) -> None:
-    r"""Check that a chart keeps the contract of :class:`groma.geometry._manifold.Manifold`.
+    r"""Check that a chart keeps the contract of :class:`groma.geometry.manifold.Manifold`.
 
     With the retraction :math:`\boxplus` and its inverse :math:`\boxminus`, on random states x and y:
 

@@ -11,8 +11,9 @@ import pytest
 
 from groma import cameras
 from groma._numba import kernel, loop
-from groma.cameras import _camera, _dispatch
-from groma.cameras._check import check_camera
+from groma.cameras import contract as _camera
+from groma.cameras import dispatch as _dispatch
+from groma.cameras.check import check_camera
 from groma.errors import InputError
 
 pytestmark = pytest.mark.kernels
@@ -59,7 +60,7 @@ CACHED = """
 import numpy as np
 from groma import cameras
 from groma._numba import loop
-from groma.cameras._camera import project
+from groma.cameras.contract import project
 
 @loop
 def pixels(model_tag, params, points, out):

@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 
 from groma import cameras
-from groma.cameras._check import check_camera
+from groma.cameras.check import check_camera
 from groma.errors import InputError, ShapeError
 
 pytestmark = pytest.mark.kernels
@@ -121,7 +121,7 @@ def test_the_plane_through_the_centre_has_no_image(name):
 
 @pytest.mark.parametrize("name", CASES)
 def test_kernels_write_zeros_where_there_is_no_image(name):
-    from groma.cameras._dispatch import project, project_jacobian, unproject
+    from groma.cameras.dispatch import project, project_jacobian, unproject
 
     model, params = cameras.model(name), params_of(name)
     pixel, by_point, by_params = np.ones(2), np.ones((2, 3)), np.ones((2, model.num_parameters))

@@ -9,9 +9,9 @@ import warnings
 
 import pytest
 
-from groma.cli._guard import guard
 from groma.cli.app import app
 from groma.cli.main import run
+from groma.cli.shared.guard import guard
 from groma.errors import InputError, OutputError
 
 COMMANDS = [[command.name] for command in app.registered_commands] + [["evaluate", "poses"]]

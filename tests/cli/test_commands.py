@@ -12,14 +12,14 @@ import pytest
 import groma
 from groma import _numba_cache
 from groma._counted import counted
-from groma.cli._compilation import Compilation, compilation_time, spent
-from groma.cli._diagnosis import why_steps_ran_out
-from groma.cli._mapping import last_loss
+from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
 from groma.cli.main import run
+from groma.cli.shared.compilation import Compilation, compilation_time, spent
+from groma.cli.shared.diagnosis import why_steps_ran_out
+from groma.cli.shared.mapping import last_loss
 from groma.errors import ProblemError
 from groma.factors.losses import Cauchy, GemanMcClure, Huber
 from groma.io import read_scene, write_scene
-from groma.pipelines.adjust import LAST_SCALE_SIGMAS, AdjustOptions
 from groma.scene import Relations, compare, synthetic
 
 pytestmark = pytest.mark.kernels
@@ -138,7 +138,7 @@ def test_a_map_is_diagnosed_at_its_own_noise(scenes):
     """Twice the noise, twice as weak."""
     from types import SimpleNamespace
 
-    from groma.cli._mapping import _diagnosis
+    from groma.cli.shared.mapping import _diagnosis
 
     scene = read_scene(scenes / "truth.npz").replace(relations=Relations())  # these have a noise of their own
     weakness = []
@@ -151,7 +151,7 @@ def test_a_map_is_diagnosed_at_its_own_noise(scenes):
 
 
 def test_many_images_are_diagnosed_when_asked(scenes, here, capsys, monkeypatch):
-    monkeypatch.setattr("groma.cli._diagnosis.MANY_IMAGES", 5)
+    monkeypatch.setattr("groma.cli.shared.diagnosis.MANY_IMAGES", 5)
     arguments = ["adjust", str(scenes / "points.npz"), "--max-iterations", "1", "-f", "--json", "r.json"]
     assert run([*arguments, "--verbose"]) == 0
     assert "--diagnosis asks for it" in capsys.readouterr().out
@@ -164,7 +164,7 @@ def test_a_diagnosis_that_fails_is_a_warning(scenes, here, capsys, monkeypatch):
     def fail(*_, **__):
         raise FloatingPointError("something odd")
 
-    monkeypatch.setattr("groma.pipelines.diagnosis.diagnose_scene", fail)
+    monkeypatch.setattr("groma.adjustment.diagnosis.diagnose_scene", fail)
     arguments = ["adjust", str(scenes / "points.npz"), "-o", "out.npz", "--max-iterations", "1", "--report", "p.html"]
     assert run(arguments) == 0
     assert "warning: What the data determine could not be found out: something odd" in capsys.readouterr().err
@@ -196,7 +196,7 @@ def test_covariances_that_are_impossible_do_not_cost_the_result(scenes, here, ca
     def fail(*_, **__):
         raise ProblemError("7 directions are not determined.")
 
-    monkeypatch.setattr("groma.pipelines.uncertainty.uncertainty", fail)
+    monkeypatch.setattr("groma.adjustment.uncertainty.uncertainty", fail)
     arguments = ["adjust", str(scenes / "points.npz"), "-o", "out.npz", "--covariance", "c.npz", "--json", "r.json"]
     assert run([*arguments, "--max-iterations", "1"]) == 1
     said = capsys.readouterr()
@@ -281,7 +281,7 @@ def test_bad_input_is_one_line(scenes, here, arguments, capsys):
 @pytest.mark.parametrize("name", ["out.xyz", "out.txt"])
 def test_a_target_that_cannot_hold_the_result_is_refused_before_the_work(scenes, here, name, monkeypatch):
     """The work takes hours in large scenes, and its result would be lost."""
-    monkeypatch.setattr("groma.pipelines.adjust.adjust", lambda *_: pytest.fail("was adjusted"))
+    monkeypatch.setattr("groma.adjustment.adjust.adjust", lambda *_: pytest.fail("was adjusted"))
     assert run(["adjust", str(scenes / "start.npz"), "-o", name]) == 1
     assert os.listdir(here) == []
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groma.cli import _cabinet
 from groma.cli.main import run
+from groma.cli.shared import cabinet as _cabinet
 from groma.io import read_scene
 from groma.scene import Lines, Similarity
 

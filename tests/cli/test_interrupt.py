@@ -13,7 +13,7 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals of POSIX system
 # The process sends itself the signal that Ctrl-C sends, when the solver reports its first step.
 PROGRAM = """
 import os, signal, sys
-import groma.pipelines.adjust as module
+import groma.adjustment.adjust as module
 adjust = module.adjust
 
 def interrupted(scene, options=None, progress=None):
@@ -49,7 +49,7 @@ def test_ctrl_c_in_mid_solve(tmp_path):
 
 
 def test_a_signal_that_a_library_swallows_is_not_forgotten():
-    from groma.cli._interrupt import interruptible
+    from groma.cli.shared.interrupt import interruptible
 
     calls = []
     before = signal.getsignal(signal.SIGTERM)
@@ -73,7 +73,7 @@ def test_a_signal_that_a_library_swallows_is_not_forgotten():
 
 def test_ctrl_c_while_mapping_says_how_to_go_on(tmp_path, monkeypatch, capsys):
     from groma.cli.main import run
-    from groma.pipelines import map as mapping
+    from groma.mapping import map as mapping
 
     (tmp_path / "photos").mkdir()
 

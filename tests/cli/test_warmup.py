@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from groma import _numba_cache, cameras
-from groma.cli import _warmup, _warmup_runs
 from groma.cli.main import run
-from groma.factors._factor import registered
+from groma.cli.shared import warmup as _warmup
+from groma.cli.shared import warmup_runs as _warmup_runs
+from groma.factors.contract import registered
 
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
 

@@ -17,7 +17,7 @@ from groma.geometry import quaternion
 from groma.io import write_colmap, write_obj, write_ply, write_scene
 from groma.io.reference import holds_scene, read_line3dpp, read_reference
 from groma.scene import Lines, Scene, Similarity
-from groma.scene.synthetic import holistic
+from groma.scene.synthetic.scenes import holistic
 
 UNIT = np.array([[[0, 0, 0], [1.0, 0, 0]]])
 

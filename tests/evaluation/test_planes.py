@@ -12,7 +12,7 @@ from groma.evaluation import evaluate_planes, match_planes, score_planes, score_
 from groma.evaluation.planes import plane_places
 from groma.io import write_scene
 from groma.scene import Lines, Planes, Points, Relations, Scene
-from groma.scene.synthetic import holistic
+from groma.scene.synthetic.scenes import holistic
 
 FLOOR, WALL = [0, 0, 1, -1.0], [1, 0, 0, 2.0]
 

@@ -10,7 +10,7 @@ from groma.evaluation.poses import pairwise_auc, rotation_angle
 from groma.geometry import quaternion
 from groma.io import read_scene
 from groma.scene import Similarity
-from groma.scene.synthetic import holistic
+from groma.scene.synthetic.scenes import holistic
 
 
 def random_similarity(rng: np.random.Generator, scale: float = 3.0) -> Similarity:

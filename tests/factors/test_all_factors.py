@@ -9,10 +9,10 @@ import pytest
 
 import groma.factors
 from groma.factors import check_factor, registered
-from groma.factors._check import _ambients, _linearize, _residuals
 from groma.factors._examples import random_poses
 from groma.factors._record import poses_from_states
-from groma.factors.point_on_plane import PointOnPlane
+from groma.factors.checks.check import _ambients, _linearize, _residuals
+from groma.factors.relations.point_on_plane import PointOnPlane
 
 pytestmark = pytest.mark.kernels
 NAMES = sorted(registered())

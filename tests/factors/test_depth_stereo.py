@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError, ShapeError
-from groma.factors._factor import Ref
-from groma.factors.line_reprojection import LineReprojection
-from groma.factors.point_depth import PointDepth
-from groma.factors.point_reprojection import PointReprojection
-from groma.factors.stereo_line import StereoLine
-from groma.factors.stereo_point import StereoPoint
+from groma.factors.contract import Ref
+from groma.factors.observations.line_reprojection import LineReprojection
+from groma.factors.observations.point_depth import PointDepth
+from groma.factors.observations.point_reprojection import PointReprojection
+from groma.factors.observations.stereo_line import StereoLine
+from groma.factors.observations.stereo_point import StereoPoint
 
 pytestmark = pytest.mark.kernels
 

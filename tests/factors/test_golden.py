@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from groma.errors import FileFormatError, InputError
-from groma.factors._golden import FILES, check_golden
+from groma.factors.checks.golden import FILES, check_golden
 
 pytestmark = pytest.mark.kernels
 

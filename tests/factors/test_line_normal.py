@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError
-from groma.factors._factor import Ref
-from groma.factors.line_normal import LineNormal
+from groma.factors.contract import Ref
+from groma.factors.observations.line_normal import LineNormal
 
 pytestmark = pytest.mark.kernels
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError
-from groma.factors._factor import Ref
-from groma.factors.plane_observation import PlaneObservation
-from groma.factors.plane_quaternion import PlaneQuaternion
+from groma.factors.contract import Ref
+from groma.factors.observations.plane_observation import PlaneObservation
+from groma.factors.observations.plane_quaternion import PlaneQuaternion
 from groma.geometry import quaternion, so3
 
 pytestmark = pytest.mark.kernels

@@ -9,14 +9,14 @@ import pytest
 from scipy.linalg import expm, logm
 
 from groma.errors import ShapeError
-from groma.factors._check import _linearize, _residuals, check_factor
 from groma.factors._examples import make_example, random_poses
-from groma.factors._factor import Ref
 from groma.factors._record import poses_from_states
-from groma.factors.pose_between import PoseBetween
-from groma.factors.pose_prior import PosePrior
-from groma.factors.position_prior import PositionPrior
-from groma.factors.vector_prior import VectorPrior
+from groma.factors.checks.check import _linearize, _residuals, check_factor
+from groma.factors.contract import Ref
+from groma.factors.priors.pose_between import PoseBetween
+from groma.factors.priors.pose_prior import PosePrior
+from groma.factors.priors.position_prior import PositionPrior
+from groma.factors.priors.vector_prior import VectorPrior
 from groma.geometry import se3
 
 pytestmark = pytest.mark.kernels

@@ -11,12 +11,12 @@ import pytest
 
 from groma.cameras import models
 from groma.errors import InputError, ShapeError
-from groma.factors._check import check_factor
-from groma.factors._factor import Example, Ref
-from groma.factors.line_bearing import LineBearing
-from groma.factors.line_reprojection import LineReprojection
-from groma.factors.point_reprojection import PointReprojection
-from groma.geometry._manifold import Euclidean
+from groma.factors.checks.check import check_factor
+from groma.factors.contract import Example, Ref
+from groma.factors.observations.line_bearing import LineBearing
+from groma.factors.observations.line_reprojection import LineReprojection
+from groma.factors.observations.point_reprojection import PointReprojection
+from groma.geometry.manifold import Euclidean
 
 pytestmark = pytest.mark.kernels
 

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 
 from groma.errors import ShapeError
-from groma.factors._check import check_factor
 from groma.factors._examples import random_poses
-from groma.factors._factor import Example, Ref
-from groma.factors.line_bearing import LineBearing
-from groma.factors.line_normal import LineNormal
-from groma.factors.line_reprojection import LineReprojection
-from groma.factors.plane_observation import PlaneObservation
-from groma.factors.plane_quaternion import PlaneQuaternion
-from groma.factors.point_depth import PointDepth
-from groma.factors.point_reprojection import PointReprojection
-from groma.factors.stereo_line import StereoLine
-from groma.factors.stereo_point import StereoPoint
+from groma.factors.checks.check import check_factor
+from groma.factors.contract import Example, Ref
+from groma.factors.observations.line_bearing import LineBearing
+from groma.factors.observations.line_normal import LineNormal
+from groma.factors.observations.line_reprojection import LineReprojection
+from groma.factors.observations.plane_observation import PlaneObservation
+from groma.factors.observations.plane_quaternion import PlaneQuaternion
+from groma.factors.observations.point_depth import PointDepth
+from groma.factors.observations.point_reprojection import PointReprojection
+from groma.factors.observations.stereo_line import StereoLine
+from groma.factors.observations.stereo_point import StereoPoint
 from groma.geometry import se3
-from groma.geometry.pose_charts import POSE_CHARTS
+from groma.geometry.charts.pose_charts import POSE_CHARTS
 
 pytestmark = pytest.mark.kernels
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError
-from groma.factors import _factor, registered, selfcheck
-from groma.factors._selfcheck import SelfCheckReport, SelfCheckRow
-from groma.factors.position_prior import PositionPrior
+from groma.factors import contract as _factor
+from groma.factors import registered, selfcheck
+from groma.factors.checks.selfcheck import SelfCheckReport, SelfCheckRow
+from groma.factors.priors.position_prior import PositionPrior
 
 pytestmark = pytest.mark.kernels
 

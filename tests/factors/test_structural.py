@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from groma.errors import ShapeError
-from groma.factors._check import _ambients, _linearize, _residuals
-from groma.factors._factor import Ref, registered
-from groma.factors.line_direction import LineDirection
-from groma.factors.line_on_plane import LineOnPlane, SegmentOnPlane
-from groma.factors.orthogonal import LineParallelToPlane, OrthogonalLines, OrthogonalPlanes
-from groma.factors.parallel import LinePerpendicularToPlane, ParallelLines, ParallelPlanes
-from groma.factors.point_on_line import PointOnLine
-from groma.factors.point_on_plane import PointOnPlane
+from groma.factors.checks.check import _ambients, _linearize, _residuals
+from groma.factors.contract import Ref, registered
+from groma.factors.relations.line_direction import LineDirection
+from groma.factors.relations.line_on_plane import LineOnPlane, SegmentOnPlane
+from groma.factors.relations.orthogonal import LineParallelToPlane, OrthogonalLines, OrthogonalPlanes
+from groma.factors.relations.parallel import LinePerpendicularToPlane, ParallelLines, ParallelPlanes
+from groma.factors.relations.point_on_line import PointOnLine
+from groma.factors.relations.point_on_plane import PointOnPlane
 
 pytestmark = pytest.mark.kernels
 N = 8

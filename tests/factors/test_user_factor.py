@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError, ShapeError
-from groma.factors import _factor
-from groma.factors._check import _ambients, _linearize, _residuals, check_factor
+from groma.factors import contract as _factor
 from groma.factors._examples import charts
-from groma.factors._factor import Example, Ref, registered
-from groma.factors.point_on_plane import PointOnPlane
+from groma.factors.checks.check import _ambients, _linearize, _residuals, check_factor
+from groma.factors.contract import Example, Ref, registered
+from groma.factors.relations.point_on_plane import PointOnPlane
 from groma.factors.user import UserFactor, factor, transform
 
 pytestmark = pytest.mark.kernels

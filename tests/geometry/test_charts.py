@@ -6,8 +6,8 @@ import pytest
 from _charts import by_name
 
 from groma.errors import InputError, ShapeError
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.plane_charts import PLANE_CHARTS
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.plane_charts import PLANE_CHARTS
 
 pytestmark = [
     pytest.mark.kernels,

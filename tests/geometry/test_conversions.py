@@ -12,10 +12,10 @@ import pytest
 
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion
-from groma.geometry._manifold import Euclidean
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.plane_charts import PLANE_CHARTS
 from groma.geometry.conversions import conversion_jacobian, convert, convert_covariance
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.plane_charts import PLANE_CHARTS
+from groma.geometry.manifold import Euclidean
 
 pytestmark = pytest.mark.kernels
 

@@ -11,9 +11,9 @@ from _charts import by_name, differences
 
 from groma.errors import InputError
 from groma.geometry import quaternion
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.line_free import FreeLineRight
-from groma.geometry.line_orthonormal import OrthonormalLineLeft, OrthonormalLineRight
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.line_free import FreeLineRight
+from groma.geometry.charts.line_orthonormal import OrthonormalLineLeft, OrthonormalLineRight
 
 pytestmark = pytest.mark.kernels
 

@@ -6,12 +6,12 @@ import pytest
 
 from groma import testing
 from groma.errors import InputError
-from groma.geometry._manifold import Euclidean
-from groma.geometry.line_charts import LINE_CHARTS, CartesianLine
-from groma.geometry.plane_charts import PLANE_CHARTS, NormalOffsetPlane
-from groma.geometry.point3 import POINT_CHARTS, from_homogeneous, to_homogeneous
-from groma.geometry.pose_charts import POSE_CHARTS, PoseBody, PoseLeft, PoseRight
-from groma.geometry.unit3 import DIRECTION_CHARTS, Unit3
+from groma.geometry.charts.line_charts import LINE_CHARTS, CartesianLine
+from groma.geometry.charts.plane_charts import PLANE_CHARTS, NormalOffsetPlane
+from groma.geometry.charts.point3 import POINT_CHARTS, from_homogeneous, to_homogeneous
+from groma.geometry.charts.pose_charts import POSE_CHARTS, PoseBody, PoseLeft, PoseRight
+from groma.geometry.charts.unit3 import DIRECTION_CHARTS, Unit3
+from groma.geometry.manifold import Euclidean
 from groma.testing import check_manifold
 
 pytestmark = pytest.mark.kernels

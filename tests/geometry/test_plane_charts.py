@@ -10,7 +10,7 @@ from _charts import STEP, by_name, differences
 
 from groma.errors import InputError
 from groma.geometry import quaternion
-from groma.geometry.plane_charts import PLANE_CHARTS
+from groma.geometry.charts.plane_charts import PLANE_CHARTS
 
 pytestmark = pytest.mark.kernels
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from groma.errors import ShapeError
-from groma.geometry.point_inverse_depth import LARGEST_GROWTH, InverseDepthPoint
+from groma.geometry.charts.point_inverse_depth import LARGEST_GROWTH, InverseDepthPoint
 
 pytestmark = pytest.mark.kernels
 CHART = InverseDepthPoint()

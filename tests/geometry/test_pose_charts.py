@@ -10,7 +10,7 @@ from scipy.linalg import expm
 
 from groma.errors import InputError, ShapeError
 from groma.geometry import se3, so3
-from groma.geometry.pose_charts import POSE_CHARTS, PoseBody, PoseLeft, PoseRight
+from groma.geometry.charts.pose_charts import POSE_CHARTS, PoseBody, PoseLeft, PoseRight
 
 pytestmark = pytest.mark.kernels
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError, ShapeError
-from groma.geometry import unit3
+from groma.geometry.charts import unit3
 
 
 def _directions(seed: int = 1, count: int = 30) -> np.ndarray:

@@ -35,7 +35,7 @@ from groma.io import (
 )
 from groma.scene import Cameras, Scene
 from groma.scene.compare import equal, near
-from groma.scene.synthetic import holistic
+from groma.scene.synthetic.scenes import holistic
 
 BAL = Path(__file__).parents[1] / "data" / "bal"
 

@@ -13,11 +13,20 @@ from _models import rig_scene
 from groma.cli.main import run
 from groma.errors import FileFormatError, OutputError
 from groma.io import read_scene, structures_of, write_colmap
-from groma.io._limap_files import LINE_2D, MEMBER_2D, MEMBER_3D, NONE
-from groma.io.limap import Group2d, Group3d, Lines3d, Structures, from_scene, read_limap, with_structures, write_limap
+from groma.io.limap.files import LINE_2D, MEMBER_2D, MEMBER_3D, NONE
+from groma.io.limap.structures import (
+    Group2d,
+    Group3d,
+    Lines3d,
+    Structures,
+    from_scene,
+    read_limap,
+    with_structures,
+    write_limap,
+)
 from groma.scene import Directions, LineObservations, Lines, Planes, Relations, Scene
 from groma.scene.compare import equal, near
-from groma.scene.synthetic import holistic
+from groma.scene.synthetic.scenes import holistic
 
 DATA = Path(__file__).parents[1] / "data" / "limap"
 FILES = ("structures2d", "lines3D", "groups3D", "wireframe3D")

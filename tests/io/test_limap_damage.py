@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from groma.errors import FileFormatError, GromaError, InputError
 from groma.io import read_scene, write_colmap
-from groma.io._limap_files import TRACK
-from groma.io.limap import Group3d, from_scene, read_limap, with_structures, write_limap
+from groma.io.limap.files import TRACK
+from groma.io.limap.structures import Group3d, from_scene, read_limap, with_structures, write_limap
 from groma.scene import Scene
 
 DATA = Path(__file__).parents[1] / "data" / "limap"

@@ -17,7 +17,7 @@ from _limap import LIMAP_PYTHON
 from groma.cli.main import run
 from groma.evaluation import evaluate_poses
 from groma.io import read_scene, write_colmap
-from groma.scene.synthetic import holistic
+from groma.scene.synthetic.scenes import holistic
 
 pytestmark = pytest.mark.skipif(not LIMAP_PYTHON, reason="needs pylimap 2.0 (or GROMA_LIMAP_PYTHON)")
 

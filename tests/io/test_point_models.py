@@ -4,9 +4,10 @@
 import pytest
 
 from groma.errors import InputError
-from groma.io import colmap_sfm, read_colmap, to_pycolmap, write_colmap
-from groma.io.colmap_sfm import FIRST_PAIR_ANGLES, PointModelOptions, reconstruct_points
-from groma.scene.synthetic import holistic
+from groma.io import read_colmap, to_pycolmap, write_colmap
+from groma.io.colmap import sfm as colmap_sfm
+from groma.io.colmap.sfm import FIRST_PAIR_ANGLES, PointModelOptions, reconstruct_points
+from groma.scene.synthetic.scenes import holistic
 
 
 @pytest.mark.parametrize("form", ["binary", "text"])

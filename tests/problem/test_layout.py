@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from groma.factors import PointReprojection
-from groma.factors._factor import Ref
-from groma.geometry._manifold import Euclidean
-from groma.geometry.pose_charts import PoseLeft
-from groma.problem._sorting import PairTable, argsort_by, distinct_pairs, first_and_last
+from groma.factors.contract import Ref
+from groma.geometry.charts.pose_charts import PoseLeft
+from groma.geometry.manifold import Euclidean
 from groma.problem.lay_out import lay_out
 from groma.problem.problem import Problem
+from groma.problem.sorting import PairTable, argsort_by, distinct_pairs, first_and_last
 from groma.problem.variables import Variables
 
 pytestmark = pytest.mark.kernels

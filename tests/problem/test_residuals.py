@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from groma.factors import registered
-from groma.factors._factor import Ref
-from groma.factors.point_on_plane import PointOnPlane
-from groma.geometry._manifold import Euclidean
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.plane_charts import PLANE_CHARTS
-from groma.geometry.pose_charts import POSE_CHARTS
+from groma.factors.contract import Ref
+from groma.factors.relations.point_on_plane import PointOnPlane
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.plane_charts import PLANE_CHARTS
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.geometry.manifold import Euclidean
 from groma.problem.residuals import jacobians_of, residuals_of, squared_norms
 from groma.problem.variables import Variables
 

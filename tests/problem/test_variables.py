@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from groma.errors import ProblemError, ShapeError
-from groma.geometry._manifold import Euclidean
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.plane_charts import PLANE_CHARTS
-from groma.geometry.pose_charts import POSE_CHARTS
-from groma.geometry.unit3 import DIRECTION_CHARTS
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.plane_charts import PLANE_CHARTS
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.geometry.charts.unit3 import DIRECTION_CHARTS
+from groma.geometry.manifold import Euclidean
 from groma.problem.gauge import gauge_directions, move_world
 from groma.problem.variables import Variables
 

@@ -18,9 +18,9 @@ from groma.scene import (
     Scene,
     Similarity,
 )
-from groma.scene._synthetic import project_pinhole
 from groma.scene.compare import equal, near
-from groma.scene.synthetic import holistic
+from groma.scene.synthetic.noise import project_pinhole
+from groma.scene.synthetic.scenes import holistic
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import pytest
 
 from groma.errors import InputError
 from groma.evaluation.poses import rotation_angle
-from groma.scene._synthetic import project_pinhole
 from groma.scene.compare import equal
-from groma.scene.synthetic import corridor, holistic
+from groma.scene.synthetic.noise import project_pinhole
+from groma.scene.synthetic.scenes import corridor, holistic
 
 
 def incidence_error(scene) -> float:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from groma.factors import LineReprojection, PointOnPlane, PointReprojection
-from groma.factors._factor import Ref
+from groma.factors.contract import Ref
 from groma.factors.losses import Trivial
 from groma.geometry import quaternion, se3
-from groma.geometry._manifold import Euclidean
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.plane_charts import PLANE_CHARTS
-from groma.geometry.pose_charts import POSE_CHARTS
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.plane_charts import PLANE_CHARTS
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from groma.solver._block_cholesky import BlockCholesky
-from groma.solver._ordering import fill_reducing_order
+from groma.solver.linear.block_cholesky import BlockCholesky
+from groma.solver.linear.ordering import fill_reducing_order
 
 pytestmark = pytest.mark.kernels
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from problems import scene_problem
 
-from groma.problem._parallel import Workers
 from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
-from groma.solver import _coarse
-from groma.solver.linear import ConjugateGradients, Dense
-from groma.solver.schur import ReducedSystem
+from groma.problem.parallel import Workers
+from groma.solver.linear import coarse as _coarse
+from groma.solver.linear.reduced import ConjugateGradients, Dense
+from groma.solver.linear.schur import ReducedSystem
 
 pytestmark = pytest.mark.kernels
 

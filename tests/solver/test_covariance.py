@@ -10,20 +10,19 @@ from problems import dense_normal_equations, pixels_of, scene_problem
 
 from groma.errors import InputError, ProblemError
 from groma.factors import LineDirection, LineReprojection, PointOnPlane, PointReprojection, SegmentOnPlane
-from groma.factors._factor import Ref
+from groma.factors.contract import Ref
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.plane_charts import PLANE_CHARTS
+from groma.geometry.charts.unit3 import DIRECTION_CHARTS
 from groma.geometry.conversions import convert_covariance
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.plane_charts import PLANE_CHARTS
-from groma.geometry.unit3 import DIRECTION_CHARTS
 from groma.problem.gauge import world_motions
 from groma.problem.lay_out import lay_out
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
-from groma.solver import quantities
-from groma.solver._datum import unmoved
-from groma.solver._fronts import Fronts
-from groma.solver.covariance import Covariances
-from groma.solver.linear import Dense
+from groma.solver.covariance.datum import unmoved
+from groma.solver.covariance.marginals import Covariances, quantities
+from groma.solver.linear.fronts import Fronts
+from groma.solver.linear.reduced import Dense
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 

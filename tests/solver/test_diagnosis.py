@@ -18,18 +18,18 @@ from groma.factors import (
     PointReprojection,
     PositionPrior,
 )
-from groma.factors._factor import Ref
+from groma.factors.contract import Ref
 from groma.factors.losses import Tukey
 from groma.geometry import quaternion, se3
-from groma.geometry._manifold import Euclidean
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.plane_charts import PLANE_CHARTS
-from groma.geometry.pose_charts import POSE_CHARTS
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.plane_charts import PLANE_CHARTS
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
-from groma.solver._observability import camera_centers, motion, observers
-from groma.solver.covariance import Covariances
-from groma.solver.diagnosis import diagnose
+from groma.solver.covariance.marginals import Covariances
+from groma.solver.linear.visible_motion import camera_centers, motion, observers
+from groma.solver.observability.diagnosis import diagnose
 
 pytestmark = pytest.mark.kernels
 
@@ -320,7 +320,7 @@ def test_a_plane_that_nothing_lies_on_is_no_problem():
 @pytest.mark.parametrize("on_a_line", [1, 40], ids=["alone", "touching each other"])
 def test_lines_that_stay_in_the_system_are_judged_like_others(on_a_line, dense, monkeypatch):
     """More points than lines, tied to each other: lines are kept, and those in an epipolar plane are found."""
-    monkeypatch.setattr("groma.solver._weak_modes.DENSE", dense)
+    monkeypatch.setattr("groma.solver.observability.weak_modes.DENSE", dense)
     ends = np.array([[[-1, 0, 1.0], [1, 0, 1.0]], [[0, 0, -1], [0.3, 1, 1]], [[-1, 0, 0.0], [1, 1.5, 0.0]]])
     xyz = np.vstack([CLOUD, ends[1:2].mean(axis=1)])
     problem = problem_of(PATH, xyz, ends)
@@ -336,7 +336,7 @@ def test_lines_that_stay_in_the_system_are_judged_like_others(on_a_line, dense, 
 @pytest.mark.parametrize("name", ["camera with two points", "two planes", "focal length and depth", "free scene"])
 def test_large_systems_are_judged_like_small_ones(name, monkeypatch):
     small = diagnose(CASES_BY_NAME[name]())
-    monkeypatch.setattr("groma.solver._weak_modes.DENSE", 0)
+    monkeypatch.setattr("groma.solver.observability.weak_modes.DENSE", 0)
     large = diagnose(CASES_BY_NAME[name]())
     assert [finding.kind for finding in large.findings] == [finding.kind for finding in small.findings]
     assert large.num_open_directions == small.num_open_directions

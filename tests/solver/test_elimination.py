@@ -5,14 +5,14 @@ import pytest
 from problems import dense_normal_equations, scene_problem
 
 from groma.factors.losses import Cauchy
-from groma.problem._parallel import Workers
 from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
-from groma.solver._reduction import Reduction
+from groma.problem.parallel import Workers
 from groma.solver.levenberg_marquardt import LevenbergMarquardt
-from groma.solver.linear import choose
+from groma.solver.linear.reduced import choose
+from groma.solver.linear.reduction import Reduction
+from groma.solver.linear.schur import LANDMARK_DAMPING, MIN_DIAGONAL, ReducedSystem
 from groma.solver.report import SolveReport, Stopwatch
-from groma.solver.schur import LANDMARK_DAMPING, MIN_DIAGONAL, ReducedSystem
 from groma.solver.steps import Step, curvature, diagonal, gradient, retract
 
 pytestmark = pytest.mark.kernels

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from problems import scene_problem
 
-from groma.problem._parallel import Workers
 from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
-from groma.solver._refinement import landmark_refiner
-from groma.solver._trial import Trial
+from groma.problem.parallel import Workers
 from groma.solver.options import SolverOptions
+from groma.solver.refinement import landmark_refiner
 from groma.solver.steps import Step
+from groma.solver.trial import Trial
 
 ONLY_LINES = SolverOptions(landmark_steps=1, landmark_groups=("lines",))
 

@@ -7,10 +7,10 @@ import pytest
 from problems import scene_problem
 
 from groma.errors import ProblemError
-from groma.factors._factor import Ref
+from groma.factors.contract import Ref
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
-from groma.solver.shards import Shard, solve_shards
+from groma.solver.reduce.shards import Shard, solve_shards
 from groma.solver.solve import solve
 from groma.solver.termination import Termination
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from problems import INTRINSICS, dense_normal_equations, pixels_of, scene_problem
 
-import groma.solver.schur as schur_module
+import groma.solver.linear.schur as schur_module
 import groma.solver.solve as solve_module
 from groma.errors import ProblemError
 from groma.factors import PointOnLine, PointReprojection, VectorPrior
-from groma.factors._factor import Example, Factor, Ref, Slot
+from groma.factors.contract import Example, Factor, Ref, Slot
 from groma.factors.losses import Cauchy, Truncated
-from groma.geometry._manifold import Euclidean
-from groma.geometry.pose_charts import POSE_CHARTS
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.options import SolverOptions

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from groma.geometry import quaternion, se3, so3
-from groma.tracking.camera import TrackCamera, into
-from groma.tracking.coarse_alignment import small_image, turn_between, turned_prediction
+from groma.tracking.frame.camera import TrackCamera, into
+from groma.tracking.frame.coarse_alignment import small_image, turn_between, turned_prediction
 
 CAMERA = TrackCamera.of(_room.camera())
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from groma.geometry import se3
 from groma.tracking import Tracker, TrackOptions
-from groma.tracking.features import Features
-from groma.tracking.observations import Measurements
+from groma.tracking.frame.features import Features
+from groma.tracking.frame.measurements import Measurements
+from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.outcome import History
-from groma.tracking.track_map import Keyframe, TrackMap
 
 NO_FEATURES = Features(
     np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 32), np.uint8), np.zeros(0), np.zeros(0, int)

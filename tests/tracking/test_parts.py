@@ -5,25 +5,25 @@ import _room
 import numpy as np
 import pytest
 
-from groma.factors._factor import Ref
-from groma.factors.plane_observation import PlaneObservation
-from groma.frontend.point_tracks import corners, follow, spread
+from groma.factors.contract import Ref
+from groma.factors.observations.plane_observation import PlaneObservation
+from groma.features.point_tracks import corners, follow, spread
 from groma.geometry import se3
 from groma.scene.landmarks import Lines
-from groma.tracking.camera import TrackCamera, back, into, planes_back, planes_into
-from groma.tracking.depth import depth_at, segment_inverse_depths
-from groma.tracking.features import SEGMENT_NOISE
-from groma.tracking.frame_planes import frame_planes
-from groma.tracking.landmarks import ALIVE, DEAD, LineTable, PlaneTable, PointTable
-from groma.tracking.lines import assign, carried, line_ends
-from groma.tracking.motion import MapView, estimate_pose
-from groma.tracking.observations import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
-from groma.tracking.planes import add_planes, assign_planes, merge_planes
-from groma.tracking.prediction import MotionModel
-from groma.tracking.relocalise import pose_from_matches
-from groma.tracking.sparse_depth import fill_sparse
-from groma.tracking.stereo import dense_disparities, match_columns
-from groma.tracking.triangulation import triangulate
+from groma.tracking.frame.camera import TrackCamera, back, into, planes_back, planes_into
+from groma.tracking.frame.depth import depth_at, segment_inverse_depths
+from groma.tracking.frame.features import SEGMENT_NOISE
+from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.frame.planes import frame_planes
+from groma.tracking.frame.sparse_depth import fill_sparse
+from groma.tracking.frame.stereo import dense_disparities, match_columns
+from groma.tracking.map.landmarks import ALIVE, DEAD, LineTable, PlaneTable, PointTable
+from groma.tracking.map.lines import assign, carried, line_ends
+from groma.tracking.map.planes import add_planes, assign_planes, merge_planes
+from groma.tracking.map.triangulation import triangulate
+from groma.tracking.pose.estimate import MapView, estimate_pose
+from groma.tracking.pose.prediction import MotionModel
+from groma.tracking.pose.relocalise import pose_from_matches
 
 CAMERA = TrackCamera(500.0, 510.0, 320.0, 240.0, 640, 480, 0.2)
 IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from groma.frontend.point_tracks import corners, follow, image_noise
+from groma.features.point_tracks import corners, follow, image_noise
 
 
 def _texture(seed: int) -> np.ndarray:

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from groma.tracking.stereo import dense_disparities, match_columns
+from groma.tracking.frame.stereo import dense_disparities, match_columns
 
 HEIGHT, WIDTH = 160, 480
 

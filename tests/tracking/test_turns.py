@@ -13,13 +13,13 @@ import pytest
 
 from groma.geometry import quaternion, se3, so3
 from groma.tracking import Tracker, TrackOptions
-from groma.tracking.belief import Belief
-from groma.tracking.camera import TrackCamera
-from groma.tracking.depth_check import depth_agreement
-from groma.tracking.features import FrameFeatures
-from groma.tracking.motion import PoseEstimate
-from groma.tracking.relocalise import pose_from_matches
-from groma.tracking.track_map import TrackMap
+from groma.tracking.frame.camera import TrackCamera
+from groma.tracking.frame.features import FrameFeatures
+from groma.tracking.map.track_map import TrackMap
+from groma.tracking.pose.depth_check import depth_agreement
+from groma.tracking.pose.estimate import PoseEstimate
+from groma.tracking.pose.relocalise import pose_from_matches
+from groma.tracking.pose.verification import Belief
 
 pytestmark = pytest.mark.filterwarnings("error")
 OPTIONS = TrackOptions(num_points=250, num_features=500)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from groma.viz import _charts
+from groma.viz.report import charts as _charts
 
 
 def _tree(svg: str) -> ElementTree.Element:

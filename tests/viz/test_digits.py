@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from groma.viz import _digits
+from groma.viz.report import digits as _digits
 
 
 @pytest.mark.parametrize(

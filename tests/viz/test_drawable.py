@@ -7,7 +7,7 @@ from _scene import PINHOLE, exact_scene
 
 from groma.geometry import se3
 from groma.scene import Scene
-from groma.viz._drawable import drawable
+from groma.viz.drawable import drawable
 
 
 def test_exact_observations_have_no_residual():

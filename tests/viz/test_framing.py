@@ -6,9 +6,9 @@ import pytest
 from _scene import exact_scene
 
 from groma.scene import Lines, Points, Scene
-from groma.scene.synthetic import holistic
-from groma.viz._drawable import drawable
-from groma.viz._framing import OPENING, StartingView, horizontal, starting_view, upward
+from groma.scene.synthetic.scenes import holistic
+from groma.viz.drawable import drawable
+from groma.viz.framing import OPENING, StartingView, horizontal, starting_view, upward
 
 
 def _seen(view: StartingView, places: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from groma.cli.app import app
 from groma.io import write_scene
 from groma.io.trajectories import Trajectory, write_tum
-from groma.viz import live
+from groma.viz.viewer import live
 
 ROW = "{} 0.1 0 {} 0 0 0 1 {}\n"
 

@@ -12,8 +12,8 @@ from _scene import exact_scene
 from groma.errors import InputError
 from groma.geometry import se3
 from groma.scene import Scene, synthetic
-from groma.viz._statistics import line_statistics
-from groma.viz.overlays import line_overlays, observation_crop, overlay_section, projected_segments, residual_top
+from groma.viz.report.overlays import line_overlays, observation_crop, overlay_section, projected_segments, residual_top
+from groma.viz.statistics import line_statistics
 
 
 @pytest.fixture(scope="module")

@@ -15,11 +15,12 @@ from groma.cli.main import run
 from groma.errors import InputError, OutputError
 from groma.io import write_scene
 from groma.scene import Directions, Relations, Scene
-from groma.scene.synthetic import holistic
-from groma.viz import _page_data, _page_images
-from groma.viz._pictures import jpeg_address
-from groma.viz._saved_report import saved_report
-from groma.viz.report import write_report
+from groma.scene.synthetic.scenes import holistic
+from groma.viz.pictures import jpeg_address
+from groma.viz.report import data as _page_data
+from groma.viz.report import images as _page_images
+from groma.viz.report.page import write_report
+from groma.viz.report.saved import saved_report
 
 REPORT = SimpleNamespace(
     history=[

@@ -12,9 +12,9 @@ from groma.evaluation.trajectory import score_trajectory
 from groma.geometry import quaternion, se3
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
-from groma.viz import trajectory as page
-from groma.viz._path_charts import MAX_PLACES, Curve, over_time, path
-from groma.viz.trajectory import write_track_report
+from groma.viz.report import trajectory as page
+from groma.viz.report.path_charts import MAX_PLACES, Curve, over_time, path
+from groma.viz.report.trajectory import write_track_report
 
 TIMES = np.arange(30) / 10.0
 #: A level drive along (1, 0, 1) with a swerve; y is down.

@@ -23,9 +23,10 @@ from groma.geometry import se3
 from groma.io import write_scene
 from groma.scene import Directions, Points, Relations, Scene, Similarity, synthetic
 from groma.scene.patches import plane_patches
-from groma.viz import _scene_view, viewer
-from groma.viz._view_content import LINE_MODES, REACH, ray_to_segments, view_content
-from groma.viz.viewer import open_viewer, serving
+from groma.viz.viewer import nodes as _scene_view
+from groma.viz.viewer import scene as viewer
+from groma.viz.viewer.content import LINE_MODES, REACH, ray_to_segments, view_content
+from groma.viz.viewer.scene import open_viewer, serving
 
 
 @pytest.fixture(scope="module")

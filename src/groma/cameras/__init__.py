@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From ray to pixel and back, each with its derivative: one file per family of camera models."""
 
-from groma.cameras._camera import CameraModel, model, models, register_camera
+from groma.cameras.contract import CameraModel, model, models, register_camera
 from groma.cameras.fisheye import OPENCV_FISHEYE
 from groma.cameras.opencv import FULL_OPENCV, OPENCV
 from groma.cameras.pinhole import PINHOLE, SIMPLE_PINHOLE

@@ -26,7 +26,7 @@ import math
 import numpy as np
 
 from groma._numba import kernel
-from groma.cameras._camera import CameraModel, register_camera
+from groma.cameras.contract import CameraModel, register_camera
 from groma.cameras.pinhole import bearing_from_normalized, clear, has_depth
 from groma.cameras.radial import write_point_jacobian
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 
 from groma._numba import kernel
-from groma.cameras._camera import CameraModel, register_camera
+from groma.cameras.contract import CameraModel, register_camera
 from groma.cameras.pinhole import bearing_from_normalized, clear, has_depth
 
 # --------------------------------------------------------------------------------------------------------- Kernels

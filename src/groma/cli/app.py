@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 import groma
-from groma.cli import adjust, convert, demo, evaluate, map, report, selfcheck, synth, track, view, warmup
-from groma.cli._guard import guard
+from groma.cli.commands import adjust, convert, demo, evaluate, map, report, selfcheck, synth, track, view, warmup
+from groma.cli.shared.guard import guard
 
 app = typer.Typer(
     name="groma",

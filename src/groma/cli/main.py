@@ -8,7 +8,7 @@ import os
 import sys
 from io import TextIOWrapper
 
-from groma.cli._interrupt import INTERRUPTED
+from groma.cli.shared.interrupt import INTERRUPTED
 
 
 def run(arguments: list[str] | None = None) -> int:

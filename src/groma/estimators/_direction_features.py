@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.geometry._algebra import norm, perpendicular, unit
+from groma.geometry.algebra import norm, perpendicular, unit
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.geometry._algebra import apply, cofactor, dot, matrices, ratio, stack, vectors
+from groma.geometry.algebra import apply, cofactor, dot, matrices, ratio, stack, vectors
 
 
 class TriangulationStatus(IntEnum):

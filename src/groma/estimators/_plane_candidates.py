@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.estimators._plane_loops import BALL, height_kernel, least_axis_kernel, variance_kernel
-from groma.geometry._algebra import dot, norm
+from groma.geometry.algebra import dot, norm
 
 #: Neighbours that make a candidate, and that improve it; the one whose distance is the spacing.
 _NEIGHBOURS, RANK = 32, 8

@@ -24,7 +24,7 @@ from groma.estimators._plane_loops import (
 from groma.estimators._plane_options import PlaneOptions
 from groma.estimators.association import inlier_probability
 from groma.estimators.plane_fit import PlaneFit, fit_plane, tilt_sigma
-from groma.geometry._algebra import norm, perpendicular
+from groma.geometry.algebra import norm, perpendicular
 
 #: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
 BAND = 8.0

@@ -31,7 +31,7 @@ from scipy import stats
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.estimators._direction_features import Parallel, Perpendicular, crossings
-from groma.geometry._algebra import dot, norm, perpendicular, unit, vectors
+from groma.geometry.algebra import dot, norm, perpendicular, unit, vectors
 
 #: Steps of the robust refinement.
 _REFINE_STEPS = 12

@@ -25,7 +25,7 @@ from groma.estimators._line_observations import (
     to_world,
 )
 from groma.geometry import line3, projection
-from groma.geometry._algebra import apply, norm, perpendicular, ratio, stack, unit, vectors
+from groma.geometry.algebra import apply, norm, perpendicular, ratio, stack, unit, vectors
 from groma.geometry.so3 import hat
 
 

@@ -43,7 +43,7 @@ from groma.estimators._line_observations import (
 )
 from groma.estimators.line_refinement import refine_lines
 from groma.geometry import line3, projection, segment2
-from groma.geometry._algebra import dot, norm, ratio, stack, vectors
+from groma.geometry.algebra import dot, norm, ratio, stack, vectors
 from groma.geometry.so3 import hat
 
 __all__ = [

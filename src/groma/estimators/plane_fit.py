@@ -19,7 +19,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
 from groma.estimators._plane_loops import fit_loop
-from groma.geometry._algebra import perpendicular, vectors
+from groma.geometry.algebra import perpendicular, vectors
 
 
 @dataclass(frozen=True)

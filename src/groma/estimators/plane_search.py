@@ -31,7 +31,7 @@ from groma.errors import InputError, ShapeError
 from groma.estimators._plane_candidates import Scores, features_of, from_neighbours, from_segments
 from groma.estimators._plane_growth import BAND, LINK, Grower, Grown, connected_to
 from groma.estimators._plane_options import PlaneOptions
-from groma.geometry._algebra import vectors
+from groma.geometry.algebra import vectors
 
 #: Failures one after the other, of ever weaker candidates, after which the search ends: so many at least, and one for
 #: so many candidates.

@@ -24,7 +24,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.geometry import incidence, line3, projection
-from groma.geometry._algebra import cofactor, dot, matrices, norm, not_negative, ratio, stack, unit, vectors
+from groma.geometry.algebra import cofactor, dot, matrices, norm, not_negative, ratio, stack, unit, vectors
 
 
 class TrimStatus(IntEnum):

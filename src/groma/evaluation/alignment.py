@@ -9,7 +9,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion
-from groma.geometry._algebra import finite_rows
+from groma.geometry.algebra import finite_rows
 from groma.scene import Similarity
 
 #: Second singular value of the centred points, relative to the first, below which they count as collinear.

@@ -41,7 +41,7 @@ from scipy.spatial import KDTree
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.evaluation.poses import evaluate_poses
-from groma.geometry._algebra import finite_rows
+from groma.geometry.algebra import finite_rows
 from groma.io.geometry import Geometry
 from groma.scene import Scene
 

@@ -24,7 +24,7 @@ from scipy.optimize import linear_sum_assignment
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.evaluation.lines import threshold_list
-from groma.geometry._algebra import finite_rows
+from groma.geometry.algebra import finite_rows
 from groma.scene import Scene
 
 #: Numbers held at once while points are compared with planes.

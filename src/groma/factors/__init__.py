@@ -4,15 +4,9 @@
 Importing this package registers every factor of groma; nothing is compiled before a factor is evaluated.
 """
 
-from groma.factors._check import FactorCheck, check_factor
-from groma.factors._factor import Example, Factor, Ref, Slot, register, registered
-from groma.factors._selfcheck import SelfCheckReport, SelfCheckRow, selfcheck
-from groma.factors.line_bearing import LineBearing
-from groma.factors.line_direction import LineDirection
-from groma.factors.line_normal import LineNormal
-from groma.factors.line_on_plane import LineOnPlane, SegmentOnPlane
-from groma.factors.line_reprojection import LineReprojection
-from groma.factors.line_to_pixel import LineToPixel
+from groma.factors.checks.check import FactorCheck, check_factor
+from groma.factors.checks.selfcheck import SelfCheckReport, SelfCheckRow, selfcheck
+from groma.factors.contract import Example, Factor, Ref, Slot, register, registered
 from groma.factors.losses import (
     LOSSES,
     Barron,
@@ -26,8 +20,24 @@ from groma.factors.losses import (
     Tukey,
     loss,
 )
-from groma.factors.on_plane_pixels import PointOnPlanePixels, SegmentOnPlanePixels
-from groma.factors.orthogonal import (
+from groma.factors.observations.line_bearing import LineBearing
+from groma.factors.observations.line_normal import LineNormal
+from groma.factors.observations.line_reprojection import LineReprojection
+from groma.factors.observations.plane_observation import PlaneObservation
+from groma.factors.observations.plane_quaternion import PlaneQuaternion
+from groma.factors.observations.point_depth import PointDepth
+from groma.factors.observations.point_reprojection import PointReprojection
+from groma.factors.observations.stereo_line import StereoLine
+from groma.factors.observations.stereo_point import StereoPoint
+from groma.factors.priors.pose_between import PoseBetween
+from groma.factors.priors.pose_prior import PosePrior
+from groma.factors.priors.position_prior import PositionPrior
+from groma.factors.priors.vector_prior import VectorPrior
+from groma.factors.relations.line_direction import LineDirection
+from groma.factors.relations.line_on_plane import LineOnPlane, SegmentOnPlane
+from groma.factors.relations.line_to_pixel import LineToPixel
+from groma.factors.relations.on_plane_pixels import PointOnPlanePixels, SegmentOnPlanePixels
+from groma.factors.relations.orthogonal import (
     LineParallelToPlane,
     LinePerpendicularToDirection,
     OrthogonalDirections,
@@ -35,27 +45,17 @@ from groma.factors.orthogonal import (
     OrthogonalPlanes,
     PlaneParallelToDirection,
 )
-from groma.factors.parallel import (
+from groma.factors.relations.parallel import (
     LinePerpendicularToPlane,
     ParallelDirections,
     ParallelLines,
     ParallelPlanes,
     PlanePerpendicularToDirection,
 )
-from groma.factors.plane_observation import PlaneObservation
-from groma.factors.plane_quaternion import PlaneQuaternion
-from groma.factors.point_depth import PointDepth
-from groma.factors.point_on_line import PointOnLine
-from groma.factors.point_on_plane import PointOnPlane
-from groma.factors.point_reprojection import PointReprojection
-from groma.factors.point_to_image_line import PointToImageLine
-from groma.factors.pose_between import PoseBetween
-from groma.factors.pose_prior import PosePrior
-from groma.factors.position_prior import PositionPrior
-from groma.factors.stereo_line import StereoLine
-from groma.factors.stereo_point import StereoPoint
+from groma.factors.relations.point_on_line import PointOnLine
+from groma.factors.relations.point_on_plane import PointOnPlane
+from groma.factors.relations.point_to_image_line import PointToImageLine
 from groma.factors.user import UserFactor, factor
-from groma.factors.vector_prior import VectorPrior
 
 __all__ = [
     "LOSSES",

@@ -9,14 +9,14 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import ProblemError
-from groma.factors._factor import Example, Factor
+from groma.factors.contract import Example, Factor
 from groma.geometry import se3
-from groma.geometry._manifold import Manifold
-from groma.geometry.line_charts import LINE_CHARTS
-from groma.geometry.plane_charts import PLANE_CHARTS
-from groma.geometry.point3 import POINT_CHARTS
-from groma.geometry.pose_charts import POSE_CHARTS
-from groma.geometry.unit3 import DIRECTION_CHARTS
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.plane_charts import PLANE_CHARTS
+from groma.geometry.charts.point3 import POINT_CHARTS
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.geometry.charts.unit3 import DIRECTION_CHARTS
+from groma.geometry.manifold import Manifold
 
 #: Factors in one example.
 COUNT = 6

@@ -2,7 +2,7 @@
 """What factors with a residual in pixels share: the parameters of the cameras, and the camera model.
 
 All of one group have the same model, so that its kernels are chosen when the loop is compiled (see
-:mod:`groma.cameras._dispatch`). Parameters change rarely from one observation to the next: loops keep the row they
+:mod:`groma.cameras.dispatch`). Parameters change rarely from one observation to the next: loops keep the row they
 read last.
 """
 
@@ -18,9 +18,9 @@ from groma._typing import FloatArray
 from groma.cameras import CameraModel, model
 from groma.errors import InputError, ShapeError
 from groma.factors._examples import make_example, visible_scene
-from groma.factors._factor import Example, Ref
 from groma.factors._rig import CameraFactor
-from groma.geometry._manifold import Euclidean
+from groma.factors.contract import Example, Ref
+from groma.geometry.manifold import Euclidean
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels

@@ -25,8 +25,8 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.factors._factor import Factor, Ref, Slot
 from groma.factors._record import set_rows
+from groma.factors.contract import Factor, Ref, Slot
 from groma.geometry.se3 import compose_kernel
 
 POSE = Slot("pose", "pose")

@@ -16,9 +16,9 @@ import numpy as np
 
 from groma._numba import kernel, uncached
 from groma.errors import InputError
-from groma.factors._factor import Slot
 from groma.factors._record import put_block, put_residual
-from groma.geometry._manifold import FACTOR_COLUMNS
+from groma.factors.contract import Slot
+from groma.geometry.manifold import FACTOR_COLUMNS
 
 _CENTRAL_STEP = float(np.finfo(float).eps ** (1 / 3))
 _COMPLEX_STEP = 1e-30

@@ -30,7 +30,7 @@ vector         (k,)
 It must be of the kind that Numba compiles (numbers and small arrays; no objects, no text). A factor that cannot be
 evaluated writes NaN: it is then counted as degenerate and left out. Writing to the arguments has no effect.
 
-Derivatives are taken for you, with respect to the factor coordinates (see :mod:`groma.geometry._manifold`; a pose
+Derivatives are taken for you, with respect to the factor coordinates (see :mod:`groma.geometry.manifold`; a pose
 moves by the left twist, :math:`T \leftarrow (I + h\,\hat\xi)\,T`):
 
 ``central``
@@ -60,10 +60,10 @@ from groma._numba import kernel
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
 from groma.factors._examples import indices, make_example
-from groma.factors._factor import Example, Factor, Ref, Slot, register
 from groma.factors._record import set_rows
 from groma.factors._user_loops import Loops
-from groma.geometry._manifold import AMBIENT_SIZE, Euclidean
+from groma.factors.contract import Example, Factor, Ref, Slot, register
+from groma.geometry.manifold import AMBIENT_SIZE, Euclidean
 
 #: Kinds whose size is not fixed; their slot is (name, kind, size).
 FREE_KINDS = ("intrinsics", "vector")

@@ -25,7 +25,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
-from groma.geometry._manifold import Manifold
+from groma.geometry.manifold import Manifold
 
 
 def convert(state: FloatArray, source: Manifold, target: Manifold) -> FloatArray:

@@ -19,7 +19,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.geometry import line3
-from groma.geometry._algebra import dot, norm, not_negative, ratio, stack, unit, vectors
+from groma.geometry.algebra import dot, norm, not_negative, ratio, stack, unit, vectors
 
 
 class LineRelation(IntEnum):

@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.geometry._algebra import dot, matrices, norm, not_negative, perpendicular, ratio, stack, unit, vectors
+from groma.geometry.algebra import dot, matrices, norm, not_negative, perpendicular, ratio, stack, unit, vectors
 from groma.geometry.so3 import hat
 
 #: A line whose |d| is below this fraction of |m| counts as a line at infinity.

@@ -24,7 +24,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.geometry._algebra import dot, norm, not_negative, ratio, stack, unit, vectors
+from groma.geometry.algebra import dot, norm, not_negative, ratio, stack, unit, vectors
 
 
 def _first_sign(vector: FloatArray) -> FloatArray:

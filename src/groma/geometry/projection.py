@@ -20,7 +20,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.geometry import line3
-from groma.geometry._algebra import apply, cofactor, matrices, norm, not_negative, ratio, stack, vectors
+from groma.geometry.algebra import apply, cofactor, matrices, norm, not_negative, ratio, stack, vectors
 from groma.geometry.so3 import hat, vee
 from groma.geometry.transform import Rigid, rotation_and_translation
 

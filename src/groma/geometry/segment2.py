@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.geometry._algebra import dot, norm, ratio, stack, unit, vectors
+from groma.geometry.algebra import dot, norm, ratio, stack, unit, vectors
 
 
 def _ends(segment: FloatArray, name: str = "segment") -> tuple[FloatArray, FloatArray]:

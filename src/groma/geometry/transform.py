@@ -25,7 +25,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.geometry import line3, quaternion
-from groma.geometry._algebra import apply, matrices, vectors
+from groma.geometry.algebra import apply, matrices, vectors
 from groma.geometry.so3 import hat
 
 #: A pose (..., 7), or the pair (R, t).

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Literal
 
 from groma.errors import FileFormatError, InputError
-from groma.io._atomic import atomic_output
-from groma.io._reading import existing, reading
 from groma.io.archive import is_archive_name, looks_like_archive, read_archive, write_archive
+from groma.io.atomic import atomic_output
 from groma.io.bal import check_bal, looks_like_bal, read_bal, write_bal
-from groma.io.colmap import check_colmap, from_pycolmap, read_colmap, to_pycolmap, write_colmap
+from groma.io.colmap.model import check_colmap, from_pycolmap, read_colmap, to_pycolmap, write_colmap
 from groma.io.g2o import read_g2o, write_g2o
-from groma.io.limap import Structures, structures_of
+from groma.io.limap.structures import Structures, structures_of
 from groma.io.ply import write_geometry, write_obj, write_ply
+from groma.io.reading import existing, reading
 from groma.io.trajectories import Trajectory, read_trajectory, read_tum, write_trajectory, write_tum
 from groma.scene import Scene
 
@@ -95,8 +95,8 @@ def write_scene(
     force : bool
         Replace what is there.
     like : Structures, optional
-        For COLMAP models: the LIMAP structures that the scene came from (:func:`groma.io.limap.structures_of`), to
-        keep what a scene cannot hold.
+        For COLMAP models: the LIMAP structures that the scene came from
+        (:func:`groma.io.limap.structures.structures_of`), to keep what a scene cannot hold.
 
     Raises
     ------

@@ -23,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from groma.errors import FileFormatError
-from groma.io._atomic import atomic_output
-from groma.io._reading import existing, reading
+from groma.io.atomic import atomic_output
+from groma.io.reading import existing, reading
 from groma.scene import Scene
 
 FORMAT, VERSION = "groma scene", 1

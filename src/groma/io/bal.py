@@ -26,8 +26,8 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.errors import FileFormatError, InputError, OutputError
 from groma.geometry import quaternion
-from groma.io._atomic import atomic_output
-from groma.io._reading import existing, reading
+from groma.io.atomic import atomic_output
+from groma.io.reading import existing, reading
 from groma.scene import Cameras, PointObservations, Points, Scene
 
 _FLIP = np.array([1.0, -1.0, -1.0])

@@ -34,8 +34,8 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.errors import FileFormatError
 from groma.geometry import quaternion
-from groma.io._atomic import atomic_output
-from groma.io._reading import existing, reading
+from groma.io.atomic import atomic_output
+from groma.io.reading import existing, reading
 from groma.scene.pose_graph import GraphPoses, Motions, PoseGraph
 
 #: Numbers after the tag.

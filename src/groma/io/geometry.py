@@ -9,7 +9,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import InputError
-from groma.geometry._algebra import finite_rows
+from groma.geometry.algebra import finite_rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
-from groma.io._atomic import atomic_output
+from groma.io.atomic import atomic_output
 from groma.scene import Scene
 from groma.scene.patches import PALETTE, patch_groups, plane_patches, triangle_fans
 

@@ -26,8 +26,8 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import FileFormatError
-from groma.io._reading import existing, reading
 from groma.io.geometry import Geometry
+from groma.io.reading import existing, reading
 
 _KIND = "reference"
 #: PLY's names of numbers.

@@ -26,9 +26,9 @@ import numpy.typing as npt
 from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError, ShapeError
 from groma.geometry import quaternion, se3
-from groma.io._atomic import atomic_output
-from groma.io._reading import existing, reading
-from groma.scene._table import Table, column
+from groma.io.atomic import atomic_output
+from groma.io.reading import existing, reading
+from groma.scene.table import Table, column
 
 TrajectoryFormat = Literal["auto", "tum", "kitti", "euroc"]
 

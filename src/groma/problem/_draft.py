@@ -15,10 +15,10 @@ from functools import cached_property
 import numpy as np
 
 from groma._typing import IntArray
-from groma.factors._factor import Factor, Ref
-from groma.problem._sorting import PairTable, argsort_by
+from groma.factors.contract import Factor, Ref
 from groma.problem.layout import Chain, FactorLayout, KeptClass, KeptEntry
 from groma.problem.problem import Problem
+from groma.problem.sorting import PairTable, argsort_by
 
 
 def _reordered(factor: Factor, order: IntArray, name: str, landmarks: Ref) -> Factor:

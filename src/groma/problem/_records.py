@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What happens to the records of a factor group between the factors and the sums: noise, loss, chart, constants.
 
-A record is ``[J_1 | J_2 | ... | r]`` for each residual row; see :mod:`groma.factors._factor`.
+A record is ``[J_1 | J_2 | ... | r]`` for each residual row; see :mod:`groma.factors.contract`.
 """
 
 from __future__ import annotations

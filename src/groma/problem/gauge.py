@@ -23,7 +23,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.geometry._manifold import Manifold
+from groma.geometry.manifold import Manifold
 from groma.problem.problem import Problem
 
 GAUGE_NAMES = (

@@ -14,7 +14,6 @@ import numpy as np
 from groma._typing import IntArray
 from groma.problem._draft import Draft
 from groma.problem._partition import choose_landmarks, kept_classes
-from groma.problem._sorting import PairTable, argsort_by, distinct_pairs, first_and_last
 from groma.problem.layout import (
     Chunk,
     Eliminated,
@@ -23,6 +22,7 @@ from groma.problem.layout import (
     Layout,
 )
 from groma.problem.problem import Problem
+from groma.problem.sorting import PairTable, argsort_by, distinct_pairs, first_and_last
 
 #: Factors per chunk: their records (a few hundred bytes each) should fit the second-level cache.
 CHUNK_SIZE = 4096

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from groma._typing import IntArray
-from groma.factors._factor import Factor
+from groma.factors.contract import Factor
 from groma.problem.problem import Problem
 
 

@@ -18,10 +18,10 @@ import numpy as np
 
 from groma._simd import width
 from groma._typing import FloatArray
-from groma.problem._parallel import Workers, shares_of, sum_of
 from groma.problem._records import chain_rule, cost_scaled, cost_whitened, mask, weigh, whiten
 from groma.problem._sums import add_block, add_cross, add_incidence, add_primary
 from groma.problem.layout import Chunk, FactorLayout, Layout
+from groma.problem.parallel import Workers, shares_of, sum_of
 
 States = Mapping[str, FloatArray]
 

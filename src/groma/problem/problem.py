@@ -14,7 +14,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import ProblemError
-from groma.factors._factor import Factor
+from groma.factors.contract import Factor
 from groma.problem.variables import Variables
 
 #: Kinds of variables that are plain numbers; a slot of kind ``vector`` takes any of them.

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.factors._factor import Factor
+from groma.factors.contract import Factor
 from groma.problem.variables import Variables
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray
 from groma.errors import ProblemError, ShapeError
-from groma.geometry._manifold import Manifold
+from groma.geometry.manifold import Manifold
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 from groma import cameras as camera_models
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.scene._table import Table, check_unique, column, text_column
+from groma.scene.table import Table, check_unique, column, text_column
 
 #: Kinds of sensors in a rig.
 CAMERA, OTHER = 0, 1

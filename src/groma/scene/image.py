@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.scene._table import Table, check_unique, column, text_column
+from groma.scene.table import Table, check_unique, column, text_column
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.scene._table import Table, check_unique, column
+from groma.scene.table import Table, check_unique, column
 
 #: How far a stored unit vector may be from length one.
 _UNIT_TOLERANCE = 1e-6

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
-from groma.scene._table import Table, check_sigma, column, convert
+from groma.scene.table import Table, check_sigma, column, convert
 
 
 @dataclass(frozen=True, eq=False)

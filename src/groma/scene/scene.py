@@ -25,12 +25,12 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3
-from groma.scene._table import check_index, rows_of
 from groma.scene.camera import CAMERA, Cameras, Rigs, Sensors
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
+from groma.scene.table import check_index, rows_of
 
 _QUATERNION_TOLERANCE = 1e-6
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma.solver._reduction import Reduction
+from groma.solver.linear.reduction import Reduction
 from groma.solver.steps import States, Step, curvature, diagonal, gradient
 
 #: Damping of the Gauss-Newton step, relative to the diagonal.

@@ -14,12 +14,12 @@ import numpy as np
 
 from groma._simd import width
 from groma._typing import FloatArray
-from groma.problem._parallel import Workers
 from groma.problem.layout import Chunk, Layout
 from groma.problem.linearization import NormalEquations, to_solver_order
+from groma.problem.parallel import Workers
+from groma.solver.linear.schur import MIN_DIAGONAL, invert_blocks
 from groma.solver.options import SolverOptions, first_damping
 from groma.solver.report import Iteration, SolveReport, Stopwatch, note_end, note_start
-from groma.solver.schur import MIN_DIAGONAL, invert_blocks
 from groma.solver.steps import States
 from groma.solver.termination import Termination
 

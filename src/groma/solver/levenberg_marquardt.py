@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma.solver._reduction import Reduction
-from groma.solver.linear import ConjugateGradients
-from groma.solver.schur import MIN_DIAGONAL
+from groma.solver.linear.reduced import ConjugateGradients
+from groma.solver.linear.reduction import Reduction
+from groma.solver.linear.schur import MIN_DIAGONAL
 from groma.solver.steps import States, Step
 
 MAX_DAMPING = 1e16

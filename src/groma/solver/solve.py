@@ -21,20 +21,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.problem._parallel import Workers, available_cores
 from groma.problem.lay_out import lay_out
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
+from groma.problem.parallel import Workers, available_cores
 from groma.problem.problem import Problem
-from groma.solver._blas import one_blas_thread
-from groma.solver._reduction import Reduction
-from groma.solver._refinement import landmark_refiner
-from groma.solver._trial import stretched, try_step
 from groma.solver.dogleg import Dogleg
 from groma.solver.independent import STRETCH_GAIN_RATIO, solve_independently
 from groma.solver.levenberg_marquardt import LevenbergMarquardt
-from groma.solver.linear import ConjugateGradients, choose
+from groma.solver.linear.blas import one_blas_thread
+from groma.solver.linear.reduced import ConjugateGradients, choose
+from groma.solver.linear.reduction import Reduction
+from groma.solver.linear.schur import ReducedSystem
 from groma.solver.options import SolverOptions, first_damping
+from groma.solver.refinement import landmark_refiner
 from groma.solver.report import (
     Iteration,
     SolveReport,
@@ -44,9 +44,9 @@ from groma.solver.report import (
     note_start,
     warn_of_oddities,
 )
-from groma.solver.schur import ReducedSystem
 from groma.solver.steps import States, gradient, largest, size_of
 from groma.solver.termination import Termination, cost_converged
+from groma.solver.trial import stretched, try_step
 
 #: From this many factors on, all cores are used unless the caller says otherwise.
 FACTORS_FOR_THREADS = 50_000

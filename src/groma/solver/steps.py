@@ -10,8 +10,8 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
-from groma.solver.linear import multiply
-from groma.solver.schur import MIN_DIAGONAL, ReducedSystem
+from groma.solver.linear.reduced import multiply
+from groma.solver.linear.schur import MIN_DIAGONAL, ReducedSystem
 
 States = dict[str, FloatArray]
 #: About so many states of a group are looked at for the one of middle length.

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,8 +11,8 @@ from groma._typing import FloatArray, IntArray
 from groma.geometry import se3
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
-from groma.tracking.parts import Part
-from groma.tracking.track_map import TrackMap
+from groma.tracking.backend.submaps import Part
+from groma.tracking.map.track_map import TrackMap
 
 #: What a frame can be.
 TRACKED, FOUND, WEAK, LOST, SKIPPED, STARTING = "tracked", "found", "weak", "lost", "skipped", "starting"
@@ -156,26 +155,6 @@ def _as_adjusted(times: FloatArray, poses: FloatArray, near: IntArray, own: IntA
     return out
 
 
-class Stopwatch:
-    """Seconds by stage; stages may repeat."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._stack: list[tuple[str, float]] = []
-
-    def __call__(self, stage: str) -> Stopwatch:
-        """Name the stage that the next block times."""
-        self._stack.append((stage, time.perf_counter()))
-        return self
-
-    def __enter__(self) -> Stopwatch:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        stage, began = self._stack.pop()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
-
-
 __all__ = [
     "FOUND",
     "LOST",
@@ -185,7 +164,6 @@ __all__ = [
     "WEAK",
     "Entry",
     "History",
-    "Stopwatch",
     "TrackResult",
     "TrackedFrame",
 ]

@@ -9,8 +9,8 @@ from groma.scene import Scene
 from groma.scene.camera import Cameras
 from groma.scene.landmarks import Lines, Planes, Points
 from groma.scene.observations import LineObservations, PointObservations, Relations
-from groma.tracking.camera import PINHOLE, TrackCamera
-from groma.tracking.track_map import TrackMap
+from groma.tracking.frame.camera import PINHOLE, TrackCamera
+from groma.tracking.map.track_map import TrackMap
 
 #: Points seen in fewer keyframes do not go into the scene.
 LEAST_VIEWS = 2

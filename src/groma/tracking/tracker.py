@@ -23,16 +23,15 @@ from groma.io.sequences.frame import Frame, SequenceCamera
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
 from groma.solver.report import SolveReport
-from groma.tracking.belief import Belief, is_near, score_of
-from groma.tracking.camera import TrackCamera, back
-from groma.tracking.checks import FrameChecks
-from groma.tracking.coarse_alignment import TURN_SIGMA, turned, turned_prediction
-from groma.tracking.features import FrameFeatures, grid_pixels
-from groma.tracking.following import follow_frame
-from groma.tracking.initialise import Initialiser
-from groma.tracking.keyframes import Followed, keyframe_nearby, wants_keyframe
-from groma.tracking.mapper import Mapper, Present
-from groma.tracking.motion import PoseEstimate
+from groma.tracking.backend.mapper import Mapper, Present
+from groma.tracking.backend.submaps import Part, about_parts
+from groma.tracking.frame.camera import TrackCamera, back
+from groma.tracking.frame.checks import FrameChecks
+from groma.tracking.frame.coarse_alignment import TURN_SIGMA, turned, turned_prediction
+from groma.tracking.frame.features import FrameFeatures, grid_pixels
+from groma.tracking.map.keyframes import Followed, keyframe_nearby, wants_keyframe
+from groma.tracking.map.points import find_again
+from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.outcome import (
     FOUND,
@@ -43,16 +42,17 @@ from groma.tracking.outcome import (
     WEAK,
     Entry,
     History,
-    Stopwatch,
     TrackedFrame,
     TrackResult,
 )
-from groma.tracking.parts import Part, about_parts
-from groma.tracking.points import find_again
-from groma.tracking.prediction import MotionModel
-from groma.tracking.relocalise import Found, promote
+from groma.tracking.pose.estimate import PoseEstimate
+from groma.tracking.pose.following import follow_frame
+from groma.tracking.pose.initialise import Initialiser
+from groma.tracking.pose.prediction import MotionModel
+from groma.tracking.pose.relocalise import Found, promote
+from groma.tracking.pose.verification import Belief, is_near, score_of
 from groma.tracking.result import map_to_scene
-from groma.tracking.track_map import TrackMap
+from groma.tracking.stopwatch import Stopwatch
 
 #: After this many lost frames and seconds a new map is begun.
 RESTART_FRAMES, RESTART_SECONDS = 5, 0.5

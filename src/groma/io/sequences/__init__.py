@@ -6,8 +6,8 @@ from __future__ import annotations
 import os
 
 from groma.errors import InputError
-from groma.io._endings import VIDEOS
-from groma.io._reading import existing
+from groma.io.endings import VIDEOS
+from groma.io.reading import existing
 from groma.io.sequences._calibration import CameraLike, calibration_of
 from groma.io.sequences._reader import Selection
 from groma.io.sequences.euroc import euroc_root, open_euroc

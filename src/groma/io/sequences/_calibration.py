@@ -19,7 +19,7 @@ import numpy.typing as npt
 from groma import cameras
 from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError
-from groma.io._reading import reading
+from groma.io.reading import reading
 from groma.io.sequences.frame import SequenceCamera, checked_params
 
 #: What callers may pass as a camera: a value, numbers, a line, or the name of a file.

@@ -20,7 +20,7 @@ from groma import cameras
 from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError
 from groma.geometry import se3
-from groma.io._reading import reading
+from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, from_opencv, rectification
 from groma.io.sequences._reader import Entry, FileSequence, Preparation, Selection, file_size, simple_sequence
 from groma.io.sequences.frame import SequenceCamera

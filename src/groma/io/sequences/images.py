@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from groma.errors import FileFormatError, InputError
-from groma.io._endings import IMAGES
-from groma.io._reading import reading
+from groma.io.endings import IMAGES
+from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, find_calibration, rectification
 from groma.io.sequences._reader import Entry, FileSequence, Selection, read_ahead, simple_sequence
 from groma.io.sequences.frame import Frame, Kind, SequenceCamera

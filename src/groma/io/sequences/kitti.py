@@ -14,7 +14,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import FileFormatError
-from groma.io._reading import reading
+from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, from_opencv
 from groma.io.sequences._reader import Entry, FileSequence, Selection, simple_sequence
 from groma.io.trajectories import Trajectory, read_trajectory

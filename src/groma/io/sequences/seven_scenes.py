@@ -19,7 +19,7 @@ from groma._numba import loop
 from groma._typing import FloatArray
 from groma.errors import FileFormatError
 from groma.geometry import se3
-from groma.io._reading import reading
+from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, from_opencv, read_calibration
 from groma.io.sequences._reader import Entry, FileSequence, Preparation, Selection, simple_sequence
 from groma.io.trajectories import Trajectory

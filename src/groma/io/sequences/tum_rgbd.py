@@ -15,7 +15,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError
-from groma.io._reading import reading
+from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, find_calibration, from_opencv
 from groma.io.sequences._reader import Entry, FileSequence, Preparation, Selection, simple_sequence
 from groma.io.trajectories import read_trajectory

@@ -1,0 +1,392 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Bundle adjustment of a scene: cameras, points, lines and planes together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from groma._counted import counted
+from groma.adjustment.assemble import (
+    LINE_FACTORS,
+    POINT_FACTORS,
+    Assembly,
+    AssemblyOptions,
+    assemble,
+    at_places_of,
+    disassemble,
+)
+from groma.adjustment.pixel_residuals import squared_residuals_px
+from groma.adjustment.relation_outcome import drop_failed_relations
+from groma.adjustment.rescue.clusters import settle_clusters
+from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
+from groma.adjustment.rescue.slips import without_slips
+from groma.adjustment.stages import combined, stage_entries, with_costs_at, with_loss
+from groma.adjustment.terms.relations import SURFACE_SIGMA_PX
+from groma.errors import InputError
+from groma.factors.losses import GemanMcClure, Loss, Trivial
+from groma.factors.losses import loss as make_loss
+from groma.problem.problem import Problem
+from groma.scene import Scene
+from groma.scene.local_frame import local_frame
+from groma.solver.options import SolverOptions
+from groma.solver.report import SolveReport
+from groma.solver.solve import solve
+from groma.solver.termination import Termination
+
+#: The default for what comes from matching: first a loss that pulls from afar, then one that ignores what stayed far.
+#: Losses by name and scale in pixels; see the page *How to choose* for the measurements behind them.
+ROBUST_STAGES = (("cauchy", 1.0), ("geman_mcclure", 2.0))
+#: The last scale is at least this many standard deviations of the residuals that the stage before left: a narrower
+#: loss would doubt good measurements.
+LAST_SCALE_SIGMAS = 12.0
+#: Relative decrease of the cost at which a stage that is not the last ends.
+STAGE_TOLERANCE = 1e-2
+#: The same for the first stage of plain least squares with lines, after which lines may be restarted. It also ends at
+#: the first step that is refused: mostly a single line in a wrong minimum is to blame.
+RESTART_TOLERANCE = 0.3
+
+
+@dataclass(frozen=True)
+class AdjustOptions:
+    """Options of :func:`adjust`. The defaults suit scenes that come from matching images."""
+
+    #: ``none``, ``huber``, ``soft_l1``, ``cauchy``, ``tukey``, ``geman_mcclure``, ``barron`` or ``truncated``;
+    #: ``auto`` is none for BAL problems, else Cauchy and then Geman-McClure, because matches contain outliers.
+    loss: str = "auto"
+    #: Where the loss begins to bend, in standard deviations (pixels by default); None takes 1, and 2 in the second
+    #: stage of ``auto``.
+    loss_scale: float | None = None
+    #: Move the cameras; False adjusts the landmarks alone.
+    refine_poses: bool = True
+    #: Estimate focal lengths and distortion; None: for BAL problems only.
+    refine_intrinsics: bool | None = None
+    #: Estimate principal points too, if intrinsics are refined.
+    refine_principal_point: bool = False
+    #: Estimate where cameras sit on their rig.
+    refine_rigs: bool = False
+    #: Which landmarks take part. Without planes, directions and all relations with them are left out too.
+    points: bool = True
+    lines: bool = True
+    planes: bool = True
+    #: Standard deviation of the usual point observation and segment end point, pixels; those of single observations in
+    #: the scene are relative to it. Losses are scaled in these units.
+    point_sigma_px: float = 1.0
+    line_sigma_px: float = 1.0
+    #: Correlation of the errors of a segment's two ends: see :class:`groma.adjustment.assemble.AssemblyOptions`.
+    line_end_correlation: float = 0.0
+    #: How relations between landmarks are measured: ``metric`` or ``pixels``, and how well they hold if metric: see
+    #: :class:`groma.adjustment.assemble.AssemblyOptions`.
+    structure_form: str = "metric"
+    structure_sigma_px: float = SURFACE_SIGMA_PX
+    #: Most steps tried.
+    max_iterations: int = 50
+    #: Stop when the cost falls by less than this fraction in a step.
+    function_tolerance: float = 1e-6
+    #: ``auto``, ``dense``, ``sparse`` or ``pcg``.
+    linear_solver: str = "auto"
+    #: ``cartesian``, ``orthonormal_right``, ``orthonormal_left``, ``free_right`` or ``free_left``.
+    line_chart: str = "cartesian"
+    #: ``auto``, ``free`` or ``first_camera``: see :class:`groma.adjustment.assemble.AssemblyOptions`.
+    gauge: str = "auto"
+    #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss or with lines (1 where
+    #: points are tied to lines and there is no loss), else 0.
+    landmark_steps: int | None = None
+    #: Threads; None takes one for small problems and all cores for large ones.
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("point_sigma_px", "line_sigma_px", "structure_sigma_px"):
+            if not 0.0 < getattr(self, name) < float("inf"):
+                raise InputError(f"{name} must be a positive number of pixels; got {getattr(self, name)}.")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress callback gets after every step."""
+
+    #: Steps tried so far, and the most there may be.
+    iteration: int
+    max_iterations: int
+    #: The cost after this step.
+    cost: float
+
+
+@dataclass(frozen=True)
+class AdjustReport:
+    """Outcome of :func:`adjust` in the terms of the scene; as a string, its main figures."""
+
+    #: What took part.
+    num_images: int
+    num_points: int
+    num_lines: int
+    num_planes: int
+    num_observations: int
+    #: Root mean square residual by kind of landmark, pixels: {kind: {before, after}}, without the loss.
+    rmse_px: dict[str, dict[str, float]]
+    #: How the solver got there.
+    solve: SolveReport
+    #: Sentences for the user.
+    warnings: tuple[str, ...]
+    #: One entry per loss that was solved with, in order: loss, initial_cost, first_step. Costs of different stages
+    #: cannot be compared.
+    stages: tuple[dict[str, Any], ...] = ()
+    #: Relations between landmarks by kind: how many held, and how many the loss gave up, which the scene then drops.
+    relations: dict[str, dict[str, int]] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        counts = {"images": self.num_images, "points": self.num_points, "lines": self.num_lines}
+        counts |= {"planes": self.num_planes, "observations": self.num_observations}
+        rows = [", ".join(counted(number, kind) for kind, number in counts.items() if number)]
+        rows += [
+            f"{kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms)"
+            for kind, rmse in self.rmse_px.items()
+            if None not in rmse.values()
+        ]
+        return "\n".join([*rows, str(self.solve), *(f"warning: {sentence}" for sentence in self.warnings)])
+
+    @property
+    def termination(self) -> Termination:
+        """Why the solve stopped."""
+        return self.solve.termination
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        """One entry per step tried: iteration, stage, cost, accepted, damping, step_norm, seconds and more."""
+        firsts = [stage["first_step"] for stage in self.stages]
+        return [
+            {**asdict(record), "stage": sum(first <= record.iteration for first in firsts)}
+            for record in self.solve.history
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as plain numbers and words, for JSON."""
+        solve = self.solve
+        return {
+            "num_images": self.num_images,
+            "num_points": self.num_points,
+            "num_lines": self.num_lines,
+            "num_planes": self.num_planes,
+            "num_observations": self.num_observations,
+            "num_residuals": solve.num_residuals,
+            "num_unknowns": solve.num_unknowns,
+            "initial_cost": solve.initial_cost,
+            "final_cost": solve.final_cost,
+            "initial_costs": solve.initial_costs,
+            "final_costs": solve.final_costs,
+            "reduced_chi_square": solve.reduced_chi_square,
+            "iterations": solve.iterations,
+            "termination": solve.termination.key,
+            "termination_sentence": solve.termination.sentence,
+            "converged": solve.converged,
+            "linear_solver": solve.linear_solver,
+            "threads": solve.threads,
+            "seconds": dict(solve.seconds),
+            "rmse_px": self.rmse_px,
+            "relations": self.relations,
+            "stages": list(self.stages),
+            "num_degenerate": solve.num_degenerate,
+            "num_underdetermined_landmarks": solve.num_underdetermined_landmarks,
+            "history": self.history,
+        }
+
+
+@dataclass(frozen=True)
+class AdjustResult:
+    """The adjusted scene and the report."""
+
+    scene: Scene
+    report: AdjustReport
+    #: The problem at its solution, for covariances and diagnosis; None in a result read from a file.
+    problem: Problem | None = None
+
+
+def adjust(
+    scene: Scene, options: AdjustOptions | None = None, progress: Callable[[Progress], bool | None] | None = None
+) -> AdjustResult:
+    """Adjust cameras, points, lines and planes of a scene together.
+
+    Parameters
+    ----------
+    scene
+        The scene; it is not changed.
+    options
+        See :class:`AdjustOptions`.
+    progress
+        Called after every step; return False to stop with the best state so far.
+
+    Returns
+    -------
+    AdjustResult
+        A new scene and a report.
+
+    Raises
+    ------
+    InputError
+        If the scene has nothing to adjust, or an option is not known.
+    """
+    options = options or AdjustOptions()
+    if not isinstance(scene, Scene):
+        raise InputError(
+            f"adjust takes a groma.Scene; got {type(scene).__name__}. Read one with groma.read_scene(path), or turn a "
+            "pycolmap.Reconstruction into one with groma.io.from_pycolmap(reconstruction)."
+        )
+    near = local_frame(scene)
+    if near is None:
+        return _adjusted(scene, options, progress)
+    result = _adjusted(scene.transformed(near), options, progress)
+    back = result.scene.transformed(near.inverse())
+    return replace(result, scene=back, problem=result.problem and at_places_of(result.problem, back))
+
+
+def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
+    """Adjust a scene that is near the origin of its world."""
+    stages = _stages(scene, options)
+    assembly = assemble(scene, _assembly_options(scene, options, stages[-1]))
+    if not assembly.problem.factors:
+        raise InputError(
+            f"There is nothing to adjust: the scene has {counted(scene.num_images, 'images')}, "
+            f"{scene.num_point_observations:,} point and {scene.num_line_observations:,} line observations, and the "
+            "options leave none of them. Check the input and --no-points / --no-lines."
+        )
+    problem, reports, moved = assembly.problem, [], []
+    for number, loss in enumerate(stages):
+        last = number + 1 == len(stages)
+        spent = sum(report.iterations for report in reports)
+        solver_options = SolverOptions(
+            max_iterations=options.max_iterations - spent,
+            function_tolerance=options.function_tolerance if last else _stage_tolerance(loss),
+            linear_solver=options.linear_solver,
+            landmark_steps=_landmark_steps(options, loss, problem),
+            landmark_groups=("lines",) if isinstance(loss, Trivial) and not _is_coupled(problem) else None,
+            initial_damping=_damping_after(reports, loss),
+            threads=options.threads,
+        )
+
+        patient, stopped = last or not isinstance(loss, Trivial), []
+
+        def tell(record, spent=spent, patient=patient, stopped=stopped) -> bool:
+            event = Progress(spent + record.iteration, options.max_iterations, record.cost)
+            if progress is not None and progress(event) is False:
+                stopped.append(event)
+            return not stopped and (record.accepted or patient)
+
+        if last and number:
+            loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
+        staged = Problem(problem.variables, [with_loss(factor, loss) for factor in problem.factors])
+        solution = solve(staged, solver_options, tell)
+        problem = solution.problem
+        reports.append(solution.report)
+        if stopped:
+            break
+        for renew in () if last else (renew_lines, settle_clusters):
+            problem, renewed = renew(scene, problem, options.threads)
+            moved.append(renewed)
+        if not isinstance(loss, Trivial):
+            problem, renewed = without_slips(problem, options.threads)
+            moved.append(renewed)
+            if last and problem is not solution.problem:
+                reports[-1] = with_costs_at(reports[-1], problem)
+    report = combined(reports, assembly.problem, stages)
+    adjusted, relations = drop_failed_relations(disassemble(scene, problem), problem)
+    if any(map(len, moved)):
+        adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
+    before, after = (_rmse_px(replace(assembly, problem=p)) for p in (assembly.problem, problem))
+    outcome = AdjustReport(
+        num_images=scene.num_images,
+        num_points=scene.num_points if "points" in assembly.problem.variables else 0,
+        num_lines=scene.num_lines if "lines" in assembly.problem.variables else 0,
+        num_planes=scene.num_planes if "planes" in assembly.problem.variables else 0,
+        num_observations=sum(
+            len(factor) for factor in assembly.problem.factors if factor.type_name in POINT_FACTORS + LINE_FACTORS
+        ),
+        rmse_px={kind: {"before": before[kind], "after": after[kind]} for kind in before},
+        solve=report,
+        relations=relations,
+        stages=stage_entries(stages, reports),
+        warnings=(*assembly.notes, *report.warnings),
+    )
+    return AdjustResult(adjusted, outcome, problem)
+
+
+def _is_bal(scene: Scene) -> bool:
+    return scene.num_cameras > 0 and all(name == "BAL" for name in scene.cameras.models)
+
+
+def _stages(scene: Scene, options: AdjustOptions) -> list[Loss]:
+    """Return the losses to solve with, one after the other."""
+    if options.loss == "none" or (options.loss == "auto" and _is_bal(scene)):
+        with_lines = options.lines and scene.num_line_observations > 0
+        return [Trivial(), Trivial()] if with_lines else [Trivial()]
+    if options.loss == "auto":
+        scale = 1.0 if options.loss_scale is None else options.loss_scale
+        return [make_loss(name, scale * factor) for name, factor in ROBUST_STAGES]
+    return [make_loss(options.loss, 1.0 if options.loss_scale is None else options.loss_scale)]
+
+
+def _wide_enough(loss: Loss, assembly: Assembly) -> Loss:
+    """Return the loss, widened if the residuals are noisier than its scale suggests."""
+    squares = squared_residuals_px(assembly, weighted=True)
+    if not squares or not isinstance(loss, GemanMcClure):
+        return loss
+    # the median of the squared norm of two Gaussian coordinates is 1.386 variances
+    sigma = float(np.sqrt(np.median(np.concatenate(list(squares.values()))) / 1.386))
+    return replace(loss, scale=max(loss.scale, LAST_SCALE_SIGMAS * sigma))
+
+
+def _stage_tolerance(loss: Loss) -> float:
+    return RESTART_TOLERANCE if isinstance(loss, Trivial) else STAGE_TOLERANCE
+
+
+def _damping_after(reports: list[SolveReport], loss: Loss) -> float | None:
+    """Plain least squares goes on as boldly as it ended; another loss begins anew."""
+    if not reports or not reports[-1].history or not isinstance(loss, Trivial):
+        return None
+    return reports[-1].history[-1].damping
+
+
+def _landmark_steps(options: AdjustOptions, loss: Loss, problem: Problem) -> int:
+    """Lines and robust losses leave a long tail of small joint steps; a few cheap steps of landmarks cut it short."""
+    if options.landmark_steps is not None:
+        return options.landmark_steps
+    if not isinstance(loss, Trivial):
+        return 2
+    return 0 if "lines" not in problem.variables else 1 if _is_coupled(problem) else 2
+
+
+def _is_coupled(problem: Problem) -> bool:
+    """Whether points are tied to lines. Lines are then not eliminated, and long steps tear points off their lines and
+    planes by the product of two displacements, which is much where ties are tight: points take the steps of their own.
+    """
+    return any(factor.type_name == "point_on_line" for factor in problem.factors)
+
+
+def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss) -> AssemblyOptions:
+    is_bal = _is_bal(scene)
+    refine = is_bal if options.refine_intrinsics is None else options.refine_intrinsics
+    return AssemblyOptions(
+        points=options.points,
+        lines=options.lines,
+        planes=options.planes,
+        refine_poses=options.refine_poses,
+        refine_intrinsics=refine,
+        refine_principal_point=options.refine_principal_point,
+        refine_rigs=options.refine_rigs,
+        line_chart=options.line_chart,
+        gauge=options.gauge,
+        point_sigma_px=options.point_sigma_px,
+        line_sigma_px=options.line_sigma_px,
+        line_end_correlation=options.line_end_correlation,
+        structure_form=options.structure_form,
+        structure_sigma_px=options.structure_sigma_px,
+        loss=loss,
+        drop_behind=not is_bal,
+    )
+
+
+def _rmse_px(assembly: Assembly) -> dict[str, float]:
+    """Root mean square of the reprojection residuals by kind, unweighted and without the loss, pixels."""
+    return {kind: float(np.sqrt(np.mean(squares))) for kind, squares in squared_residuals_px(assembly).items()}

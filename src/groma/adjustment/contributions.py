@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What each kind of landmark contributes: the same adjustment with and without lines, planes and what lies on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.adjustment.adjust import AdjustOptions, AdjustResult, adjust
+from groma.adjustment.uncertainty import position_sigma, uncertainty
+from groma.errors import InputError, ProblemError
+from groma.evaluation.alignment import align_poses, camera_centers
+from groma.evaluation.poses import evaluate_poses
+from groma.scene import Relations, Scene
+
+#: What is added, one after the other.
+KINDS = ("points", "lines", "planes and directions", "points on lines")
+#: With more images than this the standard deviations are left out.
+MOST_IMAGES = 300
+#: Where a distribution over the images is told: so many of a hundred are below.
+PERCENTILES = (5, 25, 50, 75, 95)
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """An adjustment of everything up to one kind of landmark; residuals in pixels.
+
+    Lengths are in scene units, or in those of the reference where there is one.
+    """
+
+    #: The kind that was added last.
+    added: str
+    #: Adjusted landmarks and relations of all kinds so far, and the relations that the loss gave up.
+    num_landmarks: int
+    num_relations: int
+    num_dropped: int
+    #: Root mean square residual by kind, without the loss.
+    rmse_px: dict[str, float]
+    #: Median distance of the camera centres from those of points alone, after a similarity alignment, and its
+    #: percentiles over the images (:data:`PERCENTILES`).
+    moved: float
+    moved_percentiles: tuple[float, ...]
+    #: Median predicted standard deviation of the camera centres, with the first camera and the scale held, because
+    #: relations in lengths leave no free scale; None where it is not known.
+    center_sigma: float | None
+    #: Why it is not known; empty if it is.
+    center_sigma_missing: str
+    #: How many landmarks the data leave open, by kind, where that is known; they are no harm to the others.
+    num_undetermined: dict[str, int]
+    #: Against a reference, if there is one: rms error of the camera centres, its percentiles over the images, and mean
+    #: error of the rotations.
+    center_error: float | None
+    center_error_percentiles: tuple[float, ...] | None
+    rotation_error_deg: float | None
+    iterations: int
+    seconds: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers and words, for JSON."""
+        return asdict(self)
+
+
+def contributions(
+    scene: Scene,
+    options: AdjustOptions | None = None,
+    reference: Scene | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Contribution, ...]:
+    """Adjust a scene by its points alone, then with lines, then with planes and directions, then with points on lines.
+
+    Every adjustment begins at the scene as it is given; kinds that it does not hold are left out.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene; it is not changed.
+    options : AdjustOptions, optional
+        How to adjust; ``points``, ``lines`` and ``planes`` say what may take part.
+    reference : Scene, optional
+        The scene taken for true; images are matched by name.
+    progress : callable, optional
+        Called with what is added, before each adjustment.
+
+    Returns
+    -------
+    tuple of Contribution
+        One entry for each kind, in the order of :data:`KINDS`.
+
+    Raises
+    ------
+    InputError
+        If the scene has no points to begin with, or no image of the reference.
+    """
+    options = options or AdjustOptions()
+    if not (options.points and scene.num_point_observations):
+        raise InputError(
+            "Contributions are measured against an adjustment by points alone, and there are no points. "
+            "Leave out --contributions, or --no-points."
+        )
+    found: list[Contribution] = []
+    alone: Scene | None = None
+    for kind, variant, chosen in _variants(scene, options):
+        if progress is not None:
+            progress(kind)
+        result = adjust(variant, chosen)
+        alone = alone or result.scene
+        found.append(_contribution(kind, result, alone, reference))
+    return tuple(found)
+
+
+def _variants(scene: Scene, options: AdjustOptions) -> list[tuple[str, Scene, AdjustOptions]]:
+    """Return what is added, the scene with the relations so far, and the options, for each kind that is there."""
+    all_of = scene.relations
+    with_lines = options.lines and scene.num_line_observations > 0
+    with_planes = options.planes and scene.num_planes + scene.num_directions > 0
+    steps = [("points", Relations(), False, False)]
+    if with_lines:
+        steps.append(("lines", Relations(), True, False))
+    if with_planes:
+        steps.append(
+            ("planes and directions", replace(all_of, point_on_line=all_of.point_on_line[:0]), with_lines, True)
+        )
+    if with_lines and len(all_of.point_on_line):
+        steps.append(("points on lines", all_of, True, with_planes))
+    return [
+        (kind, scene.replace(relations=relations), replace(options, lines=lines, planes=planes))
+        for kind, relations, lines, planes in steps
+    ]
+
+
+def _contribution(kind: str, result: AdjustResult, alone: Scene, reference: Scene | None) -> Contribution:
+    report, scene = result.report, result.scene
+    scores = None if reference is None else evaluate_poses(scene, reference)
+    unit = 1.0 if scores is None else scores.alignment.scale
+    moved = unit * _distances(scene.cam_from_world, alone.cam_from_world)
+    outcomes = report.relations.values()
+    sigma, missing, num_open = _center_sigma(result)
+    return Contribution(
+        added=kind,
+        num_landmarks=report.num_points + report.num_lines + report.num_planes,
+        num_relations=sum(outcome["held"] + outcome["dropped"] for outcome in outcomes),
+        num_dropped=sum(outcome["dropped"] for outcome in outcomes),
+        rmse_px={name: values["after"] for name, values in report.rmse_px.items()},
+        moved=0.0 if scene is alone else float(np.median(moved)),
+        moved_percentiles=_percentiles(0.0 * moved if scene is alone else moved),
+        center_sigma=None if sigma is None else unit * sigma,
+        center_sigma_missing=missing,
+        num_undetermined=num_open,
+        center_error=None if scores is None else scores.center_rmse,
+        center_error_percentiles=None if reference is None else _percentiles(_errors(scene, reference)),
+        rotation_error_deg=None if scores is None else scores.rotation_deg_mean,
+        iterations=report.solve.iterations,
+        seconds=report.solve.seconds["total"],
+    )
+
+
+def _distances(poses: FloatArray, others: FloatArray) -> FloatArray:
+    """Distances (N,) between the camera centres of poses (N, 7), the first aligned to the others by a similarity."""
+    aligned = align_poses(poses, others).poses(poses)
+    return np.linalg.norm(camera_centers(aligned) - camera_centers(others), axis=1)
+
+
+def _errors(scene: Scene, reference: Scene) -> FloatArray:
+    row = {name: k for k, name in enumerate(scene.images.names)}
+    pairs = [(row[name], k) for k, name in enumerate(reference.images.names) if name in row]
+    mine, true = np.array(pairs).T
+    return _distances(scene.cam_from_world[mine], reference.cam_from_world[true])
+
+
+def _percentiles(values: FloatArray) -> tuple[float, ...]:
+    return tuple(float(value) for value in np.percentile(values, PERCENTILES))
+
+
+def _center_sigma(result: AdjustResult) -> tuple[float | None, str, dict[str, int]]:
+    """Return the median standard deviation of the camera centres, why there is none, and how much is open by kind."""
+    if result.scene.num_images > MOST_IMAGES:
+        return None, f"more than {MOST_IMAGES} images", {}
+    try:
+        found = uncertainty(result.scene, gauge="held", problem=result.problem)
+    except (InputError, ProblemError) as error:
+        return None, str(error), {}
+    num_open = {name: len(ids) for name, ids in found.undetermined.items() if len(ids)}
+    sigma = position_sigma(found.centers)
+    known = sigma[np.isfinite(sigma) & (sigma > 0)]
+    if not len(known):
+        return None, "the poses are held" if (sigma == 0).any() else "no pose is determined", num_open
+    return float(np.median(known)), "", num_open

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The diagnosis of a scene: :func:`groma.solver.observability.diagnosis.diagnose` with the scene's own names."""
+
+from __future__ import annotations
+
+from groma.adjustment.assemble import AssemblyOptions, assemble, at_places_of
+from groma.problem.problem import Problem
+from groma.scene import Scene
+from groma.scene.local_frame import local_frame
+from groma.solver.observability.diagnosis import Diagnosis, diagnose
+
+
+def diagnose_scene(
+    scene: Scene, options: AssemblyOptions | None = None, problem: Problem | None = None, threads: int = 1
+) -> Diagnosis:
+    """Say in words what the observations of a scene determine and what they do not.
+
+    Parameters
+    ----------
+    scene : Scene
+        An adjusted scene, or a start.
+    options : AssemblyOptions, optional
+        What of the scene takes part, and its noise; the defaults otherwise.
+    problem : Problem, optional
+        The problem already made from the scene, at its solution; saves making it again.
+    threads : int
+        Threads for the linearisation.
+
+    Returns
+    -------
+    Diagnosis
+        Cameras are called by the names of their images, landmarks by their identifiers.
+    """
+    near = local_frame(scene)
+    if near is not None:
+        scene = scene.transformed(near)
+        problem = None if problem is None else at_places_of(problem, scene)
+    problem = assemble(scene, options or AssemblyOptions()).problem if problem is None else problem
+    first_image = {int(frame): k for k, frame in reversed(list(enumerate(scene.images.frame_idx)))}
+    ids = {"points": scene.points.ids, "lines": scene.lines.ids, "planes": scene.planes.ids}
+    ids["directions"] = scene.directions.ids
+
+    def name(group: str, index: int) -> str:
+        if group == "frames":
+            return f"image {scene.images.names[first_image[index]]}" if index in first_image else f"frame {index}"
+        if group in ids:
+            return f"{group.removesuffix('s')} {int(ids[group][index])}"
+        if group.startswith("intrinsics/"):
+            return f"calibration {index} ({group.removeprefix('intrinsics/')})"
+        return f"{group.removesuffix('s')} {index}"
+
+    return diagnose(problem, name, threads=threads)
+
+
+__all__ = ["diagnose_scene"]

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Adjustment of a pose graph: poses that agree best with the motions measured between them.
+
+With the measured :math:`Z_{ij}` (``first_from_second``) and poses :math:`X` (``world_from_body``) it minimises
+
+.. math:: \tfrac12 \sum_{ij} \rho\big(\lVert \mathrm{Log}(Z_{ij}^{-1} X_i^{-1} X_j) \rVert^2_{\Sigma_{ij}^{-1}}\big) .
+
+Place recognition errs now and then, and one wrong motion between distant poses bends the whole graph. A robust loss
+lets go of it, if the poses at the start are about right; :meth:`groma.scene.pose_graph.PoseGraph.chained` makes a start
+from the motions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groma._counted import counted
+from groma._typing import FloatArray, IntArray
+from groma.adjustment.adjust import Progress
+from groma.errors import InputError
+from groma.factors.contract import Ref
+from groma.factors.losses import loss as make_loss
+from groma.factors.priors.pose_between import PoseBetween
+from groma.geometry import se3
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.problem.problem import Problem
+from groma.problem.residuals import squared_norms
+from groma.problem.variables import Variables
+from groma.scene.pose_graph import PoseGraph
+from groma.solver.options import SolverOptions
+from groma.solver.report import Iteration, SolveReport
+from groma.solver.solve import solve
+
+#: Where a robust loss begins to bend unless the caller says so, in standard deviations: the length that the error of a
+#: right motion (six numbers) exceeds once in a hundred.
+LOSS_SCALE = 4.1
+#: Increments (rho, omega) of cam_from_world that leave the plane z = 0.
+_OUT_OF_PLANE = np.array([False, False, True, True, True, False])
+
+
+@dataclass(frozen=True)
+class PoseGraphOptions:
+    """Options of :func:`adjust_pose_graph`."""
+
+    #: ``none``, ``huber``, ``soft_l1``, ``cauchy``, ``tukey``, ``geman_mcclure``, ``barron`` or ``truncated``.
+    loss: str = "none"
+    #: Where the loss begins to bend, in standard deviations; None: 4.1.
+    loss_scale: float | None = None
+    #: No loss for motions from one pose to the next (ids that follow each other): odometry errs a little all the time,
+    #: place recognition much now and then.
+    trust_odometry: bool = True
+    #: Most steps.
+    max_iterations: int = 100
+    #: ``auto``, ``dense``, ``sparse`` or ``pcg``.
+    linear_solver: str = "auto"
+    #: Threads; None takes one for small graphs and all cores for large ones.
+    threads: int | None = None
+
+
+@dataclass(frozen=True)
+class PoseGraphResult:
+    """The adjusted graph, and how it got there."""
+
+    graph: PoseGraph
+    report: SolveReport
+    #: (E,) squared error of every motion in variances, without the loss, before and after.
+    chi_square_before: FloatArray
+    chi_square: FloatArray
+    #: Motions beyond the scale of the loss after the adjustment; none for plain least squares.
+    doubtful: IntArray
+
+
+def adjust_pose_graph(
+    graph: PoseGraph,
+    options: PoseGraphOptions | None = None,
+    progress: Callable[[Progress], bool | None] | None = None,
+) -> PoseGraphResult:
+    """Adjust the poses of a graph; held ones stay, and the first of each connected part without one.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Poses and motions; not changed.
+    options : PoseGraphOptions, optional
+        How.
+    progress : callable, optional
+        Called after each step; return False to stop.
+
+    Raises
+    ------
+    InputError
+        If the graph has no motions.
+    """
+    options = options or PoseGraphOptions()
+    if not len(graph.motions):
+        poses = counted(len(graph.poses), "poses")
+        raise InputError(f"The graph has {poses} and no motions between them; nothing to adjust.")
+    problem = pose_graph_problem(graph, options)
+    settings = SolverOptions(
+        max_iterations=options.max_iterations,
+        linear_solver=options.linear_solver,
+        threads=options.threads,
+        function_tolerance=1e-8,
+    )
+
+    def show(step: Iteration) -> bool | None:
+        return progress(Progress(step.iteration, options.max_iterations, step.cost)) if progress is not None else None
+
+    solution = solve(problem, settings, show)
+    before, after = (_chi_squares(graph, options, at) for at in (problem, solution.problem))
+    robust = problem.factors[1]
+    beyond = after > getattr(robust.loss, "scale", np.inf) ** 2
+    beyond[_rows(graph, options)[0]] = False
+    poses = graph.poses.replace(world_from_body=se3.inverse(solution["poses"]))
+    return PoseGraphResult(
+        graph=graph.replace(poses=poses),
+        report=solution.report,
+        chi_square_before=before,
+        chi_square=after,
+        doubtful=np.flatnonzero(beyond),
+    )
+
+
+def pose_graph_problem(graph: PoseGraph, options: PoseGraphOptions | None = None) -> Problem:
+    """Return the problem of a graph: ``poses`` (body_from_world), motions without, and motions with a loss."""
+    options = options or PoseGraphOptions()
+    part, held = graph.parts(), graph.poses.held
+    has_held = np.zeros(part.max(initial=-1) + 1, dtype=bool)
+    has_held[part[held]] = True
+    _, first = np.unique(part, return_index=True)
+    held = held.copy()
+    held[first[~has_held]] = True
+    constant = held[:, None] | (_OUT_OF_PLANE & graph.planar)
+    state = se3.inverse(graph.poses.world_from_body)
+    robust = make_loss(options.loss, LOSS_SCALE if options.loss_scale is None else options.loss_scale)
+    every = PoseBetween(
+        first=Ref("poses", graph.motions.first_idx),
+        second=Ref("poses", graph.motions.second_idx),
+        first_from_second=graph.motions.first_from_second,
+        sqrt_information=_roots(graph.motions.information),
+    )
+    trusted, doubted = _rows(graph, options)
+    factors = [every.take(trusted), replace(every.take(doubted), loss=robust)]
+    return Problem({"poses": Variables(POSE_CHARTS["left"], state, constant)}, factors)
+
+
+def _rows(graph: PoseGraph, options: PoseGraphOptions) -> tuple[IntArray, IntArray]:
+    """Return the motions without and with a loss: the two groups of factors, in their order."""
+    trusted = graph.odometry() & options.trust_odometry
+    return np.flatnonzero(trusted), np.flatnonzero(~trusted)
+
+
+def _chi_squares(graph: PoseGraph, options: PoseGraphOptions, problem: Problem) -> FloatArray:
+    """Return the squared error (E,) of every motion, in variances."""
+    result = np.zeros(len(graph.motions))
+    for rows, factor in zip(_rows(graph, options), problem.factors, strict=True):
+        result[rows] = squared_norms(factor, problem.variables)
+    return result
+
+
+def _roots(information: FloatArray) -> FloatArray:
+    """Return R (E, 6, 6) with R^T R the information, which may be semidefinite."""
+    values, vectors = np.linalg.eigh(information)
+    return np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
+
+
+__all__ = ["PoseGraphOptions", "PoseGraphResult", "adjust_pose_graph", "pose_graph_problem"]

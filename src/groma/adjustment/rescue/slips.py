@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Lines that passed through a camera, or behind it, to please a wrong observation are brought back.
+
+In the image of a camera on a line every direction is as good as another: a line that passes through the centre of one
+of its cameras fits any segment there, and under a robust loss the others may bend for it. Behind a camera, too, a line
+has an image, though nothing there can be seen. With :math:`(m, d)` the line in the camera and b the bearing of the
+middle of the segment, the ray meets the line, or passes it, at the depth
+
+.. math:: z = \frac{(d \times m)^\top b}{\|d\|^2 - (d^\top b)^2} .
+
+An observation is false if z is negative or tiny beside what the other observations of the line have. The line goes
+back to where the others want it; the false one then counts as what it is, an outlier.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators.trimming import trim_to_ray
+from groma.factors.observations.line_bearing import LineBearing
+from groma.factors.observations.line_reprojection import LineReprojection
+from groma.problem.problem import Problem
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
+
+Observing = LineReprojection | LineBearing
+
+#: A segment this many times nearer to its camera than usual for its line is not seen there.
+NEAREST = 0.01
+#: Most steps of a line on its own.
+STEPS = 20
+#: Sine of the angle from which on a line has turned: its old end points then say little about the new ones.
+TURNED = 0.02
+
+
+def without_slips(problem: Problem, threads: int | None = None) -> tuple[Problem, IntArray]:
+    """Return the problem with lines that slipped through or behind a camera back in their place, and those that turned.
+
+    Parameters
+    ----------
+    problem : Problem
+        A problem at any state, under robust losses; it comes back as it is where no line slipped.
+    threads : int, optional
+        Threads; None takes one for small problems and all cores for large ones.
+    """
+    lines = problem.variables.get("lines")
+    observing = [factor for factor in problem.factors if isinstance(factor, Observing) and len(factor)]
+    if lines is None or lines.is_constant or not observing:
+        return problem, np.zeros(0, np.int64)
+    slipped = _slipped(problem, observing)
+    if not any(rows.any() for rows in slipped):
+        return problem, np.zeros(0, np.int64)
+    mine = np.unique(np.concatenate([f.line.index[rows] for f, rows in zip(observing, slipped, strict=True)]))
+    false, factors = iter(slipped), []
+    for factor in problem.factors:
+        index = next((ref.index for _, ref in factor.references() if ref.group == "lines"), None)
+        if index is None or len(factor) == 0:
+            continue
+        keep = np.isin(index, mine)
+        if isinstance(factor, Observing):
+            keep &= ~next(false)
+        factors.append(factor.take(np.flatnonzero(keep)))
+    used = {ref.group for factor in factors for _, ref in factor.references()} - {"lines"}
+    held = {name: replace(problem.variables[name], constant=True) for name in used}
+    options = SolverOptions(max_iterations=STEPS, threads=threads)
+    settled = solve(Problem({**held, "lines": lines}, factors), options).problem.variables["lines"]
+    before, after = (group.ambient()[mine, 3:] for group in (lines, settled))
+    sine = np.linalg.norm(np.cross(before, after), axis=1)
+    turned = sine > TURNED * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    return Problem({**problem.variables, "lines": settled}, problem.factors), mine[turned]
+
+
+def _slipped(problem: Problem, factors: list[Observing]) -> list[BoolArray]:
+    """Return for each group of observations which are false; none of a line that is behind most of its cameras."""
+    depths = [_depths(problem, factor) for factor in factors]
+    line, depth = np.concatenate([factor.line.index for factor in factors]), np.concatenate(depths)
+    order = np.lexsort((depth, line))
+    count = np.bincount(line, minlength=len(problem.variables["lines"]))
+    first = np.cumsum(count) - count
+    usual = np.zeros(len(count))
+    seen = count > 0
+    usual[seen] = depth[order[(first + count // 2)[seen]]]  # of two, the farther
+    limit = np.where(usual > 0, NEAREST * usual, -np.inf)
+    return [z < limit[factor.line.index] for z, factor in zip(depths, factors, strict=True)]
+
+
+def _depths(problem: Problem, factor: Observing) -> FloatArray:
+    """Return the depth along the middle of each segment at which its ray passes the line, (N,)."""
+    ambient = {slot.name: problem.variables[ref.group].ambient()[ref.index] for slot, ref in factor.references()}
+    m, d = ambient["line"][:, :3], ambient["line"][:, 3:]
+    for name in ("pose", "extrinsics"):
+        if name in ambient:
+            T = ambient[name].reshape(-1, 3, 4)
+            d = np.einsum("nij,nj->ni", T[:, :, :3], d)
+            m = np.einsum("nij,nj->ni", T[:, :, :3], m) + np.cross(T[:, :, 3], d)
+    if isinstance(factor, LineBearing):
+        b = factor.start_bearings + factor.end_bearings
+    else:
+        middle = np.ascontiguousarray(0.5 * (factor.segments[:, :2] + factor.segments[:, 2:]))
+        b = factor.camera.unproject(ambient["intrinsics"], middle)
+    return trim_to_ray(np.concatenate([m, d], axis=1), np.zeros(3), b, min_sine=0.0).depth

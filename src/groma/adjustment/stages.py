@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""An adjustment under several losses, one after the other: the factors of a stage, and one report of all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from groma.adjustment.terms.relations import RELATION_FACTORS
+from groma.factors.contract import Factor
+from groma.factors.losses import Loss
+from groma.factors.losses import loss as make_loss
+from groma.problem.problem import Problem
+from groma.solver.options import SolverOptions
+from groma.solver.report import Iteration, SolveReport
+from groma.solver.solve import solve
+
+#: Scales of the losses of matches for relations between landmarks, in standard deviations of those.
+RELATION_SCALES = {"cauchy": 2.0, "geman_mcclure": 4.0}
+
+
+def with_loss(factor: Factor, loss: Loss) -> Factor:
+    """Return the factors under a loss; relations between landmarks have a noise of their own, and the plain scale."""
+    if factor.type_name in RELATION_FACTORS and loss.name in RELATION_SCALES:
+        loss = make_loss(loss.name, RELATION_SCALES[loss.name])
+    return factor if factor.loss == loss else replace(factor, loss=loss)
+
+
+def stage_entries(stages: list[Loss], reports: list[SolveReport]) -> tuple[dict[str, Any], ...]:
+    """Return what a report says of each stage: its loss, its cost at the start, and the number of its first step."""
+    entries, first_step = [], 1
+    for loss, report in zip(stages, reports, strict=False):
+        entries.append({"loss": loss.name, "initial_cost": report.initial_cost, "first_step": first_step})
+        first_step += report.iterations
+    return tuple(entries)
+
+
+def combined(reports: list[SolveReport], start: Problem, stages: list[Loss]) -> SolveReport:
+    """Return one report of all stages: costs under the last loss, times and steps summed."""
+    last = reports[-1]
+    if len(reports) == 1:
+        return last
+    loss, first = stages[len(reports) - 1], reports[0]
+    if loss != stages[0]:
+        under_last = [with_loss(factor, loss) for factor in start.factors]
+        first = solve(Problem(start.variables, under_last), SolverOptions(max_iterations=0)).report
+    history: list[Iteration] = []
+    for report in reports:
+        steps, seconds = len(history), history[-1].seconds if history else 0.0
+        history += [
+            replace(record, iteration=record.iteration + steps, seconds=record.seconds + seconds)
+            for record in report.history
+        ]
+    seconds = {stage: sum(report.seconds[stage] for report in reports) for stage in last.seconds}
+    return replace(
+        last,
+        initial_cost=first.initial_cost,
+        initial_costs=first.initial_costs,
+        iterations=sum(report.iterations for report in reports),
+        history=history,
+        seconds=seconds,
+    )
+
+
+def with_costs_at(report: SolveReport, problem: Problem) -> SolveReport:
+    """Return the report of a solve with the costs of a problem that was changed after it."""
+    now = solve(problem, SolverOptions(max_iterations=0)).report
+    return replace(report, final_cost=now.final_cost, final_costs=now.final_costs)

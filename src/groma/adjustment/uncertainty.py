@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""How certain the parts of an adjusted scene are, in the terms of the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.adjustment.assemble import AssemblyOptions, assemble, at_places_of, first_camera_gauge
+from groma.errors import InputError
+from groma.problem.problem import Problem
+from groma.problem.variables import Variables
+from groma.scene import Scene
+from groma.scene.local_frame import local_frame
+from groma.solver.covariance.marginals import Covariances
+
+
+@dataclass(frozen=True)
+class SceneUncertainty:
+    """Covariances of a scene. NaN where the data leave something open, zero where it is held."""
+
+    #: Frame that the covariances refer to: ``inner`` or ``held``.
+    gauge: str
+    #: Standard deviation of unit weight that they are scaled by.
+    sigma0: float
+    #: (F, 6, 6) of the frames' poses: left twist, shift before turn (radians), in the camera or rig frame.
+    poses: FloatArray
+    #: (F, 3, 3) of the frames' centres in the world, scene units squared.
+    centers: FloatArray
+    #: (P, 3, 3) of the points, scene units squared.
+    points: FloatArray
+    #: (L, 6, 6) of (m, d) of the lines with a unit direction.
+    lines: FloatArray
+    #: (L, 2, 3, 3) of the end points of the segments across their line; along it an end is where the images end.
+    segment_ends: FloatArray
+    #: (K, 4, 4) of (n, w) of the planes with a unit normal.
+    planes: FloatArray
+    #: (D, 3, 3) of the directions.
+    directions: FloatArray
+    #: Identifiers of what the data leave open, by kind: ``points``, ``lines``, ``planes``, ``directions``, and the rows
+    #: of ``frames``. Their covariances are NaN, and all others are not affected.
+    undetermined: dict[str, IntArray]
+    #: For joint covariances and derived quantities: groups are ``frames``, ``points``, ``lines``, ``planes``. Of a
+    #: scene far from the origin they are in :func:`groma.scene.local_frame.local_frame`.
+    covariances: Covariances
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return medians and worst cases of the standard deviations as plain numbers, for JSON."""
+
+        def summary(values: FloatArray) -> dict[str, Any]:
+            finite = values[np.isfinite(values)]
+            return {
+                "median": float(np.median(finite)) if len(finite) else None,
+                "largest": float(finite.max()) if len(finite) else None,
+                "undetermined": int((~np.isfinite(values)).sum()),
+            }
+
+        turn = np.sqrt(np.einsum("nii->n", self.poses[:, 3:, 3:]))
+        return {
+            "gauge": self.gauge,
+            "sigma0": self.sigma0,
+            "center": summary(position_sigma(self.centers)),
+            "rotation_deg": summary(np.rad2deg(turn)),
+            "point": summary(position_sigma(self.points)),
+            "segment_end": summary(position_sigma(self.segment_ends.reshape(-1, 3, 3))),
+            "line_direction_deg": summary(np.rad2deg(position_sigma(self.lines[:, 3:, 3:]))),
+            "plane_normal_deg": summary(np.rad2deg(position_sigma(self.planes[:, :3, :3]))),
+            "undetermined": {kind: ids.tolist() for kind, ids in self.undetermined.items()},
+        }
+
+
+def position_sigma(covariance: FloatArray) -> FloatArray:
+    """Root of the summed variances (N,) of vectors with covariances (N, m, m)."""
+    return np.sqrt(np.maximum(np.einsum("nii->n", covariance), 0.0))
+
+
+def uncertainty(
+    scene: Scene,
+    options: AssemblyOptions | None = None,
+    gauge: str = "auto",
+    sigma0: float = 1.0,
+    problem: Problem | None = None,
+) -> SceneUncertainty:
+    """Return the covariances of an adjusted scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        At its minimum.
+    options : AssemblyOptions, optional
+        The noise and the losses it was adjusted with; ``gauge`` in it is overridden.
+    gauge : str
+        ``inner``: a free network; the camera centres vary least together. ``held``: the first camera and the scale are
+        certain. ``auto``: inner, or held where relations between landmarks, measured in lengths, tie the scale.
+    sigma0 : float
+        Covariances are multiplied by its square; pass the root of the report's ``reduced_chi_square`` where the stated
+        noise is not to be believed.
+    problem : Problem, optional
+        The problem already made from the scene, at its solution. For ``inner`` its frames are freed; for ``held`` the
+        first camera and the scale are held unless the problem holds something of its own.
+
+    Returns
+    -------
+    SceneUncertainty
+        In scene units and radians.
+
+    Raises
+    ------
+    InputError
+        If the gauge is not known.
+    ProblemError
+        If the poses are not determined; :func:`groma.adjustment.diagnosis.diagnose_scene` says what. Landmarks may be
+        open.
+    """
+    if gauge not in ("auto", "inner", "held"):
+        raise InputError(f"gauge must be 'auto', 'inner' or 'held'; got {gauge!r}.")
+    options, near = options or AssemblyOptions(), local_frame(scene)
+    if near is None:
+        return _uncertainty(scene, options, gauge, sigma0, problem)
+    moved = scene.transformed(near)
+    found = _uncertainty(moved, options, gauge, sigma0, None if problem is None else at_places_of(problem, moved))
+    lines, planes = np.eye(6), np.eye(4)
+    lines[:3, 3:], planes[3, :3] = _hat(-near.translation[None])[0], near.translation
+    return replace(found, lines=lines @ found.lines @ lines.T, planes=planes @ found.planes @ planes.T)
+
+
+def _uncertainty(
+    scene: Scene, options: AssemblyOptions, gauge: str, sigma0: float, problem: Problem | None
+) -> SceneUncertainty:
+    """Return the covariances of a scene that is near the origin of its world."""
+    if gauge == "auto":
+        metric = options.planes and len(scene.relations) > 0 and options.structure_form == "metric"
+        gauge = "held" if metric else "inner"
+    if problem is None:
+        held = "first_camera" if gauge == "held" else "free"
+        problem = assemble(scene, replace(options, gauge=held)).problem
+    else:
+        problem = _in_gauge(problem, scene, gauge)
+    datum = {"frames": [1, 1, 1, 0, 0, 0]} if gauge == "inner" and _free_cameras(problem) > 2 else None
+    covariances = Covariances(problem, gauge=gauge, datum=datum)
+    factor = sigma0**2
+
+    def coordinates(name: str, size: int, count: int) -> FloatArray:
+        if name not in problem.variables:
+            return np.full((count, size, size), np.nan)
+        return covariances.of_coordinates(name) * factor
+
+    poses = coordinates("frames", 6, scene.num_frames)
+    shift = poses[:, :3, :3]
+    rotation = problem.variables["frames"].ambient().reshape(-1, 3, 4)[:, :, :3]
+    lines = coordinates("lines", 6, scene.num_lines)
+    if "lines" in problem.variables:
+        plucker = problem.variables["lines"].ambient()
+        size = np.linalg.norm(plucker[:, 3:], axis=1)
+        lines = _unit_direction(plucker, lines, slice(3, 6)) / size[:, None, None] ** 2
+    planes = coordinates("planes", 4, scene.num_planes)
+    if "planes" in problem.variables:
+        hesse = problem.variables["planes"].ambient()
+        size = np.linalg.norm(hesse[:, :3], axis=1)
+        planes = _unit_direction(hesse, planes, slice(0, 3)) / size[:, None, None] ** 2
+    return SceneUncertainty(
+        gauge=gauge,
+        sigma0=sigma0,
+        poses=poses,
+        centers=np.swapaxes(rotation, 1, 2) @ shift @ rotation,
+        points=coordinates("points", 3, scene.num_points),
+        lines=lines,
+        segment_ends=_ends(scene, lines),
+        planes=planes,
+        directions=coordinates("directions", 3, scene.num_directions),
+        undetermined=_undetermined(covariances, scene),
+        covariances=covariances,
+    )
+
+
+def _undetermined(covariances: Covariances, scene: Scene) -> dict[str, IntArray]:
+    ids = {
+        "frames": np.arange(scene.num_frames),
+        "points": scene.points.ids,
+        "lines": scene.lines.ids,
+        "planes": scene.planes.ids,
+        "directions": scene.directions.ids,
+    }
+    present = covariances.problem.variables
+    return {name: numbers[covariances.undetermined(name)] for name, numbers in ids.items() if name in present}
+
+
+def _in_gauge(problem: Problem, scene: Scene, gauge: str) -> Problem:
+    """Return the problem with free frames, or with the first one and the scale held if nothing is held yet."""
+    frames = problem.variables["frames"]
+    free = frames.free_coordinates()
+    if _free_cameras(problem) == 0 or (free is None) == (gauge == "inner"):
+        return problem
+    constant = first_camera_gauge(scene) if gauge == "held" else False
+    variables = {**problem.variables, "frames": Variables(frames.manifold, frames.state, constant)}
+    return Problem(variables, problem.factors)
+
+
+def _free_cameras(problem: Problem) -> int:
+    group = problem.variables["frames"]
+    free = group.free_coordinates()
+    return len(group) if free is None else int(free.any(axis=1).sum())
+
+
+def _unit_direction(ambient: FloatArray, covariance: FloatArray, part: slice) -> FloatArray:
+    """Covariance of homogeneous numbers whose part is kept at its length: P Sigma P^T."""
+    u = ambient[:, part] / np.linalg.norm(ambient[:, part], axis=1, keepdims=True)
+    lead = np.zeros_like(ambient)
+    lead[:, part] = u
+    scale = np.linalg.norm(ambient[:, part], axis=1, keepdims=True)
+    P = np.eye(ambient.shape[1]) - (ambient / scale)[:, :, None] * lead[:, None, :]
+    return P @ covariance @ np.swapaxes(P, 1, 2)
+
+
+def _ends(scene: Scene, lines: FloatArray) -> FloatArray:
+    """Covariance (L, 2, 3, 3) of the segment ends across their lines: X moves by d x (dm - X x dd)."""
+    d = scene.lines.segments[:, 1] - scene.lines.segments[:, 0]
+    d = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)
+    out = np.empty((len(d), 2, 3, 3))
+    across = _hat(d)
+    for k in range(2):
+        J = np.concatenate([across, -across @ _hat(scene.lines.segments[:, k])], axis=2)
+        out[:, k] = J @ lines @ np.swapaxes(J, 1, 2)
+    return out
+
+
+def _hat(v: FloatArray) -> FloatArray:
+    return np.cross(v[:, None, :], np.eye(3)[None]).swapaxes(1, 2)
+
+
+__all__ = ["SceneUncertainty", "position_sigma", "uncertainty"]

@@ -1,0 +1,398 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""What a camera model is, and the registry of models.
+
+A camera model maps a point in the camera frame (x right, y down, z forward) to a pixel, in COLMAP's pixel convention
+(the centre of the first pixel is (0.5, 0.5)), and a pixel back to a unit bearing. It depends on ``k`` parameters.
+
+Compiled loops call the kernels through :mod:`groma.cameras.dispatch`, which says what kernels promise and whose names
+are repeated here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._numba import loop
+from groma._typing import FloatArray
+from groma.cameras.dispatch import (
+    has_pinhole_kernels,
+    pinhole_parameters,
+    pinhole_parameters_jacobian,
+    project,
+    project_jacobian,
+    set_kernels,
+    unproject,
+)
+from groma.errors import InputError, ShapeError
+
+# --------------------------------------------------------------------------------------------------------- Kernels
+
+
+@loop
+def _project_all(model_tag, params, points, pixels):
+    stride = 1 if params.shape[0] > 1 else 0
+    for i in range(points.shape[0]):
+        if not project(model_tag, params[i * stride], points[i], pixels[i]):
+            pixels[i, :] = np.nan
+
+
+@loop
+def _project_jacobian_all(model_tag, params, points, pixels, J_points, J_params):
+    stride = 1 if params.shape[0] > 1 else 0
+    for i in range(points.shape[0]):
+        if not project_jacobian(model_tag, params[i * stride], points[i], pixels[i], J_points[i], J_params[i]):
+            pixels[i, :] = np.nan
+            J_points[i, :, :] = np.nan
+            J_params[i, :, :] = np.nan
+
+
+@loop
+def _unproject_all(model_tag, params, pixels, bearings):
+    stride = 1 if params.shape[0] > 1 else 0
+    for i in range(pixels.shape[0]):
+        if not unproject(model_tag, params[i * stride], pixels[i], bearings[i]):
+            bearings[i, :] = np.nan
+
+
+@loop
+def _pinhole_parameters_all(model_tag, params, K):
+    for i in range(params.shape[0]):
+        pinhole_parameters(model_tag, params[i], K[i])
+
+
+# ---------------------------------------------------------------------------------------------------------- Public
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """A camera model: its name, its parameters, and batched projection.
+
+    Batched methods take ``params`` as (k,), one camera for all rows, or (N, k), one row each.
+    """
+
+    #: Name, as options and files spell it.
+    name: str
+    #: Number of the model. It selects the kernels at compile time, so it must not change between two runs.
+    number: int
+    #: Names of the k parameters, in order.
+    parameter_names: tuple[str, ...]
+    #: Which parameters are focal lengths in pixels: one, or two (x, y).
+    focal_indices: tuple[int, ...]
+    #: Which parameters are the principal point in pixels: two (x, y), or none where it is fixed at (0, 0).
+    principal_point_indices: tuple[int, ...]
+    #: Which parameters are distortion coefficients.
+    extra_indices: tuple[int, ...]
+    #: COLMAP's name of the same model, or None.
+    colmap_name: str | None = None
+    #: Whether points at and behind the image plane have an image of their own (fisheye), so that z > 0 is no test.
+    sees_behind: bool = False
+
+    @property
+    def num_parameters(self) -> int:
+        """Number k of parameters."""
+        return len(self.parameter_names)
+
+    @property
+    def tag(self) -> tuple[int, ...]:
+        """What compiled loops take to select this model, see :mod:`groma.cameras.dispatch`."""
+        return (0,) * (self.number + 1)
+
+    @property
+    def has_pinhole_parameters(self) -> bool:
+        """Whether the model is free of distortion by its form, so that straight lines have straight images."""
+        return has_pinhole_kernels(self.number + 1)
+
+    def project(self, params: FloatArray, points_in_cam: FloatArray) -> FloatArray:
+        """Project points to pixels.
+
+        Parameters
+        ----------
+        params : (k,) or (N, k) float64
+            Camera parameters.
+        points_in_cam : (N, 3) float64
+            Points in the camera frame, scene units.
+
+        Returns
+        -------
+        (N, 2) float64
+            Pixels; rows of NaN where the model has no value (perspective: z = 0; fisheye: straight behind).
+
+        Raises
+        ------
+        ShapeError
+            If an array has another shape.
+
+        Notes
+        -----
+        Perspective models also give a pixel for z < 0, the one of the opposite point.
+        """
+        points = _rows(points_in_cam, 3, "points_in_cam")
+        pixels = np.empty((len(points), 2))
+        _project_all(self.tag, self.check_parameters(params, len(points)), points, pixels)
+        return pixels
+
+    def project_jacobian(
+        self, params: FloatArray, points_in_cam: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Project points and differentiate the pixels by point and parameters.
+
+        Arguments as in :meth:`project`.
+
+        Returns
+        -------
+        pixels : (N, 2) float64
+        pixels_wrt_points : (N, 2, 3) float64
+        pixels_wrt_params : (N, 2, k) float64
+            All NaN where the model has no value.
+        """
+        points = _rows(points_in_cam, 3, "points_in_cam")
+        count = len(points)
+        pixels, by_point = np.empty((count, 2)), np.empty((count, 2, 3))
+        by_params = np.empty((count, 2, self.num_parameters))
+        _project_jacobian_all(self.tag, self.check_parameters(params, count), points, pixels, by_point, by_params)
+        return pixels, by_point, by_params
+
+    def unproject(self, params: FloatArray, pixels: FloatArray) -> FloatArray:
+        """Find the unit bearings that project to pixels; the inverse of :meth:`project` in front of the camera.
+
+        Parameters
+        ----------
+        params : (k,) or (N, k) float64
+            Camera parameters.
+        pixels : (N, 2) float64
+            Pixels.
+
+        Returns
+        -------
+        (N, 3) float64
+            Unit bearings in the camera frame; rows of NaN where the pixel lies beyond the radius up to which the
+            distortion is monotone, so that no bearing, or more than one, would fit.
+        """
+        rows = _rows(pixels, 2, "pixels")
+        bearings = np.empty((len(rows), 3))
+        _unproject_all(self.tag, self.check_parameters(params, len(rows)), rows, bearings)
+        return bearings
+
+    def pinhole_parameters(self, params: FloatArray) -> FloatArray:
+        """Return fx, fy, cx, cy (N, 4) of a model without distortion, for ``params`` (k,) or (N, k).
+
+        Raises
+        ------
+        InputError
+            If the model has distortion, under which images of lines are curves.
+        """
+        self.require_pinhole()
+        rows = self.check_parameters(params)
+        K = np.empty((len(rows), 4))
+        _pinhole_parameters_all(self.tag, rows, K)
+        return K
+
+    def require_pinhole(self) -> None:
+        """Raise :class:`~groma.errors.InputError` unless the model is free of distortion by its form."""
+        if not self.has_pinhole_parameters:
+            free = ", ".join(other.name for other in models() if other.has_pinhole_parameters)
+            raise InputError(
+                f"Straight image lines need a camera model without distortion ({free}); got {self.name}. "
+                f"Use the bearing factor for lines under distortion, or undistort the segments first."
+            )
+
+    def focal_length(self, params: FloatArray) -> FloatArray:
+        """Mean focal length in pixels, shape () or (N,) for ``params`` (k,) or (N, k)."""
+        return self._as_params(params)[..., list(self.focal_indices)].mean(axis=-1)
+
+    def camera_matrix(self, params: FloatArray) -> FloatArray:
+        r"""Return :math:`K = [f_x, 0, c_x;\ 0, f_y, c_y;\ 0, 0, 1]`, shape (3, 3) or (N, 3, 3), distortion left out."""
+        params = self._as_params(params)
+        K = np.zeros((*params.shape[:-1], 3, 3))
+        K[..., 0, 0] = params[..., self.focal_indices[0]]
+        K[..., 1, 1] = params[..., self.focal_indices[-1]]
+        K[..., 2, 2] = 1.0
+        if self.principal_point_indices:
+            K[..., :2, 2] = params[..., list(self.principal_point_indices)]
+        return K
+
+    def undistort_pixels(self, params: FloatArray, pixels: FloatArray) -> FloatArray:
+        """Move pixels to where a camera of equal focal length and principal point, without distortion, sees them.
+
+        Parameters
+        ----------
+        params : (k,) or (N, k) float64
+            Camera parameters.
+        pixels : (N, 2) float64
+            Pixels as measured.
+
+        Returns
+        -------
+        (N, 2) float64
+            Pixels of the camera with matrix :meth:`camera_matrix`; NaN where :meth:`unproject` has no value or the
+            bearing does not point forward.
+        """
+        bearings = self.unproject(params, pixels)
+        bearings[~(bearings[:, 2] > 0.0)] = np.nan
+        K = np.broadcast_to(self.camera_matrix(params), (len(bearings), 3, 3))
+        return np.einsum("nij,nj->ni", K[:, :2], bearings / bearings[:, 2:])
+
+    def bearing_jacobian(self, params: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+        r"""Bearings and their derivative by the pixel.
+
+        .. math::
+            \frac{\partial f}{\partial u} = J^+ = J^\top (J J^\top)^{-1}, \qquad
+            J = \frac{\partial\,\mathrm{project}}{\partial X}\Big|_{X=f}
+
+        Projection does not depend on the length of its argument, so :math:`J f = 0` and the columns of the
+        derivative lie in the tangent plane of the bearing: :math:`f^\top \partial f/\partial u = 0`.
+
+        Parameters
+        ----------
+        params : (k,) or (N, k) float64
+            Camera parameters.
+        pixels : (N, 2) float64
+            Pixels.
+
+        Returns
+        -------
+        bearings : (N, 3) float64
+        bearings_wrt_pixels : (N, 3, 2) float64
+            In radians per pixel; NaN where there is no bearing or the derivative is singular.
+        """
+        bearings = self.unproject(params, pixels)
+        _, J, _ = self.project_jacobian(params, bearings)
+        (a, b), c = (J * J).sum(axis=-1).T, (J[:, 0] * J[:, 1]).sum(axis=-1)
+        determinant = a * b - c * c
+        determinant[~(determinant > 0.0)] = np.nan
+        adjugate = np.stack([b, -c, -c, a], axis=-1).reshape(-1, 2, 2)
+        return bearings, np.swapaxes(J, 1, 2) @ (adjugate / determinant[:, None, None])
+
+    def bearing_covariance(
+        self, params: FloatArray, pixels: FloatArray, sigma: float | FloatArray = 1.0
+    ) -> tuple[FloatArray, FloatArray]:
+        r"""Bearings and the covariance that pixel noise gives them.
+
+        .. math:: \Sigma_f = G\, \Sigma_u\, G^\top, \qquad G = \partial f/\partial u
+
+        A residual :math:`n^\top f` of a fixed plane normal then has the variance :math:`n^\top \Sigma_f\, n`.
+
+        Parameters
+        ----------
+        params : (k,) or (N, k) float64
+            Camera parameters.
+        pixels : (N, 2) float64
+            Pixels.
+        sigma : float, (N,) or (N, 2, 2) float64
+            Noise of the pixels: a standard deviation per coordinate in pixels, or covariances in square pixels.
+
+        Returns
+        -------
+        bearings : (N, 3) float64
+        covariances : (N, 3, 3) float64
+            Square radians, of rank 2: the bearing itself is in the null space. NaN where there is no bearing.
+        """
+        bearings, G = self.bearing_jacobian(params, pixels)
+        sigma = np.asarray(sigma, dtype=np.float64)
+        if sigma.shape in ((), (len(G),)):
+            return bearings, (sigma**2).reshape(-1, 1, 1) * (G @ np.swapaxes(G, 1, 2))
+        if sigma.shape != (len(G), 2, 2):
+            raise ShapeError(f"sigma must be a number, (N,) or (N, 2, 2) with N = {len(G)} pixels; got {sigma.shape}.")
+        return bearings, G @ sigma @ np.swapaxes(G, 1, 2)
+
+    def check_parameters(self, params: FloatArray, count: int | None = None) -> FloatArray:
+        """Return ``params`` as contiguous rows (1, k) or (N, k); raise ShapeError unless they fit ``count`` items."""
+        rows = np.atleast_2d(self._as_params(params))
+        if rows.ndim != 2 or (count is not None and len(rows) not in (1, count)):
+            expected = f"({self.num_parameters},) or (N, {self.num_parameters})"
+            raise ShapeError(f"params must have shape {expected} with N = {count}; got {np.shape(params)}.")
+        return np.ascontiguousarray(rows)
+
+    def _as_params(self, params: FloatArray) -> FloatArray:
+        params = np.asarray(params, dtype=np.float64)
+        if params.ndim == 0 or params.shape[-1] != self.num_parameters:
+            raise ShapeError(
+                f"{self.name} has the {self.num_parameters} parameters {', '.join(self.parameter_names)}; "
+                f"got an array of shape {params.shape}. Pass them along the last axis, in this order."
+            )
+        return params
+
+
+_MODELS: dict[str, CameraModel] = {}
+
+
+def register_camera(
+    camera: CameraModel,
+    project: Callable[..., bool],
+    project_jacobian: Callable[..., bool],
+    unproject: Callable[..., bool],
+    pinhole_parameters: Callable[..., None] | None = None,
+    pinhole_parameters_jacobian: Callable[..., None] | None = None,
+) -> CameraModel:
+    """Make a camera model known by name, and its kernels to compiled loops.
+
+    Parameters
+    ----------
+    camera : CameraModel
+        The model. Its number must be free; groma uses 0 to 15. Keep it the same from run to run: compiled loops are
+        cached on disk by this number. Empty Numba's cache folder after changing the kernels.
+    project, project_jacobian, unproject : callable
+        Kernels (decorated with ``groma._numba.kernel``) as described in :mod:`groma.cameras.dispatch`, without the
+        tag.
+    pinhole_parameters, pinhole_parameters_jacobian : callable, optional
+        For models without distortion only.
+
+    Returns
+    -------
+    CameraModel
+        The same model.
+
+    Raises
+    ------
+    InputError
+        If the name or the number belongs to another model.
+    """
+    for other in _MODELS.values():
+        if (other.name == camera.name) != (other.number == camera.number):
+            raise InputError(
+                f"A camera model needs a name and a number of its own; got {camera.name!r} and {camera.number}, "
+                f"but {other.name!r} has number {other.number}. Choose a free number from 16 upwards."
+            )
+    _MODELS[camera.name] = camera
+    kernels = project, project_jacobian, unproject, pinhole_parameters, pinhole_parameters_jacobian
+    set_kernels(camera.number + 1, *kernels)
+    return camera
+
+
+def model(name: str) -> CameraModel:
+    """Return the camera model of the given name, for example ``"PINHOLE"``; InputError lists the names if unknown."""
+    if name not in _MODELS:
+        raise InputError(
+            f"Camera model must be one of {', '.join(other.name for other in models())}; got {name!r}. "
+            f"Convert the images to one of these models first, or register it with groma.cameras.register_camera."
+        )
+    return _MODELS[name]
+
+
+def models() -> tuple[CameraModel, ...]:
+    """All registered camera models, by number."""
+    return tuple(sorted(_MODELS.values(), key=lambda camera: camera.number))
+
+
+def _rows(array: FloatArray, columns: int, name: str) -> FloatArray:
+    rows = np.ascontiguousarray(array, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != columns:
+        hint = f" Did you mean {name}.T?" if rows.ndim == 2 and rows.shape[0] == columns else ""
+        raise ShapeError(f"{name} must have shape (N, {columns}); got {rows.shape}.{hint}")
+    return rows
+
+
+__all__ = [
+    "CameraModel",
+    "model",
+    "models",
+    "pinhole_parameters",
+    "pinhole_parameters_jacobian",
+    "project",
+    "project_jacobian",
+    "register_camera",
+    "unproject",
+]

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma adjust``: bundle adjustment of a COLMAP model, a BAL file or a groma archive; of a pose graph, too."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from groma.cli.shared import options as _options
+from groma.cli.shared.adjusting import CovarianceGauge, Wanted, adjust_and_write
+from groma.errors import InputError
+
+LinearSolver = Literal["auto", "dense", "sparse", "pcg"]
+
+
+def adjust(
+    source: _options.Input,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="OUT",
+            help="Result: a folder (COLMAP model and structures), a groma archive (.npz) or a BAL file (.txt, .bz2, "
+            ".gz). Without it nothing but the report is written.",
+        ),
+    ] = None,
+    loss: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron or truncated. auto: robust "
+            "(Cauchy, then Geman-McClure) for what comes from matching, none for BAL files.",
+        ),
+    ] = "auto",
+    loss_scale: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="Scale of the loss, in units of the noise (pixels for images). Default: 1."),
+    ] = None,
+    refine_intrinsics: Annotated[
+        bool | None,
+        typer.Option(
+            "--refine-intrinsics/--fix-intrinsics",
+            help="Estimate the calibration too. Default: yes for BAL files, no otherwise.",
+        ),
+    ] = None,
+    refine_principal_point: Annotated[
+        bool, typer.Option("--refine-principal-point", help="With the intrinsics: principal points too.")
+    ] = False,
+    refine_rigs: Annotated[
+        bool, typer.Option("--refine-rigs", help="Estimate where the cameras sit on their rig.")
+    ] = False,
+    points: Annotated[bool, typer.Option("--points/--no-points", help="Use points.")] = True,
+    lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Use lines.")] = True,
+    planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Use planes.")] = True,
+    max_iterations: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Stop after N steps. Default: 50, for pose graphs 100.")
+    ] = None,
+    linear_solver: Annotated[LinearSolver, typer.Option(help="How each step is solved.")] = "auto",
+    line_chart: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="How lines move: cartesian (default), orthonormal_left, orthonormal_right, free_left or free_right.",
+        ),
+    ] = None,
+    gauge: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="free; first_camera, to hold the first camera and the scale; or auto (default): free, unless distances"
+            " between landmarks are in scene units.",
+        ),
+    ] = None,
+    page: Annotated[
+        Path | None, typer.Option("--report", metavar="FILE", help="Also write an HTML page: before and after.")
+    ] = None,
+    covariance: Annotated[
+        Path | None,
+        typer.Option(
+            "--covariance",
+            metavar="FILE",
+            help="Also write how certain the result is: covariances (.npz) or standard deviations (.json) of images, "
+            "points, lines, planes and directions.",
+        ),
+    ] = None,
+    covariance_gauge: Annotated[
+        CovarianceGauge,
+        typer.Option(
+            "--covariance-gauge",
+            help="What it refers to: inner, all camera centres together; held, the first camera and the scale.",
+        ),
+    ] = "auto",
+    sigma0: Annotated[
+        float,
+        typer.Option(
+            "--sigma0",
+            metavar="S",
+            help="With --covariance: the noise of the measurements in units of that stated (1 pixel unless the scene "
+            "says otherwise).",
+        ),
+    ] = 1.0,
+    diagnosis: Annotated[
+        bool | None,
+        typer.Option(
+            "--diagnosis/--no-diagnosis",
+            help="Say what the data do not determine. Default: yes up to 300 images.",
+        ),
+    ] = None,
+    contributions: _options.Contributions = False,
+    truth: _options.Truth = None,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    seed: _options.Seed = 0,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Adjust cameras, points, lines and planes together (bundle adjustment).
+
+    Reads a scene, minimises the robust reprojection error over everything in it and writes the scene back. The input
+    is never changed. LIMAP's structures beside a COLMAP model are read and written too, with what they hold besides.
+    What the data do not determine is said in words at the end. A pose graph (.g2o, .g2o.gz) is adjusted, too.
+    Chance plays no part here: --seed is accepted so that scripts can pass it everywhere.
+    """
+    from groma.cli.shared import output as _output
+    from groma.cli.shared.console import Console
+    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.pose_graph import adjust_pose_graph_file, is_pose_graph
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_outputs(force, output, page, covariance, json_target=json_target)
+    if covariance is not None and covariance.suffix not in (".npz", ".json"):
+        raise InputError(f"--covariance must end in .npz or .json; got {covariance}.")
+    if not 0.0 < sigma0 < float("inf"):
+        raise InputError(f"--sigma0 must be positive; got {sigma0}.")
+    if truth is not None and not contributions:
+        raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
+    check_inputs(source, truth)
+    if is_pose_graph(source):
+        refused = {
+            "--report": page, "--covariance": covariance, "--contributions": contributions, "--gauge": gauge,
+            "--line-chart": line_chart, "--refine-intrinsics": refine_intrinsics, "--refine-rigs": refine_rigs,
+        }  # fmt: skip
+        given = {
+            "loss": "none" if loss == "auto" else loss, "loss_scale": loss_scale, "linear_solver": linear_solver,
+            "max_iterations": max_iterations, "threads": threads,
+        }  # fmt: skip
+        options_of_graph = {name: value for name, value in given.items() if value is not None}
+        numbers_of_graph = adjust_pose_graph_file(source, output, console, force, options_of_graph, refused)
+        _output.write_json(json_target, numbers_of_graph, force)
+        return
+
+    from groma.adjustment.adjust import AdjustOptions
+
+    chosen = {
+        "loss_scale": loss_scale,
+        "refine_intrinsics": refine_intrinsics,
+        "max_iterations": max_iterations,
+        "line_chart": line_chart,
+        "gauge": gauge,
+        "threads": threads,
+    }
+    options = AdjustOptions(
+        loss=loss,
+        refine_principal_point=refine_principal_point,
+        refine_rigs=refine_rigs,
+        points=points,
+        lines=lines,
+        planes=planes,
+        linear_solver=linear_solver,
+        **{name: value for name, value in chosen.items() if value is not None},  # type: ignore[arg-type]
+    )
+    wanted = Wanted(
+        output=output,
+        page=page,
+        covariance=covariance,
+        gauge=covariance_gauge,
+        sigma0=sigma0,
+        diagnosis=diagnosis,
+        contributions=contributions,
+        truth=truth,
+        json_target=json_target,
+        force=force,
+    )
+    adjust_and_write(console, source, options, wanted)

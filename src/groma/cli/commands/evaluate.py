@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma evaluate``: a result against a reference, in the scores of the field."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from groma._counted import counted
+from groma.cli.shared import options as _options
+from groma.cli.shared import output as _output
+from groma.cli.shared.console import Console
+from groma.cli.shared.input import check_inputs
+from groma.errors import InputError
+
+# As groma.io.trajectories and groma.evaluation.trajectory have them; not imported, because they load NumPy.
+_Format = Literal["auto", "tum", "kitti", "euroc"]
+_Alignment = Literal["se3", "sim3", "none"]
+_StepUnit = Literal["frames", "metres", "seconds"]
+
+
+def poses(
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to judge.")],
+    reference: Annotated[Path, typer.Argument(metavar="REF", help="Scene taken for true.")],
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Compare the camera poses of two scenes after similarity alignment; images are matched by name."""
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_json(json_target, force)
+    check_inputs(estimate, reference)
+
+    from groma.evaluation.poses import evaluate_poses
+    from groma.io import read_scene
+
+    scores = evaluate_poses(read_scene(estimate), read_scene(reference))
+    console.say(f"{counted(scores.num_images, 'images')} in both, after similarity alignment")
+    if scores.num_missing:
+        missing = counted(scores.num_missing, "images")
+        console.warn(
+            f"{missing} of the reference {'is' if scores.num_missing == 1 else 'are'} missing in the estimate."
+        )
+    if scores.num_images < 3:
+        console.warn("The alignment takes the centres of one or two images onto each other, whatever their poses.")
+    console.say(f"  camera centres   {scores.center_rmse:.6g} rms, in units of the reference")
+    console.say(f"  rotations        {scores.rotation_deg_mean:.4g} deg mean, {scores.rotation_deg_max:.4g} max")
+    areas = ", ".join(f"{value:.3f} at {degrees:g} deg" for degrees, value in scores.auc.items())
+    console.say(f"  pose error AUC   {areas}")
+    _output.write_json(json_target, scores.to_dict(), force)
+
+
+_Thresholds = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--threshold",
+        metavar="TAU",
+        help="Distance in units of REF; may be repeated. By default 1, 5 and 10 thousandths of its extent.",
+    ),
+]
+
+
+def lines(
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene or line set to judge.")],
+    reference: Annotated[
+        Path,
+        typer.Argument(
+            metavar="REF",
+            help="Scene, line set or edge graph (.npz, .npy, .txt), mesh (.ply, .obj) or points taken for true.",
+        ),
+    ],
+    threshold: _Thresholds = None,
+    align: Annotated[
+        bool, typer.Option("--align", help="First align EST to REF by the poses of images in both scenes.")
+    ] = False,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Compare 3D line segments with a reference: how much of it is covered, how much of the lines is right."""
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_json(json_target, force)
+    check_inputs(estimate, reference)
+
+    from groma.evaluation.lines import evaluate_lines, score_lines
+    from groma.io import read_scene
+    from groma.io.reference import read_reference
+
+    if align:
+        scores = evaluate_lines(read_scene(estimate), read_scene(reference), threshold, align=True)
+    else:
+        scores = score_lines(read_reference(estimate).segments, read_reference(reference), threshold)
+    lines_there = counted(scores.num_lines, "lines")
+    console.say(f"{lines_there}, {scores.length:.6g} long; reference {scores.reference_length:.6g} long")
+    if scores.num_lines == 0:
+        console.warn(f"{estimate} holds no lines.")
+    console.say("  threshold  recall of length  precision: lines  lines 90 %   length   length found")
+    for tau, recall in scores.recall_length.items():
+        shares = [recall, scores.precision_count[tau], scores.precision_strict[tau], scores.precision_length[tau]]
+        row = "  ".join(_percent(share, width) for share, width in zip(shares, (14, 14, 8, 6), strict=True))
+        console.say(f"  {tau:9.4g}  {row}  {scores.inlier_length[tau]:13.6g}")
+    _output.write_json(json_target, scores.to_dict(), force)
+
+
+def planes(
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to judge.")],
+    reference: Annotated[
+        Path,
+        typer.Argument(metavar="REF", help="Scene with planes, or points (.ply, .obj, .npy, .npz) taken for true."),
+    ],
+    threshold: _Thresholds = None,
+    max_angle: Annotated[
+        float, typer.Option("--max-angle", metavar="DEG", help="Largest angle between planes that match.")
+    ] = 10.0,
+    max_offset: Annotated[
+        float | None,
+        typer.Option("--max-offset", metavar="D", help="Largest offset of planes that match; by default 1 % of REF."),
+    ] = None,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Compare planes with reference planes (angles and offsets of matches) or with points (share explained)."""
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_json(json_target, force)
+    check_inputs(estimate, reference)
+
+    from groma.evaluation.planes import evaluate_planes, score_planes_by_points
+    from groma.io import read_scene
+    from groma.io.reference import holds_scene, read_reference
+
+    scene = read_scene(estimate)
+    if scene.num_planes == 0:
+        console.warn(f"{estimate} holds no planes.")
+    if holds_scene(reference):
+        if threshold is not None:
+            raise InputError("--threshold is for a reference of points. For planes pass --max-angle and --max-offset.")
+        found = evaluate_planes(scene, read_scene(reference), max_angle, max_offset)
+        planes_there = counted(found.num_planes, "planes")
+        console.say(f"{len(found.matches):,} of {planes_there} match {found.num_reference:,} of the reference")
+        console.say(f"  precision   {_percent(found.precision)}, recall {_percent(found.recall)}")
+        if len(found.matches):
+            console.say(f"  normals     {found.normal_deg_mean:.4g} deg mean, {found.normal_deg_max:.4g} max")
+            console.say(
+                f"  offsets     {found.offset_mean:.4g} mean, {found.offset_max:.4g} max, in units of the reference"
+            )
+        _output.write_json(json_target, found.to_dict(), force)
+        return
+    shares = score_planes_by_points(scene.planes.hesse, read_reference(reference).surface_points(), threshold)
+    console.say(f"{counted(shares.num_planes, 'planes')}, {counted(shares.num_points, 'points')}")
+    for tau, share in shares.inlier_share.items():
+        console.say(f"  {tau:9.4g}  {100 * share:5.1f} % of the points, {shares.inlier_rmse[tau]:.4g} rms")
+    _output.write_json(json_target, shares.to_dict(), force)
+
+
+def trajectory(
+    estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory to judge.")],
+    reference: Annotated[Path, typer.Argument(metavar="REF", help="Trajectory taken for true.")],
+    format: Annotated[_Format, typer.Option("--format", help="Format of both files; .gz is unpacked.")] = "auto",
+    align: Annotated[_Alignment, typer.Option("--align", help="Alignment of EST to REF; sim3 for monocular.")] = "se3",
+    max_time_difference: Annotated[
+        float, typer.Option("--max-time-difference", metavar="S", help="Largest difference of associated times, s.")
+    ] = 0.01,
+    rpe_delta: Annotated[float, typer.Option("--rpe-delta", metavar="D", help="Step of the relative errors.")] = 1.0,
+    rpe_unit: Annotated[_StepUnit, typer.Option("--rpe-unit", help="Unit of the step.")] = "frames",
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Compare a trajectory with a reference: absolute and relative errors, and drift; poses are matched by time."""
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_json(json_target, force)
+    check_inputs(estimate, reference)
+
+    from groma.evaluation.trajectory import Spread, score_trajectory
+    from groma.io import read_trajectory
+
+    def row(name: str, spread: Spread, unit: str) -> None:
+        console.say(
+            f"  {name:20s} {spread.rmse:10.6g} rms {spread.mean:10.6g} mean {spread.median:10.6g} median "
+            f"{spread.max:10.6g} max  {unit}"
+        )
+
+    scores = score_trajectory(
+        read_trajectory(estimate, format),
+        read_trajectory(reference, format),
+        align,
+        max_time_difference,
+        rpe_delta,
+        rpe_unit,
+    )
+    applied = {"se3": "rotation and translation", "sim3": f"similarity of scale {scores.similarity.scale:.6g}"}
+    console.say(
+        f"{counted(scores.num_poses, 'poses')} associated of {scores.num_estimate:,} and {scores.num_reference:,}, "
+        f"path of {scores.path_length:.6g} m; alignment: {applied.get(align, 'none')}"
+    )
+    step = f"{rpe_delta:g} {rpe_unit.removesuffix('s') if rpe_delta == 1 else rpe_unit}"
+    row("absolute, position", scores.ate, "m")
+    row("absolute, rotation", scores.rotation_deg, "deg")
+    if scores.rpe_translation is None or scores.rpe_rotation_deg is None:
+        console.warn(f"No two associated poses are {step} apart; there are no relative errors.")
+    else:
+        row("relative, position", scores.rpe_translation, f"m per {step}")
+        row("relative, rotation", scores.rpe_rotation_deg, f"deg per {step}")
+    if scores.drift_percent is not None:
+        console.say(
+            f"  drift                {scores.drift_percent:10.6g} %   {scores.drift_deg_per_metre:10.6g} deg/m, "
+            f"mean over segments of {scores.segment_lengths[0]:.4g} to {scores.segment_lengths[-1]:.4g} m"
+        )
+    _output.write_json(json_target, scores.to_dict(), force)
+
+
+def _percent(share: float, width: int = 0) -> str:
+    """A share in percent; a dash where there is nothing to have a share of."""
+    return f"{100 * share:{width}.1f} %" if share == share else f"{'–':>{width}} %"

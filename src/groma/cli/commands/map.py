@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma map``: points, lines and planes from photographs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from groma.cli.shared import options as _options
+from groma.errors import InputError
+
+
+def map_(
+    images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of photographs, and of folders of them.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="OUT", help="Folder for the results."),
+    ],
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "--model",
+            metavar="MODEL",
+            help="Poses, cameras and points: a COLMAP model, an archive (.npz) or the OUT of a map. Without it they "
+            "are reconstructed.",
+        ),
+    ] = None,
+    camera_model: Annotated[
+        str, typer.Option(metavar="NAME", help="Without --model: lens model to estimate, by COLMAP's name.")
+    ] = "SIMPLE_RADIAL",
+    camera_params: Annotated[
+        str | None,
+        typer.Option(metavar="F,CX,CY,...", help="Without --model: the calibration, if it is known; it is then kept."),
+    ] = None,
+    line_matches: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="NPZ", help="Segments and their matches from elsewhere; the documentation has the layout."
+        ),
+    ] = None,
+    min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
+    planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
+    refine_poses: Annotated[
+        bool, typer.Option("--refine-poses/--fix-poses", help="Move the cameras too, or the landmarks alone.")
+    ] = True,
+    refine_intrinsics: Annotated[
+        bool, typer.Option("--refine-intrinsics/--fix-intrinsics", help="Estimate the calibration too.")
+    ] = False,
+    refine_points: Annotated[
+        bool, typer.Option("--refine-points/--keep-points", help="Measure the points of the model again in the images.")
+    ] = False,
+    diagnosis: Annotated[
+        bool | None,
+        typer.Option(
+            "--diagnosis/--no-diagnosis", help="Say what the data do not determine. Default: yes up to 300 images."
+        ),
+    ] = None,
+    contributions: _options.Contributions = False,
+    truth: _options.Truth = None,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    seed: _options.Seed = 0,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Map photographs: points, lines and planes, adjusted together.
+
+    OUT then holds a COLMAP model with the lines and planes beside it (structures/), scene.npz, lines and planes as PLY
+    and OBJ, summary.json and report.html. Finished stages are kept in OUT.work until the end: after an interruption the
+    same command goes on from there.
+    """
+    from groma.cli.shared import output as _output
+    from groma.cli.shared.console import Console
+    from groma.cli.shared.input import check_inputs
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_outputs(force, output, json_target=json_target)
+    check_inputs(images, model, line_matches, truth)
+
+    if model is not None and (camera_params is not None or camera_model != "SIMPLE_RADIAL"):
+        raise InputError("--camera-model and --camera-params are for images without a model. Leave them out.")
+
+    if truth is not None and not contributions:
+        raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
+
+    from groma.cli.shared.mapping import map_and_write
+    from groma.features.external import read_matches
+    from groma.io import read_scene
+    from groma.mapping.map import MapOptions
+
+    options = MapOptions(
+        min_segment_length=min_length,
+        find_planes=planes,
+        refine_points=refine_points,
+        refine_poses=refine_poses,
+        refine_intrinsics=refine_intrinsics,
+        camera_model=camera_model,
+        camera_params=_parameters(camera_params),
+        threads=threads,
+        seed=seed,
+    )
+    numbers = map_and_write(
+        console,
+        images,
+        output,
+        read_scene(model) if model is not None else None,
+        options,
+        force,
+        f"Map of {images.absolute().name}",
+        line_matches=read_matches(line_matches) if line_matches is not None else None,
+        diagnose=diagnosis,
+        contributions=contributions,
+        truth=read_scene(truth) if truth is not None else None,
+    )
+    console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
+    _output.write_json(json_target, numbers, force)
+
+
+def _parameters(text: str | None) -> tuple[float, ...] | None:
+    """Camera parameters from numbers with commas between them."""
+    if text is None:
+        return None
+    try:
+        return tuple(float(number) for number in text.split(","))
+    except ValueError:
+        raise InputError(f"--camera-params must be numbers with commas between them; got {text!r}.") from None

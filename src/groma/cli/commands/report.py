@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma report``: a scene as one HTML file that opens anywhere."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from groma.cli.shared import options as _options
+
+
+def report(
+    source: _options.Input,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The HTML file.")] = Path(
+        "report.html"
+    ),
+    images: Annotated[
+        Path | None,
+        typer.Option("--images", metavar="DIR", help="Folder of the photographs, with what was measured in them."),
+    ] = None,
+    before: Annotated[
+        Path | None, typer.Option(metavar="SCENE", help="The same scene before adjustment, to compare with.")
+    ] = None,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Write a self-contained HTML page of a scene: 3D view, photographs, residuals, numbers. It needs no network.
+
+    For the folder of a finished map the page also says how the adjustment went and what became of the segments.
+    """
+    from groma.cli.shared import output as _output
+    from groma.cli.shared.console import Console
+    from groma.cli.shared.input import check_inputs
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_outputs(force, output, json_target=json_target, file=True)
+    check_inputs(source, images, before)
+
+    from groma.cli.shared.counts import counts_of
+    from groma.errors import InputError
+    from groma.io import read_scene
+    from groma.viz.pictures import image_file
+    from groma.viz.report.page import write_report
+    from groma.viz.report.saved import saved_report
+
+    if images is not None and not images.is_dir():
+        raise InputError(f"{images} is not a folder of images. Check --images.")
+    scene = read_scene(source)
+    earlier = read_scene(before) if before is not None else None
+    if images is not None and scene.num_images and not any(image_file(images, name) for name in scene.images.names):
+        console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[0]!r}.")
+    saved = saved_report(source) if source.is_dir() else None
+    with _output.atomic_output(output, force) as draft:
+        write_report(
+            draft,
+            earlier,
+            scene,
+            saved,
+            images,
+            title=source.absolute().name,
+            fates=saved.fates if saved is not None else None,
+            explanation=saved.explanation if saved is not None else "",
+        )
+    console.say(f"Wrote {output}")
+    _output.write_json(json_target, {"output": str(output), **counts_of(scene)}, force)

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma selfcheck``: every derivative, and the covariances, checked on this machine."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from groma._counted import counted
+from groma.cli.shared import options as _options
+from groma.errors import InputError
+
+if TYPE_CHECKING:
+    from groma.cli.shared.console import Console
+
+
+def selfcheck(
+    golden: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder of reference values (*.json) to compare with as well."),
+    ] = None,
+    nees: Annotated[
+        bool,
+        typer.Option("--nees", help="Check covariances instead: errors of simulated scenes against what they predict."),
+    ] = False,
+    runs: Annotated[
+        int, typer.Option(min=2, metavar="N", help="Scenes simulated with --nees, for either gauge.")
+    ] = 100,
+    seed: _options.Seed = 0,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Compare the analytic derivatives of every factor with numeric ones, and with reference values.
+
+    Prints the worst deviation per factor and block. With --nees, simulates scenes of known noise and prints how the
+    errors of poses, points, lines, planes, directions and intrinsics compare with their covariances. Exit code 1 if
+    something is too large.
+    """
+    from groma.cli.shared import output as _output
+    from groma.cli.shared.console import Console
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_json(json_target, force)
+    if golden is not None and not golden.is_dir():
+        raise InputError(f"--golden must be a folder of reference values; there is none at {golden}. Check the path.")
+    console.announce_compilation()
+    passed, numbers = _check_covariances(console, runs, seed) if nees else _check_derivatives(console, golden, seed)
+    _output.write_json(json_target, numbers, force)
+    if not passed:
+        raise typer.Exit(1)
+
+
+def _check_derivatives(console: "Console", golden: Path | None, seed: int) -> tuple[bool, dict[str, Any]]:
+    from groma.factors.checks.selfcheck import selfcheck as run_selfcheck
+
+    outcome = run_selfcheck(golden, seed)
+    console.say(f"{'factor':<28}{'block':<34}{'against':<12}{'cases':>6}{'worst / allowed':>18}")
+    for row in outcome.rows:
+        mark = "" if row.passed else "   FAILED"
+        console.say(f"{row.factor:<28}{row.block:<34}{row.against:<12}{row.cases:>6}{row.worst:>18.2e}{mark}")
+    failures = sum(not row.passed for row in outcome.rows)
+    console.say(f"{counted(len(outcome.rows), 'comparisons')}, {failures:,} failed.")
+    return outcome.passed, outcome.to_dict()
+
+
+def _check_covariances(console: "Console", runs: int, seed: int) -> tuple[bool, dict[str, Any]]:
+    from groma.adjustment.consistency import consistency
+
+    outcome = consistency(runs, seed)
+    console.say("Normalised estimation error squared: its average should be the degrees of freedom.")
+    console.say(f"{'gauge':<8}{'kind':<12}{'expected':>9}{'average':>9}{'95 % band':>19}{'errors':>9}")
+    for row in outcome.rows:
+        mark = "" if row.inside else "   outside" if row.passed else "   FAILED"
+        band = f"{row.low:.3f} .. {row.high:.3f}"
+        console.say(f"{row.gauge:<8}{row.kind:<12}{row.dof:>9}{row.average:>9.3f}{band:>19}{row.count:>9}{mark}")
+    inside = sum(row.inside for row in outcome.rows)
+    failures = sum(not row.passed for row in outcome.rows)
+    console.say(
+        f"{inside} of {len(outcome.rows)} averages are in their band (1 in 20 is not, by chance); {failures} failed."
+    )
+    return outcome.passed, outcome.to_dict()

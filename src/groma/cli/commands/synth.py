@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma synth``: synthetic scenes with exact truth."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from groma.cli.shared import options as _options
+
+Kind = Literal["holistic", "corridor"]
+
+
+def synth(
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for truth.npz and start.npz (made anew).")
+    ],
+    kind: Annotated[
+        Kind,
+        typer.Option(help="holistic: cameras on a sphere look into a cube of points, lines, planes. corridor: a walk."),
+    ] = "holistic",
+    cameras: Annotated[int, typer.Option("--cameras", "-n", min=2, metavar="N", help="Number of cameras.")] = 50,
+    noise: Annotated[
+        float | None,
+        typer.Option(min=0.0, metavar="PX", help="Noise of the measurements, pixels. Default: 1; in a corridor 0.5."),
+    ] = None,
+    seed: _options.Seed = 0,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Make a scene of points, lines and planes whose exact truth is known.
+
+    truth.npz holds the exact scene with noisy measurements; start.npz the same scene with perturbed cameras and
+    landmarks, as an adjustment would meet it.
+    """
+    from groma.cli.shared import output as _output
+    from groma.cli.shared.console import Console
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_outputs(force, output, json_target=json_target)
+
+    from groma.cli.shared.counts import counts_of, sentence_of
+    from groma.io import write_scene
+    from groma.scene import synthetic
+
+    make = synthetic.holistic if kind == "holistic" else synthetic.corridor
+    made = make(cameras, seed=seed) if noise is None else make(cameras, seed=seed, noise_px=noise)
+    with _output.atomic_output(output, force) as draft:
+        draft.mkdir()
+        write_scene(made.truth, draft / "truth.npz")
+        write_scene(made.start, draft / "start.npz")
+    console.say(f"Wrote {output / 'truth.npz'} and {output / 'start.npz'}: {sentence_of(made.truth)}")
+    _output.write_json(
+        json_target, {"kind": kind, "seed": seed, "noise_px": made.noise_px, **counts_of(made.truth)}, force
+    )

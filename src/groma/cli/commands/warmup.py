@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma warmup``: compile everything once, so that no later command waits for the compiler."""
+
+from typing import Annotated, Any
+
+import typer
+
+from groma._counted import counted
+from groma.cli.shared import options as _options
+
+
+def warmup(
+    parts: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[adjust|map|track]...", help="What to compile for; everything if left out."),
+    ] = None,
+    again: Annotated[bool, typer.Option("--again", help="Run even if everything is there.")] = False,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Compile and keep what groma adjust, groma map and groma track need on this machine.
+
+    Small scenes are adjusted, mapped and tracked, and what is compiled on the way is kept on disk: in NUMBA_CACHE_DIR
+    if that is set, else beside the sources, else (where those cannot be written) in the user's cache folder. Useful
+    after an installation, an upgrade or a change of the processor, and when an image of a machine is built.
+    """
+    from groma.cli.shared import output as _output
+    from groma.cli.shared.console import Console
+    from groma.errors import InputError, OutputError
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_json(json_target, force)
+
+    import time
+
+    begin = time.perf_counter()
+    from groma.cli.shared import warmup as _warmup
+
+    wanted = tuple(name for name in _warmup.PARTS if name in (parts or _warmup.PARTS))
+    if unknown := {*(parts or ())} - {*_warmup.PARTS}:
+        raise InputError(f"There is nothing to compile for {', '.join(sorted(unknown))}; there are "
+                         f"{', '.join(_warmup.PARTS)}.")  # fmt: skip
+    if not _warmup.place():
+        raise OutputError(
+            "No folder for compiled functions can be written, so nothing would be kept. Set NUMBA_CACHE_DIR to one."
+        )
+    missing = wanted if again else tuple(name for name in wanted if not _warmup.is_ready(name))
+    numbers: dict[str, Any] = {"parts": list(wanted), "compiled": 0, "loaded": 0, "unsaved": 0}
+    if missing:
+        with console.stages() as progress:
+            numbers |= _warmup.run(missing, progress)
+    numbers |= {"seconds": time.perf_counter() - begin, "folder": _warmup.place()}
+    for sentence in _sentences(numbers, bool(missing)):
+        console.say(sentence)
+    if numbers["unsaved"]:
+        console.warn(f"{counted(numbers['unsaved'], 'functions')} could not be written; is the disk full?")
+    _output.write_json(json_target, numbers, force)
+    if numbers["unsaved"]:
+        raise typer.Exit(1)
+
+
+def _sentences(numbers: dict[str, Any], ran: bool) -> list[str]:
+    parts = ", ".join(numbers["parts"])
+    if not ran:
+        return [f"Everything is there for {parts} ({numbers['seconds']:.1f} s).", f"Folder: {numbers['folder']}"]
+    return [
+        f"Compiled {counted(numbers['compiled'], 'functions')} for {parts} in {numbers['seconds']:.1f} s; "
+        f"{numbers['loaded']:,} were there.",
+        f"Folder: {numbers['folder']}",
+    ]

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What commands share: text, progress, interruption, whole or no output."""

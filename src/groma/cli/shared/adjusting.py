@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Adjusting a scene as a command does it: run the adjustment, write what is wanted, say what came out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from groma.cli.shared import output as _output
+from groma.errors import ProblemError
+
+if TYPE_CHECKING:
+    from groma.adjustment.adjust import AdjustOptions, AdjustResult
+    from groma.cli.shared.console import Console
+    from groma.scene import Scene
+
+CovarianceGauge = Literal["auto", "inner", "held"]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What comes out of ``groma adjust``; None and False stand for what is not wanted."""
+
+    #: Places of the adjusted scene, of the page and of the covariances.
+    output: Path | None = None
+    page: Path | None = None
+    covariance: Path | None = None
+    #: What the covariances refer to, and the noise in units of that stated.
+    gauge: CovarianceGauge = "auto"
+    sigma0: float = 1.0
+    #: Say what the data determine; None: unless there are many images.
+    diagnosis: bool | None = None
+    #: Adjust with fewer kinds of landmarks, too, and compare with the poses of a scene.
+    contributions: bool = False
+    truth: Path | None = None
+    #: Value of --json, and whether files may be replaced.
+    json_target: str | None = None
+    force: bool = False
+
+
+def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wanted: Wanted) -> None:
+    """Adjust the scene in a file, write what is wanted and say how it went.
+
+    Raises
+    ------
+    ProblemError
+        If covariances are wanted that do not exist, after everything else was written and said.
+    """
+    from groma.adjustment.adjust import adjust
+    from groma.adjustment.diagnosis import diagnose_scene
+    from groma.cli.shared.compilation import compilation_time
+    from groma.cli.shared.diagnosis import diagnosis_of, why_steps_ran_out
+    from groma.io import check_target, read_scene, structures_of, write_scene
+
+    before = read_scene(source)
+    if wanted.output is not None:
+        check_target(before, wanted.output)
+    true = None if wanted.truth is None else read_scene(wanted.truth)
+    console.announce_compilation()
+    with compilation_time() as compilation, console.progress() as progress:
+        result = adjust(before, options, progress)
+    numbers: dict[str, Any] = result.report.to_dict()
+    numbers["seconds"]["compilation"] = compilation.seconds
+    if wanted.contributions:
+        from groma.adjustment.contributions import contributions
+
+        numbers["contributions"] = [entry.to_dict() for entry in contributions(before, options, true)]
+    numbers["diagnosis"] = diagnosis_of(
+        result.scene, lambda: diagnose_scene(result.scene, problem=result.problem), console, wanted.diagnosis
+    )
+    numbers["warnings"] = [*result.report.warnings, *why_steps_ran_out(numbers)]
+
+    if wanted.output is not None:
+        write_scene(result.scene, wanted.output, force=wanted.force, like=structures_of(source))
+    if wanted.page is not None:
+        _write_page(wanted.page, before, result, numbers, f"Adjustment of {source.absolute().name}", wanted.force)
+    failure = None
+    if wanted.covariance is not None:
+        try:
+            numbers["uncertainty"] = _write_covariances(wanted.covariance, result, wanted)
+        except ProblemError as error:  # raised at the end, when all else is written and said
+            failure = error
+    _say(console, numbers, compilation.compiled)
+    for path in (wanted.output, wanted.page, wanted.covariance if failure is None else None):
+        if path is not None:
+            console.say(f"Wrote {path}")
+    if all(place is None for place in (wanted.output, wanted.page, wanted.covariance, wanted.json_target)):
+        console.say("No -o given: the adjusted scene was not written.")
+    _output.write_json(wanted.json_target, numbers, wanted.force)
+    if failure is not None:
+        raise failure
+
+
+def _say(console: Console, numbers: dict[str, Any], compiled: bool) -> None:
+    """Say the main numbers, what the data do not determine, and the warnings."""
+    from groma.cli.shared.contributions import describe_contributions
+    from groma.cli.shared.diagnosis import say_diagnosis
+    from groma.cli.shared.numbers import describe, describe_uncertainty
+
+    lines = describe(numbers, numbers["termination_sentence"], verbose=console.verbose, compiled=compiled)
+    lines += describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else []
+    lines += describe_contributions(numbers.get("contributions", []))
+    for line in lines:
+        console.say(line)
+    say_diagnosis(numbers["diagnosis"], console)
+    for sentence in numbers["warnings"]:
+        console.warn(sentence)
+
+
+def _write_page(
+    page: Path, before: Scene, result: AdjustResult, numbers: dict[str, Any], title: str, force: bool
+) -> None:
+    """Write the HTML page of an adjustment."""
+    from groma.viz.report.page import write_report
+    from groma.viz.report.tables import contributions_card
+
+    with _output.atomic_output(page, force) as draft:
+        write_report(
+            draft,
+            before,
+            result.scene,
+            result.report,
+            title=title,
+            warnings=numbers["warnings"],
+            diagnosis=numbers["diagnosis"],
+            cards=contributions_card(numbers.get("contributions")),
+        )
+
+
+def _write_covariances(path: Path, result: AdjustResult, wanted: Wanted) -> dict[str, Any]:
+    """Write the covariances of an adjusted scene and return their summary."""
+    from groma.adjustment.uncertainty import uncertainty
+    from groma.cli.shared.covariance import write_covariances
+
+    found = uncertainty(result.scene, gauge=wanted.gauge, sigma0=wanted.sigma0, problem=result.problem)
+    write_covariances(path, result.scene, found, wanted.force)
+    return found.to_dict()

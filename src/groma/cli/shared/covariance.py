@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The file of ``groma adjust --covariance``: covariances as arrays (.npz), or standard deviations as text (.json).
+
+===============  =============  ======================================================================================
+Array            Shape          Content
+===============  =============  ======================================================================================
+``image_names``  (N,)           images, and in ``image_frames`` the row of each one's pose
+``poses``        (F, 6, 6)      left twist of ``cam_from_world`` or of the rig: shift, then turn
+``centers``      (F, 3, 3)      centres in the world
+``points``       (P, 3, 3)      places; ``point_ids`` names them
+``lines``        (L, 6, 6)      Plücker coordinates (m, d) with a unit direction; ``line_ids``
+``segment_ends`` (L, 2, 3, 3)   end points across their line
+``planes``       (K, 4, 4)      (n, w) with a unit normal; ``plane_ids``
+``directions``   (D, 3, 3)      unit vectors; ``direction_ids``
+``gauge``        ()             ``inner`` or ``held``, and in ``sigma0`` the factor that was applied
+===============  =============  ======================================================================================
+
+Scene units and radians; NaN where the data leave something open.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.cli.shared import output as _output
+
+if TYPE_CHECKING:
+    from groma.adjustment.uncertainty import SceneUncertainty
+    from groma.scene import Scene
+
+#: Fields of :class:`SceneUncertainty` that go into the file as they are.
+_FIELDS = ("poses", "centers", "points", "lines", "segment_ends", "planes", "directions")
+
+
+def write_covariances(path: Path, scene: Scene, found: SceneUncertainty, force: bool) -> None:
+    """Write what is known of the uncertainty of a scene; the ending of ``path`` chooses the form."""
+    if path.suffix == ".json":
+        _output.write_json(str(path), standard_deviations(scene, found), force)
+        return
+    arrays: dict[str, Any] = {name: getattr(found, name) for name in _FIELDS}
+    arrays |= {
+        "gauge": np.array(found.gauge),
+        "sigma0": np.array(found.sigma0),
+        "image_names": np.array(scene.images.names, dtype=np.str_),
+        "image_frames": np.asarray(scene.images.frame_idx),
+        **{f"{kind}_ids": np.asarray(ids) for kind, ids in _ids(scene).items()},
+    }
+    with _output.atomic_output(path, force) as draft, draft.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def standard_deviations(scene: Scene, found: SceneUncertainty) -> dict[str, Any]:
+    """Return the standard deviations of everything by its name: along x, y, z in scene units, angles in degrees."""
+    ids = _ids(scene)
+    center, turn = _sigma(found.centers), np.rad2deg(_total(found.poses[:, 3:, 3:]))
+    frames = scene.images.frame_idx
+    ends = _sigma(found.segment_ends.reshape(-1, 3, 3)).reshape(-1, 2, 3)
+    along = np.rad2deg(_total(found.lines[:, 3:, 3:]))
+    normal, offset = np.rad2deg(_total(found.planes[:, :3, :3])), _sigma(found.planes[:, 3:, 3:])[:, 0]
+    return {
+        "gauge": found.gauge,
+        "sigma0": found.sigma0,
+        "summary": found.to_dict(),
+        "images": [
+            {"name": name, "center": center[frame].tolist(), "rotation_deg": float(turn[frame])}
+            for name, frame in zip(scene.images.names, frames.tolist(), strict=True)
+        ],
+        "points": _rows(ids["point"], position=_sigma(found.points)),
+        "lines": _rows(ids["line"], ends=ends, direction_deg=along),
+        "planes": _rows(ids["plane"], normal_deg=normal, offset=offset),
+        "directions": _rows(ids["direction"], angle_deg=np.rad2deg(_total(found.directions))),
+    }
+
+
+def _ids(scene: Scene) -> dict[str, Any]:
+    kinds = {"point": scene.points, "line": scene.lines, "plane": scene.planes, "direction": scene.directions}
+    return {kind: landmarks.ids for kind, landmarks in kinds.items()}
+
+
+def _rows(ids: Any, **columns: FloatArray) -> list[dict[str, Any]]:
+    values = {name: column.tolist() for name, column in columns.items()}
+    return [{"id": int(ids[k]), **{name: column[k] for name, column in values.items()}} for k in range(len(ids))]
+
+
+def _sigma(covariance: FloatArray) -> FloatArray:
+    """Roots of the variances (N, m) of covariances (N, m, m)."""
+    return np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
+
+
+def _total(covariance: FloatArray) -> FloatArray:
+    """Roots of the summed variances (N,) of covariances (N, m, m)."""
+    return np.sqrt(np.maximum(np.einsum("nii->n", covariance), 0.0))

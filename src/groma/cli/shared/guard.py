@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Turn what a command raises into an exit code and one line; a traceback is only for errors of groma itself."""
+
+import functools
+import sys
+import warnings
+from collections.abc import Callable
+from typing import ParamSpec
+
+import typer
+
+from groma.cli.shared.interrupt import INTERRUPTED
+from groma.errors import GromaError
+
+P = ParamSpec("P")
+
+
+def guard(command: Callable[P, None]) -> Callable[P, None]:
+    """Wrap a command: known errors end in exit code 1 and one line, Ctrl-C in 130; warnings are lines, too."""
+
+    @functools.wraps(command)
+    def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            with warnings.catch_warnings():
+                if not kwargs.get("quiet"):
+                    warnings.showwarning = _show
+                    warnings.simplefilter("always", UserWarning)
+                else:
+                    warnings.simplefilter("ignore")
+                command(*args, **kwargs)
+            if sys.stdout is not None:  # a process may be started without one
+                sys.stdout.flush()
+        except KeyboardInterrupt:
+            _fail("interrupted; nothing is left half written.", INTERRUPTED)
+        except BrokenPipeError:
+            # The reader of a pipe has gone (``groma ... | head``). Nothing more can be said to it.
+            sys.stdout = None  # type: ignore[assignment]
+            raise typer.Exit(1) from None
+        except GromaError as error:
+            _fail(str(error), 1)
+        except OSError as error:
+            place = f"{error.filename}: " if error.filename else ""
+            _fail(f"{place}{error.strerror or error}", 1)
+        except MemoryError:
+            _fail("the memory of this machine is not enough for this input.", 1)
+
+    return guarded
+
+
+def _show(message: Warning | str, category: type[Warning], *_where: object) -> None:
+    """Print a warning for the user as one line; others are for developers and stay silent."""
+    if category is UserWarning:
+        print(f"warning: {message}", file=sys.stderr, flush=True)
+
+
+def _fail(message: str, code: int) -> None:
+    line = " ".join(message.split())
+    print(f"groma: {line}", file=sys.stderr, flush=True)
+    raise typer.Exit(code) from None

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Writing results: complete or not at all, and never over something that was there unless asked to."""
+
+import json
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from groma.errors import OutputError
+
+#: What the commands write into folders. A folder that holds anything else is not replaced by ``--force``.
+_RESULTS = re.compile(
+    r"(cameras|images|points3D|rigs|frames)\.(bin|txt)|structures|(scene|start|truth)\.npz|(lines|planes)\.(ply|obj)|"
+    r"summary\.json|report\.html|trajectory\.txt|part_\d+"
+)
+
+
+def check_outputs(
+    force: bool, output: Path | None, *files: Path | None, json_target: str | None = None, file: bool = False
+) -> None:
+    """Refuse early, before any work is done, places that cannot be written, or that are given twice.
+
+    Parameters
+    ----------
+    force : bool
+        What is there may be replaced.
+    output : Path, optional
+        Where the result goes, a file or a folder.
+    files : Path or None
+        Further results, which are files; None for those that are not wanted.
+    json_target : str, optional
+        Value of --json.
+    file : bool
+        ``output`` is a file, too.
+    """
+    report = None if json_target in (None, "-") else Path(json_target)
+    taken: set[Path] = set()
+    for number, path in enumerate((output, *files, report)):
+        if path is None:
+            continue
+        check_output(path, force, file=number > 0 or file)
+        if path.absolute() in taken:
+            raise OutputError(f"{path} is given for two results, and one would replace the other. Name them apart.")
+        taken.add(path.absolute())
+
+
+def check_output(path: Path, force: bool, file: bool = False) -> None:
+    """Refuse early, before any work is done, what :func:`atomic_output` would refuse at the end.
+
+    Parameters
+    ----------
+    path : Path
+        Where a result goes.
+    force : bool
+        What is there may be replaced, if groma wrote it.
+    file : bool
+        The result is a file: it never replaces a folder.
+    """
+    parent = path.absolute().parent
+    if not parent.is_dir():
+        raise OutputError(f"Cannot write {path}: the folder {parent} does not exist. Make it first.")
+    try:
+        tempfile.TemporaryDirectory(prefix=".groma.", dir=parent).cleanup()
+    except OSError as error:
+        raise OutputError(
+            f"Cannot write {path}: nothing can be made in the folder {parent} ({error.strerror or error}). Choose "
+            "another place."
+        ) from error
+    if not (path.exists() or path.is_symlink()):
+        return
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OutputError(f"{path} is a device or a pipe, not a file. Pass a file name; --json - is standard output.")
+    if file and path.is_dir():
+        raise OutputError(f"{path} is a folder. Pass the name of a file.")
+    if not force:
+        raise OutputError(f"{path} exists already. Pass --force to replace it, or choose another name.")
+    if path.is_dir():
+        foreign = sorted(entry.name for entry in path.iterdir() if not _RESULTS.fullmatch(entry.name))
+        if foreign:
+            raise OutputError(
+                f"{path} holds {foreign[0]!r}, which groma did not write; --force does not replace such a folder. "
+                "Choose another name."
+            )
+
+
+@contextmanager
+def atomic_output(path: Path, force: bool, workshop_in: Path | None = None) -> Iterator[Path]:
+    """Yield a place to write a file or folder to; it becomes ``path`` when the block ends well, else it vanishes.
+
+    It is built in ``workshop_in`` (default: beside ``path``).
+    """
+    from groma.io.atomic import atomic_output as complete_or_not_at_all
+
+    check_output(path, force)
+    with complete_or_not_at_all(path, force, workshop_in) as draft:
+        yield draft
+
+
+def check_json(target: str | None, force: bool) -> None:
+    """Refuse a report that could not be written, before any work is done."""
+    if target not in (None, "-"):
+        check_output(Path(target), force, file=True)
+
+
+def write_json(target: str | None, content: dict[str, object], force: bool = False) -> None:
+    """Write ``content`` to the file ``target``, to standard output when it is '-', nowhere when it is None.
+
+    Numbers that are not finite become null, which every JSON reader accepts.
+    """
+    if target is None:
+        return
+    text = json.dumps(plain(content), indent=2, allow_nan=False) + "\n"
+    if target == "-":
+        print(text, end="", flush=True)
+        return
+    with atomic_output(Path(target), force) as draft:
+        draft.write_text(text, encoding="utf-8")
+
+
+def plain(value: object) -> object:
+    """Turn NumPy numbers and arrays, enumerations and paths into what JSON knows; not-finite numbers into None."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, (str, bool, int)) or value is None:
+        return value
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())  # type: ignore[attr-defined]
+    if isinstance(value, float):
+        return value if value - value == 0 else None
+    return str(value)

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Factors that hold variables without an image: measured poses, motions between them, positions, parameters."""

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""A camera centre is known: GNSS, a surveyed station.
+
+.. math:: r = c - \tilde c, \qquad c = -R^\top t, \qquad
+          \frac{\partial r}{\partial (\rho, \omega)} = \left[ -R^\top,\; 0 \right]
+
+for the pose ``cam_from_world`` = (R, t) and its left increment. The residual is in the world frame, in scene units.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from groma._numba import loop
+from groma._typing import FloatArray
+from groma.factors._examples import indices, make_example
+from groma.factors._record import set_rows
+from groma.factors.contract import Example, Factor, Ref, Slot, register
+
+
+# ------------------------------------------------------------------------------------------------------------ Kernels
+@loop
+def _linearize_all(poses, positions, index, begin, end, column, record):
+    last = record.shape[2] - 1
+    for i in range(begin, end):
+        T, row = poses[index[i]], record[i - begin]
+        for j in range(3):
+            row[j, last] = -(T[j] * T[3] + T[4 + j] * T[7] + T[8 + j] * T[11]) - positions[i, j]
+            if column >= 0:
+                for k in range(3):
+                    row[j, column + k] = -T[4 * k + j]
+                    row[j, column + 3 + k] = 0.0
+    return 0
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
+@register("position_prior")
+@dataclass(frozen=True, kw_only=True)
+class PositionPrior(Factor):
+    """Known camera centres; residual in scene units, world frame."""
+
+    #: The poses, cam_from_world.
+    pose: Ref
+    #: (N, 3) measured camera centres in the world.
+    cam_center_in_world: FloatArray
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("pose", "pose"),)
+
+    def __post_init__(self) -> None:
+        set_rows(self, "cam_center_in_world", 3)
+
+    @property
+    def residual_size(self) -> int:  # noqa: D102
+        return 3
+
+    def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
+        return ambients[0], self.cam_center_in_world
+
+    def linearize(  # noqa: D102
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        poses, positions = inputs
+        return _linearize_all(poses, positions, self.pose.index, begin, end, columns[0], record)
+
+    @classmethod
+    def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
+        return make_example(cls(pose=Ref("poses", indices(rng, 4)), cam_center_in_world=rng.normal(size=(6, 3))), rng)

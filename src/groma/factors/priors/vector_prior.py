@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Numbers are known: a surveyed point, the intrinsics of a calibration.
+
+.. math:: r = x - \tilde x, \qquad \frac{\partial r}{\partial x} = I
+
+for any variable that moves by addition (a point, intrinsics, a vector). For poses there are
+:mod:`groma.factors.priors.pose_prior` and :mod:`groma.factors.priors.position_prior`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.errors import ShapeError
+from groma.factors._examples import indices, make_example
+from groma.factors.contract import Example, Factor, Ref, Slot, register
+from groma.geometry.manifold import Euclidean
+
+
+@register("vector_prior")
+@dataclass(frozen=True, kw_only=True)
+class VectorPrior(Factor):
+    """Known values of points, intrinsics or other plain numbers; residual in their units."""
+
+    #: The variables.
+    variable: Ref
+    #: (N, k) measured values, k being the size of the variables.
+    measured: FloatArray
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("variable", "vector"),)
+
+    def __post_init__(self) -> None:
+        measured = np.ascontiguousarray(self.measured, dtype=np.float64)
+        if measured.ndim != 2 or len(measured) != len(self):
+            raise ShapeError(
+                f"VectorPrior.measured must have shape ({len(self)}, k), one row for each index; got {measured.shape}."
+            )
+        object.__setattr__(self, "measured", measured)
+
+    @property
+    def residual_size(self) -> int:  # noqa: D102
+        return self.measured.shape[1]
+
+    def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
+        if ambients[0].shape[1] != self.residual_size:
+            raise ShapeError(
+                f"VectorPrior.measured has {self.residual_size} columns, but the variables of group "
+                f"{self.variable.group!r} have {ambients[0].shape[1]} numbers. Pass one value for each number."
+            )
+        return ambients
+
+    def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:  # noqa: D102
+        np.subtract(inputs[0][self.variable.index[begin:end]], self.measured[begin:end], out=out)
+        return 0
+
+    def linearize(  # noqa: D102
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        self.residuals(inputs, begin, end, record[:, :, -1])
+        if columns[0] >= 0:
+            record[:, :, columns[0] : columns[0] + self.residual_size] = np.eye(self.residual_size)
+        return 0
+
+    @classmethod
+    def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
+        factor = cls(variable=Ref("vectors", indices(rng, 4)), measured=rng.normal(size=(6, 5)))
+        return make_example(factor, rng, manifolds={"vectors": Euclidean(5)})

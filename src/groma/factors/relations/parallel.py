@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Two directions are parallel.
+
+Of a line the direction d takes part, of a plane the normal n, and a vanishing direction is one itself. With unit
+vectors
+
+.. math:: r = \hat d_1 \times \hat d_2, \quad
+          \frac{\partial r}{\partial d_1} = -[\hat d_2]_\times \frac{I - \hat d_1 \hat d_1^\top}{\lVert d_1\rVert},
+          \quad
+          \frac{\partial r}{\partial d_2} = [\hat d_1]_\times \frac{I - \hat d_2 \hat d_2^\top}{\lVert d_2\rVert} .
+
+:math:`\lVert r\rVert` is the sine of the angle. Three rows of rank two, smooth everywhere; zero for opposite
+directions too, so the orientation of a line or a plane does not matter. Lines parallel to a vanishing direction have a
+file of their own, :mod:`groma.factors.relations.line_direction`; a line parallel to a *plane* is a case of
+:mod:`groma.factors.relations.orthogonal`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from groma._numba import kernel, loop
+from groma._typing import FloatArray
+from groma.factors._examples import indices, make_example
+from groma.factors._record import put_residual
+from groma.factors.contract import Example, Factor, Ref, Slot, register
+from groma.geometry.manifold import FACTOR_COLUMNS
+
+#: Where the direction starts in the numbers of each kind.
+DIRECTION_OFFSET = {"line": 3, "plane": 0, "direction": 0}
+
+
+# ------------------------------------------------------------------------------------------------------------ Kernels
+@kernel
+def put_direction_block(J, record, column, size, offset):
+    """Write a block of ``size`` columns that is zero except for ``J`` (m, 3) at ``offset``."""
+    if column >= 0:
+        for i in range(J.shape[0]):
+            for j in range(size):
+                record[i, column + j] = 0.0
+            for j in range(3):
+                record[i, column + offset + j] = J[i, j]
+
+
+@kernel
+def _linearize(d1, d2, r, J_first, J_second):
+    k1 = d1[0] * d1[0] + d1[1] * d1[1] + d1[2] * d1[2]
+    k2 = d2[0] * d2[0] + d2[1] * d2[1] + d2[2] * d2[2]
+    if not (k1 > 1e-200 and k2 > 1e-200):
+        return False
+    k1, k2 = 1.0 / math.sqrt(k1), 1.0 / math.sqrt(k2)
+    a0, a1, a2 = d1[0] * k1, d1[1] * k1, d1[2] * k1
+    b0, b1, b2 = d2[0] * k2, d2[1] * k2, d2[2] * k2
+    r[0], r[1], r[2] = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    # -[b] (I - a aᵀ) = -[b] - r aᵀ, as [b] a = -r; and [a] (I - b bᵀ) = [a] - r bᵀ
+    J_first[0, 0], J_first[0, 1], J_first[0, 2] = 0.0, b2, -b1
+    J_first[1, 0], J_first[1, 1], J_first[1, 2] = -b2, 0.0, b0
+    J_first[2, 0], J_first[2, 1], J_first[2, 2] = b1, -b0, 0.0
+    J_second[0, 0], J_second[0, 1], J_second[0, 2] = 0.0, -a2, a1
+    J_second[1, 0], J_second[1, 1], J_second[1, 2] = a2, 0.0, -a0
+    J_second[2, 0], J_second[2, 1], J_second[2, 2] = -a1, a0, 0.0
+    for i in range(3):
+        J_first[i, 0] = (J_first[i, 0] - r[i] * a0) * k1
+        J_first[i, 1] = (J_first[i, 1] - r[i] * a1) * k1
+        J_first[i, 2] = (J_first[i, 2] - r[i] * a2) * k1
+        J_second[i, 0] = (J_second[i, 0] - r[i] * b0) * k2
+        J_second[i, 1] = (J_second[i, 1] - r[i] * b1) * k2
+        J_second[i, 2] = (J_second[i, 2] - r[i] * b2) * k2
+    return True
+
+
+@loop
+def _linearize_all(variables, indices, layout, begin, end, columns, record):
+    sizes, offsets = layout
+    r, J_first, J_second = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    degenerate = 0
+    for i in range(begin, end):
+        first = variables[0][indices[0][i], offsets[0] : offsets[0] + 3]
+        second = variables[1][indices[1][i], offsets[1] : offsets[1] + 3]
+        if not _linearize(first, second, r, J_first, J_second):
+            r[:], J_first[:], J_second[:] = 0.0, 0.0, 0.0
+            degenerate += 1
+        put_direction_block(J_first, record[i - begin], columns[0], sizes[0], offsets[0])
+        put_direction_block(J_second, record[i - begin], columns[1], sizes[1], offsets[1])
+        put_residual(r, record[i - begin])
+    return degenerate
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
+@dataclass(frozen=True, kw_only=True)
+class DirectionPair(Factor):
+    """Two variables that each have a direction; the base of the parallel and orthogonal factors.
+
+    Subclasses declare two slots of kind line, plane or direction.
+    """
+
+    @property
+    def _sizes(self) -> tuple[int, int]:
+        return tuple(FACTOR_COLUMNS[slot.kind] for slot in self.slots)  # type: ignore[return-value]
+
+    @property
+    def _offsets(self) -> tuple[int, int]:
+        return tuple(DIRECTION_OFFSET[slot.kind] for slot in self.slots)  # type: ignore[return-value]
+
+    @classmethod
+    def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102
+        # Groups of their own, so that no direction is paired with itself.
+        refs: dict[str, Any] = {slot.name: Ref(slot.name, indices(rng, 4)) for slot in cls.slots}
+        return make_example(cls(**refs), rng)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParallelDirectionPair(DirectionPair):
+    """Base of the factors whose two directions are parallel; residual is the cross product of unit vectors."""
+
+    @property
+    def residual_size(self) -> int:  # noqa: D102
+        return 3
+
+    @property
+    def residual_rank(self) -> int:  # noqa: D102
+        return 2
+
+    def linearize(  # noqa: D102
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        (_, first), (_, second) = self.references()
+        layout = self._sizes, self._offsets
+        return _linearize_all(inputs, (first.index, second.index), layout, begin, end, columns, record)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Parallel(ParallelDirectionPair):
+    #: The one variable.
+    first: Ref
+    #: The other variable.
+    second: Ref
+
+
+@register("parallel_lines")
+@dataclass(frozen=True, kw_only=True)
+class ParallelLines(_Parallel):
+    """Pairs of parallel lines. Degenerate for a line at infinity."""
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "line"), Slot("second", "line"))
+
+
+@register("parallel_planes")
+@dataclass(frozen=True, kw_only=True)
+class ParallelPlanes(_Parallel):
+    """Pairs of parallel planes. Degenerate for the plane at infinity."""
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "plane"), Slot("second", "plane"))
+
+
+@register("line_perpendicular_to_plane")
+@dataclass(frozen=True, kw_only=True)
+class LinePerpendicularToPlane(_Parallel):
+    """Lines perpendicular to planes: direction parallel to normal."""
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "line"), Slot("second", "plane"))
+
+
+@register("plane_perpendicular_to_direction")
+@dataclass(frozen=True, kw_only=True)
+class PlanePerpendicularToDirection(_Parallel):
+    """Planes whose normal is a vanishing direction, a floor and the vertical for example."""
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "plane"), Slot("second", "direction"))
+
+
+@register("parallel_directions")
+@dataclass(frozen=True, kw_only=True)
+class ParallelDirections(_Parallel):
+    """Pairs of equal vanishing directions, up to orientation."""
+
+    slots: ClassVar[tuple[Slot, ...]] = (Slot("first", "direction"), Slot("second", "direction"))

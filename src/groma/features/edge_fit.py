@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Fit segments to the grey levels: direction by gradient sign, position below a pixel, standard deviation.
+
+A detector that grows regions places a line by its region. Here the edge is measured again. At every pixel of length
+the gradient across the segment is sampled a pixel apart, and its peak :math:`e_k` located as the centre of a Gaussian
+window that is also the centroid of the gradient in it: unlike a parabola through the largest samples this does not lean
+towards pixel centres (0.1 pixels on a sharp edge parallel to an axis; this one 0.03), and unlike a centroid without a
+window it does not see the neighbouring edge. A robust line :math:`e = a + b\,s` through these peaks, with
+:math:`-1/2 \le s \le 1/2` along the segment, moves the end points across it.
+
+The residuals of that line also tell how well it is known. With :math:`n` samples of variance :math:`\sigma_e^2` and
+correlation :math:`\rho` from one to the next, the variance of an end point across a fitted line is
+
+.. math:: \sigma^2 = \sigma_0^2 + \frac{4\,\sigma_e^2}{n}\,\frac{1 + \rho}{1 - \rho} + \left(\frac{b}{6}\right)^2
+
+:math:`\sigma_0` stands for what no image can tell: lens model, shading. Edges that are not straight are a matter of
+their own: the bow b is the coefficient of :math:`s^2 - 1/12` in the residuals, zero unless it stands out from their
+noise. The chord of an arc lies elsewhere in every image, by about the b / 6 that the arc's ends are off the fitted
+line; with a sigma of that size it takes little part in what is exact.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from groma._numba import kernel, loop
+from groma._typing import FloatArray
+from groma.features.images import GrayImage
+
+REACH = 3  # samples across the segment reach this far on either side, pixels
+SAMPLES = 2 * REACH + 1
+WINDOW = 1.5  # standard deviation of the window, pixels
+MAX_SHIFT = 1.5  # an end point that would move further keeps its place, pixels
+SIGMA_FLOOR = 0.03  # pixels
+SIGMA_UNFITTED = 0.5  # of segments that could not be fitted, pixels
+PRIOR_SIGMA = 0.15  # of one sample, pixels
+PRIOR_COUNT = 10.0  # samples that the prior weighs
+BOW_TEST = 9.0  # a bow counts from three standard deviations
+
+
+# -------------------------------------------------------------------------------------------------------- Kernels
+@kernel
+def _bilinear(image, x, y):
+    """Grey level at array coordinates, border repeated."""
+    height, width = image.shape
+    x = min(max(x, 0.0), width - 1.0)
+    y = min(max(y, 0.0), height - 1.0)
+    i, j = min(int(y), max(height - 2, 0)), min(int(x), max(width - 2, 0))
+    i1, j1 = min(i + 1, height - 1), min(j + 1, width - 1)
+    fx, fy = x - j, y - i
+    top = image[i, j] * (1.0 - fx) + image[i, j1] * fx
+    bottom = image[i1, j] * (1.0 - fx) + image[i1, j1] * fx
+    return top * (1.0 - fy) + bottom * fy
+
+
+@kernel
+def _peak(profile):
+    """Offset of the steepest ascent in a profile of grey levels, pixels; NaN where there is none inside."""
+    best, at = 0.0, -1
+    for k in range(SAMPLES - 1):
+        rise = profile[k + 1] - profile[k]
+        if rise > best:
+            best, at = rise, k
+    if at < 1 or at > SAMPLES - 3:
+        return math.nan
+    center = at - REACH + 0.5
+    for _ in range(4):
+        total = 0.0
+        moment = 0.0
+        for k in range(SAMPLES - 1):
+            away = k - REACH + 0.5 - center
+            weight = max(profile[k + 1] - profile[k], 0.0) * math.exp(-0.5 * away * away / WINDOW**2)
+            total += weight
+            moment += weight * away
+        # The window pulls the centroid back by this factor when the edge is blurred by about one pixel.
+        center += 1.5 * moment / total
+        if abs(center - (at - REACH + 0.5)) > 1.0:
+            return math.nan
+    return center
+
+
+@kernel
+def _line_fit(s, e, w, n, out):
+    """Weighted line e = a + b s; writes a, b; whether it is defined."""
+    sw = 0.0
+    ss = 0.0
+    se = 0.0
+    sss = 0.0
+    sse = 0.0
+    for k in range(n):
+        sw += w[k]
+        ss += w[k] * s[k]
+        se += w[k] * e[k]
+        sss += w[k] * s[k] * s[k]
+        sse += w[k] * s[k] * e[k]
+    determinant = sw * sss - ss * ss
+    if determinant <= 1e-6 * sw * sw:
+        return False
+    out[0] = (sss * se - ss * sse) / determinant
+    out[1] = (sw * sse - ss * se) / determinant
+    return True
+
+
+@loop
+def _measure_all(image, ends, fit, new_ends, sigma, strength):
+    """Direct, fit and rate all segments; `image` is float32, smoothed."""
+    profile = np.zeros(SAMPLES)
+    line = np.zeros(2)
+    for row in range(ends.shape[0]):
+        u1, v1, u2, v2 = ends[row, 0], ends[row, 1], ends[row, 2], ends[row, 3]
+        length = math.hypot(u2 - u1, v2 - v1)
+        count = max(int(length), 2)
+        dx, dy = (u2 - u1) / max(length, 1e-9), (v2 - v1) / max(length, 1e-9)
+        # Mean gradient towards the right hand (-dy, dx): its sign gives the direction.
+        total = 0.0
+        for k in range(count):
+            t = (k + 0.5) / count
+            x, y = u1 + t * (u2 - u1) - 0.5, v1 + t * (v2 - v1) - 0.5
+            total += _bilinear(image, x - dy, y + dx) - _bilinear(image, x + dy, y - dx)
+        if total < 0.0:
+            u1, v1, u2, v2 = u2, v2, u1, v1
+            dx, dy = -dx, -dy
+        strength[row] = 0.5 * abs(total) / count
+        new_ends[row, 0], new_ends[row, 1], new_ends[row, 2], new_ends[row, 3] = u1, v1, u2, v2
+        sigma[row] = SIGMA_UNFITTED
+        if not fit:
+            continue
+        s, e, w, spread = np.zeros(count), np.zeros(count), np.ones(count), np.zeros(count)
+        n = 0
+        for k in range(count):
+            t = (k + 0.5) / count
+            x, y = u1 + t * (u2 - u1) - 0.5, v1 + t * (v2 - v1) - 0.5
+            for j in range(SAMPLES):
+                profile[j] = _bilinear(image, x - (j - REACH) * dy, y + (j - REACH) * dx)
+            peak = _peak(profile)
+            if peak == peak:
+                s[n], e[n] = t - 0.5, peak
+                n += 1
+        if n < 5 or n < 0.5 * count:
+            continue
+        # Start from the median offset: half of the samples may belong to a neighbouring edge.
+        line[0], line[1] = np.median(e[:n]), 0.0
+        good = True
+        for _ in range(4):
+            for k in range(n):
+                spread[k] = abs(e[k] - line[0] - line[1] * s[k])
+            cut = 4.0 * max(1.4826 * np.median(spread[:n]), 0.05)
+            for k in range(n):
+                ratio = spread[k] / cut
+                w[k] = (1.0 - ratio * ratio) ** 2 if ratio < 1.0 else 0.0
+            if not _line_fit(s, e, w, n, line):
+                good = False
+                break
+        first, second = line[0] - 0.5 * line[1], line[0] + 0.5 * line[1]
+        if not good or abs(first) > MAX_SHIFT or abs(second) > MAX_SHIFT:
+            continue
+        new_ends[row, 0], new_ends[row, 1] = u1 - dy * first, v1 + dx * first
+        new_ends[row, 2], new_ends[row, 3] = u2 - dy * second, v2 + dx * second
+        weight, squares, lagged, before = 0.0, 0.0, 0.0, 0.0
+        bow, bows = 0.0, 0.0
+        for k in range(n):
+            residual = e[k] - line[0] - line[1] * s[k]
+            arc = s[k] * s[k] - 1.0 / 12.0
+            bow += w[k] * arc * residual
+            bows += w[k] * arc * arc
+            weight += w[k]
+            squares += w[k] * residual * residual
+            if k > 0:
+                lagged += math.sqrt(w[k] * w[k - 1]) * residual * before
+            before = residual
+        variance = (squares + PRIOR_COUNT * PRIOR_SIGMA**2) / (weight + PRIOR_COUNT)
+        rho = min(max(lagged / max(squares, 1e-12), 0.0), 0.9)
+        effective = max(weight * (1.0 - rho) / (1.0 + rho), 2.0)
+        bow /= max(bows, 1e-12)
+        if bow * bow * bows < BOW_TEST * variance * (weight / effective):
+            bow = 0.0
+        sigma[row] = math.sqrt(SIGMA_FLOOR**2 + 4.0 * variance / effective + (bow / 6.0) ** 2)
+
+
+# --------------------------------------------------------------------------------------------------------- Public
+def measure_edges(image: GrayImage, ends: FloatArray, fit: bool = True) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Direct segments by the gradient (darker side left), fit them to the grey levels, and rate them.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey image.
+    ends : (N, 4) float64
+        Segments within about a pixel of the edges, pixels.
+    fit : bool
+        Whether the end points may move across the segment; otherwise only their order changes.
+
+    Returns
+    -------
+    ends : (N, 4) float64
+        End points.
+    sigma : (N,) float64
+        Standard deviation of an end point across the segment, pixels; 0.5 for segments that could not be fitted.
+    strength : (N,) float64
+        Mean gradient across the segment, grey levels per pixel.
+    """
+    ends = np.ascontiguousarray(ends, dtype=np.float64)
+    new_ends, sigma, strength = np.zeros_like(ends), np.zeros(len(ends)), np.zeros(len(ends))
+    if len(ends):
+        smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
+        _measure_all(smooth, ends, fit, new_ends, sigma, strength)
+    return new_ends, sigma, strength
+
+
+__all__ = ["measure_edges"]

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Segments by OpenCV's LSD, in groma's pixel convention, with a standard deviation each.
+
+LSD works on an image reduced by ``scale`` and multiplies its coordinates by 1 / scale at the end. Its origin is the
+centre of the first *reduced* pixel, which lies at 0.5 / scale from the corner of the image. Hence the shift by
+0.5 / scale (0.625 pixels for 0.8) and not by 0.5; it is applied here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from groma.errors import InputError
+from groma.features.edge_fit import measure_edges
+from groma.features.images import to_gray
+from groma.features.merging import merge_collinear
+from groma.features.segments import Segments
+
+SMALLEST_IMAGE = 8  # pixels; LSD needs a few gradients, and no segment fits in less
+
+
+@dataclass(frozen=True)
+class LsdDetector:
+    """Line segment detector (Grompone von Gioi et al., 2010) without its refinement, then fitted to the grey levels."""
+
+    min_length: float = 20.0
+    """Shortest segment, pixels."""
+    min_strength: float = 3.0
+    """Smallest mean gradient across a segment, grey levels (of 255) per pixel."""
+    scale: float = 0.8
+    """Reduction of the image before detection."""
+    fit: bool = True
+    """Fit the end points to the grey levels across the segment (see :mod:`groma.features.edge_fit`)."""
+    merge: bool = True
+    """Join collinear neighbours (see :mod:`groma.features.merging`)."""
+    max_segments: int = 0
+    """Keep at most so many, the longest; 0 keeps all."""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.min_length) and self.min_length > 0.0):
+            raise InputError(f"min_length must be positive, in pixels; got {self.min_length}. The default is 20.")
+        if not 0.1 <= self.scale <= 4.0:
+            raise InputError(f"scale must lie between 0.1 and 4; got {self.scale}. The default is 0.8.")
+        if not (np.isfinite(self.min_strength) and self.min_strength >= 0.0):
+            raise InputError(f"min_strength must be 0 or more; got {self.min_strength}. The default is 3.")
+        if self.max_segments < 0:
+            raise InputError(f"max_segments must be 0 (no limit) or more; got {self.max_segments}.")
+
+    def detect(self, image: npt.NDArray[np.generic]) -> Segments:
+        """Segments of an image, longest first.
+
+        Parameters
+        ----------
+        image : (H, W) or (H, W, 3) uint8
+            See :func:`groma.features.images.to_gray` for other types.
+
+        Returns
+        -------
+        Segments
+            None for images without edges or smaller than 8 x 8.
+        """
+        gray = to_gray(image)
+        if min(gray.shape) < SMALLEST_IMAGE or gray.min() == gray.max():
+            return Segments.empty()
+        detected = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD, self.scale).detect(gray)[0]
+        if detected is None or np.size(detected) == 0:
+            return Segments.empty()
+        ends = np.asarray(detected, dtype=np.float64).reshape(-1, 4) + 0.5 / self.scale
+        ends = _keep_long(ends, min(self.min_length, 8.0) if self.merge else self.min_length)
+        ends, sigma, strength = measure_edges(gray, ends, fit=self.fit)
+        if self.merge:
+            merged = merge_collinear(ends)
+            if len(merged) < len(ends):
+                ends, sigma, strength = measure_edges(gray, merged, fit=self.fit)
+        height, width = gray.shape
+        limit = np.array([width, height, width, height], dtype=np.float64)
+        ends = np.clip(ends, 0.0, limit)
+        length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
+        rows = np.flatnonzero((length >= self.min_length) & (strength >= self.min_strength))
+        rows = rows[np.lexsort((ends[rows, 1], ends[rows, 0], -length[rows]))]
+        if self.max_segments:
+            rows = rows[: self.max_segments]
+        return Segments(ends[rows], sigma[rows], strength[rows])
+
+
+def _keep_long(ends: npt.NDArray[np.float64], shortest: float) -> npt.NDArray[np.float64]:
+    return ends[np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]) >= shortest]
+
+
+__all__ = ["LsdDetector"]

@@ -1,0 +1,330 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Find patches of one image in another to a few hundredths of a pixel: least-squares matching.
+
+Keypoint detectors place each keypoint by itself; in good photographs the places of one physical point scatter by a
+quarter of a pixel. The grey levels around them say more. A template T, cut from one image about a keypoint, is aligned
+to another image I under an affine map and a gain and an offset of brightness,
+
+.. math:: \min_{A, c, \alpha, \beta} \sum_x w(x)\, \big(\alpha\, I(c + A x) + \beta - T(x)\big)^2 ,
+
+with x the place in the template relative to the keypoint and w a Gaussian window. The iteration is inverse
+compositional: the increment is sought in the template, where its normal matrix is constant,
+
+.. math:: s(x) = [\,g_u x^\top,\; g_v x^\top,\; g_u, g_v,\; T,\; 1\,], \qquad
+          H = \sum_x w\, s s^\top + \Lambda, \qquad (\Delta A, \Delta c) = -H^{-1} \sum_x w\, s\, e ,
+
+where :math:`g = \nabla T`, and the map becomes :math:`A (I + \Delta A)^{-1},\; c - A (I + \Delta A)^{-1} \Delta c`.
+:math:`\Lambda` holds the increments of a shape that few grey levels determine near the given one.
+
+Of the remaining differences' variance :math:`\sigma_e^2`, the place in the template has the covariance
+:math:`\sigma_e^2 H^{-1}` (its two rows and columns), carried to the image by A.
+
+Reference: S. Baker, I. Matthews, *Lucas-Kanade 20 Years On*, 2004, section 3.2 (inverse compositional), with the gain
+and offset of A. Gruen, *Adaptive Least Squares Correlation*, 1985.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from groma._numba import kernel, loop
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.errors import ShapeError
+from groma.features.images import GrayImage
+
+RADIUS = 7  # of the template, pixels
+SIZE = 2 * RADIUS + 3  # side of a template: the patch and one pixel more for its gradient
+SPREAD = 4.0  # standard deviation of the window, pixels
+SMOOTHING = 0.8  # of both images, pixels: cubic interpolation is exact to a hundredth of a pixel then
+MAX_ITERATIONS = 20
+STEP = 2e-3  # pixels: a smaller step ends the iteration
+SHAPE_SIGMA = 0.1  # how far a step may turn, shear and stretch the patch, against grey levels of no texture
+_COUNT = (2 * RADIUS + 1) ** 2
+
+
+# -------------------------------------------------------------------------------------------------------- Kernels
+@kernel
+def _cubic_weights(f, w):
+    """Catmull-Rom weights at the fraction f between the two middle ones of four samples."""
+    w[0] = ((-0.5 * f + 1.0) * f - 0.5) * f
+    w[1] = (1.5 * f - 2.5) * f * f + 1.0
+    w[2] = ((-1.5 * f + 2.0) * f + 0.5) * f
+    w[3] = (0.5 * f - 0.5) * f * f
+
+
+@kernel
+def _solve_in_place(H, n):
+    """Invert the symmetric positive definite H by Gauss-Jordan steps; False where it is singular."""
+    for k in range(n):
+        pivot = H[k, k]
+        if not pivot > 1e-12:
+            return False
+        for j in range(n):
+            H[k, j] /= pivot
+        H[k, k] = 1.0 / pivot
+        for i in range(n):
+            if i != k:
+                factor = H[i, k]
+                for j in range(n):
+                    if j != k:
+                        H[i, j] -= factor * H[k, j]
+                H[i, k] = -factor / pivot
+    return True
+
+
+@loop
+def _cut_all(image, pixels, templates, fractions):
+    """Copy the surroundings of pixels; `fractions` is the keypoint relative to the middle of its template."""
+    height, width = image.shape
+    reach = RADIUS + 1
+    for row in range(pixels.shape[0]):
+        j, i = int(pixels[row, 0]), int(pixels[row, 1])
+        if j < reach or i < reach or j >= width - reach or i >= height - reach:
+            fractions[row, 0], fractions[row, 1] = math.nan, math.nan
+            continue
+        fractions[row, 0], fractions[row, 1] = pixels[row, 0] - j - 0.5, pixels[row, 1] - i - 0.5
+        for v in range(SIZE):
+            for u in range(SIZE):
+                templates[row, v, u] = image[i + v - reach, j + u - reach]
+
+
+@loop
+def _align_all(image, templates, fractions, template_index, pixels, shapes, out_pixels, covariance, correlation):
+    """Align one template per row to the image; correlation NaN where it left the image or has no texture."""
+    height, width = image.shape
+    window = np.empty(2 * RADIUS + 1)
+    for k in range(2 * RADIUS + 1):
+        window[k] = math.exp(-0.5 * ((k - RADIUS) / SPREAD) ** 2)
+    S, T, W, warped = np.empty((_COUNT, 8)), np.empty(_COUNT), np.empty(_COUNT), np.empty(_COUNT)
+    H, rhs, delta, wu, wv = np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(4), np.empty(4)
+    for row in range(pixels.shape[0]):
+        correlation[row] = math.nan
+        out_pixels[row, 0], out_pixels[row, 1] = pixels[row, 0], pixels[row, 1]
+        number = template_index[row]
+        fu, fv = fractions[number, 0], fractions[number, 1]
+        if not abs(fu) + abs(fv) < math.inf:
+            continue
+        total, mean = 0.0, 0.0
+        for v in range(2 * RADIUS + 1):
+            for u in range(2 * RADIUS + 1):
+                k = v * (2 * RADIUS + 1) + u
+                W[k] = window[u] * window[v]
+                T[k] = templates[number, v + 1, u + 1]
+                total += W[k]
+                mean += W[k] * T[k]
+        mean /= total
+        squares = 0.0
+        for a in range(8):
+            for b in range(8):
+                H[a, b] = 0.0
+        for v in range(2 * RADIUS + 1):
+            y = v - RADIUS - fv
+            for u in range(2 * RADIUS + 1):
+                x = u - RADIUS - fu
+                k = v * (2 * RADIUS + 1) + u
+                gu = 0.5 * (templates[number, v + 1, u + 2] - templates[number, v + 1, u])
+                gv = 0.5 * (templates[number, v + 2, u + 1] - templates[number, v, u + 1])
+                T[k] -= mean
+                squares += W[k] * T[k] * T[k]
+                S[k, 0], S[k, 1], S[k, 2], S[k, 3] = gu * x, gu * y, gv * x, gv * y
+                S[k, 4], S[k, 5], S[k, 6], S[k, 7] = gu, gv, T[k], 1.0
+                for a in range(8):
+                    for b in range(a + 1):
+                        H[a, b] += W[k] * S[k, a] * S[k, b]
+        if not squares > total:  # less than a grey level of texture
+            continue
+        noise = 0.01 * squares / total  # what is not explained: a tenth of the contrast
+        for a in range(8):
+            for b in range(a):
+                H[b, a] = H[a, b]
+        for a in range(4):
+            H[a, a] += noise / SHAPE_SIGMA**2
+        if not _solve_in_place(H, 8):
+            continue
+        A0, A1, A2, A3 = shapes[row, 0, 0], shapes[row, 0, 1], shapes[row, 1, 0], shapes[row, 1, 1]
+        cu, cv = pixels[row, 0] - 0.5, pixels[row, 1] - 0.5
+        inside, residual, likeness = True, 0.0, -1.0
+        for iteration in range(MAX_ITERATIONS + 1):
+            mean = 0.0
+            for v in range(2 * RADIUS + 1):
+                y = v - RADIUS - fv
+                for u in range(2 * RADIUS + 1):
+                    x = u - RADIUS - fu
+                    pu, pv = cu + A0 * x + A1 * y, cv + A2 * x + A3 * y
+                    if not (pu >= 1.0 and pv >= 1.0 and pu < width - 2.0 and pv < height - 2.0):
+                        inside = False
+                        break
+                    j, i = int(pu), int(pv)
+                    _cubic_weights(pu - j, wu)
+                    _cubic_weights(pv - i, wv)
+                    level = 0.0
+                    for b in range(4):
+                        line = 0.0
+                        for a in range(4):
+                            line += wu[a] * image[i - 1 + b, j - 1 + a]
+                        level += wv[b] * line
+                    k = v * (2 * RADIUS + 1) + u
+                    warped[k] = level
+                    mean += W[k] * level
+                if not inside:
+                    break
+            if not inside:
+                break
+            mean /= total
+            common, energy = 0.0, 0.0
+            for k in range(_COUNT):
+                warped[k] -= mean
+                energy += W[k] * warped[k] * warped[k]
+                common += W[k] * warped[k] * T[k]
+            if not energy > 1e-3 * squares or not common > 0.0:
+                inside = False
+                break
+            likeness = common / math.sqrt(energy * squares)
+            gain = common / energy
+            for a in range(8):
+                rhs[a] = 0.0
+            residual = 0.0
+            for k in range(_COUNT):
+                e = gain * warped[k] - T[k]
+                residual += W[k] * e * e
+                for a in range(8):
+                    rhs[a] += W[k] * S[k, a] * e
+            for a in range(6):
+                delta[a] = 0.0
+                for b in range(8):
+                    delta[a] += H[a, b] * rhs[b]
+            if iteration == MAX_ITERATIONS:
+                break
+            # The increment of the template, undone in the image.
+            D0, D1, D2, D3 = 1.0 + delta[0], delta[1], delta[2], 1.0 + delta[3]
+            determinant = D0 * D3 - D1 * D2
+            if not determinant > 0.2:
+                inside = False
+                break
+            B0, B1 = (A0 * D3 - A1 * D2) / determinant, (A1 * D0 - A0 * D1) / determinant
+            B2, B3 = (A2 * D3 - A3 * D2) / determinant, (A3 * D0 - A2 * D1) / determinant
+            A0, A1, A2, A3 = B0, B1, B2, B3
+            su, sv = A0 * delta[4] + A1 * delta[5], A2 * delta[4] + A3 * delta[5]
+            cu -= su
+            cv -= sv
+            if su * su + sv * sv < STEP**2:
+                break
+        if not inside:
+            continue
+        correlation[row] = likeness
+        out_pixels[row, 0], out_pixels[row, 1] = cu + 0.5, cv + 0.5
+        variance = residual / total * _COUNT / (_COUNT - 8.0)
+        c00, c01, c11 = H[4, 4], H[4, 5], H[5, 5]
+        left0, left1 = A0 * c00 + A1 * c01, A0 * c01 + A1 * c11
+        right0, right1 = A2 * c00 + A3 * c01, A2 * c01 + A3 * c11
+        covariance[row, 0, 0] = variance * (left0 * A0 + left1 * A1)
+        covariance[row, 0, 1] = variance * (left0 * A2 + left1 * A3)
+        covariance[row, 1, 0] = covariance[row, 0, 1]
+        covariance[row, 1, 1] = variance * (right0 * A2 + right1 * A3)
+
+
+# --------------------------------------------------------------------------------------------------------- Public
+@dataclass(frozen=True)
+class Templates:
+    """Patches cut about keypoints."""
+
+    #: (P, 17, 17) float32, smoothed grey levels.
+    levels: npt.NDArray[np.float32]
+    #: (P, 2) the keypoint relative to the centre of the middle pixel, pixels; NaN where the image ends too near.
+    fractions: FloatArray
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Where templates were found."""
+
+    #: (N, 2) place of the keypoint in the image, pixels; the given one where nothing was found.
+    pixels: FloatArray
+    #: (N, 2, 2) covariance of that place, pixels squared; zero where nothing was found.
+    covariance: FloatArray
+    #: (N,) correlation coefficient of the template and the image under it, -1 to 1; NaN where nothing was found.
+    correlation: FloatArray
+
+    @property
+    def found(self) -> BoolArray:
+        """(N,) whether the iteration ended inside the image, on texture."""
+        return np.isfinite(self.correlation)
+
+
+def smoothed(image: GrayImage) -> npt.NDArray[np.float32]:
+    """Return the grey levels as templates are cut from and aligned to: float32, slightly smoothed."""
+    levels = image.astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(levels, (0, 0), SMOOTHING, borderType=cv2.BORDER_REPLICATE), np.float32)
+
+
+def cut_templates(smooth_image: npt.NDArray[np.float32], pixels: FloatArray) -> Templates:
+    """Cut a template about each keypoint (N, 2) of an image made by :func:`smoothed`.
+
+    The template is copied, not interpolated; the keypoint lies between its pixels.
+    """
+    pixels = _rows(pixels, (2,), "pixels")
+    templates = np.zeros((len(pixels), SIZE, SIZE), np.float32)
+    fractions = np.zeros((len(pixels), 2))
+    _cut_all(smooth_image, pixels, templates, fractions)
+    return Templates(templates, fractions)
+
+
+def align_templates(
+    smooth_image: npt.NDArray[np.float32],
+    templates: Templates,
+    template_index: IntArray,
+    pixels: FloatArray,
+    shapes: FloatArray,
+) -> Alignment:
+    """Align templates to an image.
+
+    Parameters
+    ----------
+    smooth_image : (H, W) float32
+        Made by :func:`smoothed`.
+    templates : Templates
+        From other images.
+    template_index : (N,) int
+        The template that each row looks for.
+    pixels : (N, 2) float64
+        Where it is looked for, within a pixel or two, pixels.
+    shapes : (N, 2, 2) float64
+        Derivative of pixels in this image by pixels of the template, to about a fifth.
+
+    Returns
+    -------
+    Alignment
+        Places, covariances and correlations.
+
+    Raises
+    ------
+    ShapeError
+        If an array has another shape.
+    """
+    pixels, shapes = _rows(pixels, (2,), "pixels"), _rows(shapes, (2, 2), "shapes")
+    index = np.ascontiguousarray(template_index, dtype=np.int64)
+    if not len(index) == len(pixels) == len(shapes):
+        raise ShapeError(
+            f"template_index, pixels and shapes must be equally long; got {len(index)}, {len(pixels)}, {len(shapes)}."
+        )
+    found = np.zeros((len(pixels), 2))
+    covariance, correlation = np.zeros((len(pixels), 2, 2)), np.zeros(len(pixels))
+    _align_all(
+        smooth_image, templates.levels, templates.fractions, index, pixels, shapes, found, covariance, correlation
+    )
+    return Alignment(found, covariance, correlation)
+
+
+def _rows(array: FloatArray, row: tuple[int, ...], name: str) -> FloatArray:
+    rows = np.ascontiguousarray(array, dtype=np.float64)
+    if rows.shape[1:] != row:
+        raise ShapeError(f"{name} must have shape (N, {', '.join(map(str, row))}); got {rows.shape}.")
+    return rows
+
+
+__all__ = ["Alignment", "Templates", "align_templates", "cut_templates", "smoothed"]

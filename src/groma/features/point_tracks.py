@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Follow points from image to image by OpenCV's pyramidal Lucas-Kanade, and find new ones worth following.
+
+Where there is nothing but noise, Lucas-Kanade stays near where it was told to begin, and such a point would confirm
+whatever was predicted. So patches must be alike, and corners must stand out from the noise of the image.
+
+Pixels count from the corner of the image (first pixel's centre at 0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.features.images import GrayImage
+
+_HALF = np.float32(0.5)
+#: Least correlation of a patch with the one it was followed from: more signal than noise.
+LEAST_ALIKE = 0.5
+#: Width of the blocks in which corners are rated, pixels; the mean eigenvalue in them that noise of one grey level
+#: makes (OpenCV's units: 12 times 25 samples, by 4, 5 and 255), and how often that a corner must have. Noise alone
+#: reaches three times in an image of 640 x 480.
+BLOCK, NOISE_EIGENVALUE, ABOVE_NOISE = 5, 12.0 * 25.0 / (4.0 * 5.0 * 255.0) ** 2, 4.0
+
+
+def follow(
+    image_1: GrayImage,
+    image_2: GrayImage,
+    pixels: FloatArray,
+    guesses: FloatArray | None = None,
+    levels: int = 3,
+    window: int = 15,
+    round_trip: float | None = 1.0,
+) -> tuple[FloatArray, BoolArray]:
+    """Where points of the first image are in the second.
+
+    Parameters
+    ----------
+    image_1, image_2 : (H, W) uint8
+        Images.
+    pixels : (N, 2)
+        Points of the first image, pixels.
+    guesses : (N, 2), optional
+        Where they are expected in the second; the same place by default.
+    levels : int
+        Levels of the pyramid above the image itself.
+    window : int
+        Width of the compared patches, pixels.
+    round_trip : float, optional
+        Points must come back to within this distance, pixels; None does not go back.
+
+    Returns
+    -------
+    (N, 2) float64, (N,) bool
+        Pixels, and which points were found inside the image, with a patch like the one they had.
+    """
+    if not len(pixels):
+        return np.zeros((0, 2)), np.zeros(0, dtype=bool)
+    settings: dict = {
+        "winSize": (window, window),
+        "maxLevel": levels,
+        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03),
+        "minEigThreshold": 1e-4,
+    }
+    start = np.ascontiguousarray(pixels, dtype=np.float32) - _HALF
+    guess = start.copy() if guesses is None else np.ascontiguousarray(guesses, dtype=np.float32) - _HALF
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        image_1, image_2, start, guess.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **settings
+    )
+    good = found.ravel() == 1
+    height, width = image_2.shape
+    with np.errstate(invalid="ignore"):
+        good &= ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
+    if good.any():
+        rows = np.flatnonzero(good)
+        good[rows] = _alike(image_1, image_2, start[rows], there[rows], window) > LEAST_ALIKE
+    if round_trip is not None and good.any():
+        settings["maxLevel"] = min(1, levels)
+        rows = np.flatnonzero(good)
+        home, returned, _ = cv2.calcOpticalFlowPyrLK(
+            image_2, image_1, there[rows], start[rows].copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **settings
+        )
+        good[rows] = (returned.ravel() == 1) & (np.linalg.norm(home - start[rows], axis=1) <= round_trip)
+    return there.astype(np.float64) + 0.5, good
+
+
+def _alike(image_1: GrayImage, image_2: GrayImage, first, second, window: int) -> FloatArray:
+    """Correlation (N,) of the patches around points (N, 2) of two images, in OpenCV's pixels."""
+    reach = np.arange(window, dtype=np.float32) - window // 2
+    offset = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2)
+    patches = []
+    for image, places in ((image_1, first), (image_2, second)):
+        at = places[:, None] + offset
+        values = cv2.remap(
+            image, np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1]), cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        ).astype(np.float32)  # fmt: skip
+        patches.append(values - values.mean(axis=1, keepdims=True))
+    a, b = patches
+    size = np.sqrt(np.einsum("nk,nk->n", a, a) * np.einsum("nk,nk->n", b, b))
+    return np.einsum("nk,nk->n", a, b) / np.maximum(size, 1e-6)
+
+
+def spread(
+    pixels: FloatArray, strength: FloatArray, taken: FloatArray, shape: tuple[int, int], count: int, cell: int = 24
+) -> IntArray:
+    """Choose points evenly over the image: the strongest of each grid cell that holds no point yet.
+
+    Parameters
+    ----------
+    pixels : (N, 2)
+        Candidates, pixels.
+    strength : (N,)
+        Higher is better.
+    taken : (M, 2)
+        Points that are there already, pixels.
+    shape : (H, W)
+        Size of the image.
+    count : int
+        Most points chosen.
+    cell : int
+        Width of a cell, pixels.
+
+    Returns
+    -------
+    (n,) int
+        Rows of the candidates, strongest first.
+    """
+    columns = shape[1] // cell + 1
+    used = np.zeros((shape[0] // cell + 1) * columns, dtype=bool)
+    if len(taken):
+        at = (np.clip(taken, 0, (shape[1] - 1, shape[0] - 1)) // cell).astype(np.int64)
+        used[at[:, 1] * columns + at[:, 0]] = True
+    order = np.argsort(-strength, kind="stable")
+    at = (pixels[order] // cell).astype(np.int64)
+    cells = at[:, 1] * columns + at[:, 0]
+    order, cells = order[~used[cells]], cells[~used[cells]]
+    first = np.unique(cells, return_index=True)[1]
+    return order[np.sort(first)][:count]
+
+
+def corners(image: GrayImage, count: int, distance: float, mask: GrayImage | None = None) -> FloatArray:
+    """Corners (Shi and Tomasi) that noise does not explain, (N, 2) pixels, strongest first."""
+    found = cv2.goodFeaturesToTrack(image, count, 0.005, distance, mask=mask, blockSize=BLOCK)
+    if found is None:
+        return np.zeros((0, 2))
+    at = found.reshape(-1, 2)
+    column, row = at.astype(np.int64).T
+    strength = cv2.cornerMinEigenVal(image, BLOCK)[row, column]
+    return at[strength > ABOVE_NOISE * NOISE_EIGENVALUE * image_noise(image) ** 2].astype(np.float64) + 0.5
+
+
+def image_noise(image: GrayImage) -> float:
+    """Standard deviation of the noise of an image, grey levels, from differences that planes of grey do not make."""
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    return 1.4826 / 6.0 * float(np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, kernel)[::2, ::2])))
+
+
+__all__ = ["corners", "follow", "image_noise", "spread"]

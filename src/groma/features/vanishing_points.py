@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Vanishing points of an image's segments, and the directions that they agree on across images.
+
+A segment's end points become bearings :math:`f_1, f_2`, under any camera model, and the segment the plane with normal
+:math:`n = \mathrm{unit}(f_1 \times f_2)`. Its 3D line runs in this plane. A vanishing point is therefore a direction
+perpendicular to many normals: :mod:`groma.estimators.directions` finds several of them, with covariance, weighted by
+what segments of their length and noise can tell. There is no difference between vanishing points inside the image,
+outside and at infinity.
+
+Noise: with :math:`a_k = n^\top \delta f_k` the displacement of an end point out of the plane, in radians,
+
+.. math:: \delta n = -a_1\, \frac{f_2 \times n}{\sin\theta} - a_2\, \frac{n \times f_1}{\sin\theta},
+          \qquad \sin\theta = \lVert f_1 \times f_2\rVert .
+
+Directions need rotations only, so with posed images all segments of all images vote together: vanishing directions of
+single images are the candidates, turned to the world, and all segments that agree refine them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.cameras import CameraModel
+from groma.errors import InputError, ShapeError
+from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_normals
+from groma.geometry import quaternion
+from groma.geometry.algebra import apply, dot, norm, ratio, unit, vectors
+
+#: Segments whose ends are closer than this have no normal, radians.
+_LEAST_ANGLE = 1e-6
+
+
+@dataclass(frozen=True)
+class VanishingPoints:
+    """Vanishing points of one image."""
+
+    #: (V, 3) unit directions in the camera frame, towards the front (z >= 0), the strongest first.
+    directions: FloatArray
+    #: (V, 3, 3) covariances, square radians, rank 2.
+    covariance: FloatArray
+    #: (V,) base-10 logarithm of the expected number of false alarms.
+    log10_false_alarms: FloatArray
+    #: (N,) the vanishing point of each segment, -1 for none.
+    label: IntArray
+    #: (M, 2) pairs of vanishing points whose directions are orthogonal within their uncertainty.
+    orthogonal: IntArray
+    #: (N, 3) unit normals of the segments' planes, camera frame; zero for segments without one.
+    normals: FloatArray
+    #: (N, 3, 2) square roots of the normals' covariances, radians.
+    factors: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    def pixels(self, model: CameraModel, params: FloatArray) -> FloatArray:
+        """Return the vanishing points (V, 2) in pixels; NaN where a direction has no image."""
+        return model.project(params, self.directions)
+
+
+def segment_normals(
+    ends: FloatArray, sigma: float | FloatArray, model: CameraModel, params: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Unit normals of the planes through camera centre and segments, with the square roots of their covariances.
+
+    Parameters
+    ----------
+    ends : (N, 4) float64
+        Segments u1 v1 u2 v2, pixels.
+    sigma : float or (N,) float64
+        Standard deviation of the end points across the segment, pixels.
+    model : CameraModel
+        Camera model; distortion is allowed.
+    params : (k,) float64
+        Its parameters.
+
+    Returns
+    -------
+    normals : (N, 3) float64
+        Camera frame; zero for segments without length or outside the model's range.
+    factors : (N, 3, 2) float64
+        F with covariance F Fᵀ, radians; zero where the normal is.
+
+    Raises
+    ------
+    ShapeError
+        If an array has another shape.
+    """
+    ends = vectors(ends, 4, "ends")
+    spread = np.broadcast_to(np.asarray(sigma, dtype=np.float64), (len(ends),)) if np.ndim(sigma) == 0 else sigma
+    spread = np.asarray(spread, dtype=np.float64)
+    if ends.ndim != 2 or spread.shape != (len(ends),):
+        raise ShapeError(f"ends and sigma must have shapes (N, 4) and (N,); got {ends.shape} and {spread.shape}.")
+    first, first_by_pixel = model.bearing_jacobian(params, np.ascontiguousarray(ends[:, :2]))
+    second, second_by_pixel = model.bearing_jacobian(params, np.ascontiguousarray(ends[:, 2:]))
+    crossed = np.cross(first, second)
+    sine = norm(crossed)
+    usable = (sine > _LEAST_ANGLE) & np.isfinite(first_by_pixel).all((1, 2)) & np.isfinite(second_by_pixel).all((1, 2))
+    usable &= np.isfinite(spread) & (spread > 0.0)
+    normals = ratio(crossed, sine[:, None], usable[:, None], 0.0)
+    columns = []
+    for across, by_pixel in ((np.cross(second, normals), first_by_pixel), (np.cross(normals, first), second_by_pixel)):
+        slip = spread * norm(np.einsum("ni,nij->nj", normals, by_pixel))
+        columns.append(ratio(across * slip[:, None], sine[:, None], usable[:, None], 0.0))
+    return normals, np.stack(columns, axis=-1)
+
+
+def find_vanishing_points(
+    ends: FloatArray,
+    sigma: float | FloatArray,
+    model: CameraModel,
+    params: FloatArray,
+    options: DirectionOptions | None = None,
+) -> VanishingPoints:
+    """Find the vanishing points of an image.
+
+    Parameters
+    ----------
+    ends, sigma, model, params
+        As for :func:`segment_normals`.
+    options : DirectionOptions, optional
+        What counts as a vanishing point.
+
+    Returns
+    -------
+    VanishingPoints
+        The strongest first; empty where segments agree no more than by chance.
+
+    Raises
+    ------
+    ShapeError
+        If an array has another shape.
+    """
+    normals, factors = segment_normals(ends, sigma, model, params)
+    good = np.flatnonzero(dot(normals, normals) > 0.0)
+    found = directions_from_normals(normals[good], factors[good], options)
+    label = np.full(len(normals), -1)
+    label[good] = found.label
+    front = np.where(found.vectors[:, 2:] < 0.0, -1.0, 1.0)
+    return VanishingPoints(
+        found.vectors * front,
+        found.covariance,
+        found.log10_false_alarms,
+        label,
+        found.orthogonal,
+        normals,
+        factors,
+    )
+
+
+def consistent_directions(
+    vanishing_points: Sequence[VanishingPoints],
+    cam_from_world: FloatArray,
+    options: DirectionOptions | None = None,
+    rotation_sigma: float = 0.0,
+) -> DirectionSet:
+    """Find the directions in the world that the vanishing points of several images agree on.
+
+    Parameters
+    ----------
+    vanishing_points : sequence of C VanishingPoints
+        One per image.
+    cam_from_world : (C, 7) float64
+        Poses [qx qy qz qw tx ty tz]; only their rotations take part.
+    options : DirectionOptions, optional
+        What counts as a direction; by default two images must support it.
+    rotation_sigma : float
+        Standard deviation of the images' rotations, radians; widens the tests.
+
+    Returns
+    -------
+    DirectionSet
+        World frame. ``label`` counts the segments of all images, one image after the other.
+
+    Raises
+    ------
+    InputError
+        If the numbers of images differ.
+    """
+    options = options or DirectionOptions(min_groups=2)
+    poses = vectors(cam_from_world, 7, "cam_from_world")
+    if poses.ndim != 2 or len(poses) != len(vanishing_points):
+        raise InputError(
+            f"cam_from_world must have one row for each of the {len(vanishing_points)} images; got shape {poses.shape}."
+        )
+    rotations = np.swapaxes(quaternion.to_matrix(poses[:, :4]), 1, 2)
+    count = [len(image.normals) for image in vanishing_points]
+    image_idx = np.repeat(np.arange(len(count)), count)
+    empty = np.zeros((0, 3)), np.zeros((0, 3, 2))
+    normals = np.concatenate([empty[0], *(image.normals for image in vanishing_points)])
+    factors = np.concatenate([empty[1], *(image.factors for image in vanishing_points)])
+    candidates = np.concatenate(
+        [empty[0], *(apply(turn, image.directions) for turn, image in zip(rotations, vanishing_points, strict=True))]
+    )
+    good = np.flatnonzero(dot(normals, normals) > 0.0)
+    turned = rotations[image_idx[good]]
+    widened = replace(options, parallel_sigma=float(np.hypot(options.parallel_sigma, rotation_sigma)))
+    found = directions_from_normals(
+        unit(apply(turned, normals[good])), turned @ factors[good], widened, image_idx[good], candidates
+    )
+    label = np.full(len(normals), -1)
+    label[good] = found.label
+    return replace(found, label=label)
+
+
+__all__ = ["VanishingPoints", "consistent_directions", "find_vanishing_points", "segment_normals"]

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Small vector helpers shared by the line and plane algebra: checks at the door, products over the last axis."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import BoolArray, FloatArray
+from groma.errors import InputError, ShapeError
+
+
+def vectors(value: npt.ArrayLike, size: int, name: str) -> FloatArray:
+    """``value`` as float64, refused with a ShapeError unless its last axis has ``size`` entries."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != size:
+        hint = f" Did you mean {name}.T?" if array.ndim == 2 and array.shape[0] == size else ""
+        raise ShapeError(f"{name} must have shape (..., {size}); got {array.shape}. Pass one row per item.{hint}")
+    return array
+
+
+def matrices(value: npt.ArrayLike, rows: int, columns: int, name: str) -> FloatArray:
+    """``value`` as float64, refused with a ShapeError unless it ends in ``rows`` x ``columns``."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape[-2:] != (rows, columns):
+        raise ShapeError(
+            f"{name} must have shape (..., {rows}, {columns}); got {array.shape}. Pass one matrix per item."
+        )
+    return array
+
+
+def finite_rows(name: str, values: npt.ArrayLike, row: tuple[int, ...]) -> FloatArray:
+    """``values`` as finite float64 of shape (N, *row), refused with a ShapeError or an InputError otherwise."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape[1:] != row:
+        wanted = ", ".join(map(str, row))
+        raise ShapeError(f"{name} must have shape (N, {wanted}); got {array.shape}.")
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} must be finite. Remove the rows that are not.")
+    return array
+
+
+def not_negative(value: float, name: str) -> float:
+    """``value``, refused with an InputError unless it is zero or greater."""
+    if not value >= 0.0:
+        raise InputError(f"{name} must be zero or greater; got {value}. Pass a tolerance such as 1e-9.")
+    return float(value)
+
+
+def dot(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Dot product (...) of vectors (..., k), the leading axes broadcast."""
+    return np.asarray(np.einsum("...i,...i->...", first, second))
+
+
+def norm(vector: FloatArray) -> FloatArray:
+    """Euclidean length (...) of vectors (..., k)."""
+    return np.asarray(np.sqrt(dot(vector, vector)))
+
+
+def apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    """Matrices (..., n, k) times vectors (..., k), the leading axes broadcast: (..., n)."""
+    return np.asarray(np.einsum("...ij,...j->...i", matrix, vector))
+
+
+def ratio(numerator: FloatArray, denominator: FloatArray, valid: BoolArray, otherwise: float = np.nan) -> FloatArray:
+    """``numerator / denominator`` where ``valid``, else ``otherwise``; never a warning."""
+    shape = np.broadcast_shapes(np.shape(numerator), np.shape(denominator), np.shape(valid))
+    out = np.full(shape, otherwise)
+    np.divide(numerator, denominator, out=out, where=np.broadcast_to(valid, shape))
+    return out
+
+
+def unit(vector: FloatArray) -> FloatArray:
+    """Vectors (..., k) divided by their lengths, without overflow or underflow; zero where zero or not finite."""
+    largest = np.abs(vector).max(axis=-1, keepdims=True, initial=0.0)
+    scaled = ratio(vector, largest, (largest > 0.0) & np.isfinite(largest), 0.0)
+    return scaled / np.maximum(norm(scaled), 1.0)[..., None]
+
+
+def stack(*parts: FloatArray) -> FloatArray:
+    """Concatenate over the last axis, the leading axes broadcast."""
+    leading = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    return np.concatenate([np.broadcast_to(part, (*leading, part.shape[-1])) for part in parts], axis=-1)
+
+
+def perpendicular(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors b1, b2 (..., 3) such that (b1, b2, d/|d|) is a right-handed orthonormal frame.
+
+    b1 lies across the smallest component of d, so no direction is nearly singular. Charts have another rule, which
+    kernels can follow: see :mod:`groma.geometry.charts.chart`.
+    """
+    axis = np.zeros(direction.shape)
+    np.put_along_axis(axis, np.argmin(np.abs(direction), axis=-1)[..., None], 1.0, axis=-1)
+    first = unit(np.cross(direction, axis))
+    return first, np.cross(unit(direction), first)
+
+
+def cofactor(matrix: FloatArray) -> FloatArray:
+    r"""Cofactor matrices of matrices (..., 3, 3), :math:`\det(N) N^{-\top}` also where N is singular.
+
+    Its rows are the cross products of the other two rows: ``cofactor(N) @ (a x b) = (N a) x (N b)``.
+    """
+    first, second, third = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
+    return np.stack([np.cross(second, third), np.cross(third, first), np.cross(first, second)], axis=-2)

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Points: three numbers (x, y, z), their charts, and their homogeneous form [X, Y, Z, W].
+
+.. math:: (x, y, z) = (X, Y, Z) / W, \qquad X_b = R\,X_a + t .
+
+Points are moved into another frame by :func:`groma.geometry.se3.transform_points`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.errors import ShapeError
+from groma.geometry.charts.point_inverse_depth import InverseDepthPoint
+from groma.geometry.manifold import Euclidean, Manifold
+
+#: Charts of points by name: moved by addition, or linear in the inverse of the distance from an anchor.
+POINT_CHARTS: dict[str, Manifold] = {
+    Euclidean.name: Euclidean(3, "point"),
+    InverseDepthPoint.name: InverseDepthPoint(),
+}
+
+
+def to_homogeneous(point: FloatArray) -> FloatArray:
+    """Homogeneous points (..., 4) with W = 1 of points (..., 3)."""
+    point = np.asarray(point, dtype=np.float64)
+    if point.ndim == 0 or point.shape[-1] != 3:
+        raise ShapeError(f"A point must have shape (..., 3); got {point.shape}.")
+    return np.concatenate([point, np.ones((*point.shape[:-1], 1))], axis=-1)
+
+
+def from_homogeneous(point: FloatArray) -> FloatArray:
+    """Points (..., 3) of homogeneous points (..., 4), W last; NaN for points at infinity (W = 0)."""
+    point = np.asarray(point, dtype=np.float64)
+    if point.ndim == 0 or point.shape[-1] != 4:
+        raise ShapeError(f"A homogeneous point must have shape (..., 4), W last; got {point.shape}.")
+    scale = point[..., 3:]
+    return point[..., :3] / np.where(scale == 0, np.nan, scale)
+
+
+__all__ = ["POINT_CHARTS", "from_homogeneous", "to_homogeneous"]

@@ -1,0 +1,344 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A first model of points and poses from photographs alone, by pycolmap: SIFT, matching, incremental mapping.
+
+Features and matches are kept in a database; what is finished there is not done again, and a run that was killed goes on
+in the middle of either. Work is handed to pycolmap in small batches, which is what progress, Ctrl-C and going on need.
+
+The result does not depend on how threads take turns: images and cameras are entered in the order of their names before
+anything runs in parallel, and every source of random numbers is seeded.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import shutil
+import tempfile
+import zlib  # noqa: F401 - must be loaded before pycolmap, see groma.io.colmap.model
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from groma import cameras as camera_models
+from groma._counted import counted
+from groma.errors import GromaError, InputError, OutputError
+from groma.io.colmap.model import from_pycolmap
+from groma.io.colmap.quiet import quiet
+from groma.scene import Scene
+
+#: Up to this many images every pair is matched; beyond it each image is matched with its followers by name.
+EXHAUSTIVE_LIMIT = 120
+#: Followers, and then every second power of two, so that a walk around a building is closed.
+_OVERLAP = 12
+_FARTHEST = 2**9
+#: Images whose pairs are matched in one call; their features are loaded once for all of them.
+_BLOCK = 8
+#: Bytes that must be free before work is handed to pycolmap, whose threads end the process where they find a full disk:
+#: in any case, for the features of an image, for the matches of a pair.
+_ROOM, _IMAGE_ROOM, _PAIR_ROOM = 8 << 20, 4 << 20, 1 << 18
+#: Degrees under which the rays of the first two images should meet; the second where the first finds none. A camera
+#: that drives forward has no wide angles, and pycolmap lowers what it is given only twice by half.
+FIRST_PAIR_ANGLES = (16.0, 4.0)
+#: Matches per image from which overlap and texture are not what is missing.
+FEW_MATCHES = 100
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class PointModelOptions:
+    """Options of :func:`reconstruct_points`."""
+
+    #: A camera model that COLMAP and groma share; its distortion is estimated.
+    camera_model: str = "SIMPLE_RADIAL"
+    #: Parameters of the camera, in the model's order, if they are known: they are then kept.
+    camera_params: tuple[float, ...] | None = None
+    #: Seed of the random numbers of matching and mapping.
+    seed: int = 0
+    #: Most threads of pycolmap; None: as many as there are processors.
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        known = {model.name: model for model in camera_models.models() if model.colmap_name is not None}
+        model = known.get(self.camera_model)
+        if model is None:
+            raise InputError(f"The camera model must be one of {', '.join(known)}; got {self.camera_model!r}.")
+        given = self.camera_params
+        if given is not None and len(given) != model.num_parameters:
+            raise InputError(
+                f"Camera model {model.name} has {model.num_parameters} parameters "
+                f"({', '.join(model.parameter_names)}); got {len(given)}. Pass them in this order."
+            )
+        if given is not None and not (all(map(math.isfinite, given)) and given[0] > 0):
+            raise InputError(
+                f"The camera parameters ({', '.join(model.parameter_names)}) must be numbers, the focal length "
+                f"positive; got {', '.join(f'{value:g}' for value in given)}."
+            )
+
+
+def reconstruct_points(
+    images: str | os.PathLike[str],
+    work: str | os.PathLike[str],
+    names: Sequence[str],
+    options: PointModelOptions | None = None,
+    progress: Progress | None = None,
+) -> Scene:
+    """Reconstruct poses and points from photographs.
+
+    Images of the same size and the same EXIF camera share one camera. The EXIF orientation is not applied: pixels are
+    taken as they are stored.
+
+    Parameters
+    ----------
+    images : path
+        Folder of photographs.
+    work : path
+        Folder for the database; what is finished there is not done again.
+    names : sequence of str
+        The images, by their names in the folder.
+    options : PointModelOptions, optional
+        Camera model, seed, threads.
+    progress : callable, optional
+        Called with the name of a stage, what is done and what there is to do.
+
+    Returns
+    -------
+    Scene
+        The model with most images. Images that could not be placed are not in it.
+
+    Raises
+    ------
+    InputError
+        If no model comes out: too few images, no overlap, or no texture.
+    OutputError
+        If there is no room in ``work``, or pycolmap fails otherwise.
+    """
+    import pycolmap
+
+    options = options or PointModelOptions()
+    say = progress or (lambda stage, done, total: None)
+    folder, names = Path(work), sorted(names)
+    database = folder / "database.db"
+    pycolmap.set_random_seed(options.seed)
+    with quiet(pycolmap), _explained(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        _check_room(folder)
+        _enter_images(pycolmap, database, Path(images), names, options)
+        _find_features(pycolmap, database, Path(images), names, options, say)
+        _match(pycolmap, database, names, options, say)
+        models = []
+        for angle in FIRST_PAIR_ANGLES:
+            models = models or _reconstruct(pycolmap, database, Path(images), folder, len(names), options, angle, say)
+    if not models:
+        with _opened(pycolmap, database) as content:
+            features, matches = content.num_keypoints(), content.num_inlier_matches()
+        raise InputError(
+            f"No reconstruction came out of the {counted(len(names), 'images')} in {images}: {features:,} points "
+            f"were found in them and {matches:,} matches between them. "
+            f"{_why_none(features, matches, len(names))} "
+            "Take more images with more overlap, from places some steps apart, or pass a model with --model."
+        )
+    # Of equally many images the one with more points, so that the choice does not depend on an order.
+    best = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    return from_pycolmap(best)
+
+
+def _why_none(features: int, matches: int, count: int) -> str:
+    """Say why nothing could be reconstructed."""
+    if features == 0:
+        return "They show no texture."
+    if matches < FEW_MATCHES * count:
+        return "They overlap too little, or show too little texture."
+    return "They match, but no two show depth: the camera only turned, or moved too little for its distance."
+
+
+# ------------------------------------------------------------------------------------------------------------ stages
+
+
+def _enter_images(pycolmap: Any, database: Path, images: Path, names: list[str], options: PointModelOptions) -> None:
+    """Enter cameras and images, before features are found in parallel, so that their numbers are always the same."""
+    try:
+        with _opened(pycolmap, database) as content:
+            if content.num_images() == len(names):
+                return
+            content.clear_all_tables()  # a run was killed here
+    except RuntimeError:  # damaged by somebody else: made again
+        for path in database.parent.glob(f"{database.name}*"):
+            path.unlink()
+        with _opened(pycolmap, database):
+            pass
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for name in names:
+        bitmap = pycolmap.Bitmap.read(str(images / name), False)
+        if bitmap is None:
+            raise InputError(
+                f"{images / name} cannot be read by pycolmap, which finds the points. Convert it to JPEG or PNG."
+            )
+        groups.setdefault((bitmap.width, bitmap.height, bitmap.exif_camera_model()), []).append(name)
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = camera_models.model(options.camera_model).colmap_name
+    if options.camera_params is not None:
+        if len(groups) > 1:
+            sizes = ", ".join(sorted({f"{key[0]}x{key[1]}" for key in groups}))
+            raise InputError(
+                f"One set of camera parameters was given, but the images come from {len(groups)} cameras ({sizes}). "
+                "Leave the parameters out, or map the images of one camera."
+            )
+        reader.camera_params = ",".join(repr(float(value)) for value in options.camera_params)
+    for members in groups.values():
+        pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, members, reader)
+
+
+def _find_features(
+    pycolmap: Any, database: Path, images: Path, names: list[str], options: PointModelOptions, say: Progress
+) -> None:
+    with _opened(pycolmap, database) as content:
+        done = {image.name for image in content.read_all_images() if content.exists_descriptors(image.image_id)}
+    missing = [name for name in names if name not in done]
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.num_threads = options.threads or -1
+    batch = options.threads or os.cpu_count() or 1
+    for start in range(0, len(missing), batch):
+        say("finding points in images", len(names) - len(missing) + start, len(names))
+        _check_room(database.parent, len(missing[start : start + batch]) * _IMAGE_ROOM)
+        pycolmap.extract_features(
+            database,
+            images,
+            image_names=missing[start : start + batch],
+            extraction_options=extraction,
+            device=pycolmap.Device.cpu,
+        )
+
+
+def _match(pycolmap: Any, database: Path, names: list[str], options: PointModelOptions, say: Progress) -> None:
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.num_threads = options.threads or -1
+    verification.ransac.random_seed = options.seed
+    common = {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
+    total = sum(len(block) for block in pair_blocks(len(names)))
+    if any(name.split() != [name] for name in names):
+        # A list of pairs is cut at white space; these calls need none, but tell nothing before they end.
+        say("matching points of image pairs", 0, total)
+        _check_room(database.parent, total * _PAIR_ROOM)
+        if len(names) <= EXHAUSTIVE_LIMIT:
+            pycolmap.match_exhaustive(database, **common)
+        else:
+            pairing = pycolmap.SequentialPairingOptions()
+            pairing.overlap = _OVERLAP
+            pycolmap.match_sequential(database, pairing_options=pairing, **common)
+        return
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = database.with_name("pairs.txt")
+    done = 0
+    for block in pair_blocks(len(names)):
+        say("matching points of image pairs", done, total)
+        _check_room(database.parent, len(block) * _PAIR_ROOM)
+        done += len(block)
+        lines = "".join(f"{names[i]} {names[j]}\n" for i, j in block)
+        pairing.match_list_path.write_text(lines, encoding="utf-8")
+        pycolmap.match_image_pairs(database, pairing_options=pairing, **common)
+
+
+def pair_blocks(count: int) -> Iterator[list[tuple[int, int]]]:
+    """Yield the pairs of images to match, in blocks that need the features of few images."""
+    steps = {*range(1, _OVERLAP + 1), *(2**k for k in range(_FARTHEST.bit_length()))}
+    if count <= EXHAUSTIVE_LIMIT:
+        steps = set(range(1, count))
+    starts = range(0, count, _BLOCK)
+    for row in starts:
+        for column in range(row, count, _BLOCK):
+            block = [
+                (i, j)
+                for i in range(row, min(row + _BLOCK, count))
+                for j in range(max(i + 1, column), min(column + _BLOCK, count))
+                if j - i in steps
+            ]
+            if block:
+                yield block
+
+
+def _reconstruct(
+    pycolmap: Any,
+    database: Path,
+    images: Path,
+    work: Path,
+    count: int,
+    options: PointModelOptions,
+    angle: float,
+    say: Progress,
+) -> list[Any]:
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline.num_threads = 1  # with more, sums depend on which thread is first, and so do the points kept
+    for part in (pipeline, pipeline.mapper, pipeline.triangulation):
+        part.random_seed = options.seed
+    pipeline.mapper.init_min_tri_angle = angle
+    if options.camera_params is not None:
+        pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False
+        pipeline.mapper.abs_pose_refine_focal_length = pipeline.mapper.abs_pose_refine_extra_params = False
+    placed = [0]
+
+    def one_more(number: int) -> None:
+        placed[0] += number
+        say("placing cameras", min(placed[0], count), count)
+
+    say("placing cameras", 0, count)
+    _check_room(work)
+    found = pycolmap.incremental_mapping(
+        database,
+        images,
+        work / "models",
+        options=pipeline,
+        initial_image_pair_callback=lambda: one_more(2),
+        next_image_callback=lambda: one_more(1),
+    )
+    return [found[number] for number in sorted(found)]
+
+
+# ----------------------------------------------------------------------------------------------------------- helpers
+
+
+@contextmanager
+def _opened(pycolmap: Any, database: Path) -> Iterator[Any]:
+    content = pycolmap.Database.open(str(database))
+    try:
+        yield content
+    finally:
+        content.close()
+
+
+def _check_room(folder: Path, more: int = 0) -> None:
+    """Refuse to begin what the disk may have no room for."""
+    free, needed = shutil.disk_usage(folder).free, _ROOM + more
+    if free < needed:
+        raise OutputError(
+            f"The disk of {folder} has {free >> 20} MiB left; the points of the images need {-(-needed >> 20)} MiB. "
+            "Make room there; the same command then goes on."
+        )
+    if hasattr(os, "posix_fallocate"):  # knows of quotas and limits, too
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            try:
+                os.posix_fallocate(probe.fileno(), 0, needed)
+            except OSError as error:
+                if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                    raise
+
+
+@contextmanager
+def _explained(folder: Path) -> Iterator[None]:
+    """Turn what pycolmap and the file system raise into errors of groma."""
+    try:
+        yield
+    except GromaError:
+        raise
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
+        raise OutputError(
+            f"The points of the images cannot be reconstructed in {folder}: {reason.rstrip('.')}. See that there is "
+            "room and you may write there; the same command then goes on. If it fails again, remove that folder."
+        ) from error
+
+
+__all__ = ["EXHAUSTIVE_LIMIT", "PointModelOptions", "pair_blocks", "reconstruct_points"]

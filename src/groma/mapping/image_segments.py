@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The segments of all images, one image in memory at a time; where a lens bends lines, found where they are straight.
+
+A straight edge seen through a distorting lens is an arc. A detector of straight segments breaks it into short chords
+beside it. Images of such cameras are therefore resampled without distortion, with the same camera matrix; segments are
+found there, and their end points taken back to the image as it is, which is what the rest of groma measures in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from groma import cameras as camera_models
+from groma._typing import FloatArray
+from groma.errors import InputError
+from groma.features.external import ExternalMatches
+from groma.features.images import GrayImage
+from groma.features.segments import Segments
+from groma.geometry import segment2
+from groma.mapping.photographs import read_gray
+from groma.scene import Scene
+
+#: A lens that moves no pixel by more than this is taken as it is; pixels.
+NEGLIGIBLE = 0.05
+#: The resampled image is at most so much larger than the original, per side; wide lenses lose their corners.
+MAX_GROWTH = 2.0
+#: Places looked at along a segment, to find the part of it inside the image.
+_SAMPLES = 65
+
+
+class Detector(Protocol):
+    """What finds segments in an image: see :mod:`groma.features`."""
+
+    def detect(self, image: npt.NDArray[np.generic]) -> Segments:
+        """Segments of a grey image."""
+        ...
+
+
+@dataclass(frozen=True)
+class Straightener:
+    """Resamples the images of one camera without distortion, and takes segments back."""
+
+    model: camera_models.CameraModel
+    params: FloatArray
+    #: (width, height) of the original image.
+    size: tuple[int, int]
+    #: (3, 3) camera matrix of the resampled image.
+    K: FloatArray
+    #: (H, W, 2) float32: where each of its pixels lies in the original, in array coordinates.
+    source: npt.NDArray[np.float32]
+
+    @staticmethod
+    def of(model: camera_models.CameraModel, params: FloatArray, width: int, height: int) -> Straightener | None:
+        """Make one for a camera; None if its lens bends nothing worth the effort."""
+        u, v = np.linspace(0.0, width, 33), np.linspace(0.0, height, 33)
+        border = np.concatenate([np.column_stack([u, np.full(33, side)]) for side in (0.0, height)])
+        border = np.concatenate([border, *(np.column_stack([np.full(33, side), v]) for side in (0.0, width))])
+        straight = model.undistort_pixels(params, border)
+        straight = straight[np.isfinite(straight).all(1)]
+        if len(straight) == len(border) and np.abs(straight - border).max() <= NEGLIGIBLE:
+            return None
+        growth = 0.5 * (MAX_GROWTH - 1.0) * np.array([width, height])
+        corner = np.array([width, height], float)
+        low = np.maximum(np.floor(straight.min(0, initial=0.0)), np.floor(-growth))
+        high = np.minimum(np.ceil(straight.max(0, initial=0.0)), np.ceil(corner + growth))
+        if len(straight) < len(border):  # a view so wide that its border has no place in a plane
+            low, high = np.floor(-growth), np.ceil(corner + growth)
+        K = model.camera_matrix(params).copy()
+        K[:2, 2] -= low
+        columns, rows = (high - low).astype(int)
+        source = np.empty((rows, columns, 2), np.float32)
+        u = np.arange(columns) + 0.5
+        for row in range(rows):
+            rays = np.column_stack([(u - K[0, 2]) / K[0, 0], np.full(columns, (row + 0.5 - K[1, 2]) / K[1, 1])])
+            pixels = model.project(params, np.column_stack([rays, np.ones(columns)]))
+            source[row] = np.where(np.isfinite(pixels), pixels - 0.5, -1e6)
+        return Straightener(model, params, (width, height), K, source)
+
+    def detect(self, detector: Detector, image: GrayImage) -> Segments:
+        """Find segments in an image of this camera; their end points are pixels of the image as it is."""
+        # The border is repeated: black outside would be an edge all around.
+        straight = cv2.remap(image, self.source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+        found = detector.detect(straight)
+        if len(found) == 0:
+            return found
+        shortest = segment2.length(found.ends).min()
+        along = np.linspace(0.0, 1.0, _SAMPLES)[:, None]
+        places = found.ends[:, None, :2] * (1.0 - along) + found.ends[:, None, 2:] * along
+        inside = self._inside(places.reshape(-1, 2)).reshape(len(found), _SAMPLES)
+        first, last = inside.argmax(1), _SAMPLES - 1 - inside[:, ::-1].argmax(1)
+        rows = np.arange(len(found))
+        ends = np.hstack([places[rows, first], places[rows, last]])
+        keep = inside.any(1) & (segment2.length(ends) >= shortest)
+        bent = self._bend(ends[keep].reshape(-1, 2)).reshape(-1, 4)
+        return Segments(bent, found.sigma[keep], found.strength[keep])
+
+    def _bend(self, pixels: FloatArray) -> FloatArray:
+        """Pixels of the original image, from pixels of the resampled one."""
+        rays = np.column_stack([(pixels - self.K[:2, 2]) / self.K[[0, 1], [0, 1]], np.ones(len(pixels))])
+        return self.model.project(self.params, rays)
+
+    def _inside(self, pixels: FloatArray) -> npt.NDArray[np.bool_]:
+        bent = self._bend(pixels)
+        inside = np.all((bent >= 0.0) & (bent <= np.array(self.size)), axis=1)
+        # Far out a polynomial lens model folds the plane back into the image; only what comes back was seen there.
+        back = self.model.undistort_pixels(self.params, bent[inside]) + self._shift
+        inside[inside] = np.all(np.abs(back - pixels[inside]) < 0.5, axis=1)
+        return inside
+
+    @property
+    def _shift(self) -> FloatArray:
+        """From pixels without distortion to pixels of the resampled image."""
+        return self.K[:2, 2] - self.model.camera_matrix(self.params)[:2, 2]
+
+
+def detect_segments(
+    folder: Path, scene: Scene, detector: Detector, say: Callable[[str, int, int], None]
+) -> list[Segments]:
+    """Find the segments of every image of a scene; pixels of the images as they are."""
+    straighteners: dict[int, Straightener | None] = {}
+    found = []
+    for i, name in enumerate(scene.images.names):
+        say("finding segments", i, scene.num_images)
+        image = read_gray(folder / name)
+        camera = int(scene.images.camera_idx[i])
+        if camera not in straighteners:
+            model = camera_models.model(scene.cameras.models[camera])
+            # One is kept: it is larger than the image, and there may be a camera for every image.
+            straighteners = {
+                camera: Straightener.of(model, scene.cameras.params_of(camera), image.shape[1], image.shape[0])
+            }
+        straightener = straighteners[camera]
+        found.append(detector.detect(image) if straightener is None else straightener.detect(detector, image))
+    return found
+
+
+def given_segments(
+    folder: Path, scene: Scene, external: ExternalMatches, say: Callable[[str, int, int], None]
+) -> list[Segments]:
+    """Return segments from elsewhere, directed and rated by the grey levels of the images.
+
+    Raises
+    ------
+    InputError
+        If the file names other images, or has matches of segments that it does not hold.
+    """
+    names = set(scene.images.names)
+    used = {name for pair in external.matches for name in pair} & names
+    known = set(external.segments) & names
+    if not known:
+        example = min([*external.segments, *(name for pair in external.matches for name in pair)], default="none")
+        raise InputError(
+            f"The line matches hold segments of no image of the model; they name {example!r}, the model "
+            f"{scene.images.names[0]!r}. Names must match."
+        )
+    if used - known:
+        raise InputError(
+            f"The line matches refer to segments of {min(used - known)!r}, but do not hold them. Add an array "
+            f"'segments|{min(used - known)}'."
+        )
+    found = []
+    for i, name in enumerate(scene.images.names):
+        say("reading segments", i, scene.num_images)
+        found.append(external.segments_of(name, read_gray(folder / name)) if name in known else Segments.empty())
+    return found
+
+
+__all__ = ["Straightener", "detect_segments", "given_segments"]

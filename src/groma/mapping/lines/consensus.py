@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Which of a segment's proposals several images agree on.
+
+Proposals q, q' of different neighbours with covariances support each other by
+:math:`(q - q')^\top (\Sigma + \Sigma')^{-1} (q - q')`. The best supported ones are fused in information form,
+
+.. math:: \Sigma_f^{-1} = \sum w_j \Sigma_j^{-1}, \qquad \Sigma_f^{-1} q_f = \sum w_j \Sigma_j^{-1} q_j,
+
+one proposal per neighbour, compared again, and the place that most neighbours agree on is kept. What the image itself
+proposes, from points or a vanishing direction, takes part like a neighbour, but cannot make up for one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._numba import kernel, loop
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.mapping.lines.proposals import Proposals
+
+#: Mahalanobis distance up to which two proposals agree: 99.7 % for two degrees of freedom.
+GATE = 11.6
+#: Hypotheses per segment that are fused and compared.
+NUM_SEEDS = 3
+
+
+# ------------------------------------------------------------------------------------------------------------ Kernels
+@kernel
+def _distance(d1, d2, c11, c12, c22):
+    """Squared Mahalanobis distance."""
+    return (c22 * d1 * d1 - 2.0 * c12 * d1 * d2 + c11 * d2 * d2) / max(c11 * c22 - c12 * c12, 1e-300)
+
+
+@loop
+def _support(pointers, order, neighbor, values, num_neighbors, gate, total):
+    """Support of every proposal of every segment by the proposals of other neighbours: total (M,)."""
+    best = np.zeros(num_neighbors + 2)
+    for i in range(len(pointers) - 1):
+        begin, end = pointers[i], pointers[i + 1]
+        largest = 0.0
+        for k in range(begin, end):
+            largest = max(largest, values[order[k], 2])
+        for k in range(begin, end):
+            p = order[k]
+            reach = math.sqrt(gate * (values[p, 2] + largest))
+            best[:] = 0.0
+            best[neighbor[p]] = values[p, 5]
+            for side in range(-1, 2, 2):
+                m = k + side
+                while begin <= m < end:
+                    r = order[m]
+                    d1 = values[r, 0] - values[p, 0]
+                    if abs(d1) > reach:
+                        break
+                    m += side
+                    if neighbor[r] == neighbor[p]:
+                        continue
+                    d2 = values[r, 1] - values[p, 1]
+                    c11, c22 = values[r, 2] + values[p, 2], values[r, 4] + values[p, 4]
+                    if d1 * d1 > gate * c11 or d2 * d2 > gate * c22:
+                        continue
+                    distance = _distance(d1, d2, c11, values[r, 3] + values[p, 3], c22)
+                    if distance < gate:
+                        weight = values[r, 5] * (1.0 - distance / gate)
+                        if weight > best[neighbor[r]]:
+                            best[neighbor[r]] = weight
+            total[p] = best.sum()
+
+
+@loop
+def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate, min_support, q, covariance, score,
+            supporters, rival, assisted):  # fmt: skip
+    """Fuse the best supported proposals of each segment and keep the one that most neighbours agree on."""
+    chosen = np.empty(num_neighbors + 2, np.int64)
+    nearest = np.empty(num_neighbors + 2)
+    for i in range(len(pointers) - 1):
+        begin, end = pointers[i], pointers[i + 1]
+        used = np.zeros(end - begin, np.bool_)
+        for _ in range(NUM_SEEDS):
+            seed, top = -1, 0.0
+            for k in range(begin, end):
+                if not used[k - begin] and total[order[k]] > top:
+                    seed, top = k, total[order[k]]
+            if seed < 0 or top <= score[i] - 1.0:
+                break
+            p = order[seed]
+            q1, q2, c11, c12, c22 = values[p, 0], values[p, 1], values[p, 2], values[p, 3], values[p, 4]
+            number, points, value = 0, 0, 0.0
+            for _ in range(3):  # fuse, compare again
+                nearest[:] = gate
+                chosen[:] = -1
+                for k in range(begin, end):
+                    r = order[k]
+                    d1, d2 = values[r, 0] - q1, values[r, 1] - q2
+                    v11, v22 = values[r, 2] + c11, values[r, 4] + c22
+                    if d1 * d1 > gate * v11 or d2 * d2 > gate * v22:
+                        continue
+                    distance = _distance(d1, d2, v11, values[r, 3] + c12, v22)
+                    if distance < gate:
+                        used[k - begin] = True
+                    if distance < nearest[neighbor[r]]:
+                        nearest[neighbor[r]], chosen[neighbor[r]] = distance, r
+                number, points, value = 0, 0, 0.0
+                i11 = i12 = i22 = y1 = y2 = 0.0
+                for n in range(num_neighbors + 2):
+                    r = chosen[n]
+                    if r < 0:
+                        continue
+                    if n >= num_neighbors:
+                        points = 1
+                    else:
+                        number += 1
+                    weight = 1.0 / (1.0 + nearest[n] / 4.0)
+                    value += values[r, 5] * (1.0 - nearest[n] / gate)
+                    determinant = values[r, 2] * values[r, 4] - values[r, 3] * values[r, 3]
+                    if not determinant > 0.0:
+                        continue
+                    w11, w12, w22 = values[r, 4] / determinant, -values[r, 3] / determinant, values[r, 2] / determinant
+                    i11, i12, i22 = i11 + weight * w11, i12 + weight * w12, i22 + weight * w22
+                    y1 += weight * (w11 * values[r, 0] + w12 * values[r, 1])
+                    y2 += weight * (w12 * values[r, 0] + w22 * values[r, 1])
+                determinant = i11 * i22 - i12 * i12
+                if not determinant > 0.0:
+                    break
+                c11, c12, c22 = i22 / determinant, -i12 / determinant, i11 / determinant
+                q1, q2 = c11 * y1 + c12 * y2, c12 * y1 + c22 * y2
+            if number < min_support or number + points < 2:
+                continue
+            if value > score[i]:
+                rival[i] = score[i]
+                score[i] = value
+                q[i, 0], q[i, 1] = q1, q2
+                covariance[i, 0], covariance[i, 1], covariance[i, 2] = c11, c12, c22
+                assisted[i, 0], assisted[i, 1] = chosen[num_neighbors] >= 0, chosen[num_neighbors + 1] >= 0
+                for n in range(num_neighbors):
+                    supporters[i, n] = other[chosen[n]] if chosen[n] >= 0 else -1
+            elif value > rival[i]:
+                rival[i] = value
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The place chosen for each segment of an image."""
+
+    #: (n,) whether enough neighbours agree on one.
+    found: BoolArray
+    #: (n, 2) inverse depths of the end points.
+    q: FloatArray
+    #: (n, 3) their variances and covariance, c11 c12 c22.
+    covariance: FloatArray
+    #: (n,) summed support.
+    score: FloatArray
+    #: (n,) support of the best place that disagrees.
+    rival: FloatArray
+    #: (n, num_neighbors) rows of the supporting segments, -1 for none.
+    supporters: IntArray
+    #: (n, 2) whether known points, and a point with a vanishing direction, have a part in it.
+    assisted: BoolArray
+
+
+def choose(proposals: Proposals, num_segments: int, num_neighbors: int, min_support: int) -> Choice:
+    """Choose the place of each segment by the summed support of distinct neighbours."""
+    by_segment = np.lexsort([proposals.values[:, 0], proposals.segment])
+    pointers = np.searchsorted(proposals.segment[by_segment], np.arange(num_segments + 1))
+    total = np.zeros(len(proposals.segment))
+    _support(pointers, by_segment, proposals.neighbor, proposals.values, num_neighbors, GATE, total)
+    q, covariance = np.zeros((num_segments, 2)), np.zeros((num_segments, 3))
+    score, rival = np.zeros(num_segments), np.zeros(num_segments)
+    supporters = np.full((num_segments, num_neighbors), -1, np.int64)
+    assisted = np.zeros((num_segments, 2), bool)
+    _choose(
+        pointers, by_segment, proposals.neighbor, proposals.other, proposals.values, total, num_neighbors, GATE,
+        min_support, q, covariance, score, supporters, rival, assisted,
+    )  # fmt: skip
+    return Choice(score > 0.0, q, covariance, score, rival, supporters, assisted)

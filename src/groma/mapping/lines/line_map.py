@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Mapped lines, who sees them, and what became of every segment, in numbers and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.mapping.lines.rejection import REMEDIES, WORDS, Fate
+from groma.scene import LineObservations, Lines, Relations, Scene
+
+if TYPE_CHECKING:
+    from groma.features.segments import Segments
+
+#: Groups of segments that :func:`explain` names; the others are counted together.
+_NAMED = 4
+
+
+@dataclass(frozen=True, eq=False)
+class LineMap:
+    """Lines, the segments that observe them, and what became of all others."""
+
+    #: (L, 6) Plücker lines (m, d), unit direction, world frame.
+    lines: FloatArray
+    #: (L, 2, 3) end points; directed like the segments.
+    segments: FloatArray
+    #: (N,) image of each observation; observations are sorted by line.
+    image_idx: IntArray
+    #: (N,) number of the segment within its image.
+    segment_idx: IntArray
+    #: (N,) line of each observation.
+    line_idx: IntArray
+    #: (N,) root mean square distance of the segment's end points to the projected line, pixels.
+    residual: FloatArray
+    #: (L,) number of images that see the line.
+    num_images: IntArray
+    #: (L,) median over its observations of ``residual``, pixels.
+    median_residual: FloatArray
+    #: (L,) largest standard deviation of the end points across the line, scene units.
+    uncertainty: FloatArray
+    #: One array per image: the :class:`Fate` of each segment.
+    fates: tuple[IntArray, ...]
+    #: One array per image: its neighbours, best first.
+    neighbors: tuple[IntArray, ...]
+    #: Number of observations whose own proposals include one from known ``points``, or from a point and one of the
+    #: vanishing ``directions``.
+    assisted: dict[str, int] = field(default_factory=dict)
+    #: Seconds per stage.
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def num_lines(self) -> int:
+        """Number of lines."""
+        return len(self.lines)
+
+    def fate_counts(self) -> dict[Fate, int]:
+        """Number of segments with each fate."""
+        counts = np.bincount(np.concatenate([*self.fates, np.empty(0, np.int64)]), minlength=len(Fate))
+        return {fate: int(counts[fate]) for fate in Fate}
+
+    def add_to(self, scene: Scene, segments: Sequence[Segments]) -> Scene:
+        """Return the scene with these lines and their observations in place of its own lines."""
+        first = np.cumsum([0, *(len(one) for one in segments)])[self.image_idx] + self.segment_idx
+        measured = np.concatenate([np.zeros((0, 4)), *(one.ends for one in segments)])[first]
+        sigma = np.concatenate([np.zeros(0), *(one.sigma for one in segments)])[first]
+        usual = float(np.median(sigma)) if len(sigma) else 1.0
+        return scene.replace(
+            lines=Lines.through(self.segments),
+            line_observations=LineObservations(self.image_idx, self.line_idx, measured, sigma / usual),
+            relations=Relations(point_on_plane=scene.relations.point_on_plane),
+        )
+
+
+def explain(line_map: LineMap) -> str:
+    """Say in words how many segments were mapped, where the others were lost, and what would help."""
+    counts = line_map.fate_counts()
+    total = sum(counts.values())
+    if not line_map.fates:
+        return "There are no images. Pass a scene with images and poses."
+    if total == 0:
+        return (
+            "No segments were found in any image. The photographs may be blank, blurred or very dark; a smaller least "
+            "length (--min-length) finds shorter ones."
+        )
+    mapped = counts[Fate.MAPPED] + counts[Fate.RECOVERED]
+    number = f"{line_map.num_lines:,} {'line' if line_map.num_lines == 1 else 'lines'}"
+    head = f"{number} from {mapped:,} of {total:,} segments in {_images(len(line_map.fates))}."
+    lost = sorted(((n, fate) for fate, n in counts.items() if fate > Fate.RECOVERED and n), reverse=True)
+    if not lost:
+        return head
+    parts = [f"{n:,} ({_percent(n, total)}) {WORDS[fate]}" for n, fate in lost[:_NAMED]]
+    others = sum(n for n, _ in lost[_NAMED:])
+    if others:
+        parts.append(f"{others:,} ({_percent(others, total)}) were lost for other reasons")
+    start = "The map is empty" if line_map.num_lines == 0 else "Of the other segments"
+    return f"{head} {start}: {'; '.join(parts)}. What would help most: {REMEDIES[lost[0][1]]}."
+
+
+def _images(number: int) -> str:
+    return f"{number} {'image' if number == 1 else 'images'}"
+
+
+def _percent(part: int, total: int) -> str:
+    return f"{100.0 * part / total:.0f} %" if 200 * part >= total else "under 1 %"
+
+
+__all__ = ["LineMap", "explain"]

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""One line where several were mapped along the same edge.
+
+An edge is mapped more than once where its darker side changes with the view, where occlusions separate the images that
+see it, and where poses are bent: around a loop the same edge lies elsewhere. Two lines are one if they agree in space,
+
+.. math:: \delta^\top (\Sigma_a + \Sigma_b + \tau^2 I)^{-1} \delta \le \gamma,
+
+with :math:`\delta` the offsets of line b from line a across it at both ends of their overlap (four numbers) and
+:math:`\Sigma` their covariances; and if no image shows them as two segments side by side. The deviation
+:math:`\tau` stands for the poses. It is a floor in pixels at the lines' distance, or what the pairs that may be one
+line disagree by, if that is more.
+
+Pairs that prefer each other are joined, fitted again, and compared again.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from groma._numba import kernel, loop
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.mapping.lines.fit import across_basis, line_residuals
+from groma.mapping.lines.tracks import Tracks
+
+#: Squared Mahalanobis distance up to which two lines agree: 99.7 % for four degrees of freedom.
+GATE = 16.3
+#: Bounds of the deviation of the poses, pixels.
+POSE_PX = (0.3, 2.5)
+#: Median of the mean of four squared normal numbers, half of them independent.
+MEDIAN_SQUARE = 0.6
+#: Lines further apart are never one, pixels.
+MAX_PX = 8.0
+#: Largest angle between two lines, radians.
+MAX_ANGLE = 0.2
+#: Share of the shorter line that must overlap along the line.
+MIN_OVERLAP = 0.2
+#: Segments of an image nearer than that to each other show one edge twice, pixels.
+SAME_PX = 1.0
+ROUNDS = 6
+
+
+# -------------------------------------------------------------------------------------------------------------- Loops
+@loop
+def _information(camera, image, ends, sigma, pointers, rows, X, H, U):
+    """Information (L, 4, 4) of the offsets of both points of each line, in the basis (L, 2, 3) across it."""
+    r, J = np.zeros(2), np.zeros((2, 4))
+    for n in range(len(pointers) - 1):
+        across_basis(X[n], U[n])
+        for m in range(pointers[n], pointers[n + 1]):
+            s = rows[m]
+            line_residuals(camera[image[s]], ends[s], sigma[s], X[n], U[n], r, J)
+            for a in range(4):
+                for b in range(4):
+                    H[n, a, b] += J[0, a] * J[0, b] + J[1, a] * J[1, b]
+
+
+@loop
+def _bin_lines(order, first_bin, last_bin, pointers, members):
+    """Lines of every bin, in the given order; ``members`` empty: only their numbers, in ``pointers``."""
+    fill = np.zeros(len(pointers) - 1, np.int64)
+    for n in order:
+        for k in range(first_bin[n], last_bin[n] + 1):
+            if len(members):
+                members[pointers[k] + fill[k]] = n
+            fill[k] += 1
+    if not len(members):
+        for k in range(len(fill)):
+            pointers[k + 1] = pointers[k] + fill[k]
+
+
+@loop
+def _near_pairs(pointers, members, first_bin, low, X, reach, max_angle, min_overlap, pairs, span):
+    """Pairs of lines that are nearly parallel, overlap, and are near there; return the number written, or needed.
+
+    Lines come in bins along one axis and, within a bin, in the order of ``low`` (L, 2), their extent along another;
+    span (M, 2) is the overlap, as positions on the first line in units of its length.
+    """
+    count, k = 0, 0
+    for i in range(len(members)):
+        while i >= pointers[k + 1]:
+            k += 1
+        a = members[i]
+        d0, d1, d2 = X[a, 1, 0] - X[a, 0, 0], X[a, 1, 1] - X[a, 0, 1], X[a, 1, 2] - X[a, 0, 2]
+        dd = d0 * d0 + d1 * d1 + d2 * d2
+        for j in range(i + 1, pointers[k + 1]):
+            b = members[j]
+            near = min(reach[a], reach[b])
+            if low[b, 0] > low[a, 1] + near:
+                break
+            if max(first_bin[a], first_bin[b]) != k:
+                continue  # a pair that shares several bins counts in the first of them
+            e0, e1, e2 = X[b, 1, 0] - X[b, 0, 0], X[b, 1, 1] - X[b, 0, 1], X[b, 1, 2] - X[b, 0, 2]
+            ee = e0 * e0 + e1 * e1 + e2 * e2
+            de = d0 * e0 + d1 * e1 + d2 * e2
+            if not de * de > math.cos(max_angle) ** 2 * dd * ee:
+                continue
+            w0, w1, w2 = X[b, 0, 0] - X[a, 0, 0], X[b, 0, 1] - X[a, 0, 1], X[b, 0, 2] - X[a, 0, 2]
+            t0 = (w0 * d0 + w1 * d1 + w2 * d2) / dd
+            t1 = t0 + de / dd
+            first, last = max(0.0, min(t0, t1)), min(1.0, max(t0, t1))
+            if last - first < min_overlap * min(1.0, abs(t1 - t0)):
+                continue
+            close = True
+            for t in (first, last):
+                s = (t - t0) / (t1 - t0)
+                x0, x1, x2 = w0 + s * e0 - t * d0, w1 + s * e1 - t * d1, w2 + s * e2 - t * d2
+                if x0 * x0 + x1 * x1 + x2 * x2 > near * near:
+                    close = False
+            if close:
+                if count < len(pairs):
+                    pairs[count, 0], pairs[count, 1] = a, b
+                    span[count, 0], span[count, 1] = first, last
+                count += 1
+    return count
+
+
+@kernel
+def _side_by_side(ends, line, other):
+    """Whether two segments of an image overlap along the first one and are apart across it."""
+    ux, uy = ends[2] - ends[0], ends[3] - ends[1]
+    length2 = ux * ux + uy * uy
+    t0 = ((other[0] - ends[0]) * ux + (other[1] - ends[1]) * uy) / length2
+    t1 = ((other[2] - ends[0]) * ux + (other[3] - ends[1]) * uy) / length2
+    low, high = min(t0, t1), max(t0, t1)
+    away0 = abs(line[0] * other[0] + line[1] * other[1] + line[2])
+    away1 = abs(line[0] * other[2] + line[1] * other[3] + line[2])
+    return min(high, 1.0) - max(low, 0.0) > 0.3 * min(1.0, high - low) and max(away0, away1) > SAME_PX
+
+
+@loop
+def _apart(pairs, pointers, rows, image, ends, line, apart):
+    """Whether some image shows both lines of a pair side by side; the observations of a line come by image."""
+    for n in range(len(pairs)):
+        a, b = pairs[n, 0], pairs[n, 1]
+        i, begin = pointers[a], pointers[b]
+        while i < pointers[a + 1] and not apart[n]:
+            s = rows[i]
+            while begin < pointers[b + 1] and image[rows[begin]] < image[s]:
+                begin += 1
+            j = begin
+            while j < pointers[b + 1] and image[rows[j]] == image[s] and not apart[n]:
+                apart[n] = _side_by_side(ends[s], line[s], ends[rows[j]])
+                j += 1
+            i += 1
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
+def merge_agreeing(tracks: Tracks) -> int:
+    """Join lines that agree within their uncertainty and that of the poses; return how many were joined to others.
+
+    The segments of joined lines get the deviation of the poses added to their own, so that the fit keeps them.
+    """
+    merged, pose_px = 0, 0.0
+    for _ in range(ROUNDS):
+        pairs, offset, covariance, unit = _compare(tracks)
+        apart = seen_apart(tracks, pairs)
+        pairs, offset, covariance, unit = pairs[~apart], offset[~apart], covariance[~apart], unit[~apart]
+        if len(pairs) == 0:
+            break
+        if pose_px == 0.0:
+            pose_px = _pose_deviation(pairs, offset, covariance, unit, len(tracks.X))
+        distance = _distance(offset, covariance, pose_px * unit)
+        good = _preferred(pairs, distance, len(tracks.X)) & (distance < GATE)
+        if not good.any():
+            break
+        excess = np.sqrt((offset[good] ** 2).mean(1)) / unit[good]
+        _join(tracks, pairs[good], np.where(excess > POSE_PX[0], pose_px, 0.0))
+        merged += int(good.sum())
+    return merged
+
+
+def _compare(tracks: Tracks) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Pairs (M, 2) of lines that may be one, offsets (M, 4), covariances of these, and the size of a pixel there."""
+    views, count = tracks.views, len(tracks.X)
+    rows, pointers = tracks.table()
+    H, U = np.zeros((count, 4, 4)), np.zeros((count, 2, 3))
+    _information(views.camera, views.image_idx, views.ends, views.sigma, pointers, rows, tracks.X, H, U)
+    unit = _pixel_size(tracks)
+    X = tracks.X
+    pairs, span = _candidates(X, MAX_PX * unit)
+    a, b = pairs.T
+    covariance = np.linalg.inv(H + 1e-9 * np.einsum("nii->n", H)[:, None, None] * np.eye(4))
+    along = X[b, 1] - X[b, 0]
+    places = X[a, None, 0] + span[:, :, None] * (X[a, 1] - X[a, 0])[:, None]
+    on_b = np.einsum("mkc,mc->mk", places - X[b, None, 0], along) / (along**2).sum(-1)[:, None]
+    there = X[b, None, 0] + on_b[:, :, None] * along[:, None]
+    offset = np.einsum("mjc,mkc->mkj", U[a], there - places).reshape(-1, 4)
+    turn = np.einsum("mic,mjc->mij", U[a], U[b])
+    spread = np.zeros((len(pairs), 4, 4))
+    for n, at, basis in ((a, span, np.broadcast_to(np.eye(2), turn.shape)), (b, on_b, turn)):
+        weight = np.stack([1.0 - at, at], axis=-1)  # of both points, at both places
+        gain = np.einsum("mkp,mij->mkipj", weight, basis).reshape(-1, 4, 4)
+        spread += gain @ covariance[n] @ np.swapaxes(gain, 1, 2)
+    return pairs, offset, spread, np.minimum(unit[a], unit[b])
+
+
+def _candidates(X: FloatArray, reach: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Pairs (M, 2) of near, nearly parallel lines and their overlap (M, 2): a sweep along one axis in bins of another.
+
+    Work grows with the number of lines where their density stays the same.
+    """
+    if len(X) == 0:
+        return np.zeros((0, 2), np.int64), np.zeros((0, 2))
+    across, along = np.argsort(np.ptp(X.reshape(-1, 3), axis=0), kind="stable")[1:]
+    low = np.sort(X[:, :, along], axis=1)
+    order = np.argsort(low[:, 0], kind="stable")
+    # Bins a few times as wide as the usual line; a line is in all that it may share with another.
+    bounds = np.sort(X[:, :, across], axis=1) + reach[:, None] * np.array([-0.5, 0.5])
+    start, extent = bounds[:, 0].min(), bounds[:, 1] - bounds[:, 0]
+    width = max(4.0 * float(np.median(extent)), float(extent.sum()) / (4.0 * len(X)), np.ptp(bounds) / (4.0 * len(X)))
+    bins = np.floor((bounds - start) / max(width, 1e-300)).astype(np.int64)
+    first_bin, last_bin = np.ascontiguousarray(bins.T)
+    pointers = np.zeros(int(last_bin.max()) + 2, np.int64)
+    _bin_lines(order, first_bin, last_bin, pointers, np.empty(0, np.int64))
+    members = np.empty(pointers[-1], np.int64)
+    _bin_lines(order, first_bin, last_bin, pointers, members)
+    pairs, span = np.empty((4096, 2), np.int64), np.empty((4096, 2))
+    while True:
+        needed = _near_pairs(pointers, members, first_bin, low, X, reach, MAX_ANGLE, MIN_OVERLAP, pairs, span)
+        if needed <= len(pairs):
+            break
+        pairs, span = np.empty((2 * needed, 2), np.int64), np.empty((2 * needed, 2))
+    # In the order of one sweep without bins.
+    place = np.empty(len(X), np.int64)
+    place[order] = np.arange(len(X))
+    sorted_ = np.lexsort(place[pairs[:needed]].T[::-1])
+    return pairs[:needed][sorted_], span[:needed][sorted_]
+
+
+def _pixel_size(tracks: Tracks) -> FloatArray:
+    """(L,) size of a pixel at the line, scene units: median over its observations."""
+    views = tracks.views
+    rows, pointers = tracks.table()
+    line = tracks.line_of[rows]
+    P = views.camera[views.image_idx[rows]]
+    depth = np.einsum("mc,mc->m", P[:, 2, :3], tracks.X[line].mean(1)) + P[:, 2, 3]
+    size = np.abs(depth) / np.linalg.norm(P[:, 0, :3], axis=1)
+    order = np.lexsort([size, line])
+    middle = (pointers[:-1] + pointers[1:]) // 2
+    return size[order][np.minimum(middle, len(rows) - 1)]
+
+
+def seen_apart(tracks: Tracks, pairs: IntArray) -> BoolArray:
+    """Whether an image shows both lines of a pair as segments side by side."""
+    views = tracks.views
+    rows, pointers = tracks.table()
+    apart = np.zeros(len(pairs), np.bool_)
+    _apart(pairs, pointers, rows, views.image_idx, views.ends, views.line, apart)
+    return apart
+
+
+def _distance(offset: FloatArray, covariance: FloatArray, deviation: FloatArray) -> FloatArray:
+    total = covariance + (deviation**2)[:, None, None] * np.eye(4)
+    return np.einsum("mi,mi->m", offset, np.linalg.solve(total, offset[..., None])[..., 0])
+
+
+def _preferred(pairs: IntArray, distance: FloatArray, count: int) -> BoolArray:
+    """Pairs that are the best of both their lines."""
+    best = np.full(count, np.inf)
+    for side in (0, 1):
+        np.minimum.at(best, pairs[:, side], distance)
+    return (distance <= best[pairs[:, 0]]) & (distance <= best[pairs[:, 1]])
+
+
+def _pose_deviation(pairs: IntArray, offset: FloatArray, covariance: FloatArray, unit: FloatArray, count: int) -> float:
+    """Deviation of the poses in pixels: what pairs that prefer each other disagree by beyond their own noise."""
+    floor = POSE_PX[0] * unit
+    good = _preferred(pairs, _distance(offset, covariance, floor), count)
+    excess = (offset[good] ** 2).mean(1) - np.einsum("mii->m", covariance[good]) / 4.0
+    if len(excess) < 5:
+        return POSE_PX[0]
+    return float(np.clip(np.sqrt(max(np.median(excess / unit[good] ** 2), 0.0) / MEDIAN_SQUARE), *POSE_PX))
+
+
+def _join(tracks: Tracks, pairs: IntArray, pose_px: FloatArray) -> None:
+    """Join disjoint pairs, the line seen in fewer images to the other, and fit them anew."""
+    images = tracks.num_images()
+    turned = images[pairs[:, 0]] < images[pairs[:, 1]]
+    pairs = np.where(turned[:, None], pairs[:, ::-1], pairs)
+    alias, deviation = np.arange(len(tracks.X)), np.zeros(len(tracks.X) + 1)
+    alias[pairs[:, 1]] = pairs[:, 0]
+    deviation[pairs] = pose_px[:, None]
+    tracks.join(alias, deviation)
+
+
+__all__ = ["merge_agreeing", "seen_apart"]

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Edges and texture told apart by how many of the images that should show a line do show it.
+
+An edge is in most images that look at it, until something stands before it. Where the border of a blotch or a blade of
+grass gives a segment, another view gives another one, and what agrees in three images agrees in few others. A line
+that is seen in k images of the m that should show it (in view, and as long there as segments are) is therefore taken
+for a draw from one of two urns,
+
+.. math:: P(k \mid m, c) \propto \binom{m-1}{k-1}
+          \frac{B(k - 1 + r_c s_c,\; m - k + (1 - r_c)\, s_c)}{B(r_c s_c,\; (1 - r_c)\, s_c)},
+
+with the mean rates :math:`r_c` and concentrations :math:`s_c` of :data:`EDGE` and :data:`TEXTURE`, given that k is at
+least what a line needs. Which urn a line is from depends on its segments, long and strong ones being edges,
+
+.. math:: P(\text{edge}) = \frac{1}{1 + \exp(-w_0 - w_1 \log l - w_2 \log s - w_3 \log \sigma)},
+
+and few of the segments that texture gives become part of a line at all: a share :math:`\pi_c` does. Weights and shares
+are those that make lines and leftover segments of these images most likely (maximum posterior with wide priors). Where
+nothing looks like texture, as on plain boxes, the shares leave no room for it, and lines seen in few images stay.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import betaln, expit, gammaln, log_expit
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.mapping.lines.kinds import features_of
+from groma.mapping.lines.tracks import Tracks, images_near_lines
+
+#: Mean and concentration of the rate at which images that should show an edge, or a line of texture, show it.
+EDGE, TEXTURE = (0.6, 6.0), (0.22, 15.0)
+#: Priors of the log odds that what gives segments becomes a line: of texture and of edges; and their deviation.
+_SHARE_ODDS, _SHARE_SIGMA = np.log([0.06 / 0.94, 0.35 / 0.65]), 0.5
+#: Deviations of the priors of the weights.
+_WEIGHT_SIGMA = (10.0, 1.5)
+
+
+def num_expected(tracks: Tracks, neighbors: list[IntArray], size: IntArray, min_length: float) -> IntArray:
+    """(L,) how many images should show each line: its own and their neighbours, where ``min_length`` of it is in view.
+
+    ``size`` (C, 2) is the width and height of the images, pixels; 0 where it is not known.
+    """
+    views = tracks.views
+    reach = images_near_lines(tracks.line_of, views.image_idx, neighbors)
+    bound = np.where(size > 0, size, np.inf)
+    count = np.zeros(len(tracks.X), np.int64)
+    for P, lines, limit in zip(views.camera, reach, bound, strict=True):
+        x = tracks.X[lines] @ P[:, :3].T + P[:, 3]
+        ahead = (x[..., 2] > 1e-6).all(1)
+        pixel = x[ahead, :, :2] / x[ahead, :, 2:]
+        along = pixel[:, 1] - pixel[:, 0]
+        safe = np.where(np.abs(along) < 1e-9, 1e-9, along)
+        both = np.sort([-pixel[:, 0] / safe, (limit - pixel[:, 0]) / safe], axis=0)
+        shown = (both[1].min(1).clip(max=1.0) - both[0].max(1).clip(0.0)) * np.linalg.norm(along, axis=1)
+        count[lines[ahead][shown >= min_length]] += 1
+    return np.maximum(count, tracks.num_images())
+
+
+def edge_odds(
+    kinds: tuple[FloatArray, ...],
+    line_of: IntArray,
+    eligible: BoolArray,
+    seen: IntArray,
+    expected: IntArray,
+    min_images: int,
+) -> FloatArray:
+    """Log odds (L,) that a line is an edge, not texture.
+
+    Parameters
+    ----------
+    kinds : n arrays (S,)
+        What tells segments of edges from others: length in pixels, mean gradient, standard deviation of the fit.
+    line_of : (S,) int
+        Line of each segment, -1 for none.
+    eligible : (S,) bool
+        Segments that could have become part of a line.
+    seen, expected : (L,) int
+        Number of images that show each line, and that should.
+    min_images : int
+        Lines of fewer images were dropped.
+    """
+    member = line_of >= 0
+    features = features_of(eligible | member, *kinds)
+    leftover = features[eligible & ~member]
+    number = np.maximum(np.bincount(line_of[member], minlength=len(seen)), 1)
+    sums = [np.bincount(line_of[member], column, minlength=len(seen)) for column in features[member].T]
+    lines = np.column_stack(sums) / number[:, None]
+    ratio = _log_chance(seen, expected, min_images, EDGE) - _log_chance(seen, expected, min_images, TEXTURE)
+
+    spread = np.array([_WEIGHT_SIGMA[0]] + [_WEIGHT_SIGMA[1]] * len(kinds))
+
+    def cost(p: FloatArray) -> tuple[float, FloatArray]:
+        weights, odds = p[:-2], p[-2:]
+        value, slope = 0.0, np.concatenate([weights / spread**2, (odds - _SHARE_ODDS) / _SHARE_SIGMA**2])
+        for features, gain, sign in ((lines, ratio, 1.0), (leftover, 0.0, -1.0)):
+            z = features @ weights
+            texture, edge = log_expit(-z) + log_expit(sign * odds[0]), log_expit(z) + log_expit(sign * odds[1]) + gain
+            value -= np.logaddexp(texture, edge).sum()
+            is_edge, share = expit(edge - texture), sign * expit(-sign * odds)
+            slope[:-2] -= features.T @ (is_edge - expit(z))
+            slope[-2:] -= share * [(1.0 - is_edge).sum(), is_edge.sum()]
+        prior = (weights**2 / spread**2).sum() + ((odds - _SHARE_ODDS) ** 2).sum() / _SHARE_SIGMA**2
+        return value + 0.5 * prior, slope
+
+    p = minimize(cost, np.concatenate([1.0 / spread, _SHARE_ODDS]), jac=True, method="L-BFGS-B").x
+    return lines @ p[:-2] + ratio + log_expit(p[-1]) - log_expit(p[-2])
+
+
+def _log_chance(seen: IntArray, expected: IntArray, min_images: int, kind: tuple[float, float]) -> FloatArray:
+    """Log probability that so many images show a line of a kind, given that it is a line."""
+    tries = (np.maximum(expected, seen) - 1).astype(np.float64)
+    hits = (seen - 1).astype(np.float64)
+    missed = sum(
+        np.exp(_beta_binomial(np.full(len(tries), k), tries, kind)) * (tries >= k) for k in range(min_images - 1)
+    )
+    return _beta_binomial(hits, tries, kind) - np.log(np.maximum(1.0 - missed, 1e-12))
+
+
+def _beta_binomial(hits: FloatArray, tries: FloatArray, kind: tuple[float, float]) -> FloatArray:
+    """Log probability of so many hits, of tries whose chance is drawn from a beta law."""
+    a, b = kind[0] * kind[1], (1.0 - kind[0]) * kind[1]
+    hits = np.minimum(hits, tries)
+    number = gammaln(tries + 1) - gammaln(hits + 1) - gammaln(tries - hits + 1)
+    return number + betaln(hits + a, tries - hits + b) - betaln(a, b)
+
+
+__all__ = ["edge_odds", "num_expected"]

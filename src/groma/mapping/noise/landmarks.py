@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Covariances of points and lines from the noise of their observations, poses and intrinsics held.
+
+Each landmark is on its own then: the inverse of its information matrix :math:`\sum J^\top J/\sigma^2`. Lines are
+described by where their segment's two ends move across the line, four numbers :math:`(a_1, b_1, a_2, b_2)` along two
+unit vectors; a point at the share :math:`\lambda` of the segment moves by
+:math:`(1-\lambda)\delta_1 + \lambda\delta_2`.
+The image of a measured end point is that of the line's point closest to its ray, and only its displacement across the
+image line is measured. Any camera model will do.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.cameras import model as camera_model
+from groma.geometry import quaternion
+from groma.geometry.algebra import apply, dot, norm, perpendicular, ratio, unit
+from groma.scene import Scene
+
+#: Least standard deviation of a measured coordinate, pixels: synthetic scenes may have none.
+_LEAST_SIGMA = 0.02
+
+
+@dataclass(frozen=True)
+class PointNoise:
+    """Uncertainty of the points."""
+
+    #: (P, 3, 3) covariances, scene units squared.
+    covariance: FloatArray
+    #: (P,) root mean square reprojection error over the degrees of freedom, in standard deviations.
+    misfit: FloatArray
+    #: Standard deviation of the usual measured coordinate, pixels; the observations' own are relative to it.
+    sigma_px: float
+
+    def widened(self, length: FloatArray) -> PointNoise:
+        """Return the noise with a standard deviation (P,) in every direction added, scene units."""
+        return replace(self, covariance=self.covariance + length[:, None, None] ** 2 * np.eye(3))
+
+
+@dataclass(frozen=True)
+class LineNoise:
+    """Uncertainty of the lines."""
+
+    #: (L, 2, 3) unit vectors across each line.
+    across: FloatArray
+    #: (L, 4, 4) covariances of where the two ends move along them, scene units squared.
+    covariance: FloatArray
+    #: (L,) as for points.
+    misfit: FloatArray
+    sigma_px: float
+
+    def widened(self, length: FloatArray) -> LineNoise:
+        """Return the noise with a standard deviation (L,) of both ends across the line added, scene units."""
+        return replace(self, covariance=self.covariance + length[:, None, None] ** 2 * np.eye(4))
+
+    def at(self, first_share: FloatArray, second_share: FloatArray, rows: IntArray) -> FloatArray:
+        """Cross-covariance (N, 2, 2), along ``across``, of the points at two shares of the segments ``rows``."""
+        first = np.stack([1.0 - first_share, first_share], axis=-1)
+        second = np.stack([1.0 - second_share, second_share], axis=-1)
+        blocks = self.covariance[rows].reshape(-1, 2, 2, 2, 2)
+        return np.einsum("ne,neafb,nf->nab", first, blocks, second)
+
+    def ends(self) -> FloatArray:
+        """Covariances (L, 2, 3, 3) of the end points, with as much uncertainty along the line as across."""
+        blocks = self.covariance.reshape(-1, 2, 2, 2, 2)
+        blocks = np.stack([blocks[:, 0, :, 0], blocks[:, 1, :, 1]], axis=1)
+        full = np.einsum("lai,leab,lbj->leij", self.across, blocks, self.across)
+        along = np.cross(self.across[:, 0], self.across[:, 1])
+        size = 0.5 * np.trace(blocks, axis1=2, axis2=3)
+        return full + size[..., None, None] * (along[:, :, None] * along[:, None, :])[:, None]
+
+    def directions(self, length: FloatArray) -> FloatArray:
+        """Covariances (L, 3, 3) of the unit directions, square radians."""
+        blocks = self.covariance.reshape(-1, 2, 2, 2, 2)
+        turn = blocks[:, 0, :, 0] + blocks[:, 1, :, 1] - blocks[:, 0, :, 1] - blocks[:, 1, :, 0]
+        turn = turn / np.maximum(length, 1e-300)[:, None, None] ** 2
+        return np.einsum("lai,lab,lbj->lij", self.across, turn, self.across)
+
+
+def point_noise(scene: Scene, sigma_px: float | None = None) -> PointNoise:
+    """Return the covariances of the points; ``sigma_px`` None estimates it from the residuals."""
+    table = scene.point_observations
+    pixels, by_world = project_points(scene, table.image_idx, scene.points.xyz[table.point_idx])
+    residual = pixels - table.pixel
+    good = np.asarray(np.isfinite(residual).all(axis=1) & np.isfinite(by_world).all(axis=(1, 2)))
+    weight = good / table.sigma
+    residual = np.where(good[:, None], residual, 0.0) * weight[:, None]
+    by_world = np.where(good[:, None, None], by_world, 0.0) * weight[:, None, None]
+    count = np.bincount(table.point_idx[good], minlength=scene.num_points)
+    squares = _sum(dot(residual, residual)[:, None], table.point_idx, scene.num_points)[:, 0]
+    sigma, misfit = _misfit(squares, 2 * count - 3, sigma_px)
+    information = _sum(np.einsum("nki,nkj->nij", by_world, by_world), table.point_idx, scene.num_points) / sigma**2
+    return PointNoise(_inverse(information, _extent(scene)), misfit, sigma)
+
+
+def line_noise(scene: Scene, sigma_px: float | None = None) -> LineNoise:
+    """Return the covariances of the lines; ``sigma_px`` None estimates it from the residuals."""
+    table, ends = scene.line_observations, scene.lines.segments
+    direction = unit(ends[:, 1] - ends[:, 0])
+    across = np.stack(perpendicular(direction), axis=1)
+    information = np.zeros((scene.num_lines, 4, 4))
+    squares, count = np.zeros(scene.num_lines), np.zeros(scene.num_lines, dtype=np.int64)
+    line = table.line_idx
+    for columns in (slice(0, 2), slice(2, 4)):
+        measured = np.ascontiguousarray(table.segment[:, columns])
+        share = _share_on_line(scene, table.image_idx, measured, ends[line])
+        place = ends[line, 0] + share[:, None] * (ends[line, 1] - ends[line, 0])
+        pixels, by_world = project_points(scene, table.image_idx, place)
+        tangent = unit(apply(by_world, direction[line]))
+        normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
+        residual = dot(normal, pixels - measured)
+        row = np.einsum("nk,nki,nai->na", normal, by_world, across[line])
+        row = np.hstack([(1.0 - share)[:, None] * row, share[:, None] * row])
+        good = np.isfinite(residual) & np.isfinite(row).all(axis=1)
+        weight = good / table.sigma
+        residual, row = np.where(good, residual, 0.0) * weight, np.where(good[:, None], row, 0.0) * weight[:, None]
+        information += _sum(row[:, :, None] * row[:, None, :], line, scene.num_lines)
+        squares += _sum(residual[:, None] ** 2, line, scene.num_lines)[:, 0]
+        count += np.bincount(line[good], minlength=scene.num_lines)
+    sigma, misfit = _misfit(squares, count - 4, sigma_px)
+    return LineNoise(across, _inverse(information / sigma**2, _extent(scene)), misfit, sigma)
+
+
+def project_points(scene: Scene, image_idx: IntArray, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 2) of points in the world and their derivatives (N, 2, 3) by them; NaN behind the camera."""
+    poses = scene.cam_from_world[image_idx]
+    in_cam = quaternion.rotate(poses[:, :4], places) + poses[:, 4:]
+    pixels, by_world = np.full((len(places), 2), np.nan), np.full((len(places), 2, 3), np.nan)
+    for name, rows, params in _by_model(scene, image_idx):
+        model = camera_model(name)
+        front = rows if model.sees_behind else rows[in_cam[rows, 2] > 0]
+        chosen = params[np.isin(rows, front, assume_unique=True)]
+        pixels[front], by_cam, _ = model.project_jacobian(chosen, np.ascontiguousarray(in_cam[front]))
+        by_world[front] = by_cam @ quaternion.to_matrix(poses[front, :4])
+    return pixels, by_world
+
+
+def _share_on_line(scene: Scene, image_idx: IntArray, measured: FloatArray, ends: FloatArray) -> FloatArray:
+    """Where on the segments (0 first end, 1 second) the points closest to the rays of pixels lie."""
+    poses = scene.cam_from_world[image_idx]
+    bearing = np.full((len(measured), 3), np.nan)
+    for name, rows, params in _by_model(scene, image_idx):
+        bearing[rows] = camera_model(name).unproject(params, measured[rows])
+    ray = quaternion.rotate(quaternion.conjugate(poses[:, :4]), bearing)
+    center = -quaternion.rotate(quaternion.conjugate(poses[:, :4]), poses[:, 4:])
+    along = ends[:, 1] - ends[:, 0]
+    normal = np.cross(np.cross(along, ray), ray)
+    slope = dot(normal, along)
+    share = ratio(dot(normal, center - ends[:, 0]), slope, np.abs(slope) > 1e-12 * dot(along, along))
+    # Rays nearly along the line say nothing; far points would only disturb.
+    return np.where(np.abs(share - 0.5) < 3.0, share, np.nan)
+
+
+def _by_model(scene: Scene, image_idx: IntArray):
+    """Yield (model name, rows, parameters (n, k) of the rows)."""
+    camera = scene.images.camera_idx[image_idx]
+    names = np.array(scene.cameras.models, dtype=object)
+    for name in dict.fromkeys(scene.cameras.models):
+        rows = np.flatnonzero(names[camera] == name)
+        if len(rows):
+            yield name, rows, scene.cameras.params[camera[rows], : camera_model(name).num_parameters]
+
+
+def _misfit(squares: FloatArray, freedom: IntArray, sigma_px: float | None) -> tuple[float, FloatArray]:
+    """Noise of a coordinate, robustly over the landmarks, and each landmark's misfit in units of it."""
+    known = freedom > 0
+    variance = ratio(squares, freedom.astype(np.float64), known, 0.0)
+    sigma = _LEAST_SIGMA
+    if sigma_px is not None:
+        sigma = sigma_px
+    elif known.any():
+        order = np.argsort(variance[known])
+        # The landmark in the middle of the degrees of freedom; a few outliers do not move it.
+        cumulated = np.cumsum(freedom[known][order])
+        middle = order[np.searchsorted(cumulated, 0.5 * cumulated[-1])]
+        sigma = float(np.sqrt(variance[known][middle]))
+    sigma = max(sigma, _LEAST_SIGMA)
+    return sigma, np.sqrt(variance) / sigma
+
+
+def _sum(blocks: FloatArray, owner: IntArray, count: int) -> FloatArray:
+    """Sums (count, a, b) of blocks (N, a, b) by owner."""
+    flat = blocks.reshape(len(blocks), math.prod(blocks.shape[1:]))
+    out = np.zeros((count, flat.shape[1]))
+    for column in range(flat.shape[1]):
+        out[:, column] = np.bincount(owner, weights=flat[:, column], minlength=count)
+    return out.reshape(count, *blocks.shape[1:])
+
+
+def _extent(scene: Scene) -> float:
+    places = np.concatenate([scene.points.xyz, scene.lines.segments.reshape(-1, 3), scene.cam_centers_in_world])
+    away = norm(places - np.median(places, axis=0)) if len(places) else np.ones(1)
+    return max(float(np.median(away)), 1e-12)
+
+
+def _inverse(information: FloatArray, extent: float) -> FloatArray:
+    """Inverses of information matrices; what is not observed is uncertain by the extent of the scene."""
+    return np.asarray(np.linalg.inv(information + np.eye(information.shape[-1]) / extent**2), dtype=np.float64)

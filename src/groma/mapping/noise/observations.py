@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""The noise of the observations of a scene, from their residuals.
+
+Some points are seen sharply in all their images, others in none: fine corners and large blobs, the rims of shadows,
+what is not quite one place. Squared residuals differ far more between points than within one. So each point :math:`i`
+is given a variance of its own, :math:`v_i`, around the usual :math:`s^2`, and Student's distribution for the sake of
+mistakes. With :math:`q_{ij}` the squared norm of a residual of two coordinates,
+
+.. math:: \frac{\nu_b s^2}{v_i} \sim \chi^2_{\nu_b}, \qquad \frac{q_{ij}}{2 v_i} \sim F_{2, \nu_w}.
+
+Logarithms tell the two apart: :math:`\log q` varies by :math:`\psi_1(1) + \psi_1(\nu_w / 2)` within the points, and
+their levels by :math:`\psi_1(\nu_b / 2)`, where :math:`\psi_1` is the trigamma function. The variances follow by
+expectation maximisation. Noise of one size gives an infinite :math:`\nu_b`, and all points the same variance.
+
+The two ends of a segment are not independent. A line fitted to the many pixels of an edge knows its middle better than
+its ends, whose errors then have a correlation of -1/2; an edge that is not quite where it is seen from elsewhere, as
+on a rounded corner, is off as a whole. Which of the two prevails is told by the residuals.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from scipy.special import polygamma
+
+from groma._typing import FloatArray, IntArray
+from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.pixel_residuals import squared_residuals_px
+from groma.mapping.noise.landmarks import project_points
+from groma.problem.residuals import residuals_of
+from groma.scene import Scene
+
+#: Residuals smaller than this are not believed, pixels: synthetic scenes may have none.
+MIN_SIGMA_PX = 0.02
+#: Fewer observations tell nothing; this is assumed then, pixels.
+_FEWEST, _UNKNOWN_PX = 10, 1.0
+#: The median of the squared norm of two Gaussian coordinates, in variances.
+_MEDIAN = 1.386
+#: Observations of a point that tell its noise from chance, and how many such points tell the noise of all.
+_MANY_VIEWS, _MANY_POINTS = 4, 100
+#: Smallest squared residual, relative to the usual one: its logarithm is taken.
+_LEAST_SQUARE = 1e-4
+#: Half the degrees of freedom lie between these.
+_SHAPES = (0.5, 1e4)
+_STEPS = 20
+#: Beyond this, a correlation of the two ends of segments is not believed.
+_MOST_CORRELATED = 0.8
+
+
+def noise_px(scene: Scene, kind: Literal["points", "lines"], end_correlation: float = 0.0) -> float:
+    """Return the standard deviation of the usual coordinate of one kind of landmark, robustly, pixels.
+
+    The median of the squared norm of two Gaussian coordinates is 1.386 variances; fitted landmarks take their share.
+    The observations' own standard deviations are relative to what is returned. For lines it is that of an end point,
+    given how the errors of the two ends are correlated.
+    """
+    options = AssemblyOptions(
+        points=kind == "points", lines=kind == "lines", planes=False, line_end_correlation=end_correlation
+    )
+    assembly = assemble(scene, options)
+    squares = squared_residuals_px(assembly, weighted=True).get(kind)
+    if squares is None or len(squares) < _FEWEST:
+        return _UNKNOWN_PX
+    unknowns = 3 * scene.num_points if kind == "points" else 4 * scene.num_lines
+    share = 1.0 - min(unknowns / (2 * len(squares)), 0.8)
+    return max(float(np.sqrt(np.median(squares) / _MEDIAN / share)), MIN_SIGMA_PX)
+
+
+def line_end_correlation(scene: Scene) -> float:
+    """Return the correlation of the errors of segments' two ends across them, robustly, from the residuals.
+
+    Segments of lines that few images see follow their line and are left out; where no others are, it is zero.
+    """
+    problem = assemble(scene, AssemblyOptions(points=False, planes=False)).problem
+    images = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
+    ends = [np.zeros((0, 2))]
+    for factor in problem.factors:
+        told = images[factor.line.index] >= _MANY_VIEWS  # type: ignore[attr-defined]
+        ends.append((residuals_of(factor, problem.variables) * np.asarray(factor.sqrt_information)[:, None])[told])
+    first, second = np.concatenate(ends).T
+    if len(first) < _MANY_POINTS:
+        return 0.0
+    shift, turn = np.median(np.abs(first + second)) ** 2, np.median(np.abs(first - second)) ** 2
+    return float(np.clip((shift - turn) / max(shift + turn, 1e-300), -_MOST_CORRELATED, _MOST_CORRELATED))
+
+
+def moved_px(before: Scene, after: Scene, share: float) -> float:
+    """Return the distance in the images, pixels, by which this share of the points' observations moved at least.
+
+    Both scenes have the same observations; what counts is where their points are seen, so the frame does not matter.
+    """
+    table = before.point_observations
+    first, second = (
+        project_points(scene, table.image_idx, scene.points.xyz[table.point_idx])[0] for scene in (before, after)
+    )
+    away = np.linalg.norm(second - first, axis=1)
+    away = away[np.isfinite(away)]
+    return float(np.quantile(away, 1.0 - share)) if len(away) else 0.0
+
+
+def with_point_noise(scene: Scene) -> Scene:
+    """Return the scene with the noise of each point in the standard deviations of its observations.
+
+    The standard deviations that the observations have are multiplied by a number per point, whose median over the
+    observations is one. Points seen seldom stay near the usual noise; a scene with few points is returned as it is.
+    """
+    table, count = scene.point_observations, scene.num_points
+    pixels, _ = project_points(scene, table.image_idx, scene.points.xyz[table.point_idx])
+    residual = (pixels - table.pixel) / table.sigma[:, None]
+    seen = np.isfinite(residual).all(axis=1)
+    squares, owner = (residual[seen] ** 2).sum(axis=1), table.point_idx[seen]
+    number = np.bincount(owner, minlength=count)
+    if np.count_nonzero(number >= _MANY_VIEWS) < _MANY_POINTS:
+        return scene
+    # Fitting a point takes three of the two coordinates per observation; what is left is as if they all were smaller.
+    freedom = np.maximum(2 * number - 3, 1)
+    share = (freedom / np.maximum(2 * number, 1))[owner]
+    usual = float(np.median(squares / share)) / _MEDIAN
+    if usual < MIN_SIGMA_PX**2:
+        return scene
+    squares = np.maximum(squares, _LEAST_SQUARE * usual * share)
+    between, within = _degrees_of_freedom(np.log(squares / share), owner, number)
+    variance = np.full(count, usual)
+    for _ in range(_STEPS):
+        weight = (within + 2.0) / (within + squares / share / variance[owner])
+        variance = (between * usual + np.bincount(owner, weight * squares, count)) / (between + freedom)
+        usual = 1.0 / float(np.mean(1.0 / variance[number > 0]))
+    own = np.sqrt(variance)[table.point_idx]
+    return scene.replace(point_observations=table.replace(sigma=table.sigma * own / np.median(own)))
+
+
+def _degrees_of_freedom(levels: FloatArray, owner: IntArray, number: IntArray) -> tuple[float, float]:
+    """Degrees of freedom between points and within, from logarithms of squares and the number there are of each point.
+
+    Few make them rather infinite than small: each is what is left of a variance that chance explains.
+    """
+    chosen = number[owner] >= _MANY_VIEWS
+    levels, owner = levels[chosen], owner[chosen]
+    points = np.flatnonzero(number >= _MANY_VIEWS)
+    mean = np.bincount(owner, levels, len(number)) / np.maximum(number, 1)
+    within = float(((levels - mean[owner]) ** 2).sum() / (number[points] - 1).sum())
+    between = float(np.var(mean[points]) - within * np.mean(1.0 / number[points]))
+    return 2.0 * _inverse_trigamma(between), 2.0 * _inverse_trigamma(within - float(polygamma(1, 1.0)))
+
+
+def _inverse_trigamma(value: float) -> float:
+    """Where the trigamma function, which falls, has a value; the nearer end where that is out of bounds."""
+    shapes = np.geomspace(*_SHAPES, 1000)[::-1]
+    return float(np.interp(value, polygamma(1, shapes), shapes))
+
+
+__all__ = ["line_end_correlation", "moved_px", "noise_px", "with_point_noise"]

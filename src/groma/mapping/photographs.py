@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The folder of photographs: which files there are, how they are read, whether they fit the model.
+
+Pixels are taken as they are stored. An EXIF orientation is not applied, here as in COLMAP: the two must agree, and the
+camera of a model has the size of the stored image.
+"""
+
+from __future__ import annotations
+
+import posixpath
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from groma.errors import GromaError, InputError
+from groma.features.images import GrayImage, to_gray
+from groma.io.endings import IMAGES, VIDEOS
+from groma.scene import Scene
+
+_START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Return the images in a folder and its sub-folders, sorted; hidden files are not looked at."""
+    if not folder.is_dir():
+        what = "is a file, not a folder of images" if folder.exists() else "is not a folder of images"
+        video = folder.suffix.lower() in VIDEOS
+        remedy = "Take pictures out of it, or follow it with groma track." if video else "Check the path."
+        raise InputError(f"{folder} {what}. {remedy}")
+    files = sorted(
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in IMAGES
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        and path.is_file()
+    )
+    if not files:
+        raise InputError(f"{folder} holds no images ({', '.join(IMAGES)}). Check the path.")
+    return files
+
+
+def read_gray(path: Path) -> GrayImage:
+    """Read an image of any type as grey levels.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is no image, or ends too early.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}. Check the file.") from error
+    if content[:2] == b"\xff\xd8" and content.rfind(_END_OF_IMAGE) < content.rfind(_START_OF_SCAN):
+        # Decoders fill what is missing with grey. A preview inside the file has both marks, so the last ones count.
+        raise InputError(f"{path} ends in the middle of the picture (JPEG without its end). Copy it again.")
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = _decoded(content, flags)
+    if image is None:  # kinds that are not turned into grey while they are read: floating point TIFF
+        image = _decoded(content, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        if image is not None:
+            return to_gray(image)
+    except GromaError:
+        pass
+    raise InputError(
+        f"{path} cannot be read as an image: it is damaged or of an unknown kind. Replace it, or leave it out of the "
+        "folder and the model."
+    )
+
+
+def _decoded(content: bytes, flags: int) -> np.ndarray | None:
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+    except cv2.error:
+        return None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
+    """Check that every image of a model is among the files; where only the folder differs, say which to pass."""
+    again = next((name for name, number in Counter(scene.images.names).items() if number > 1), None)
+    if again is not None:
+        raise InputError(
+            f"The model has more than one image named {again!r}; images are found by name. Rename or remove the others."
+        )
+    files = set(names)
+    missing = [name for name in scene.images.names if name not in files]
+    if not missing:
+        return
+    number = f"{len(missing):,} of the {scene.num_images:,} images of the model are not"
+    if len(missing) == scene.num_images:
+        number = f"None of the {scene.num_images:,} images of the model is"
+    there = "there is 1 image," if len(names) == 1 else f"there are {len(names):,} images, for example"
+    raise InputError(
+        f"{number} in {folder}, for example {missing[0]!r}; {there} {names[0]!r}. "
+        + _suggestion(folder, names, missing)
+    )
+
+
+def _suggestion(folder: Path, names: Sequence[str], missing: list[str]) -> str:
+    """What to do about image names that are not there."""
+    by_end = {posixpath.basename(name): name for name in names}
+    found = [(name, by_end[posixpath.basename(name)]) for name in missing if posixpath.basename(name) in by_end]
+    for wanted, there in found:
+        if there.endswith(f"/{wanted}"):
+            return f"Pass the folder {folder / there[: -len(wanted) - 1]}."
+        if wanted.endswith(f"/{there}"):
+            above = wanted[: -len(there) - 1]
+            if folder.absolute().as_posix().endswith(f"/{above}"):
+                return f"Pass the folder {Path(folder.absolute().as_posix()[: -len(above) - 1])}."
+            return f"The model's names begin with {above!r}: move the images to such a folder, and pass its parent."
+    by_case = {name.lower(): name for name in names}
+    by_stem = {posixpath.splitext(name)[0]: name for name in names}
+    for wanted in missing:
+        if wanted.lower() in by_case:
+            return f"They differ in upper and lower case ({by_case[wanted.lower()]!r}); rename the files."
+        stem = posixpath.splitext(wanted)[0]
+        if stem in by_stem:
+            return f"There is {by_stem[stem]!r}, of another kind; convert the images, or pass the original ones."
+    return "Pass the folder the model was made from; names must match."
+
+
+def check_images(folder: Path, names: Sequence[str], model: Scene | None, say: Callable[[str, int, int], None]) -> None:
+    """Check that every image of the model, or of the folder, can be read, and has the size of its camera."""
+    sizes = {} if model is None else _sizes(model)
+    used = list(names) if model is None else list(model.images.names)
+    for i, name in enumerate(used):
+        say("checking images", i, len(used))
+        height, width = read_gray(folder / name).shape
+        size = sizes.get(name, (0, 0))
+        if size == (0, 0) or size == (width, height):
+            continue
+        remedy = "Pass the images the model was made from."
+        if size == (height, width):
+            remedy = "It is turned by 90 degrees: pass the images as they were stored when the model was made."
+        raise InputError(f"{folder / name} has {width}x{height} pixels, its camera {size[0]}x{size[1]}. {remedy}")
+
+
+def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
+    """Width and height of the camera of every image."""
+    cameras = model.cameras
+    of_camera = list(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
+    return {name: of_camera[camera] for name, camera in zip(model.images.names, model.images.camera_idx, strict=True)}
+
+
+__all__ = ["check_images", "check_names", "image_files", "read_gray"]

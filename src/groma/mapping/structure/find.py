@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Planes, common directions, and which points and lines belong to them: the structure of a scene.
+
+From a scene with poses, points and perhaps lines:
+
+1. the noise of every landmark, from its observations, the cameras held;
+2. planes in points and segments (:mod:`groma.estimators.plane_fit`), directions shared by lines
+   (:mod:`groma.estimators.directions`), with covariances;
+3. relations, each a statistical test: point on plane, line on plane, line along direction, point on line.
+
+Nothing has a tolerance in pixels or in scene units: how near is near follows from the noise. What is too uncertain to
+tell is left alone, for a missing relation costs little and a wrong one bends the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.adjustment.terms.relations import SURFACE_SIGMA_PX, lengths_per_pixel
+from groma.errors import InputError
+from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines, orthogonal_pairs
+from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
+from groma.geometry.algebra import norm
+from groma.mapping.distinct import num_distinct
+from groma.mapping.noise.landmarks import line_noise, point_noise
+from groma.mapping.structure import relations as _relations
+from groma.scene import Directions, Planes, Relations, Scene
+
+#: Related lines below which a direction is not one that lines share.
+_FEWEST_PARALLEL = 2
+
+
+@dataclass(frozen=True)
+class StructureOptions:
+    """Options of :func:`find_structure`."""
+
+    #: What counts as a plane.
+    planes: PlaneOptions = field(default_factory=PlaneOptions)
+    #: What counts as a direction shared by lines.
+    directions: DirectionOptions = field(default_factory=DirectionOptions)
+    #: Whether relations between points and lines are returned.
+    points_on_lines: bool = True
+    #: Level of the chi-square tests of relations.
+    level: float = 0.95
+    #: Least probability that a related landmark is no clutter.
+    min_probability: float = 0.7
+    #: The same for lines on planes and along directions. A wrong relation bends a whole line, and these probabilities
+    #: are too high: errors that the images share, such as those of an edge that is a groove, are in no covariance.
+    min_line_probability: float = 0.9
+    #: Landmarks seen in fewer images take no part: nothing checks their matches.
+    min_views: int = 3
+    #: Landmarks whose reprojection error is so many times the usual one take no part.
+    max_misfit: float = 3.0
+    #: How well points and lines keep to what they lie on at worst, as a length in the images, pixels: walls are not
+    #: flat, and what was measured very well would show it. Added to the noise of points and lines. How well they really
+    #: do, which an adjustment has to know, is told by what was found: :mod:`groma.mapping.structure.flatness`.
+    surface_sigma_px: float = SURFACE_SIGMA_PX
+    #: Standard deviations of points and of segment end points, pixels; None: from the residuals.
+    point_sigma_px: float | None = None
+    line_sigma_px: float | None = None
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A scene with its structure, and how sure it is."""
+
+    #: The scene with new planes, directions and relations.
+    scene: Scene
+    #: The planes as found, with covariance, in the order of the scene.
+    planes: PlaneSet
+    #: The directions as found, with covariance, in the order of the scene.
+    directions: DirectionSet
+    #: (M, 2) pairs of planes whose normals are orthogonal within their uncertainty.
+    orthogonal_planes: IntArray
+    #: (M, 2) pairs (plane, direction) where the direction is parallel to the plane within the uncertainty.
+    directions_in_planes: IntArray
+    #: Probability that each relation is no coincidence, by the names of :class:`groma.scene.Relations`.
+    probability: dict[str, FloatArray]
+    #: Standard deviations that the tests used, pixels; 0 where there is nothing of the kind.
+    point_sigma_px: float
+    line_sigma_px: float
+
+    @property
+    def orthogonal_directions(self) -> IntArray:
+        """(M, 2) pairs of directions that are orthogonal within their uncertainty."""
+        return self.directions.orthogonal
+
+
+def find_structure(
+    scene: Scene,
+    options: StructureOptions | None = None,
+    candidates: FloatArray | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Scene:
+    """Return the scene with planes, directions and relations found in its points and lines.
+
+    Parameters
+    ----------
+    scene : Scene
+        Posed images with points, lines or both, and their observations. It is not changed; planes, directions and
+        relations that it has are replaced.
+    options : StructureOptions, optional
+        See there.
+    candidates : (H, 3) float64, optional
+        Directions in the world to try for lines, such as those of
+        :func:`groma.features.vanishing_points.consistent_directions`.
+    progress : callable, optional
+        Called with stage, number done, number in all.
+
+    Returns
+    -------
+    Scene
+        The same cameras and landmarks; planes, directions and relations are new, and none where none stands out.
+
+    Raises
+    ------
+    InputError
+        If an option is out of range.
+
+    Notes
+    -----
+    The poses are taken as right. Adjust the scene before: a bent reconstruction has bent walls, which are no planes.
+    """
+    return detect_structure(scene, options, candidates, progress).scene
+
+
+def detect_structure(
+    scene: Scene,
+    options: StructureOptions | None = None,
+    candidates: FloatArray | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Structure:
+    """Find planes, directions and relations, and return them with covariances and probabilities.
+
+    Parameters and errors as for :func:`find_structure`.
+    """
+    options = options or StructureOptions()
+    level, least, least_line = options.level, options.min_probability, options.min_line_probability
+    if not (0.0 < level < 1.0 and 0.0 <= least < 1.0 and 0.0 <= least_line < 1.0):
+        raise InputError(
+            "level must lie between 0 and 1, min_probability and min_line_probability from 0 to below 1; got "
+            f"{level}, {least} and {least_line}. Usual values are 0.95, 0.7 and 0.9."
+        )
+    report = progress or (lambda stage, done, total: None)
+    report("finding planes", 0, 1)
+    marks = _landmarks(scene, options)
+    good_points, good_lines = np.flatnonzero(marks.point_usable), np.flatnonzero(marks.line_usable)
+    segments = marks.segments[good_lines]
+    on_line, p_on = _relations.on_lines(marks, level, least)
+    line_of_point, position = np.full(len(marks.points), -1), np.full(len(marks.segments) + 1, -1)
+    line_of_point[on_line[:, 0]] = on_line[:, 1]
+    position[good_lines] = np.arange(len(good_lines))
+    carriers = position[line_of_point[good_points]]
+    planes = find_planes(
+        marks.points[good_points],
+        marks.point_noise.covariance[good_points],
+        segments,
+        marks.line_noise.ends()[good_lines],
+        options.planes,
+        carriers,
+        lambda done, total: report("finding planes", done, total),
+    )
+    report("finding directions", 0, 1)
+    turning = marks.line_noise.directions(norm(marks.segments[:, 1] - marks.segments[:, 0]))
+    directions = directions_from_lines(
+        _unit_directions(scene)[good_lines], turning[good_lines], options.directions, candidates
+    )
+    report("finding what lies on what", 0, 1)
+    point_plane, line_plane, p_point, p_line = _relations.on_planes(marks, planes, level, (least, least_line))
+    kept = np.bincount(point_plane[:, 1], minlength=len(planes)) + 2 * np.bincount(
+        line_plane[:, 1], minlength=len(planes)
+    )
+    planes, new = _only(planes, kept >= (options.planes.min_support + 1) // 2)
+    stays_point, stays_line = new[point_plane[:, 1]] >= 0, new[line_plane[:, 1]] >= 0
+    point_plane, line_plane = _renumbered(point_plane, new), _renumbered(line_plane, new)
+    along, p_along = _relations.along_directions(
+        marks, directions, options.directions.parallel_sigma, level, least_line
+    )
+    shared = np.bincount(along[:, 1], minlength=len(directions)) >= _FEWEST_PARALLEL
+    directions, new = _only_directions(directions, shared)
+    stays_along, along = new[along[:, 1]] >= 0, _renumbered(along, new)
+    if not options.points_on_lines:
+        on_line, p_on = on_line[:0], p_on[:0]
+    relations = Relations(
+        point_on_plane=point_plane, line_on_plane=line_plane, line_along_direction=along, point_on_line=on_line
+    )
+    normals = planes.covariance[:, :3, :3]
+    both = orthogonal_pairs(
+        np.concatenate([planes.planes[:, :3], directions.vectors]), np.concatenate([normals, directions.covariance])
+    )
+    mixed = both[(both[:, 0] < len(planes)) & (both[:, 1] >= len(planes))] - np.array([0, len(planes)])
+    return Structure(
+        scene=scene.replace(
+            planes=Planes(np.arange(len(planes)) + 1, planes.planes),
+            directions=Directions(np.arange(len(directions)) + 1, directions.vectors),
+            relations=relations,
+        ),
+        planes=planes,
+        directions=directions,
+        orthogonal_planes=both[both[:, 1] < len(planes)],
+        directions_in_planes=mixed,
+        probability={
+            "point_on_plane": p_point[stays_point],
+            "line_on_plane": p_line[stays_line],
+            "line_along_direction": p_along[stays_along],
+            "point_on_line": p_on,
+        },
+        point_sigma_px=marks.point_noise.sigma_px if scene.num_points else 0.0,
+        line_sigma_px=marks.line_noise.sigma_px if scene.num_lines else 0.0,
+    )
+
+
+def _landmarks(scene: Scene, options: StructureOptions) -> _relations.Landmarks:
+    """Points and lines with their noise, and which of them may take part."""
+    points = point_noise(scene, options.point_sigma_px).widened(
+        options.surface_sigma_px * lengths_per_pixel(scene, "point")
+    )
+    lines = line_noise(scene, options.line_sigma_px).widened(
+        options.surface_sigma_px * lengths_per_pixel(scene, "line")
+    )
+    seen = num_distinct(scene.point_observations.point_idx, scene.point_observations.image_idx, scene.num_points)
+    lines_seen = num_distinct(scene.line_observations.line_idx, scene.line_observations.image_idx, scene.num_lines)
+    point_usable = (seen >= options.min_views) & (points.misfit < options.max_misfit)
+    line_usable = (lines_seen >= options.min_views) & (lines.misfit < options.max_misfit)
+    line_usable &= norm(scene.lines.segments[:, 1] - scene.lines.segments[:, 0]) > 0.0
+    spacing = _relations.spacings(scene.points.xyz, scene.lines.segments)
+    return _relations.Landmarks(
+        scene.points.xyz, points, point_usable, scene.lines.segments, lines, line_usable, *spacing
+    )
+
+
+def _unit_directions(scene: Scene) -> FloatArray:
+    return scene.lines.plucker[:, 3:]
+
+
+def _only(planes: PlaneSet, kept: np.ndarray) -> tuple[PlaneSet, IntArray]:
+    """Return some of the planes, and the new number of each old one, -1 where it is gone."""
+    rows = np.flatnonzero(kept)
+    new = np.full(len(planes), -1)
+    new[rows] = np.arange(len(rows))
+    shown = np.append(new, -1)
+    chosen = PlaneSet(
+        planes.planes[rows],
+        planes.covariance[rows],
+        planes.support[rows],
+        planes.share[rows],
+        planes.band[rows],
+        planes.log10_false_alarms[rows],
+        shown[planes.point_label],
+        shown[planes.segment_label],
+        [planes.places[row] for row in rows],
+    )
+    return chosen, new
+
+
+def _only_directions(directions: DirectionSet, kept: np.ndarray) -> tuple[DirectionSet, IntArray]:
+    """Return some of the directions, and the new number of each old one, -1 where it is gone."""
+    new = np.where(kept, np.cumsum(kept) - 1, -1)
+    right = new[directions.orthogonal]
+    chosen = DirectionSet(
+        directions.vectors[kept],
+        directions.covariance[kept],
+        directions.support[kept],
+        directions.log10_false_alarms[kept],
+        np.append(new, -1)[directions.label],
+        right[(right >= 0).all(axis=1)],
+    )
+    return chosen, new
+
+
+def _renumbered(pairs: IntArray, new: IntArray) -> IntArray:
+    renumbered = np.column_stack([pairs[:, 0], new[pairs[:, 1]]])
+    return renumbered[renumbered[:, 1] >= 0]
+
+
+__all__ = ["Structure", "StructureOptions", "detect_structure", "find_structure"]

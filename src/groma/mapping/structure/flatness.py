@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""How flat the planes of a scene are: the distances that points and lines keep from them beyond their own noise.
+
+The height h of a landmark over its plane varies by the landmark's own variance :math:`s^2`, which its observations
+tell, and by that of the surface: plaster, joints, frames, and what belongs to it only nearly. The surface has one
+standard deviation t for the scene, as a length in the images; with :math:`\ell` the length of a pixel at the landmark,
+
+.. math:: -2\log L(t) = \sum_i \log(s_i^2 + t^2\ell_i^2) + \frac{h_i^2}{s_i^2 + t^2\ell_i^2} + \text{const}.
+
+A plane was fitted to its n landmarks, with three unknowns: their heights were larger by :math:`\sqrt{n/(n-3)}`, and
+three tell nothing. Too small a deviation bends landmarks to a plane, too large a one leaves untold what the plane knows
+of them. Taken is the upper end of the confidence interval, one standard deviation above the likeliest: where landmarks
+are few or noisy it stays large.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.adjustment.terms.relations import lengths_per_pixel
+from groma.mapping.noise.landmarks import line_noise, point_noise
+from groma.mapping.structure.find import StructureOptions
+from groma.scene import Scene
+
+#: Least deviation, pixels. Tighter ties change little any more, and slow an adjustment down.
+_LEAST = 0.02
+#: Deviations that are tried from the least to the most.
+_TRIED = 100
+#: Unknowns of a plane.
+_UNKNOWNS = 3
+#: Plane, height, variance and length of a pixel of landmarks.
+_Heights = tuple[IntArray, FloatArray, FloatArray, FloatArray]
+_NOTHING: _Heights = np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0)
+
+
+def surface_noise_px(scene: Scene, options: StructureOptions) -> float:
+    """Return the standard deviation of landmarks from the planes that they lie on, as a length in the images, pixels.
+
+    Parameters
+    ----------
+    scene : Scene
+        Landmarks with their observations, and the planes and relations that were found in them.
+    options : StructureOptions
+        What they were found with. No more than its ``surface_sigma_px`` is returned, and that where nothing is on a
+        plane.
+    """
+    heights = [_of_points(scene, options.point_sigma_px), _of_lines(scene, options.line_sigma_px)]
+    plane, height, variance, length = (np.concatenate(column) for column in zip(*heights, strict=True))
+    count = np.bincount(plane, minlength=scene.num_planes)[plane]
+    told = count > _UNKNOWNS
+    variance, length = variance[told], length[told]
+    squared = height[told] ** 2 * count[told] / (count[told] - _UNKNOWNS)
+    most = options.surface_sigma_px
+    tried = np.geomspace(min(_LEAST, most), most, _TRIED)
+    surprise = np.empty(_TRIED)
+    for k, sigma in enumerate(tried):
+        total = variance + (sigma * length) ** 2
+        surprise[k] = (np.log(total) + squared / total).sum()
+    return float(tried[np.flatnonzero(surprise <= surprise.min() + 1.0)[-1]])
+
+
+def _of_points(scene: Scene, sigma_px: float | None) -> _Heights:
+    """Planes of points, heights over them, their own variances, and the length of a pixel there."""
+    if len(scene.relations.point_on_plane) == 0:
+        return _NOTHING
+    point, plane = scene.relations.point_on_plane.T
+    normal, offset = scene.planes.hesse[plane, :3], scene.planes.hesse[plane, 3]
+    covariance = point_noise(scene, sigma_px).covariance[point]
+    variance = np.einsum("ni,nij,nj->n", normal, covariance, normal)
+    height = np.einsum("ni,ni->n", scene.points.xyz[point], normal) + offset
+    return plane, height, variance, lengths_per_pixel(scene, "point")[point]
+
+
+def _of_lines(scene: Scene, sigma_px: float | None) -> _Heights:
+    """The same of both ends of lines."""
+    if len(scene.relations.line_on_plane) == 0:
+        return _NOTHING
+    line, plane = scene.relations.line_on_plane.T
+    normal, offset = scene.planes.hesse[plane, :3], scene.planes.hesse[plane, 3]
+    noise = line_noise(scene, sigma_px)
+    slope = np.einsum("nai,ni->na", noise.across[line], normal)
+    blocks = noise.covariance[line].reshape(-1, 2, 2, 2, 2)
+    variance = np.einsum("na,neaeb,nb->ne", slope, blocks, slope)
+    height = np.einsum("nei,ni->ne", scene.lines.segments[line], normal) + offset[:, None]
+    length = np.repeat(lengths_per_pixel(scene, "line")[line], 2)
+    return np.repeat(plane, 2), height.ravel(), variance.ravel(), length
+
+
+__all__ = ["surface_noise_px"]

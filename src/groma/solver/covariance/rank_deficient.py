@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Kept variables that the data leave open: how to hold them, so that all others have their covariances.
+
+There are two sorts. A direction x of one plane with :math:`x^\top H x = 0` (two points hold it, and it can turn about
+them) moves no residual by itself, so it is coupled to nothing; small matrices tell, for any number of planes. What
+moves only together, such as a plane and points on it that are seen once, are modes of the reduced system whose
+eigenvalue is zero. Held along such directions the system can be inverted, and what they move is reported instead of
+estimated. Where they move more than a few cameras, nothing is left to refer covariances to, and that is an error.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray
+from groma.errors import ProblemError
+from groma.problem.layout import KeptClass, Layout
+from groma.problem.linearization import NormalEquations
+from groma.solver.linear.elimination import LANDMARK_TOLERANCE, scaled_blocks
+from groma.solver.linear.fronts import Fronts
+from groma.solver.linear.modes import MODES, Modes, smallest
+from groma.solver.linear.reduced import Blocks
+
+#: A variable that moves by more than this in a scaled mode of zero cost is loose; this share of the poses may be.
+LOOSE, MAX_LOOSE = 1e-6, 0.2
+#: Modes of zero cost that are sought at most.
+MOST_MODES = 1024
+
+
+def hold_open_blocks(
+    equations: NormalEquations, S: Blocks, size: FloatArray, known: list[BoolArray], G: FloatArray
+) -> tuple[Blocks, list[BoolArray]]:
+    """Hold the directions in which planes, directions and other kept landmarks move no residual.
+
+    Parameters
+    ----------
+    equations
+        Linearised.
+    S : dict
+        Scaled system.
+    size : (unknowns,) float
+        What the unknowns were multiplied by.
+    known
+        By kept class: which unknowns (count * width,) are held already.
+    G : (unknowns, k) float
+        Free motions of the scene, which are held elsewhere.
+
+    Returns
+    -------
+    tuple
+        The system, and by kept class which unknowns are open.
+    """
+    S, is_open = dict(S), [np.zeros(len(part), bool) for part in known]
+    for c, kept in enumerate(equations.layout.kept):
+        if _kind(equations.layout, kept) in ("pose", "intrinsics"):
+            continue
+        shape = kept.count, kept.width
+        H = equations.H[c, c][: kept.count * kept.width**2].reshape(*shape, kept.width)
+        H, own_size = scaled_blocks(H)
+        H[:, np.arange(kept.width), np.arange(kept.width)] += known[c].reshape(shape)
+        values, vectors = np.linalg.eigh(H)
+        at = slice(kept.start, kept.start + kept.count * kept.width)
+        carried = np.any(G[at].reshape(kept.count, -1) != 0.0, axis=1)
+        null = (values < LANDMARK_TOLERANCE) & ~carried[:, None]
+        if null.any():
+            X = vectors * null[:, None, :] * (size[at].reshape(shape) / own_size)[:, :, None]
+            X /= np.maximum(np.linalg.norm(X, axis=1, keepdims=True), 1e-300)
+            blocks = S[c, c].copy()
+            blocks[: kept.count] += X @ np.swapaxes(X, 1, 2)
+            S[c, c] = blocks
+            is_open[c] = np.any(np.abs(X) > LOOSE, axis=2).reshape(-1)
+    return S, is_open
+
+
+def zero_modes(layout: Layout, fronts: Fronts, S: Blocks) -> Modes:
+    """Return the smallest modes of a scaled system, so many that not all of them are of zero cost, if that can be."""
+    count, most = MODES, min(MOST_MODES, layout.num_kept_unknowns)
+    modes = smallest(layout, fronts, S, count)
+    while modes.num_null == count < most:
+        count = min(4 * count, most)
+        modes = smallest(layout, fronts, S, count)
+    return modes
+
+
+def loses_the_cameras(layout: Layout, modes: Modes) -> bool:
+    """Tell whether modes of zero cost move more of the poses than a few, or are more than were sought."""
+    if modes.num_null == len(modes.values):
+        return True
+    loose = np.any(np.abs(modes.vectors[:, : modes.num_null]) > LOOSE, axis=1)
+    poses = np.concatenate([np.full(c.count * c.width, _kind(layout, c) == "pose") for c in layout.kept])
+    return bool(poses.any() and loose[poses].mean() > MAX_LOOSE)
+
+
+def deficiency(layout: Layout, modes: Modes, num_free: int) -> ProblemError:
+    """Return the error that says how many directions are open, and what they move.
+
+    ``num_free`` of them are motions of the whole scene that nothing holds.
+    """
+    if not len(modes.values):
+        return ProblemError(
+            "The normal equations are spoilt by rounding: some residual changes far more than all others when its "
+            "variables move. groma.solver.observability.diagnosis.diagnose(problem) may name them; drop them, or "
+            "adjust with a loss."
+        )
+    number = f"at least {modes.num_null}" if modes.num_null == len(modes.values) else str(max(modes.num_null, 1))
+    if num_free:
+        return ProblemError(
+            f"The normal equations are rank deficient by {number}; {num_free} of them are motions of the whole scene. "
+            "Hold variables constant, pass gauge='inner', or add priors."
+        )
+    null: BoolArray = np.asarray(np.abs(modes.vectors[:, : modes.num_null]) > LOOSE)
+    moved, total = 0, 0
+    for kept in layout.kept:
+        if _kind(layout, kept) == "pose":
+            part = null[kept.start : kept.start + kept.count * kept.width].reshape(kept.count, -1)
+            moved, total = moved + int(part.any(axis=1).sum()), total + kept.count
+    what = f"; {moved} of {total} poses are not determined" if moved else ""
+    return ProblemError(
+        f"The normal equations are rank deficient by {number}{what}. "
+        "groma.solver.observability.diagnosis.diagnose(problem) names what is not determined; drop it, or add priors."
+    )
+
+
+def _kind(layout: Layout, kept: KeptClass) -> str:
+    return layout.problem.variables[kept.members[0].group].manifold.kind
+
+
+__all__ = ["LOOSE", "deficiency", "hold_open_blocks", "loses_the_cameras", "zero_modes"]

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Factorisation of the sparse reduced system front by front, and the part of its inverse that lies on its pattern.
+
+Blocks are eliminated in a fill-reducing order. Blocks that fill the same rows form a *front*: a small dense matrix over
+the blocks it eliminates (1) and the later blocks it touches (2). Children come before parents, and
+
+.. math:: F = S_{front} + \sum_{children} U, \qquad F_{11} = L_{11}L_{11}^\top, \quad
+          L_{21} = F_{21}L_{11}^{-\top}, \quad U = F_{22} - L_{21}L_{21}^\top .
+
+The inverse Z restricted to a front follows from that of its parent, which holds all of :math:`Z_{22}` (Takahashi's
+recursion, by fronts). With :math:`X = L_{21}L_{11}^{-1}`
+
+.. math:: Z_{21} = -Z_{22}X, \qquad Z_{11} = L_{11}^{-\top}L_{11}^{-1} + X^\top Z_{22} X .
+
+Every block of S lies in some front, so all blocks of Z that landmarks ask for are found, and no other is ever formed.
+All work is in dense products of LAPACK and BLAS; for a chain of cameras it grows linearly with their number.
+
+References
+----------
+Takahashi, Fagan and Chen, 1973; Erisman and Tinney, *On computing certain elements of the inverse of a sparse matrix*,
+1975; Duff and Reid, *The multifrontal solution of indefinite sparse symmetric linear equations*, 1983.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.linalg import get_lapack_funcs, solve_triangular
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.problem.layout import Layout
+from groma.solver.linear.ordering import fill_reducing_order
+from groma.solver.linear.reduced import Blocks
+from groma.solver.linear.visible_motion import distinct
+
+#: A reduced system with more than this share of its blocks filled is one front.
+FULL_SHARE = 0.4
+#: Up to this many blocks everything is one front.
+FEW_BLOCKS = 12
+#: A front joins its parent where its columns get longer by at most this share.
+EXTRA_ZEROS = 0.15
+
+
+@dataclass
+class _Front:
+    """Which blocks a front eliminates and touches, and where the numbers of S go."""
+
+    #: Global numbers of the eliminated blocks, then of the later ones, each in elimination order.
+    blocks: IntArray
+    num_eliminated: int
+    #: Unknowns of the front in the reduced system, and how many of them are eliminated.
+    unknowns: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    size: int = 0
+    parent: int = -1
+    #: Where the later unknowns lie in the parent's front.
+    in_parent: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    #: For each class pair: slots of S, and their first row and column in the front.
+    entries: dict[tuple[int, int], tuple[IntArray, IntArray, IntArray]] = field(default_factory=dict)
+    children: int = 0
+
+
+class Fronts:
+    """Cholesky factorisation of the blocks of one layout, with solves and the inverse on the pattern.
+
+    Parameters
+    ----------
+    layout : Layout
+        Its kept classes and the block pattern of the reduced system.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        first = np.concatenate([[0], np.cumsum([c.count for c in layout.kept])])
+        self._widths = np.concatenate([np.full(c.count, c.width, np.int64) for c in layout.kept])
+        self._starts = np.concatenate([c.start + c.width * np.arange(c.count, dtype=np.int64) for c in layout.kept])
+        pairs = {
+            (a, b): (first[a] + rows.astype(np.int64), first[b] + columns.astype(np.int64))
+            for (a, b), (rows, columns) in layout.blocks.items()
+        }
+        position, fronts = _arrange(pairs, int(first[-1]), self._widths)
+        self._fronts = fronts
+        self._complete(position, pairs)
+        self._L: list[tuple[FloatArray, FloatArray]] = []
+
+    def _complete(self, position: IntArray, pairs: dict) -> None:
+        """Number the unknowns of every front and sort the blocks of S into the fronts."""
+        home = np.empty(len(position), np.int64)
+        for f, front in enumerate(self._fronts):
+            home[front.blocks[: front.num_eliminated]] = f
+            front.unknowns = _ranges(self._starts[front.blocks], self._widths[front.blocks])
+            front.size = int(self._widths[front.blocks[: front.num_eliminated]].sum())
+        local = np.zeros(len(position), np.int64)
+        sorted_pairs = {}
+        for pair, (rows, columns) in pairs.items():
+            front_of = np.where(position[rows] <= position[columns], home[rows], home[columns])
+            order = np.argsort(front_of, kind="stable")
+            bounds = np.searchsorted(front_of[order], np.arange(len(self._fronts) + 1))
+            sorted_pairs[pair] = (rows, columns, order, bounds)
+        for f, front in enumerate(self._fronts):
+            widths = self._widths[front.blocks]
+            local[front.blocks] = np.concatenate([[0], np.cumsum(widths)[:-1]])
+            for pair, (rows, columns, order, bounds) in sorted_pairs.items():
+                slots = order[bounds[f] : bounds[f + 1]]
+                if len(slots):
+                    front.entries[pair] = (slots, local[rows[slots]], local[columns[slots]])
+        for front in self._fronts:
+            later = front.blocks[front.num_eliminated :]
+            if len(later):
+                front.parent = int(home[later[0]])
+                parent = self._fronts[front.parent]
+                parent.children += 1
+                local[parent.blocks] = np.concatenate([[0], np.cumsum(self._widths[parent.blocks])[:-1]])
+                front.in_parent = _ranges(local[later], self._widths[later])
+
+    @property
+    def largest(self) -> int:
+        """Unknowns of the largest front."""
+        return max(len(front.unknowns) for front in self._fronts)
+
+    def factorize(self, blocks: Blocks) -> bool:
+        """Factorise S, given by its upper blocks; False if it is not positive definite."""
+        self._L = []
+        updates: dict[int, list[tuple[IntArray, FloatArray]]] = {}
+        (potrf,) = get_lapack_funcs(("potrf",), (np.zeros((1, 1)),))
+        for f, front in enumerate(self._fronts):
+            F = np.zeros((len(front.unknowns),) * 2)
+            for (a, b), (slots, rows, columns) in front.entries.items():
+                values = blocks[a, b][slots]
+                r = rows[:, None, None] + np.arange(values.shape[1])[:, None]
+                c = columns[:, None, None] + np.arange(values.shape[2])
+                F[r, c] = values
+                F[c, r] = values
+            for index, U in updates.pop(f, []):
+                F[np.ix_(index, index)] += U
+            n = front.size
+            L, info = potrf(F[:n, :n], lower=1, clean=1)
+            if info != 0 or not np.isfinite(L).all():
+                return False
+            below = solve_triangular(L, F[:n, n:], lower=True, check_finite=False).T
+            if front.parent >= 0:
+                updates.setdefault(front.parent, []).append((front.in_parent, F[n:, n:] - below @ below.T))
+            self._L.append((L, below))
+        return True
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        """Return S^-1 times the columns of ``rhs`` (unknowns, k)."""
+        x = np.array(rhs, dtype=np.float64)
+        for front, (L, below) in zip(self._fronts, self._L, strict=True):
+            n = front.size
+            y = solve_triangular(L, x[front.unknowns[:n]], lower=True, check_finite=False)
+            x[front.unknowns[:n]] = y
+            x[front.unknowns[n:]] -= below @ y
+        for front, (L, below) in zip(reversed(self._fronts), reversed(self._L), strict=True):
+            n = front.size
+            y = x[front.unknowns[:n]] - below.T @ x[front.unknowns[n:]]
+            x[front.unknowns[:n]] = solve_triangular(L, y, lower=True, trans=1, check_finite=False)
+        return x
+
+    def inverse_on_pattern(self) -> Blocks:
+        """Return the blocks of S^-1 at the places of the blocks of S."""
+        layout = self._layout
+        result = {
+            (a, b): np.empty((len(rows), layout.kept[a].width, layout.kept[b].width))
+            for (a, b), (rows, _) in layout.blocks.items()
+        }
+        kept: dict[int, FloatArray] = {}
+        waiting = [front.children for front in self._fronts]
+        (potri,) = get_lapack_funcs(("potri",), (np.zeros((1, 1)),))
+        for f in range(len(self._fronts) - 1, -1, -1):
+            front, (L, below) = self._fronts[f], self._L[f]
+            n = front.size
+            Z = np.empty((len(front.unknowns),) * 2)
+            inner, _ = potri(L, lower=1)
+            inner = np.tril(inner) + np.tril(inner, -1).T
+            if front.parent >= 0:
+                Z22 = kept[front.parent][np.ix_(front.in_parent, front.in_parent)]
+                X = solve_triangular(L, below.T, lower=True, trans=1, check_finite=False).T
+                Z21 = -(Z22 @ X)
+                inner = inner - X.T @ Z21
+                Z[n:, n:], Z[n:, :n], Z[:n, n:] = Z22, Z21, Z21.T
+                waiting[front.parent] -= 1
+                if waiting[front.parent] == 0:
+                    del kept[front.parent]
+            Z[:n, :n] = 0.5 * (inner + inner.T)
+            for (a, b), (slots, rows, columns) in front.entries.items():
+                r = rows[:, None, None] + np.arange(layout.kept[a].width)[:, None]
+                c = columns[:, None, None] + np.arange(layout.kept[b].width)
+                result[a, b][slots] = Z[r, c]
+            if front.children:
+                kept[f] = Z
+        return result
+
+
+def _ranges(starts: IntArray, widths: IntArray) -> IntArray:
+    """Return start, start + 1, ..., start + width - 1 for each start, one after the other."""
+    ends = np.cumsum(widths)
+    return np.arange(int(ends[-1]) if len(ends) else 0) + np.repeat(starts - (ends - widths), widths)
+
+
+def _arrange(pairs: dict, count: int, widths: IntArray) -> tuple[IntArray, list[_Front]]:
+    """Return the place of each block in the elimination, and the fronts, children before parents."""
+    rows = np.concatenate([r for r, _ in pairs.values()])
+    columns = np.concatenate([c for _, c in pairs.values()])
+    off = rows != columns
+    rows, columns = rows[off], columns[off]
+    if 2 * len(rows) > FULL_SHARE * count * count or count <= FEW_BLOCKS:
+        return np.arange(count), [_Front(np.arange(count), count)]
+    position = fill_reducing_order(rows, columns, count)
+    return position, _supernodes(position, rows, columns, widths)
+
+
+def _supernodes(position: IntArray, rows: IntArray, columns: IntArray, widths: IntArray) -> list[_Front]:
+    """Fill of every column in elimination order, and columns joined where that costs little."""
+    count = len(position)
+    low = np.minimum(position[rows], position[columns])
+    high = np.maximum(position[rows], position[columns])
+    order = np.lexsort((high, low))
+    low, high = low[order], high[order]
+    bounds = np.searchsorted(low, np.arange(count + 1))
+    structure: list[IntArray] = [np.zeros(0, np.int64)] * count
+    children: list[list[int]] = [[] for _ in range(count)]
+    for j in range(count):
+        parts = [high[bounds[j] : bounds[j + 1]], *(structure[c] for c in children[j])]
+        merged = distinct(np.concatenate(parts))
+        structure[j] = merged[merged > j]
+        if len(structure[j]):
+            children[int(structure[j][0])].append(j)
+    at = np.empty(count, np.int64)
+    at[position] = np.arange(count)
+    width_at = widths[at]
+    columns_of: list[list[int]] = [[j] for j in range(count)]
+    size_of = width_at.astype(np.int64)
+    rows_of = np.array([int(width_at[s].sum()) for s in structure])
+    alive: BoolArray = np.ones(count, bool)
+    for j in range(count):
+        if not len(structure[j]):
+            continue
+        p = int(structure[j][0])  # not joined to anything yet, because its parent is later
+        extra = size_of[p] + rows_of[p] - rows_of[j]
+        if extra <= EXTRA_ZEROS * (size_of[j] + rows_of[j]):
+            columns_of[p] = columns_of[j] + columns_of[p]
+            size_of[p] += size_of[j]
+            alive[j] = False
+    fronts = []
+    for j in np.flatnonzero(alive):
+        own = np.array(sorted(columns_of[j]), np.int64)
+        fronts.append(_Front(at[np.concatenate([own, structure[j]])], len(own)))
+    return fronts
+
+
+__all__ = ["Fronts"]

@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Elimination of landmarks, the reduced system, and back-substitution.
+
+The damped normal equations
+
+.. math:: \begin{bmatrix} H + \lambda D_c & W^\top \\ W & V + \lambda D_l \end{bmatrix}
+          \begin{bmatrix} \delta_c \\ \delta_l \end{bmatrix} = -\begin{bmatrix} g_c \\ g_l \end{bmatrix},
+          \qquad D = \mathrm{diag}(J^\top J)
+
+are reduced to the kept blocks; some landmarks take a share of the damping, see :data:`LANDMARK_DAMPING`. With
+:math:`N = -(V + \lambda D_l)^{-1}`, block by block,
+
+.. math:: S = H + \lambda D_c + W^\top N W, \qquad S\,\delta_c = -(g_c + W^\top N g_l), \qquad
+          \delta_l = N (g_l + W \delta_c).
+
+Cost per landmark with n incidences: one inverse of size 3 or 4, n products ``N W`` and n(n+1)/2 block products that are
+added to S. The block products dominate; they run in explicit vectors (:mod:`groma._simd`). Each thread adds to its own
+copy of S, because two landmarks may touch the same block.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._numba import loop
+from groma._simd import add_matvec, add_product, set_product, width
+from groma._typing import FloatArray
+from groma.problem.layout import Chunk, Layout
+from groma.problem.linearization import NormalEquations
+from groma.problem.parallel import sum_of
+
+#: Diagonal entries are damped as if they were at least this large.
+MIN_DIAGONAL = 1e-6
+#: Damping of landmarks by kind, relative to that of all other variables; 1 where a kind is not named. The damping is
+#: measured by the diagonal, which says little about the depth of a far point: along its rays the cost is flatter by the
+#: square of the angle between them, and a damping that suits the cameras holds the point back for many steps.
+LANDMARK_DAMPING = {"point": 0.03}
+#: A pivot below this fraction of its diagonal entry means a direction the data do not determine.
+PIVOT_TOLERANCE = 1e-13
+
+# ---------------------------------------------------------------------------------------------------------- Kernels
+
+
+@loop
+def invert_blocks(V, g, damping, step, begin, end, N, h, dof):
+    """N = -(V + damping D)^-1 and h = N g for landmarks begin..end; undetermined directions do not move.
+
+    The damping of landmark p is ``damping[p * step]``: one for all (step 0) or one for each (step 1). Returns how many
+    landmarks have an undetermined direction.
+    """
+    n = len(dof)
+    L = np.zeros((n, n))
+    inverse = np.zeros((n, n))
+    pivots = np.zeros(n)
+    singular = 0
+    for p in range(begin, end):
+        v0 = p * n * n
+        factor = damping[p * step]
+        deficient = False
+        # V + damping D = L diag(pivots) L^T with a unit lower triangle
+        for j in range(n):
+            diagonal = V[v0 + j * n + j]
+            diagonal += factor * max(diagonal, MIN_DIAGONAL)
+            pivot = diagonal
+            for k in range(j):
+                pivot -= L[j, k] * L[j, k] * pivots[k]
+            if pivot > PIVOT_TOLERANCE * diagonal and V[v0 + j * n + j] > 0.0:
+                pivots[j] = pivot
+                for i in range(j + 1, n):
+                    total = V[v0 + i * n + j]
+                    for k in range(j):
+                        total -= L[i, k] * L[j, k] * pivots[k]
+                    L[i, j] = total / pivot
+            else:
+                deficient = True
+                pivots[j] = 0.0
+                for i in range(j + 1, n):
+                    L[i, j] = 0.0
+        if deficient:
+            singular += 1
+        for j in range(n):  # inverse of L, column by column
+            for i in range(j + 1, n):
+                total = -L[i, j]
+                for k in range(j + 1, i):
+                    total -= L[i, k] * inverse[k, j]
+                inverse[i, j] = total
+        for i in range(n):
+            for j in range(i, n):
+                total = 0.0
+                for k in range(j, n):
+                    if pivots[k] > 0.0:
+                        left = 1.0 if k == i else inverse[k, i]
+                        right = 1.0 if k == j else inverse[k, j]
+                        total -= left * right / pivots[k]
+                N[v0 + i * n + j] = total
+                N[v0 + j * n + i] = total
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += N[v0 + i * n + j] * g[p * n + j]
+            h[p * n + i] = total
+    return singular
+
+
+@loop
+def _eliminate(pointer, block, W, incidence, N, h, begin, end, slots, pair_pointer, Y, S, g, dof, c_width, one):
+    """S += W^T N W and g += W^T h for one class of kept blocks; W begins with the block of ``incidence``."""
+    dl, dc = len(dof), len(c_width)
+    w_size, s_size = dl * dc, dc * dc
+    for p in range(begin, end):
+        s = pair_pointer[p]
+        first, last = pointer[p], pointer[p + 1]
+        for k in range(first, last):
+            c, at = np.int64(block[k]), (k - incidence) * w_size
+            set_product(Y, 0, N, p * (dl * dl), dl, W, at, dc, dof, dof, c_width)
+            add_product(g, c * dc, h, p * dl, 1, W, at, dc, dof, one, c_width)
+            for m in range(k, last):
+                add_product(
+                    S, np.int64(slots[s]) * s_size, Y, 0, dc, W, (m - incidence) * w_size, dc, dof, c_width, c_width
+                )
+                s += 1
+
+
+@loop
+def _eliminate_cross(pointer_a, W_a, first_a, pointer_b, W_b, first_b, N, begin, end, slots, pair_pointer, Y, S,
+                     dof, a_width, b_width):  # fmt: skip
+    """S_ab += W_a^T N W_b for two classes of kept blocks."""
+    dl, da, db = len(dof), len(a_width), len(b_width)
+    for p in range(begin, end):
+        s = pair_pointer[p]
+        for k in range(pointer_b[p], pointer_b[p + 1]):
+            set_product(Y, 0, N, p * (dl * dl), dl, W_b, (k - first_b) * (dl * db), db, dof, dof, b_width)
+            for m in range(pointer_a[p], pointer_a[p + 1]):
+                target = np.int64(slots[s]) * (da * db)
+                add_product(S, target, W_a, (m - first_a) * (dl * da), da, Y, 0, db, dof, a_width, b_width)
+                s += 1
+
+
+@loop
+def _add_incident_steps(pointer, block, W, delta_c, begin, end, t, dof, c_width):
+    """T += W delta_c for landmarks begin..end."""
+    dl, dc = len(dof), len(c_width)
+    for p in range(begin, end):
+        for k in range(pointer[p], pointer[p + 1]):
+            add_matvec(t, p * dl, W, k * (dl * dc), delta_c, np.int64(block[k]) * dc, dof, c_width)
+
+
+@loop
+def _landmark_steps(N, t, V, g, begin, end, delta, dof):
+    """Delta = N t for landmarks begin..end; return delta D delta and g delta."""
+    n = len(dof)
+    squares, slope = 0.0, 0.0
+    for p in range(begin, end):
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += N[p * n * n + i * n + j] * t[p * n + j]
+            delta[p * n + i] = total
+            squares += max(V[p * n * n + i * n + i], MIN_DIAGONAL) * total * total
+            slope += g[p * n + i] * total
+    return squares, slope
+
+
+# ----------------------------------------------------------------------------------------------------------- Public
+
+_ONE = width(1)
+
+
+class ReducedSystem:
+    """The blocks of S and the right-hand side, and the way back to the landmarks."""
+
+    def __init__(self, equations: NormalEquations) -> None:
+        self.equations = equations
+        self.layout: Layout = equations.layout
+        layout = self.layout
+        shares = len(equations.shares)
+        self.N = [np.empty_like(V) for V in equations.V]
+        self.h = [np.empty_like(g) for g in equations.g_landmarks]
+        self._S = [
+            {
+                pair: np.zeros(len(rows) * layout.kept[pair[0]].width * layout.kept[pair[1]].width)
+                for pair, (rows, _) in layout.blocks.items()
+            }
+            for _ in range(shares)
+        ]
+        self._g = [[np.zeros(c.count * c.width) for c in layout.kept] for _ in range(shares)]
+        widest = max([c.width for c in layout.kept], default=0)
+        tallest = max([e.dof for e in layout.eliminated], default=0)
+        self._Y = [np.zeros(widest * tallest) for _ in range(shares)]
+        kinds = [layout.problem.variables[e.group].manifold.kind for e in layout.eliminated]
+        self._landmark_damping = [LANDMARK_DAMPING.get(kind, 1.0) for kind in kinds]
+        self._singular = [0] * shares
+        self.num_singular_landmarks = 0
+        #: Of the last steps of the landmarks: the sums of delta D delta, with D as their damping takes it, and g delta.
+        self.landmark_squares = self.landmark_slope = 0.0
+
+    def clear(self) -> None:
+        """Set all sums to zero."""
+        for parts in self._S:
+            for S in parts.values():
+                S[:] = 0.0
+        for gradients in self._g:
+            for g in gradients:
+                g[:] = 0.0
+        self._singular = [0] * len(self._S)
+
+    def eliminate_chunk(self, share: int, chunk: Chunk, damping: float) -> None:
+        """Eliminate the landmarks of one chunk into the share's copy of S.
+
+        Where the equations are compact, this must follow the linearisation of the chunk: its W is there only then.
+        """
+        e = chunk.eliminated
+        if e is None:
+            return
+        eliminated, equations = self.layout.eliminated[e], self.equations
+        dof, N, h = width(eliminated.dof), self.N[e], self.h[e]
+        own = np.array([damping * self._landmark_damping[e]])
+        self._singular[share] += invert_blocks(
+            equations.V[e], equations.g_landmarks[e], own, 0, chunk.begin, chunk.end, N, h, dof
+        )
+        for c, incidences in eliminated.incidences.items():
+            _eliminate(
+                incidences.pointer, incidences.block, *equations.blocks_of_chunk(share, chunk, c), N, h,
+                chunk.begin, chunk.end, incidences.pair_slots, incidences.pair_pointer, self._Y[share],
+                self._S[share][c, c], self._g[share][c], dof, width(self.layout.kept[c].width), _ONE,
+            )  # fmt: skip
+        for (a, b), (slots, pointer) in eliminated.cross.items():
+            _eliminate_cross(
+                eliminated.incidences[a].pointer, *equations.blocks_of_chunk(share, chunk, a),
+                eliminated.incidences[b].pointer, *equations.blocks_of_chunk(share, chunk, b),
+                N, chunk.begin, chunk.end, slots, pointer, self._Y[share], self._S[share][a, b],
+                dof, width(self.layout.kept[a].width), width(self.layout.kept[b].width),
+            )  # fmt: skip
+
+    def eliminate(self, damping: float) -> None:
+        """Eliminate all landmarks again, for another damping at the same linearisation; not where that is compact."""
+        self.clear()
+
+        def work(share: int) -> None:
+            for chunk in self.equations.shares[share]:
+                self.eliminate_chunk(share, chunk, damping)
+
+        self.equations.workers.map(work, len(self.equations.shares))
+
+    def assemble(self, damping: float) -> None:
+        """Sum the threads' parts, add H and the damping: the blocks ``S`` and the right-hand side ``rhs``."""
+        layout = self.layout
+        self.num_singular_landmarks = sum(self._singular)
+        self.S: dict[tuple[int, int], FloatArray] = {}
+        for pair in layout.blocks:
+            a, b = layout.kept[pair[0]].width, layout.kept[pair[1]].width
+            S = sum_of([parts[pair] for parts in self._S], self.equations.workers)
+            direct = layout.num_direct[pair] * a * b
+            S[:direct] += self.equations.H[pair]
+            S = S.reshape(-1, a, b)
+            if pair[0] == pair[1]:
+                diagonal = self.diagonal(pair[0])
+                blocks = S[: layout.kept[pair[0]].count]
+                steps = np.arange(a)
+                blocks[:, steps, steps] += damping * np.maximum(diagonal, MIN_DIAGONAL)
+                held = diagonal == 0.0
+                if held.any():
+                    blocks[:, steps, steps] += held
+            self.S[pair] = S
+        reduced = [sum_of([parts[c] for parts in self._g], self.equations.workers) for c in range(len(layout.kept))]
+        self.rhs = [-(a + b) for a, b in zip(self.equations.g_kept, reduced, strict=True)]
+
+    def diagonal(self, c: int) -> FloatArray:
+        """Return the diagonal of H for one class, (count, width)."""
+        kept = self.layout.kept[c]
+        H = self.equations.H[c, c][: kept.count * kept.width**2].reshape(kept.count, kept.width, kept.width)
+        return np.einsum("nii->ni", H)
+
+    def incident_products(self, delta_kept: list[FloatArray]) -> list[FloatArray]:
+        """Return W delta_c for the landmarks of each eliminated group, (count * dof,)."""
+        products = [np.zeros_like(g) for g in self.equations.g_landmarks]
+        for e, eliminated in enumerate(self.layout.eliminated):
+            for c, incidences in eliminated.incidences.items():
+                _add_incident_steps(
+                    incidences.pointer, incidences.block, self.equations.W[e][c], delta_kept[c], 0, eliminated.count,
+                    products[e], width(eliminated.dof), width(self.layout.kept[c].width),
+                )  # fmt: skip
+        return products
+
+    def landmark_steps(self, delta_kept: list[FloatArray]) -> list[FloatArray]:
+        """Back-substitute: steps of the landmarks of each eliminated group, (count * dof,)."""
+        deltas = [np.empty_like(g) for g in self.equations.g_landmarks]
+        sums = [g.copy() for g in self.equations.g_landmarks]
+
+        def work(share: int) -> tuple[float, float]:
+            squares, slope = 0.0, 0.0
+            for chunk in self.equations.shares[share]:
+                e = chunk.eliminated
+                if e is None:
+                    continue
+                eliminated = self.layout.eliminated[e]
+                dof = width(eliminated.dof)
+                for c, incidences in eliminated.incidences.items():
+                    _add_incident_steps(
+                        incidences.pointer, incidences.block, self.equations.W[e][c], delta_kept[c],
+                        chunk.begin, chunk.end, sums[e], dof, width(self.layout.kept[c].width),
+                    )  # fmt: skip
+                more = _landmark_steps(
+                    self.N[e], sums[e], self.equations.V[e], self.equations.g_landmarks[e],
+                    chunk.begin, chunk.end, deltas[e], dof,
+                )  # fmt: skip
+                squares, slope = squares + self._landmark_damping[e] * more[0], slope + more[1]
+            return squares, slope
+
+        parts = self.equations.workers.map(work, len(self.equations.shares))
+        self.landmark_squares, self.landmark_slope = (sum(part[i] for part in parts) for i in range(2))
+        return deltas

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a diagnosis consists of, and small words for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from groma.solver.observability.messages import listing
+
+#: Indices listed in ``to_dict``.
+LISTED = 20
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing worth knowing."""
+
+    #: For programs: ``point_no_parallax``, ``line_along_motion``, ``camera_open`` and so on.
+    kind: str
+    #: ``note``, ``warning`` or ``problem``.
+    severity: str
+    sentence: str
+    #: The group of variables it is about, and which of them; empty if it is about the whole.
+    group: str = ""
+    indices: tuple[int, ...] = ()
+    values: dict[str, float] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON; long lists of indices are cut."""
+        return {
+            "kind": self.kind,
+            "severity": self.severity,
+            "sentence": self.sentence,
+            "group": self.group,
+            "count": len(self.indices),
+            "indices": list(self.indices[:LISTED]),
+            "values": {name: float(value) if np.isfinite(value) else None for name, value in self.values.items()},
+        }
+
+
+def few(parts: list[str], most: int = 5) -> str:
+    """Return the first of a list in words, and how many more there are."""
+    if len(parts) <= most:
+        return listing(parts)
+    return f"{', '.join(parts[:most])} and {len(parts) - most:,} more"
+
+
+def first_upper(text: str) -> str:
+    """Return a text that begins with a capital."""
+    return text[:1].upper() + text[1:]
+
+
+__all__ = ["Finding", "few", "first_upper"]

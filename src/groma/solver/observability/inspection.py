@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""One linearisation of a problem, as the parts of a diagnosis look at it.
+
+Free motions of the whole scene are sought in the reduced system S first: eliminated landmarks follow the cameras as
+well as they can there, so a motion G of the kept variables is one of the whole scene exactly if :math:`G^\top S\,G` is
+zero. That costs next to nothing, whatever the number of landmarks. But S carries the rounding of all landmarks, of far
+points above all; where that leaves a doubt, the normal equations with the landmarks are asked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray
+from groma.problem.gauge import gauge_directions
+from groma.problem.layout import Layout
+from groma.problem.linearization import NormalEquations
+from groma.problem.problem import Problem
+from groma.problem.residuals import squared_norms
+from groma.solver.covariance.datum import FREE_TOLERANCE, free_motions, held_coordinates, middle_and_extent, unmoved
+from groma.solver.linear.reduced import multiply
+from groma.solver.linear.schur import ReducedSystem
+from groma.solver.linear.visible_motion import camera_centers, motion
+from groma.solver.observability.messages import Names
+
+#: Standard deviation, in viewing distances or radians, from which a direction is not determined, or is weak.
+UNDETERMINED, WEAK = 1.0, 0.2
+#: A motion that costs more than this share of what its size suggests in the reduced system is held for certain.
+CERTAIN = 1e-5
+#: Points looked at for the middle and the extent of the scene.
+SAMPLE = 4096
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """A problem, its linearisation at its states, and what is derived from both where it is needed."""
+
+    problem: Problem
+    layout: Layout
+    equations: NormalEquations
+    #: Undamped, with the landmarks eliminated.
+    system: ReducedSystem
+    names: Names
+
+    @cached_property
+    def centers(self) -> dict[str, FloatArray]:
+        """Centres (count, 3) of the poses of each group."""
+        return camera_centers(self.problem)
+
+    @cached_property
+    def all_centers(self) -> FloatArray:
+        """(C, 3) centres of all poses."""
+        return np.concatenate([np.zeros((0, 3)), *self.centers.values()])
+
+    @cached_property
+    def held(self) -> tuple[list[BoolArray], list[BoolArray]]:
+        """Which unknowns are held constant: by kept class, and by eliminated group in solver order."""
+        return held_coordinates(self.layout)
+
+    @cached_property
+    def place_and_size(self) -> tuple[FloatArray, float]:
+        """Middle and extent of points and cameras."""
+        return middle_and_extent(self.problem, SAMPLE)
+
+    @cached_property
+    def free_motions(self) -> tuple[FloatArray, FloatArray]:
+        """World motions that cost nothing: combinations (7, k) of the seven, and their increments (unknowns, k)."""
+        G, held = self._world_motions(), np.concatenate(self.held[0])
+        combinations = np.eye(7)
+        if held.any():
+            combinations = unmoved(G[held])
+        still = np.abs(G @ combinations).max(axis=0, initial=0.0) <= 1e-9
+        combinations = combinations[:, ~still]
+        if combinations.shape[1]:
+            diagonal = np.concatenate([self.system.diagonal(c).reshape(-1) for c in range(len(self.layout.kept))])
+            M = np.where(diagonal[:, None] > 0.0, G @ combinations, 0.0)  # what nothing sees is not in the way
+            cost = M.T @ np.stack([self._times(column) for column in M.T], axis=1)
+            size = M.T @ (diagonal[:, None] * M)
+            scale = 1.0 / np.sqrt(np.maximum(np.diag(size), 1e-300))
+            values, vectors = np.linalg.eigh(0.5 * (cost + cost.T) * scale[:, None] * scale)
+            expected = np.einsum("ik,ij,jk->k", vectors, size * scale[:, None] * scale, vectors)
+            unsure = (values > FREE_TOLERANCE * expected) & (values < CERTAIN * expected)
+            if unsure.any() or self.system.num_singular_landmarks:
+                exact = free_motions(self.layout, self.equations, self.system)
+                return exact.combinations, np.concatenate(exact.kept)
+            combinations = combinations @ (scale[:, None] * vectors)[:, values < FREE_TOLERANCE * expected]
+        return combinations, G @ combinations
+
+    def _times(self, x: FloatArray) -> FloatArray:
+        parts = [np.ascontiguousarray(x[c.start : c.start + c.count * c.width]) for c in self.layout.kept]
+        return np.concatenate(multiply(self.layout, self.system.S, parts))
+
+    def _world_motions(self) -> FloatArray:
+        """Increments (unknowns, 7) of the kept variables under the seven world motions."""
+        references = [r for factor in self.problem.factors for r in factor.references()]
+        mounted = {ref.group for slot, ref in references if slot.name == "extrinsics"}
+        center, length = self.place_and_size
+        G = np.zeros((self.layout.num_kept_unknowns, 7))
+        for c in self.layout.kept:
+            blocks = G[c.start : c.start + c.count * c.width].reshape(c.count, c.width, 7)
+            for member in c.members:
+                group = self.problem.variables[member.group]
+                part = gauge_directions(group.manifold, group.state, center, length, member.group in mounted)
+                rows = member.blocks(np.arange(len(group)))
+                blocks[rows, member.offset : member.offset + member.dof] = part.transpose(1, 2, 0)
+        return G
+
+    def motion_of(self, name: str) -> FloatArray:
+        """Motions (count, m, dof) in comparable units of kept variables by their increments."""
+        group = self.problem.variables[name]
+        center, length = self.place_and_size
+        middle = np.tile(center, (len(group), 1))
+        if group.manifold.kind == "plane":
+            middle = self.on_planes(name)
+        return motion(group.manifold, group.state, middle, np.full(len(group), length))
+
+    def on_planes(self, name: str) -> FloatArray:
+        """Middle (count, 3) of the points that lie on each plane; of the scene where there are none."""
+        count = len(self.problem.variables[name])
+        sums, total = np.zeros((count, 3)), np.zeros(count)
+        for factor in self.problem.factors:
+            refs = {self.problem.variables[ref.group].manifold.kind: ref for _, ref in factor.references()}
+            if "plane" in refs and "point" in refs and refs["plane"].group == name:
+                points = self.problem.variables[refs["point"].group].ambient()[refs["point"].index]
+                np.add.at(sums, refs["plane"].index, points)
+                np.add.at(total, refs["plane"].index, 1.0)
+        return np.where(total[:, None] > 0, sums / np.maximum(total, 1.0)[:, None], self.place_and_size[0])
+
+    def information_of(self, name: str) -> tuple[FloatArray, BoolArray]:
+        """Information (count, dof, dof) on kept variables with all others held, and what is held of each."""
+        for c, kept in enumerate(self.layout.kept):
+            for member in kept.members:
+                if member.group == name:
+                    rows = member.blocks(np.arange(len(self.problem.variables[name])))
+                    part = slice(member.offset, member.offset + member.dof)
+                    held = self.held[0][c].reshape(kept.count, kept.width)[rows, part]
+                    return self.system.S[c, c][rows, part, part], held
+        raise KeyError(name)
+
+    @cached_property
+    def squares(self) -> list[FloatArray]:
+        """Squared norm of every residual of every group of factors, divided by the noise, without the loss."""
+        return [squared_norms(factor, self.problem.variables) for factor in self.problem.factors]
+
+    def worst_residuals(self, name: str, chosen: BoolArray) -> FloatArray:
+        """Largest weighted residual (count,) of the chosen variables; zero for others."""
+        worst = np.zeros(len(chosen))
+        for factor, squares in zip(self.problem.factors, self.squares, strict=True):
+            for _, ref in factor.references():
+                if ref.group == name:
+                    mine = np.flatnonzero(chosen[ref.index])
+                    np.maximum.at(worst, ref.index[mine], squares[mine])
+        return np.sqrt(worst)
+
+    @cached_property
+    def residuals_of_cameras(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """For each group of poses: summed squared weighted residuals, and number of measured numbers, of every pose."""
+        result = {name: (np.zeros(len(centers)), np.zeros(len(centers))) for name, centers in self.centers.items()}
+        for k, factor in enumerate(self.problem.factors):
+            refs = {slot.name: ref for slot, ref in factor.references()}
+            if len(factor) == 0 or "pose" not in refs or refs["pose"].group not in result or len(refs) < 2:
+                continue
+            squares, index = self.squares[k], refs["pose"].index
+            sums, rows = result[refs["pose"].group]
+            sums += np.bincount(index, weights=squares, minlength=len(sums))
+            rows += factor.residual_rank * np.bincount(index, minlength=len(rows))
+        return result
+
+
+__all__ = ["UNDETERMINED", "WEAK", "Inspection"]

@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Why a point or a line is not determined by its own observations, in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.solver.linear.visible_motion import Observers, nearest_place
+from groma.solver.observability.findings import Finding, few, first_upper
+from groma.solver.observability.inspection import UNDETERMINED, WEAK, Inspection
+
+#: Camera centres nearer together than this share of the viewing distance count as one place.
+ONE_PLACE = 1e-3
+#: Below this share they hardly move, if most landmarks suffer from it.
+NEAR_ONE_PLACE = 0.03
+#: Rays that part by more than this determine a point, if its observations count in full; rays that part by more than
+#: the second angle may do so, and if a residual is this many times the noise, it is not for want of parallax.
+PARALLEL, NEARLY, DISCOUNTED = np.radians(3.0), np.radians(0.3), 5.0
+#: A line within this angle of the direction of the motion runs along it, and planes through a line nearer together than
+#: this are one plane; a ray nearer to a line than the second angle sees it end-on.
+ALONG = np.radians(5.0)
+END_ON = np.radians(0.5)
+#: Points whose least extent is below this share of the next, or below twice their uncertainty, are on one plane.
+FLAT, FLAT_SIGMAS = 1e-3, 2.0
+#: From this share of all landmarks on, what is wrong is said of the whole and none is named.
+MOST = 0.9
+
+
+def landmark_findings(
+    inspection: Inspection, name: str, seen: Observers, weakness: FloatArray, num_open: IntArray
+) -> list[Finding]:
+    """Explain the points or lines of a group whose weakest direction is not determined, or weak.
+
+    Parameters
+    ----------
+    inspection : Inspection
+        The linearisation.
+    name : str
+        The group.
+    seen : Observers
+        Who sees it.
+    weakness : (count,) float
+        Standard deviation of the weakest direction, as a share of the viewing distance.
+    num_open : (count,) int
+        Directions that are not determined.
+    """
+    kind = inspection.problem.variables[name].manifold.kind
+    is_open = ~(weakness <= UNDETERMINED)
+    findings: list[Finding] = []
+    poses = np.zeros(len(is_open), np.int64)
+    variable, pose = seen.of(is_open)
+    np.add.at(poses, variable, 1)
+    alone, rest = is_open & (poses == 1), is_open & (poses > 1)
+
+    def add(code: str, severity: str, which: BoolArray, one: str, many: str, remedy: str) -> None:
+        bad = np.flatnonzero(which)
+        if len(bad) == 0:
+            return
+        names = [inspection.names(name, int(i)) for i in bad[:1]]
+        if len(bad) == 1:
+            text, remedy = f"{first_upper(names[0])} {one}", _of_one(remedy)
+        elif len(bad) > max(MOST * len(which), 1):
+            text = (
+                f"{'All' if len(bad) == len(which) else 'Nearly all'} {kind}s ({len(bad):,} of {len(which):,}) {many}"
+            )
+        else:
+            listed = few([inspection.names(name, int(i)).removeprefix(f"{kind} ") for i in bad])
+            text = f"{len(bad):,} of {len(which):,} {kind}s {many} ({kind}s {listed})"
+        values = {"share": len(bad) / len(which), "weakest": float(weakness[bad].max())}
+        findings.append(Finding(code, severity, f"{text}. {remedy}", name, tuple(int(i) for i in bad), values))
+
+    shaky = ~is_open & (weakness > WEAK)
+    turning = _only_turning(kind, seen, rest, shaky)
+    if turning is not None:
+        bad = tuple(int(i) for i in np.flatnonzero(rest | shaky))
+        findings.append(Finding("pure_rotation", "problem", turning[0], name, bad, {"spread": turning[1]}))
+        rest, shaky = np.zeros_like(rest), np.zeros_like(shaky)
+    if kind == "point":
+        angle = _parting(inspection, name, variable, pose, seen)
+        apart = angle > PARALLEL
+        if rest.any():
+            apart |= (angle > NEARLY) & (inspection.worst_residuals(name, rest) > DISCOUNTED)
+        add(
+            "point_seen_once", "problem", alone,
+            "is seen by one camera only: its depth is open", "are seen by one camera only: their depth is open",
+            "Drop them or add views.",
+        )  # fmt: skip
+        add(
+            "point_no_parallax", "problem", rest & ~apart,
+            "has no parallax: the rays to it are almost parallel, it could be at infinity",
+            "have no parallax: the rays to them are almost parallel, they could be at infinity",
+            "Add views from farther apart if their place matters; for the rotation of the cameras they count.",
+        )  # fmt: skip
+        rest = rest & apart
+        findings += _flat(inspection, name, weakness, seen)
+    else:
+        end_on, same_plane, along = _line_geometry(inspection, name, seen)
+        can = f"can slide {'and' if (num_open[rest & same_plane] > 1).all() else 'or'} turn in it"
+        add(
+            "line_end_on", "problem", (alone | rest) & end_on,
+            "is seen end-on: it points at the cameras", "are seen end-on: they point at the cameras",
+            "A view from the side would determine them.",
+        )  # fmt: skip
+        alone, rest = alone & ~end_on, rest & ~end_on
+        add(
+            "line_seen_once", "problem", alone,
+            "is seen by one camera only: it can be any line in the plane through it and the camera",
+            "are seen by one camera only: each can be any line in the plane through it and the camera",
+            "Drop them or add views.",
+        )  # fmt: skip
+        add(
+            "line_along_motion", "problem", rest & same_plane & along,
+            f"runs along the motion of the cameras, so they all see it in one plane: it {can}",
+            f"run along the motion of the cameras, so these see each in one plane: they {can}",
+            "A view from beside the path would determine them.",
+        )  # fmt: skip
+        add(
+            "line_in_epipolar_plane", "problem", rest & same_plane & ~along,
+            f"lies in a plane with the cameras that see it (its epipolar plane) and {can}",
+            f"lie in a plane with the cameras that see them (their epipolar plane) and {can}",
+            "A view from outside that plane would determine them.",
+        )  # fmt: skip
+        rest = rest & ~same_plane
+    add(
+        f"{kind}_open", "problem", rest,
+        "is not determined: some of its observations contradict the others, and hardly count under a robust loss",
+        "are not determined: some of their observations contradict the others, and hardly count under a robust loss",
+        "These may be wrong matches.",
+    )  # fmt: skip
+    add(
+        f"{kind}_unseen", "problem", is_open & (poses == 0),
+        "is seen by no camera and not determined otherwise", "are seen by no camera and not determined otherwise",
+        "Drop them.",
+    )  # fmt: skip
+    add(
+        f"{kind}_weak", "warning", shaky,
+        f"is weak: uncertain by more than {WEAK:.0%} of the distance",
+        f"are weak: uncertain by more than {WEAK:.0%} of the distance",
+        "Views from farther apart would help.",
+    )  # fmt: skip
+    return findings
+
+
+def _parting(inspection: Inspection, name: str, variable: IntArray, pose: IntArray, seen: Observers) -> FloatArray:
+    """Twice the largest angle (count,) between the mean ray to a point and one of its rays; zero without rays."""
+    group = inspection.problem.variables[name]
+    ray = group.ambient()[variable] - seen.centers[pose]
+    ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-300)
+    mean = np.zeros((len(group), 3))
+    np.add.at(mean, variable, ray)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
+    angle = np.arctan2(
+        np.linalg.norm(np.cross(mean[variable], ray), axis=1), np.einsum("ni,ni->n", mean[variable], ray)
+    )
+    largest = np.zeros(len(group))
+    np.maximum.at(largest, variable, 2 * angle)
+    return largest
+
+
+def _only_turning(kind: str, seen: Observers, rest: BoolArray, shaky: BoolArray) -> tuple[str, float] | None:
+    """Say that the cameras stay in one place, or too near to one for most landmarks; with their spread."""
+    used = np.flatnonzero(np.bincount(seen.pose, minlength=len(seen.centers)))
+    affected = int((rest | shaky).sum())
+    if len(used) < 2 or not affected:
+        return None
+    spread = _spread(seen.centers[used]) / float(np.median(seen.distance))
+    if spread < ONE_PLACE and rest.any():
+        text = f"The cameras only turn: their centres are in one place, so the depth of {kind}s is not determined."
+    elif spread < NEAR_ONE_PLACE and affected > 0.5 * len(rest):
+        text = (
+            f"The cameras hardly move: their centres are within {spread:.1%} of the viewing distance, and the depth of "
+            f"{_so_many(kind, affected, len(rest))} is open or uncertain by more than {WEAK:.0%}."
+        )
+    else:
+        return None
+    return f"{text} Add images taken from elsewhere.", spread
+
+
+def _of_one(remedy: str) -> str:
+    """Return a remedy for several landmarks as one for a single landmark."""
+    for several, single in (("them", "it"), ("their", "its"), ("they count", "it counts")):
+        remedy = remedy.replace(several, single)
+    return remedy
+
+
+def _so_many(kind: str, affected: int, count: int) -> str:
+    """Return "all 80 points" or "43 of 80 points"."""
+    return f"all {count:,} {kind}s" if affected == count else f"{affected:,} of {count:,} {kind}s"
+
+
+def _spread(places: FloatArray) -> float:
+    return float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
+
+
+def _flat(inspection: Inspection, name: str, weakness: FloatArray, seen: Observers) -> list[Finding]:
+    """Notice that all points lie on one plane."""
+    good = weakness <= UNDETERMINED
+    xyz = inspection.problem.variables[name].ambient()[good]
+    if len(xyz) < 4:
+        return []
+    xyz = xyz - xyz.mean(axis=0)
+    extent = np.sqrt(np.maximum(np.linalg.eigvalsh(xyz.T @ xyz / len(xyz)), 0.0))
+    uncertain = FLAT_SIGMAS * float(np.median(weakness[good] * seen.distance[good]))
+    if not extent[0] < max(FLAT * extent[1], min(uncertain, 0.1 * extent[1])):
+        return []
+    return [
+        Finding(
+            "planar_scene", "warning",
+            "All points lie on one plane: poses follow from a homography, which with two views has two solutions, and "
+            "focal lengths cannot be told from distances in views that face it. Add points off the plane.",
+            name, tuple(int(i) for i in np.flatnonzero(good)), {"flatness": float(extent[0] / max(extent[1], 1e-300))},
+        )
+    ]  # fmt: skip
+
+
+def _line_geometry(inspection: Inspection, name: str, seen: Observers) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Return which lines are seen end-on, in one plane with their cameras, and along the motion of these."""
+    group, centers = inspection.problem.variables[name], seen.centers
+    d = group.ambient()[:, 3:]
+    d = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)
+    at = nearest_place(group.manifold, group.state, seen.middle)
+    ray = at[seen.variable] - centers[seen.pose]
+    normal = np.cross(ray, d[seen.variable])
+    size, away = np.linalg.norm(normal, axis=1), np.maximum(np.linalg.norm(ray, axis=1), 1e-300)
+    # a ray along the line has almost no plane; what little there is says nothing
+    sees_side = size > np.sin(END_ON) * away
+    end_on = np.bincount(seen.variable, weights=sees_side, minlength=len(group)) == 0
+    planes = _scatter(normal / np.maximum(size, 1e-300)[:, None] * sees_side[:, None], seen.variable, len(group))
+    values = np.linalg.eigvalsh(planes)
+    same_plane = values[:, 1] <= np.sin(ALONG) ** 2 * np.maximum(values[:, 2], 1e-300)
+    path = _scatter(centers[seen.pose] - seen.middle[seen.variable], seen.variable, len(group))
+    values, vectors = np.linalg.eigh(path)
+    straight = values[:, 1] < np.sin(ALONG) ** 2 * values[:, 2]
+    along = straight & (np.abs(np.einsum("ni,ni->n", vectors[:, :, 2], d)) > np.cos(ALONG))
+    return end_on, same_plane, along
+
+
+def _scatter(rows: FloatArray, index: IntArray, count: int) -> FloatArray:
+    """Sum of r r^T over the rows of each index, (count, 3, 3)."""
+    out = np.empty((count, 3, 3))
+    for i in range(3):
+        for j in range(i, 3):
+            out[:, i, j] = out[:, j, i] = np.bincount(index, weights=rows[:, i] * rows[:, j], minlength=count)
+    return out
+
+
+__all__ = ["landmark_findings"]

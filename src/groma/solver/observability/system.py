@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the reduced system leaves open: parts that share nothing, variables that nothing sees, and weak modes."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+from scipy.sparse.csgraph import connected_components
+
+from groma._typing import BoolArray, FloatArray
+from groma.solver.linear.modes import Modes, divided, scaled
+from groma.solver.linear.reduced import Blocks
+from groma.solver.observability.findings import Finding, few, first_upper
+from groma.solver.observability.inspection import UNDETERMINED, Inspection
+from groma.solver.observability.messages import listing
+from groma.solver.observability.variables import parameter_names
+from groma.solver.observability.weak_modes import weak_modes
+
+#: A variable takes part in a mode if it moves by this share of the one that moves most.
+SHARE = 0.05
+#: A mode of more cameras than this share of all is one of the whole.
+MANY = 0.3
+#: What is left of a diagonal after elimination counts as rounding below this share.
+ROUNDING = 1e-10
+#: Eigenvalues below this count as much: their vectors are not exact.
+LEAST = 1e-13
+#: Motions at one standard deviation are cut here, so that what is not determined at all does not hide the rest.
+LARGEST = 100.0
+
+
+def separate_parts(inspection: Inspection) -> list[Finding]:
+    """Find groups of kept variables that share nothing."""
+    layout, findings = inspection.layout, []
+    first = np.concatenate([[0], np.cumsum([c.count for c in layout.kept])])
+    rows = np.concatenate([first[a] + r for (a, _), (r, _) in layout.blocks.items()])
+    columns = np.concatenate([first[b] + c for (_, b), (_, c) in layout.blocks.items()])
+    graph = scipy.sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(first[-1], first[-1]))
+    _, label = connected_components(graph, directed=False)
+    for c, kept in enumerate(layout.kept):
+        group = kept.members[0].group
+        if inspection.problem.variables[group].manifold.kind != "pose":
+            continue
+        seen = inspection.system.diagonal(c).sum(axis=1) > 0
+        sizes = np.bincount(label[first[c] : first[c + 1]][seen])
+        sizes = np.sort(sizes[sizes > 0])[::-1]
+        if len(sizes) > 1:
+            of = few([f"{n:,}" for n in sizes])
+            text = (
+                f"The cameras fall into {len(sizes):,} groups that share no landmark (of {of} cameras): each can move, "
+                "turn and scale on its own. Add matches between them."
+            )
+            findings.append(Finding("separate_parts", "problem", text, group, values={"parts": float(len(sizes))}))
+    return findings
+
+
+def unseen_variables(inspection: Inspection) -> tuple[list[Finding], set[tuple[str, int]]]:
+    """Find variables of which the data say nothing at all."""
+    findings, found = [], set()
+    unseen = _unseen(inspection)
+    for c in inspection.layout.kept:
+        blocks = unseen[c.start : c.start + c.count * c.width].reshape(c.count, c.width)
+        for member in c.members:
+            group = inspection.problem.variables[member.group]
+            rows = member.blocks(np.arange(len(group)))
+            bad = np.flatnonzero(blocks[rows, member.offset : member.offset + member.dof].all(axis=1))
+            if len(bad) == 0:
+                continue
+            found |= {(member.group, int(i)) for i in bad}
+            what, one = first_upper(few([inspection.names(member.group, int(i)) for i in bad])), len(bad) == 1
+            if group.manifold.kind in ("plane", "direction"):
+                use = "lies on" if group.manifold.kind == "plane" else "runs along"
+                text = f"Nothing {use} {what[:1].lower()}{what[1:]}: {'it takes' if one else 'they take'} no part."
+                severity, code = "warning", f"{group.manifold.kind}_unused"
+            else:
+                text = f"{what} {'has' if one else 'have'} no observations at all."
+                severity, code = "problem", "no_observations"
+            findings.append(Finding(code, severity, text, member.group, tuple(map(int, bad))))
+    return findings, found
+
+
+def open_modes(inspection: Inspection, apart: bool) -> tuple[list[Finding], dict[tuple[str, int], FloatArray], int]:
+    """Find the motions of kept variables that are not determined with the scene held.
+
+    Returns
+    -------
+    tuple
+        A finding on modes of many cameras, unless the scene is in parts anyway (``apart``); of each variable that can
+        move otherwise its motions (m, k) at one standard deviation; and the number of open modes, without those of
+        landmarks alone.
+    """
+    layout, problem = inspection.layout, inspection.problem
+    unseen = _unseen(inspection)
+    held = np.concatenate(inspection.held[0])
+    S = _with_open_coordinates(inspection, unseen)
+    # where nothing but rounding is left of the diagonal, that of the system before elimination gives the scale
+    diagonal = np.concatenate([inspection.system.diagonal(c).reshape(-1) for c in range(len(layout.kept))])
+    size = np.maximum(scaled(layout, S)[1], np.sqrt(ROUNDING * diagonal))
+    G = inspection.free_motions[1].copy()
+    G[unseen | held] = 0.0
+    modes = weak_modes(layout, divided(layout, S, size), size, G)
+    if len(modes.values) == 0:
+        return [], {}, 0
+    excursions = _excursions(inspection, modes, size)
+    if not excursions:
+        return [], {}, 0
+    kinds = {name: problem.variables[name].manifold.kind for name in excursions}
+    largest = np.max([np.abs(part).max(axis=(0, 1), initial=0.0) for part in excursions.values()], axis=0)
+    is_open = largest > UNDETERMINED
+    if not is_open.any():
+        return [], {}, 0
+    whole = np.zeros(len(is_open), bool)
+    for name, part in excursions.items():
+        if kinds[name] == "pose" and len(part) > 3:
+            moving = (np.linalg.norm(part, axis=1) > SHARE * largest).sum(axis=0)
+            whole |= is_open & (moving > MANY * len(part))
+    findings = [_whole_modes(inspection, excursions, whole)] if whole.any() and not apart else []
+    local, moves = is_open & ~whole, {}
+    for name, part in excursions.items():
+        amount = np.linalg.norm(part[:, :, local], axis=1)
+        for i in np.flatnonzero((amount > np.maximum(SHARE * largest[local], UNDETERMINED)).any(axis=1)):
+            moves[name, int(i)] = part[i][:, local]
+    return findings, moves, int(is_open.sum())
+
+
+def _unseen(inspection: Inspection) -> BoolArray:
+    """Return which unknowns, not held, take no part in any residual."""
+    diagonal = [inspection.system.diagonal(c).reshape(-1) for c in range(len(inspection.layout.kept))]
+    return (np.concatenate(diagonal) == 0.0) & ~np.concatenate(inspection.held[0])
+
+
+def _with_open_coordinates(inspection: Inspection, unseen: BoolArray) -> Blocks:
+    """Return S without the ones on the diagonal that stand for coordinates of which the data say nothing.
+
+    Variables of which the data say nothing at all keep them; they are reported on their own.
+    """
+    S = dict(inspection.system.S)
+    for c, kept in enumerate(inspection.layout.kept):
+        part = unseen[kept.start : kept.start + kept.count * kept.width].reshape(kept.count, kept.width)
+        part = part & ~part.all(axis=1, keepdims=True)
+        if part.any():
+            S[c, c] = S[c, c].copy()
+            block, k = np.nonzero(part)
+            S[c, c][block, k, k] = 0.0
+    return S
+
+
+def _excursions(inspection: Inspection, modes: Modes, size: FloatArray) -> dict[str, FloatArray]:
+    """Motion (count, m, modes) of kept variables in comparable units at one standard deviation, cut; no landmarks."""
+    sigma = 1.0 / np.sqrt(np.maximum(modes.values, LEAST))
+    steps = modes.vectors * (1.0 / size)[:, None]
+    steps *= sigma
+    steps[np.concatenate(inspection.held[0])] = 0.0  # ones on the diagonal say nothing in any unit
+    result = {}
+    for c in inspection.layout.kept:
+        if inspection.problem.variables[c.members[0].group].manifold.kind in ("point", "line"):
+            continue
+        blocks = steps[c.start : c.start + c.count * c.width].reshape(c.count, c.width, -1)
+        for member in c.members:
+            rows = member.blocks(np.arange(len(inspection.problem.variables[member.group])))
+            delta = blocks[rows, member.offset : member.offset + member.dof]
+            result[member.group] = inspection.motion_of(member.group) @ delta
+    if not result:
+        return {}
+    largest = np.max([np.abs(part).max(axis=(0, 1), initial=0.0) for part in result.values()], axis=0)
+    return {name: part * np.minimum(1.0, LARGEST / np.maximum(largest, 1e-300)) for name, part in result.items()}
+
+
+def _whole_modes(inspection: Inspection, excursions: dict[str, FloatArray], whole: BoolArray) -> Finding:
+    """Describe modes that move many cameras together."""
+    count = int(whole.sum())
+    moved = {name: np.abs(part[:, :, whole]).max(axis=(0, 2)) for name, part in excursions.items() if len(part)}
+    moved = {name: size for name, size in moved.items() if size.max() > SHARE}
+    parameters: list[str] = []
+    for name, size in moved.items():
+        if inspection.problem.variables[name].manifold.kind == "intrinsics":
+            words = parameter_names(inspection, name) or tuple(f"parameter {k}" for k in range(len(size)))
+            parameters += [words[k] for k in np.flatnonzero(size > SHARE) if words[k] not in parameters]
+    ways = f"in {count:,} ways" if count > 1 else "in one way"
+    if parameters:
+        text = (
+            f"The calibration ({listing(parameters)}) and the shape of the scene make up for each other {ways}: many "
+            "cameras can move together without the data noticing. Hold the intrinsics, or add views turned or from "
+            "elsewhere."
+        )
+    else:
+        text = (
+            f"Many cameras can move together {ways} without the data noticing: parts of the scene hang together too "
+            "loosely. Add matches between them."
+        )
+    kind = "calibration_and_shape" if parameters else "loose_scene"
+    return Finding(kind, "problem", text, listing(sorted(moved)) if moved else "", values={"count": count})
+
+
+__all__ = ["open_modes", "separate_parts", "unseen_variables"]

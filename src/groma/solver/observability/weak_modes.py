@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""The least determined directions of cameras, planes, directions and calibrations.
+
+Points and lines that the reduced system keeps, because they are tied to landmarks that are eliminated, are not asked
+for here: those that share no block with each other are eliminated as well. What is left is small in most scenes, and
+then its eigenvalues are found all at once; else the smallest by inverse iteration with a sparse factorisation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+
+from groma._typing import BoolArray, FloatArray
+from groma.problem.layout import Layout
+from groma.solver.linear.fronts import Fronts
+from groma.solver.linear.modes import LARGEST_SHIFT, MODES, ROUNDS, SHIFT, Modes, smallest
+from groma.solver.linear.reduced import Blocks
+
+#: Systems of up to so many unknowns are decomposed completely.
+DENSE = 300
+#: Directions of a landmark whose scaled information is below this share of the largest are left alone.
+LANDMARK_TOLERANCE = 1e-11
+#: Weight of coordinates that are held, where they cannot be taken out.
+HOLD = 1e4
+#: A scaled system with a smaller eigenvalue than minus this is spoilt by rounding.
+NEGATIVE = 1e-6
+
+
+def weak_modes(layout: Layout, S: Blocks, size: FloatArray, G: FloatArray) -> Modes:
+    """Return the least determined directions of a scaled system, with the scene held.
+
+    Parameters
+    ----------
+    layout : Layout
+        Its kept classes.
+    S : dict
+        Upper blocks of the scaled system.
+    size : (unknowns,) float
+        What the unknowns were multiplied by.
+    G : (unknowns, m) float
+        Motions of the whole scene that are free, in unscaled unknowns. As many coordinates of few cameras are held, so
+        that what one camera can do does not move the others.
+
+    Returns
+    -------
+    Modes
+        All that there are, or the smallest; zero in landmarks that the system keeps. None if the system is not one of
+        squares, but for rounding.
+    """
+    landmarks = _lone_landmarks(layout)
+    datum = _datum(layout, size, G)
+    if not landmarks and layout.num_kept_unknowns > DENSE:
+        return smallest(layout, Fronts(layout), {pair: S[pair] + HOLD * datum.get(pair, 0.0) for pair in S})
+    matrix = _as_sparse(layout, S)
+    rest = np.ones(layout.num_kept_unknowns, bool)
+    for c, blocks in landmarks.items():
+        rest[_unknowns(layout, c, blocks)] = False
+    reduced = matrix[rest][:, rest]
+    for c, blocks in landmarks.items():
+        coupling = matrix[rest][:, _unknowns(layout, c, blocks)]
+        inverse = _inverse(S[c, c][: layout.kept[c].count][blocks])
+        count = len(inverse)
+        middle = scipy.sparse.bsr_array((inverse, np.arange(count), np.arange(count + 1)))
+        reduced = reduced - coupling @ (middle @ coupling.T)
+    held = _as_sparse(layout, datum)[rest][:, rest]
+    if reduced.shape[0] <= DENSE:
+        size, directions = np.linalg.eigh(held.toarray())
+        free = directions[:, size < 0.5]
+        values, part = np.linalg.eigh(free.T @ reduced.toarray() @ free)
+        part = free @ part
+    else:
+        values, part = _by_iteration((reduced + HOLD * held).tocsc())
+    if len(values) and values[0] < -NEGATIVE:
+        values, part = values[:0], part[:, :0]
+    vectors = np.zeros((len(rest), len(values)))
+    vectors[rest] = part
+    return Modes(values, vectors)
+
+
+def _datum(layout: Layout, size: FloatArray, G: FloatArray) -> Blocks:
+    """Return projections, on the diagonal, on what is held: one camera, and of others what that leaves free.
+
+    :func:`groma.solver.covariance.datum.constrained` spreads its constraints over cameras as suits the factorisation.
+    Here the frame must be one that a reader would choose, because what is said of cameras is relative to it.
+    """
+    datum = {(c, c): np.zeros((len(layout.blocks[c, c][0]), k.width, k.width)) for c, k in enumerate(layout.kept)}
+    kinds = [layout.problem.variables[c.members[0].group].manifold.kind for c in layout.kept]
+    left = np.eye(G.shape[1])
+    for chosen in (("pose",), tuple(set(kinds) - {"pose"})):
+        while left.shape[1]:
+            moved = G @ left
+            strongest, where = 1e-9 * float(np.abs(G).max(initial=0.0)), None
+            for c, kept in enumerate(layout.kept):
+                if kinds[c] in chosen:
+                    part = moved[kept.start : kept.start + kept.count * kept.width].reshape(kept.count, -1)
+                    strength = np.linalg.norm(part, axis=1)
+                    if strength.max(initial=0.0) > strongest:
+                        strongest, where = float(strength.max()), (c, int(strength.argmax()))
+            if where is None:
+                break
+            c, block = where
+            first = layout.kept[c].start + block * layout.kept[c].width
+            rows = slice(first, first + layout.kept[c].width)
+            U, values, Vt = np.linalg.svd(moved[rows])
+            rank = int((values > 1e-6 * values[0]).sum())
+            U = np.linalg.qr(U[:, :rank] / size[rows, None])[0]  # no motion along U, in scaled unknowns
+            datum[c, c][block] += U @ U.T
+            left = left @ Vt[rank:].T
+    return datum
+
+
+def _lone_landmarks(layout: Layout) -> dict[int, BoolArray]:
+    """For each kept class of points or lines, which of its blocks (count,) share none with another landmark."""
+    kinds = [layout.problem.variables[c.members[0].group].manifold.kind for c in layout.kept]
+    lone = {c: np.ones(layout.kept[c].count, bool) for c, kind in enumerate(kinds) if kind in ("point", "line")}
+    for (a, b), (rows, columns) in layout.blocks.items():
+        if a in lone and b in lone:
+            off = slice(None) if a != b else rows != columns
+            lone[a][rows[off]] = False
+            lone[b][columns[off]] = False
+    return lone
+
+
+def _unknowns(layout: Layout, c: int, blocks: BoolArray) -> np.ndarray:
+    kept = layout.kept[c]
+    return kept.start + np.flatnonzero(np.repeat(blocks, kept.width))
+
+
+def _as_sparse(layout: Layout, S: Blocks) -> scipy.sparse.csr_array:
+    """Return all of S from its upper blocks, or those of them that are given."""
+    data, row, column = [], [], []
+    for (a, b), blocks in S.items():
+        rows, columns = layout.blocks[a, b]
+        first, second = layout.kept[a], layout.kept[b]
+        values = blocks[: len(rows)]
+        i = (first.start + first.width * rows[:, None] + np.arange(first.width))[:, :, None]
+        j = (second.start + second.width * columns[:, None] + np.arange(second.width))[:, None, :]
+        i, j = (np.broadcast_to(x, values.shape).reshape(-1) for x in (i, j))
+        off = np.repeat((rows != columns) | (a != b), first.width * second.width)
+        flat = values.reshape(-1)
+        data += [flat, flat[off]]
+        row += [i, j[off]]
+        column += [j, i[off]]
+    n = layout.num_kept_unknowns
+    parts = (np.concatenate(data), (np.concatenate(row), np.concatenate(column)))
+    return scipy.sparse.coo_array(parts, shape=(n, n)).tocsr()
+
+
+def _inverse(blocks: FloatArray) -> FloatArray:
+    """Inverse of symmetric blocks, without the directions that are not determined."""
+    values, vectors = np.linalg.eigh(blocks)
+    good = values > LANDMARK_TOLERANCE * np.maximum(values[:, -1:], 1e-300)
+    return (vectors * np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+
+
+def _by_iteration(matrix: scipy.sparse.csc_array) -> tuple[FloatArray, FloatArray]:
+    """Smallest eigenvalues by inverse subspace iteration."""
+    n = int(np.diff(matrix.indptr).size)
+    X = np.linalg.qr(np.random.default_rng(0).normal(size=(n, MODES)))[0]
+    shift = SHIFT
+    while True:
+        try:
+            factors = scipy.sparse.linalg.splu(
+                (matrix + shift * scipy.sparse.eye_array(n)).tocsc(),
+                permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True},
+            )  # fmt: skip
+            break
+        except RuntimeError:  # exactly singular
+            shift *= 10.0
+            if shift > LARGEST_SHIFT:
+                return np.zeros(0), np.zeros((n, 0))
+    for _ in range(ROUNDS):
+        X = np.linalg.qr(factors.solve(X))[0]
+    product = X.T @ (matrix @ X)
+    values, vectors = np.linalg.eigh(0.5 * (product + product.T))
+    return values, X @ vectors
+
+
+__all__ = ["weak_modes"]

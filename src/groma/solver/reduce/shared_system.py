@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The reduced system of a problem that comes in shards: what each leaves behind when its landmarks are eliminated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.problem.layout import KeptClass, Layout, Member
+from groma.problem.problem import Problem
+from groma.problem.variables import Variables
+from groma.solver.linear.schur import MIN_DIAGONAL, ReducedSystem
+from groma.solver.steps import States
+
+
+class SharedSystem:
+    """The reduced system of all shards, with one class of blocks per group of variables.
+
+    A shard may merge a camera's intrinsics with its pose, and another one not; so its blocks are cut into those of
+    single variables. Blocks off the diagonal are found by number, row * columns + column.
+    """
+
+    def __init__(self, kept: Mapping[str, Variables]) -> None:
+        self._groups = list(kept)
+        self._variables = kept
+        self._sizes = [(len(group), group.manifold.dof) for group in kept.values()]
+        self._number: dict[tuple[int, int], IntArray] = {}
+        self._blocks: dict[tuple[int, int], FloatArray] = {}
+        self.clear()
+
+    def clear(self) -> None:
+        """Set all sums to zero; the blocks that are there stay."""
+        self._on_diagonal = [np.zeros((count, dof, dof)) for count, dof in self._sizes]
+        self._curvature = [np.zeros((count, dof)) for count, dof in self._sizes]
+        self._gradient = [np.zeros((count, dof)) for count, dof in self._sizes]
+        self._rhs = [np.zeros((count, dof)) for count, dof in self._sizes]
+        for blocks in self._blocks.values():
+            blocks[:] = 0.0
+
+    def largest_gradient(self) -> float:
+        """Return the largest component of the gradient of the kept variables."""
+        return max((float(np.abs(g).max()) for g in self._gradient if g.size), default=0.0)
+
+    def add(self, layout: Layout, system: ReducedSystem) -> None:
+        """Add the part of a shard."""
+        system.assemble(0.0)
+        for c, kept in enumerate(layout.kept):
+            diagonal = system.diagonal(c)
+            # Blocks that this shard does not touch were given a one, so that they could be inverted.
+            steps = np.arange(kept.width)
+            system.S[c, c][: kept.count, steps, steps] -= diagonal == 0.0
+            for member in kept.members:
+                g, block = self._groups.index(member.group), member.blocks(np.arange(self._sizes_of(member)[0]))
+                part = slice(member.offset, member.offset + member.dof)
+                self._curvature[g] += diagonal[block, part]
+                self._gradient[g] += system.equations.g_kept[c].reshape(-1, kept.width)[block, part]
+                self._rhs[g] += system.rhs[c].reshape(-1, kept.width)[block, part]
+        for a, b, rows, columns, blocks in self._cut(layout, system):
+            if a == b:
+                same = rows == columns
+                self._on_diagonal[a][rows[same]] += blocks[same]
+                rows, columns, blocks = rows[~same], columns[~same], blocks[~same]
+                upper = rows < columns
+                blocks = np.where(upper[:, None, None], blocks, blocks.swapaxes(1, 2))
+                rows, columns = np.minimum(rows, columns), np.maximum(rows, columns)
+            self._add_blocks(a, b, rows.astype(np.int64) * self._sizes[b][0] + columns, blocks)
+
+    def _add_blocks(self, a: int, b: int, number: IntArray, blocks: FloatArray) -> None:
+        known = self._number.get((a, b), np.zeros(0, np.int64))
+        values = self._blocks.get((a, b), np.zeros((0, self._sizes[a][1], self._sizes[b][1])))
+        place = np.searchsorted(known, number)
+        if len(known) == 0 or (known[np.minimum(place, len(known) - 1)] != number).any():
+            union = np.union1d(known, number)
+            grown = np.zeros((len(union), *values.shape[1:]))
+            grown[np.searchsorted(union, known)] = values
+            known, values, place = union, grown, np.searchsorted(union, number)
+            self._number[a, b], self._blocks[a, b] = known, values
+        np.add.at(values, place, blocks)
+
+    def _cut(self, layout: Layout, system: ReducedSystem) -> Iterator[tuple[int, int, IntArray, IntArray, FloatArray]]:
+        """Yield the blocks of a shard by pairs of groups a <= b: rows, columns and blocks of single variables."""
+        for (c, d), S in system.S.items():
+            rows, columns = layout.blocks[c, d]
+            for m, first in enumerate(layout.kept[c].members):
+                for n, second in enumerate(layout.kept[d].members):
+                    if c == d and n < m:
+                        continue
+                    a, b = self._groups.index(first.group), self._groups.index(second.group)
+                    mine, other = (
+                        slice(first.offset, first.offset + first.dof),
+                        slice(second.offset, second.offset + second.dof),
+                    )
+                    found = [(self._variable(first)[rows], self._variable(second)[columns], S[:, mine, other])]
+                    if c == d and m != n:  # below the diagonal lies the transpose
+                        off = rows != columns
+                        below = S[off][:, other, mine].swapaxes(1, 2)
+                        found.append((self._variable(first)[columns[off]], self._variable(second)[rows[off]], below))
+                    for row, column, blocks in found:
+                        yield (a, b, row, column, blocks) if a <= b else (b, a, column, row, blocks.swapaxes(1, 2))
+
+    def _sizes_of(self, member: Member) -> tuple[int, int]:
+        return self._sizes[self._groups.index(member.group)]
+
+    def _variable(self, member: Member) -> IntArray:
+        """Return the variable of each block."""
+        count = self._sizes_of(member)[0]
+        return np.arange(count) if member.block_of is None else np.argsort(member.block_of)
+
+    def system(self, damping: float) -> tuple[Layout, dict[tuple[int, int], FloatArray], list[FloatArray]]:
+        """Return a layout of the kept variables, the damped blocks, and the right-hand side."""
+        classes, start = [], 0
+        for name, (count, dof) in zip(self._groups, self._sizes, strict=True):
+            classes.append(KeptClass(dof, count, (Member(name, 0, dof),), start))
+            start += count * dof
+        blocks, S = {}, {}
+        for a, (count, dof) in enumerate(self._sizes):
+            diagonal = self._on_diagonal[a].copy()
+            steps = np.arange(dof)
+            diagonal[:, steps, steps] += damping * np.maximum(self._curvature[a], MIN_DIAGONAL)
+            diagonal[:, steps, steps] += self._curvature[a] == 0.0
+            every = np.arange(count, dtype=np.int32)
+            row, column = self._places(a, a)
+            blocks[a, a] = (np.concatenate([every, row]), np.concatenate([every, column]))
+            S[a, a] = np.concatenate([diagonal, self._blocks[a, a]]) if (a, a) in self._blocks else diagonal
+        for (a, b), values in self._blocks.items():
+            if a != b:
+                blocks[a, b], S[a, b] = self._places(a, b), values
+        layout = Layout(Problem(self._variables, ()), tuple(classes), (), (), (), blocks, {})
+        return layout, S, [rhs.reshape(-1) for rhs in self._rhs]
+
+    def _places(self, a: int, b: int) -> tuple[IntArray, IntArray]:
+        number = self._number.get((a, b), np.zeros(0, np.int64))
+        row, column = np.divmod(number, self._sizes[b][0])
+        return row.astype(np.int32), column.astype(np.int32)
+
+    def decrease(self, step: list[FloatArray], damping: float, residual: list[FloatArray] | None) -> float:
+        """Return the kept variables' part of the decrease that the quadratic model predicts."""
+        total = 0.0
+        for delta, curvature, gradient in zip(step, self._curvature, self._gradient, strict=True):
+            total += damping * float((np.maximum(curvature, MIN_DIAGONAL).reshape(-1) * delta) @ delta)
+            total -= float(gradient.reshape(-1) @ delta)
+        if residual is not None:
+            total += sum(float(r @ delta) for r, delta in zip(residual, step, strict=True))
+        return 0.5 * total
+
+    def retract(self, states: States, step: list[FloatArray]) -> States:
+        """Return the kept variables moved by a step."""
+        return {
+            name: group.manifold.retract(states[name], np.ascontiguousarray(delta.reshape(len(group), -1)))
+            for (name, group), delta in zip(self._variables.items(), step, strict=True)
+        }
+
+    def part(self, layout: Layout, step: list[FloatArray]) -> list[FloatArray]:
+        """Return a step in the blocks of a shard."""
+        parts = []
+        for kept in layout.kept:
+            blocks = np.zeros((kept.count, kept.width))
+            for member in kept.members:
+                count, dof = self._sizes_of(member)
+                delta = step[self._groups.index(member.group)].reshape(count, dof)
+                blocks[member.blocks(np.arange(count)), member.offset : member.offset + dof] = delta
+            parts.append(blocks.reshape(-1))
+        return parts
+
+
+__all__ = ["SharedSystem"]

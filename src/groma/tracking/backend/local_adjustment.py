@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Adjust keyframes and what they see: a window with older keyframes held, or all of them at the end.
+
+A job is prepared from the map, solved without looking at the map (so a thread may do it while tracking goes on), and
+applied to the map. Landmarks are eliminated; planes and poses remain in the reduced system.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.factors.contract import Factor
+from groma.factors.losses import Cauchy
+from groma.geometry import se3
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.charts.plane_charts import PLANE_CHARTS
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.geometry.manifold import Euclidean
+from groma.problem.problem import Problem
+from groma.problem.variables import Variables
+from groma.scene.landmarks import Lines
+from groma.solver.options import SolverOptions
+from groma.solver.report import SolveReport
+from groma.solver.solve import solve
+from groma.tracking.frame.camera import TrackCamera, back, into
+from groma.tracking.frame.measurements import (
+    LineMeasurements,
+    PlaneMeasurements,
+    PointMeasurements,
+    constants,
+    line_factors,
+    plane_factors,
+    point_factors,
+)
+from groma.tracking.map.landmarks import ALIVE
+from groma.tracking.map.lines import line_ends
+from groma.tracking.map.relations import structure_factors
+from groma.tracking.map.track_map import Keyframe, TrackMap
+from groma.tracking.pose.estimate import GATE
+
+#: Keyframes outside the window that are held as its border.
+BORDER = 8
+
+
+@dataclass
+class AdjustmentJob:
+    """Some keyframes with their landmarks, ready to be solved."""
+
+    camera: TrackCamera
+    keyframes: list[Keyframe]
+    #: Which of them are held.
+    held: BoolArray
+    #: Landmarks of the map that take part.
+    points: IntArray
+    lines: IntArray
+    planes: IntArray
+    problem: Problem
+    #: Measurements of points and lines, with the keyframe (position in ``keyframes``) and the row in its table.
+    point_table: PointMeasurements
+    point_rows: IntArray
+    point_pose: IntArray
+    line_table: LineMeasurements
+    line_rows: IntArray
+    line_pose: IntArray
+    max_iterations: int = 6
+    report: SolveReport | None = None
+    solved: Problem | None = field(default=None)
+
+    def solve(self) -> None:
+        """Solve; reads and changes nothing but this job."""
+        options = SolverOptions(max_iterations=self.max_iterations, function_tolerance=1e-3, threads=1)
+        solution = solve(self.problem, options)
+        self.solved, self.report = solution.problem, solution.report
+
+    def apply(self, track_map: TrackMap) -> FloatArray:
+        """Write the result to the map; return new_world_from_old_world (7,) near the newest keyframe."""
+        assert self.solved is not None
+        states = self.solved.variables
+        poses = states["poses"].state
+        old_last = self.keyframes[-1].pose.copy()
+        loose = np.ones(len(track_map.points), dtype=bool)
+        loose[self.points] = False
+        for k in np.flatnonzero(~self.held):
+            keyframe = self.keyframes[k]
+            # Landmarks that only this keyframe sees go with it.
+            rows = np.flatnonzero(loose & (track_map.points.first_keyframe == keyframe.index) & track_map.points.alive)
+            track_map.points.xyz[rows] = back(poses[k], into(keyframe.pose, track_map.points.xyz[rows]))
+            keyframe.pose = poses[k].copy()
+        if "points" in states:
+            track_map.points.xyz[self.points] = states["points"].state
+        if "lines" in states:
+            self._move_lines(track_map, states["lines"].ambient())
+        if "planes" in states:
+            hesse = states["planes"].ambient()
+            track_map.planes.hesse[self.planes] = hesse / np.linalg.norm(hesse[:, :3], axis=1, keepdims=True)
+        self._cull(track_map)
+        return se3.compose(se3.inverse(self.keyframes[-1].pose[None]), old_last[None])[0]
+
+    def _move_lines(self, track_map: TrackMap, plucker: FloatArray) -> None:
+        good = np.isfinite(plucker).all(axis=1)
+        rows = self.lines[good]
+        every = Lines.through(track_map.lines.segment[rows]).moved_to(plucker[good])
+        track_map.lines.plucker[rows] = every.plucker
+        track_map.lines.segment[rows] = every.segments
+
+    def _cull(self, track_map: TrackMap) -> None:
+        """Forget measurements that do not agree, and landmarks that lost theirs."""
+        points, lines = self.point_table, self.line_table
+        poses = np.array([keyframe.pose for keyframe in self.keyframes])
+        if len(points):
+            at = se3.transform_points(poses[self.point_pose], track_map.points.xyz[points.index])
+            away = np.linalg.norm(self.camera.project(at) - points.pixel, axis=1) / points.sigma
+            wrong = ~(away < GATE * 1.2)
+            self._forget("points", wrong, self.point_pose, self.point_rows)
+            left = np.bincount(points.index[~wrong], minlength=len(track_map.points))
+            gone = self.points[left[self.points] < 1]
+            track_map.drop_points(gone)
+        if len(lines):
+            wrong = np.zeros(len(lines), dtype=bool)
+            for k in np.unique(self.line_pose):
+                of = np.flatnonzero(self.line_pose == k)
+                ends, good = line_ends(self.camera, poses[k], track_map.lines.plucker[lines.index[of]], lines.ends[of])
+                first, second = (self.camera.project(into(poses[k], ends[:, side])) for side in (0, 1))
+                away = np.maximum(
+                    np.linalg.norm(first - lines.ends[of, :2], axis=1),
+                    np.linalg.norm(second - lines.ends[of, 2:], axis=1),
+                )
+                wrong[of] = ~(good & (away < GATE * 1.2 * lines.sigma[of] + 1.0))
+            self._forget("lines", wrong, self.line_pose, self.line_rows)
+            left = np.bincount(lines.index[~wrong], minlength=len(track_map.lines))
+            track_map.drop_lines(self.lines[left[self.lines] < 1])
+
+    def _forget(self, kind: str, wrong: BoolArray, pose: IntArray, rows: IntArray) -> None:
+        for k in np.unique(pose[wrong]):
+            keyframe = self.keyframes[k]
+            table = getattr(keyframe.measured, kind)
+            keep = np.ones(len(table), dtype=bool)
+            keep[rows[wrong & (pose == k)]] = False
+            keyframe.measured = replace(keyframe.measured, **{kind: table.take(keep)})
+
+
+def window_job(
+    track_map: TrackMap, camera: TrackCamera, size: int, relations: bool, metric: bool
+) -> AdjustmentJob | None:
+    """Prepare the newest keyframe with those that share most with it; others that see the same are held."""
+    living = track_map.living()
+    if len(living) < 2:
+        return None
+    newest, others = living[-1], living[:-1]
+    shared = track_map.shared(newest, others)
+    recent = np.arange(len(others)) >= len(others) - 2
+    order = np.argsort(-(shared + 10_000 * recent), kind="stable")
+    chosen = [int(k) for k in order[: size - 1] if shared[k] >= 10 or recent[k]]
+    window = [others[k] for k in sorted(chosen)] + [newest]
+    inside = {keyframe.index for keyframe in window}
+    outside = [keyframe for keyframe in others if keyframe.index not in inside]
+    seen = np.zeros(len(track_map.points), dtype=bool)
+    for keyframe in window:
+        seen[keyframe.measured.points.index] = True
+    common = np.array([int(seen[k.measured.points.index].sum()) for k in outside], dtype=np.int64)
+    border = [outside[k] for k in np.argsort(-common, kind="stable")[:BORDER] if common[k] >= 8]
+    held = np.array([True] * len(border) + [False] * len(window))
+    if not border:
+        held[0] = True
+        if not metric and len(held) > 2:
+            held[1] = True
+    return job_of(track_map, camera, border + window, held, relations)
+
+
+def job_of(
+    track_map: TrackMap,
+    camera: TrackCamera,
+    keyframes: list[Keyframe],
+    held: BoolArray,
+    relations: bool,
+    max_iterations: int = 6,
+) -> AdjustmentJob | None:
+    """Prepare the adjustment of some keyframes and all that at least two of them see."""
+    living = [track_map.living_measurements(keyframe) for keyframe in keyframes]
+    rows = {}
+    for kind, table in (("points", track_map.points), ("lines", track_map.lines)):
+        rows[kind] = [np.flatnonzero(table.state[getattr(k.measured, kind).index] == ALIVE) for k in keyframes]
+    points = PointMeasurements.stack([m.points for m in living])
+    lines = LineMeasurements.stack([m.lines for m in living])
+    planes = PlaneMeasurements.stack([m.planes for m in living])
+    pose = {
+        kind: np.repeat(np.arange(len(keyframes)), [len(getattr(m, kind)) for m in living])
+        for kind in ("points", "lines", "planes")
+    }
+    in_table = {kind: np.concatenate(rows[kind]) if rows[kind] else np.zeros(0, np.int64) for kind in rows}
+    # Points seen once tell nothing about poses; points that no free keyframe sees neither.
+    free = ~held
+    often = np.bincount(points.index, minlength=len(track_map.points)) >= 2
+    moving = np.zeros(len(track_map.points), dtype=bool)
+    moving[points.index[free[pose["points"]]]] = True
+    keep = often[points.index] & moving[points.index]
+    points, point_pose, point_rows = points.take(keep), pose["points"][keep], in_table["points"][keep]
+    moving = np.zeros(len(track_map.lines), dtype=bool)
+    moving[lines.index[free[pose["lines"]]]] = True
+    known = np.bincount(lines.index, minlength=len(track_map.lines)) >= 2
+    known[lines.index[np.isfinite(lines.inverse_depth).all(axis=1)]] = True
+    keep = moving[lines.index] & known[lines.index]
+    lines, line_pose, line_rows = lines.take(keep), pose["lines"][keep], in_table["lines"][keep]
+
+    point_ids, point_local = np.unique(points.index, return_inverse=True)
+    line_ids, line_local = np.unique(lines.index, return_inverse=True)
+    plane_ids, plane_local = np.unique(planes.index, return_inverse=True)
+    variables = {"poses": Variables(POSE_CHARTS["left"], np.array([k.pose for k in keyframes]), held)}
+    variables |= constants(camera)
+    if len(point_ids):
+        variables["points"] = Variables(Euclidean(3, "point"), track_map.points.xyz[point_ids])
+    if len(line_ids):
+        chart = LINE_CHARTS["cartesian"]
+        variables["lines"] = Variables(chart, chart.from_ambient(track_map.lines.plucker[line_ids]))
+    if len(plane_ids):
+        chart = PLANE_CHARTS["normal_offset"]
+        variables["planes"] = Variables(chart, chart.from_ambient(track_map.planes.hesse[plane_ids]))
+    loss = Cauchy(2.0)
+    factors: list[Factor] = [
+        *point_factors(camera, replace(points, index=point_local), point_pose, loss),
+        *line_factors(camera, replace(lines, index=line_local), line_pose, loss),
+        *plane_factors(replace(planes, index=plane_local), pose["planes"], loss),
+    ]
+    if not factors:
+        return None
+    if relations:
+        factors += structure_factors(track_map, line_ids, plane_ids)
+    return AdjustmentJob(
+        camera, keyframes, held, point_ids, line_ids, plane_ids, Problem(variables, factors),
+        points, point_rows, point_pose, lines, line_rows, line_pose, max_iterations,
+    )  # fmt: skip
+
+
+__all__ = ["AdjustmentJob", "job_of", "window_job"]

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Places seen before: recognised by described features, closed by a pose graph, and their landmarks joined.
+
+Each new keyframe is compared with older ones that share nothing with it. Enough features must match, and agree on one
+pose. The error found is spread over the keyframes between by a pose graph (odometry between neighbours, and the loops).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.factors.contract import Ref
+from groma.factors.losses import Huber
+from groma.factors.priors.pose_between import PoseBetween
+from groma.geometry import se3
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.problem.problem import Problem
+from groma.problem.variables import Variables
+from groma.scene.landmarks import Lines
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
+from groma.tracking.frame.camera import TrackCamera, back, into, planes_back, planes_into
+from groma.tracking.map.feature_points import match_features
+from groma.tracking.map.landmarks import DEAD
+from groma.tracking.map.track_map import Keyframe, TrackMap
+from groma.tracking.pose.depth_check import DENIES, depth_agreement
+from groma.tracking.pose.relocalise import feature_places, pose_from_matches
+
+#: Keyframes between a new one and those it may close a loop with.
+GAP = 12
+#: Older keyframes compared with each new one, an even choice if there are more.
+COMPARED = 25
+#: Strongest features of the new keyframe that vote for older ones.
+VOTERS = 200
+#: Features that must match, and agree on the pose.
+LEAST_MATCHES, LEAST_INLIERS = 60, 35
+#: A keyframe that shares this much with the new one is no loop.
+SHARED = 30
+#: Noise of relative poses: translation (share of the median depth of the map), rotation (radians).
+SIGMA = np.array([0.02] * 3 + [0.01] * 3)
+#: A loop that moves the newest keyframe by more than so many standard deviations of what adds up on the way is none:
+#: two places are alike.
+GATE = 6.0
+
+
+@dataclass(frozen=True)
+class LoopSearch:
+    """A new keyframe and older ones that it may close a loop with."""
+
+    newest: Keyframe
+    candidates: list[Keyframe]
+
+    def run(self) -> list[tuple[Keyframe, IntArray, IntArray]]:
+        """Return the candidates whose descriptions match best, with the rows of the pairs; looks at no map."""
+        features = self.newest.features
+        strongest = np.argsort(-features.response, kind="stable")[:VOTERS]
+        voters = replace(features, pixel=features.pixel[strongest], descriptor=features.descriptor[strongest])
+        votes = np.array([len(match_features(other.features, voters)[0]) for other in self.candidates])
+        out = []
+        for k in np.argsort(-votes, kind="stable")[:2]:
+            first, second = match_features(self.candidates[k].features, features)
+            if len(first) >= LEAST_MATCHES:
+                out.append((self.candidates[k], first, second))
+        return out
+
+
+def search_for_loop(track_map: TrackMap, metric: bool) -> LoopSearch | None:
+    """Return the search that the newest keyframe is worth, or None if it sees what older ones see anyway."""
+    newest = track_map.last
+    living = [k for k in track_map.living() if k.index < newest.index - GAP]
+    if not living or not metric:
+        return None
+    shared = track_map.shared(newest, living)
+    if shared.max(initial=0) >= SHARED:
+        return None
+    chosen = np.unique(np.linspace(0, len(living) - 1, COMPARED).astype(int))
+    return LoopSearch(newest, [living[k] for k in chosen])
+
+
+def close_loop(
+    track_map: TrackMap, camera: TrackCamera, newest: Keyframe, pairs: list[tuple[Keyframe, IntArray, IntArray]]
+) -> bool:
+    """Close a loop with what a search found, if the places agree on one pose; return whether the map was changed."""
+    best = None
+    for keyframe, first, second in pairs:
+        if not (keyframe.alive and newest.alive):
+            continue
+        found = agreeing_pose(track_map, camera, keyframe, newest, first, second, LEAST_INLIERS)
+        better = found is not None and (best is None or len(found[1]) > len(best[2]))
+        if found is not None and better and _can_be(track_map, keyframe, newest, found[0]):
+            best = (keyframe, *found)
+    if best is None:
+        return False
+    keyframe, pose, first, second = best
+    measured = se3.compose(keyframe.pose[None], se3.inverse(pose[None]))[0]
+    track_map.loops.append((keyframe.index, newest.index, measured))
+    _spread_error(track_map)
+    join_points(track_map, keyframe, newest, first, second)
+    return True
+
+
+def _can_be(track_map: TrackMap, keyframe: Keyframe, newest: Keyframe, pose: FloatArray) -> bool:
+    """Whether errors that add up at random between two keyframes explain how far the newest is from a pose (7,)."""
+    way = [one for one in track_map.living() if keyframe.index <= one.index <= newest.index]
+    centers = se3.inverse(np.array([one.pose for one in way]))[:, 4:]
+    lever = float(np.linalg.norm(centers - centers[-1], axis=1).max())
+    away = se3.log(se3.compose(pose[None], se3.inverse(newest.pose[None])))[0]
+    many = GATE * math.sqrt(newest.index - keyframe.index)
+    went = np.linalg.norm(away[:3]) < many * (SIGMA[0] * newest.depth + SIGMA[3] * lever)
+    return bool(went and np.linalg.norm(away[3:]) < many * SIGMA[3])
+
+
+def agreeing_pose(
+    track_map: TrackMap,
+    camera: TrackCamera,
+    keyframe: Keyframe,
+    newest: Keyframe,
+    first: IntArray,
+    second: IntArray,
+    least: int,
+) -> tuple[FloatArray, IntArray, IntArray] | None:
+    """Pose (7,) of a keyframe by matches to features of another in a map, and the matches that agree; None without."""
+    places = feature_places(track_map, camera, keyframe, first)
+    known = np.isfinite(places[:, 0])
+    first, second, places = first[known], second[known], places[known]
+    found = pose_from_matches(camera, places, newest.features.pixel[second], least)
+    if found is None or depth_agreement(camera, [keyframe], newest.depth_grid, found[0])[1] > DENIES:
+        return None
+    return found[0], first[found[1]], second[found[1]]
+
+
+def _spread_error(track_map: TrackMap) -> None:
+    """Solve the pose graph and move keyframes with what they first saw."""
+    living = track_map.living()
+    place = {keyframe.index: k for k, keyframe in enumerate(living)}
+    poses = np.array([keyframe.pose for keyframe in living])
+    first, second = [np.arange(len(living) - 1)], [np.arange(1, len(living))]
+    relative = [se3.compose(poses[:-1], se3.inverse(poses[1:]))]
+    # Keyframes that see the same hold each other too.
+    for k, keyframe in enumerate(living):
+        earlier = living[max(0, k - 8) : max(0, k - 1)]
+        if earlier:
+            index = np.flatnonzero(track_map.shared(keyframe, earlier) > 60) + max(0, k - 8)
+            first.append(index)
+            second.append(np.full(len(index), k))
+            relative.append(se3.compose(poses[index], se3.inverse(np.tile(poses[k], (len(index), 1)))))
+    for one, two, measured in track_map.loops:
+        if one in place and two in place:
+            first.append(np.array([place[one]]))
+            second.append(np.array([place[two]]))
+            relative.append(measured[None])
+    held = np.zeros(len(living), dtype=bool)
+    held[0] = True
+    factor = PoseBetween(
+        first=Ref("poses", np.concatenate(first)), second=Ref("poses", np.concatenate(second)),
+        first_from_second=np.concatenate(relative), sqrt_information=np.diag(1.0 / SIGMA)[None].repeat(
+            sum(map(len, first)), axis=0
+        ), loss=Huber(3.0),
+    )  # fmt: skip
+    problem = Problem({"poses": Variables(POSE_CHARTS["left"], poses, held)}, [factor])
+    solved = solve(problem, SolverOptions(max_iterations=30, threads=1))["poses"]
+    _move(track_map, living, solved)
+
+
+def _move(track_map: TrackMap, living: list[Keyframe], poses: FloatArray) -> None:
+    points, lines, planes = track_map.points, track_map.lines, track_map.planes
+    of_plane = np.full(len(planes), -1)
+    for keyframe, new in zip(living, poses, strict=True):
+        rows = np.flatnonzero(points.first_keyframe == keyframe.index)
+        points.xyz[rows] = back(new, into(keyframe.pose, points.xyz[rows]))
+        rows = np.flatnonzero((lines.first_keyframe == keyframe.index) & lines.alive)
+        if len(rows):
+            table = Lines.through(back(new, into(keyframe.pose, lines.segment[rows])))
+            lines.segment[rows], lines.plucker[rows] = table.segments, table.plucker
+        rows = keyframe.measured.planes.index
+        rows = np.unique(rows[of_plane[rows] < 0])
+        of_plane[rows] = keyframe.index
+        planes.hesse[rows] = planes_back(new, planes_into(keyframe.pose, planes.hesse[rows]))
+        planes.samples[rows] = back(new, into(keyframe.pose, planes.samples[rows]))
+        keyframe.pose = new.copy()
+
+
+def join_points(track_map: TrackMap, old: Keyframe, new: Keyframe, first: IntArray, second: IntArray) -> None:
+    """Points of both keyframes at matched features become one: the older one stays."""
+    keep, drop = old.features.point[first], new.features.point[second]
+    both = (keep >= 0) & (drop >= 0) & (keep != drop)
+    both[both] &= (track_map.points.state[keep[both]] != DEAD) & (track_map.points.state[drop[both]] != DEAD)
+    keep, drop = keep[both], drop[both]
+    if not len(keep):
+        return
+    renamed = np.arange(len(track_map.points))
+    renamed[drop] = keep
+    for keyframe in track_map.living():
+        table = keyframe.measured.points
+        if np.isin(table.index, drop).any():
+            index = renamed[table.index]
+            unique = np.unique(index, return_index=True)[1]
+            keyframe.measured = replace(keyframe.measured, points=replace(table, index=index).take(unique))
+        point = keyframe.features.point
+        point[point >= 0] = renamed[point[point >= 0]]
+    track_map.points.keyframe[keep], track_map.points.pixel[keep] = new.index, new.features.pixel[second][both]
+    track_map.points.state[drop] = DEAD
+
+
+__all__ = ["LoopSearch", "agreeing_pose", "close_loop", "join_points", "search_for_loop"]

@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What goes on behind the frames: keyframes, adjustment of windows, and loops, partly in threads of their own."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.geometry import se3
+from groma.solver.report import SolveReport
+from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
+from groma.tracking.backend.loop_closure import LoopSearch, close_loop, search_for_loop
+from groma.tracking.backend.stereo_calibration import correct_offset, estimate_offset
+from groma.tracking.backend.submaps import Joint, find_joint, join_maps, search_older_maps
+from groma.tracking.frame.camera import TrackCamera
+from groma.tracking.frame.features import FrameFeatures
+from groma.tracking.map.culling import drop_repeating_keyframes, drop_unseen
+from groma.tracking.map.keyframes import Followed, add_keyframe
+from groma.tracking.map.planes import merge_planes
+from groma.tracking.map.relations import find_lines_on_planes
+from groma.tracking.map.track_map import TrackMap
+from groma.tracking.options import TrackOptions
+from groma.tracking.pose.following import carry
+from groma.tracking.stopwatch import Stopwatch
+
+#: A chosen frame becomes a keyframe, and the result of a window's adjustment is taken up, after this many frames.
+DELAY = 2
+
+
+@dataclass
+class Present:
+    """Where the camera is: the last tracked frame, its pose, and what is followed from it."""
+
+    data: FrameFeatures | None = None
+    pose: FloatArray = field(default_factory=se3.identity)
+    followed: Followed = field(default_factory=Followed.nothing)
+    frames_since_keyframe: int = 0
+
+
+@dataclass
+class _Chosen:
+    """A frame chosen as a keyframe, with its pose in terms of a keyframe and what was followed in it."""
+
+    data: FrameFeatures
+    near: int
+    relative: FloatArray
+    followed: Followed
+    age: int = 0
+
+    def is_ready(self, delay: int) -> bool:
+        """Whether frames have passed in which its features were found. Counted, so that runs repeat exactly."""
+        self.age += 1
+        return self.age >= delay
+
+
+@dataclass
+class _Pending:
+    job: AdjustmentJob
+    future: Future | None
+    due: int
+
+
+class Mapper:
+    """Makes keyframes of chosen frames and keeps the map adjusted."""
+
+    def __init__(self, camera: TrackCamera, options: TrackOptions) -> None:
+        #: Maps begun so far; more than one after the track was lost for long.
+        self.maps, self.current = [TrackMap()], 0
+        #: How maps join older ones, by the number of the newer.
+        self.joints: dict[int, Joint] = {}
+        self.camera, self.options = camera, options
+        self.metric = True
+        self.loops = 0
+        #: A frame that is to become a keyframe; its features are being found meanwhile.
+        self.due: _Chosen | None = None
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="groma-adjust") if options.threaded else None
+        self._workers = ThreadPoolExecutor(2, thread_name_prefix="groma-detect") if options.threaded else None
+        self._pending: _Pending | None = None
+        self._search: tuple[LoopSearch, Future] | None = None
+
+    @property
+    def map(self) -> TrackMap:
+        """The map that is followed now."""
+        return self.maps[self.current]
+
+    def begin_anew(self, present: Present) -> None:
+        """Leave the present map, and begin another."""
+        self.leave(present)
+        if self.maps[-1].keyframes:
+            self.maps.append(TrackMap())
+        self.current = len(self.maps) - 1
+
+    def leave(self, present: Present) -> None:
+        """Finish what was begun on the present map."""
+        self.due = None
+        self.take_up(present, now=True)
+
+    @property
+    def threaded(self) -> bool:
+        """Whether features are found in other threads."""
+        return self._workers is not None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a window is being adjusted."""
+        return self._pending is not None
+
+    def advance(self, present: Present, watch: Stopwatch) -> None:
+        """Before each frame: take up results that are due, and make the chosen keyframe if it is."""
+        with watch("take up"):
+            self.take_up(present)
+        if self.due is not None and self.due.is_ready(DELAY if self.metric else 1):
+            self.make_keyframe(present, watch)
+
+    def adjust_start(self, present: Present) -> None:
+        """Adjust the first keyframes of a single camera."""
+        job = window_job(self.map, self.camera, self.options.window, False, self.metric)
+        if job is not None:
+            job.solve()
+            self.apply(present, job)
+
+    def choose(self, present: Present, data: FrameFeatures) -> None:
+        """Choose the present frame as a keyframe; its features are found in other threads meanwhile."""
+        if self._workers is not None:
+            data.prepare(self._workers)
+        near = self.map.near
+        relative = se3.compose(present.pose[None], se3.inverse(near.pose[None]))[0]
+        self.due = _Chosen(data, near.index, relative, present.followed)
+
+    def make_keyframe(self, present: Present, watch: Stopwatch) -> None:
+        """Make a keyframe of the frame that was chosen."""
+        assert self.due is not None
+        chosen, self.due = self.due, None
+        with watch("wait"):
+            chosen.data.wait()
+        with watch("take up"):
+            self.take_up(present, now=True)
+        with watch("keyframe"):
+            pose = se3.compose(chosen.relative[None], self.map.pose_of(chosen.near)[None])[0]
+            followed = add_keyframe(self.map, self.camera, chosen.data, pose, chosen.followed, self.options)
+            if chosen.data is present.data:
+                present.followed = followed
+            elif present.data is not None:
+                present.followed = carry(
+                    self.map, self.camera, chosen.data, present.data, followed, present.followed, present.pose
+                )
+            merge_planes(self.map.planes)
+            if self.options.relations:
+                find_lines_on_planes(self.map)
+        present.frames_since_keyframe = 0
+        with watch("adjust"):
+            job = window_job(self.map, self.camera, self.options.window, self.options.relations, self.metric)
+            if job is not None:
+                if self._pool is None:
+                    job.solve()
+                    self.apply(present, job)
+                else:
+                    self._pending = _Pending(job, self._pool.submit(job.solve), DELAY)
+        with watch("loop"):
+            search = self._what_to_search() if self.options.close_loops else None
+            if search is not None:
+                if self._pool is None:
+                    self._close_loop(present, search, search.run())
+                elif self._search is None:
+                    self._search = (search, self._pool.submit(search.run))
+        with watch("upkeep"):
+            drop_unseen(self.map)
+            drop_repeating_keyframes(self.map, self._pending.job.keyframes if self._pending else [])
+
+    def take_up(self, present: Present, now: bool = False) -> None:
+        """Take up the result of the thread when it is due."""
+        if self._pending is not None:
+            self._pending.due -= 1
+            if self._pending.due > 0 and not now:
+                return
+            pending, self._pending = self._pending, None
+            assert pending.future is not None
+            pending.future.result()
+            self.apply(present, pending.job)
+
+        # Loops are closed between adjustments, which would undo them.
+        if self._search is not None:
+            (search, future), self._search = self._search, None
+            self._close_loop(present, search, future.result())
+
+    def _what_to_search(self) -> LoopSearch | None:
+        """Search the older maps until this one is joined to one of them, then this map for loops."""
+        newest = len(self.maps) - 1
+        if 0 < newest == self.current and newest not in self.joints and self.metric:
+            return search_older_maps(self.maps, self.map.last)
+        return search_for_loop(self.map, self.metric)
+
+    def _close_loop(self, present: Present, search: LoopSearch, pairs: list) -> None:
+        if search.newest is not self.map.keyframes[search.newest.index]:
+            return
+        if pairs and not any(pair[0] in self.map.living() for pair in pairs):
+            joint = find_joint(self.maps, self.camera, search.newest, pairs)
+            if joint is not None:
+                self.joints[self.current] = joint
+                self.map.pinned.add(joint.newest.index)
+                self.maps[joint.older].pinned.add(joint.keyframe.index)
+            return
+        last = self.map.last
+        before = last.pose.copy()
+        if close_loop(self.map, self.camera, search.newest, pairs):
+            self.loops += 1
+            _follow_world(present, se3.compose(se3.inverse(last.pose[None]), before[None])[0])
+
+    def apply(self, present: Present, job: AdjustmentJob) -> None:
+        """Take up the result of an adjustment."""
+        _follow_world(present, job.apply(self.map))
+
+    def _adjust_all(self) -> SolveReport | None:
+        """Adjust all keyframes of the map together, twice: outliers are left out in between."""
+        report, living = None, self.map.living()
+        if len(living) < 2:
+            return None
+        held = np.zeros(len(living), dtype=bool)
+        held[0] = True
+        for _ in range(2):
+            job = job_of(self.map, self.camera, living, held, self.options.relations, max_iterations=15)
+            if job is not None:
+                job.solve()
+                job.apply(self.map)
+                report = job.report
+        return report
+
+    def end(self, present: Present) -> dict[int, tuple[int, int]]:
+        """End the threads and join the maps; see :func:`~groma.tracking.backend.submaps.join_maps` for what is
+        returned.
+        """
+        if self.due is not None:
+            self.make_keyframe(present, Stopwatch())
+        self.take_up(present, now=True)
+        for pool in (self._pool, self._workers):
+            if pool is not None:
+                pool.shutdown(wait=True)
+        self._pool = self._workers = None
+        return join_maps(self.maps, self.joints)
+
+    def adjust_at_end(self, part: int) -> tuple[SolveReport | None, float]:
+        """Adjust all keyframes of a map together; return the report and the offset of the right images, pixels."""
+        self.current = part
+        if not self.options.adjust_at_end or len(self.map.living()) < 2:
+            return None, 0.0
+        report = self._adjust_all()
+        offset = estimate_offset(self.map, self.camera)
+        if offset:
+            correct_offset(self.map, self.camera, offset)
+            report = self._adjust_all()
+        return report, offset
+
+
+def _follow_world(present: Present, new_from_old: FloatArray) -> None:
+    """Move the present pose with the map around the last keyframe."""
+    present.pose = se3.compose(present.pose[None], se3.inverse(new_from_old[None]))[0]
+
+
+__all__ = ["DELAY", "Mapper", "Present"]

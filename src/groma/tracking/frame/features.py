@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What is found in one frame: described features, segments with depth, planes; computed when first asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import FloatArray, IntArray
+from groma.features.depth.noise import DepthNoise
+from groma.features.lsd import LsdDetector
+from groma.features.segments import Segments
+from groma.io.sequences.frame import Frame
+from groma.tracking.frame.camera import TrackCamera
+from groma.tracking.frame.depth import (
+    DEPTH_FLOOR,
+    INVERSE_DEPTH_SIGMA,
+    DepthImage,
+    depth_at,
+    depth_sigma,
+    segment_inverse_depths,
+)
+from groma.tracking.frame.planes import FramePlanes, frame_planes
+from groma.tracking.frame.sparse_depth import fill_sparse
+from groma.tracking.frame.stereo import DISPARITY_SIGMA, Disparities, dense_disparities, match_columns
+from groma.tracking.options import TrackOptions
+
+#: Depths of a stereo pair are used where their noise is below this share of the depth. An error of the disparity shifts
+#: a point in the next image by that error times motion over baseline, far or near, so far points serve as well.
+FAR_SHARE = 0.25
+#: Errors of depth beside a segment: so many neighbours err alike.
+SEGMENT_NOISE = DepthNoise(DEPTH_FLOOR, INVERSE_DEPTH_SIGMA, 0.0, correlation=6.0, tilt=0.0, shift=0.0)
+#: Pixels from one place of the grid of depths to the next.
+GRID = 20
+Descriptors = npt.NDArray[np.uint8]
+
+
+@dataclass
+class Features:
+    """Described features (ORB) of a frame."""
+
+    #: (N, 2) pixels, (N,) response, (N,) size of a pixel of the image in the pyramid where each was found, pixels.
+    pixel: FloatArray
+    response: FloatArray
+    scale: FloatArray
+    #: (N, 32) descriptors.
+    descriptor: Descriptors
+    #: (N,) depth; NaN where unknown.
+    depth: FloatArray
+    #: (N,) the map's point at this feature, or -1.
+    point: IntArray
+
+
+@dataclass(frozen=True)
+class DetectedSegments:
+    """Segments of a frame, with inverse depths of their ends where known."""
+
+    segments: Segments
+    inverse_depth: FloatArray
+    inverse_depth_sigma: FloatArray
+
+
+class FrameFeatures:
+    """One frame and what was found in it so far."""
+
+    def __init__(self, frame: Frame, camera: TrackCamera, options: TrackOptions) -> None:
+        self.frame, self.camera, self.options = frame, camera, options
+        self.gray = np.ascontiguousarray(frame.gray)
+        self._work: list[Future] = []
+
+    @cached_property
+    def features(self) -> Features:
+        """ORB features over several scales."""
+        return describe(self.gray, self.options.num_features, self.depths)
+
+    @cached_property
+    def detected(self) -> DetectedSegments:
+        """Segments by LSD, fitted to the grey levels."""
+        detector = LsdDetector(min_length=self.options.min_segment_length, max_segments=2 * self.options.num_lines)
+        segments = detector.detect(self.gray)
+        inverse, sigma = self.inverse_depths(segments.ends)
+        return DetectedSegments(segments, inverse, sigma)
+
+    def prepare(self, pool: Executor) -> None:
+        """Begin with what a keyframe needs, in other threads; :meth:`wait` ends it."""
+        if self._work:
+            return
+        # Both kinds ask for depths, which are found first, once.
+        first = pool.submit(lambda: self.disparities if self.frame.depth is None else self.depth)
+        self._work.append(first)
+        self._work.append(pool.submit(lambda: (first.result(), self.features)))
+        if self.options.lines:
+            self._work.append(pool.submit(lambda: (first.result(), self.detected)))
+
+    def wait(self) -> None:
+        """Wait for what :meth:`prepare` began."""
+        for future in self._work:
+            future.result()
+
+    @cached_property
+    def planes(self) -> FramePlanes | None:
+        """Planes of the depth image; None without one."""
+        if self.depth is None or not self.options.planes:
+            return None
+        return frame_planes(self.camera, self.depth, self.options.max_depth)
+
+    @cached_property
+    def depth(self) -> DepthImage | None:
+        """The depth image; small holes are filled where most of it is missing."""
+        return None if self.frame.depth is None else fill_sparse(self.frame.depth, self.options.max_depth)
+
+    def depths(self, pixels: FloatArray) -> FloatArray:
+        """Depths (N,) at pixels from the depth image or the right image; NaN where unknown."""
+        if self.depth is not None:
+            return depth_at(self.depth, pixels, self.options.max_depth)
+        if self.frame.right is not None:
+            disparity = pixels[:, 0] - self.right_columns(pixels)
+            with np.errstate(divide="ignore"):
+                depth = self.camera.fx * self.camera.baseline / disparity
+            far = self.camera.fx * self.camera.baseline * FAR_SHARE / DISPARITY_SIGMA
+            return np.where((depth > 0) & (depth < far), depth, np.nan)
+        return np.full(len(pixels), np.nan)
+
+    @cached_property
+    def disparities(self) -> Disparities | None:
+        """Dense disparities of a pair of images."""
+        right = self.frame.right
+        return None if right is None else dense_disparities(self.gray, np.ascontiguousarray(right))
+
+    def right_columns(self, pixels: FloatArray, expected: FloatArray | None = None) -> FloatArray:
+        """Columns (N,) in the right image; NaN where not found or without one.
+
+        With ``expected`` (N,) columns only the points that have one are looked for.
+        """
+        if self.frame.right is None:
+            return np.full(len(pixels), np.nan)
+        right = np.ascontiguousarray(self.frame.right)
+        if expected is None:
+            return match_columns(self.gray, right, pixels, np.full(len(pixels), np.nan), self.disparities)
+        return match_columns(self.gray, right, pixels, expected, None)
+
+    @cached_property
+    def depth_grid(self) -> FloatArray:
+        """Depths at :func:`grid_pixels`; NaN where unknown."""
+        return self.depths(grid_pixels(self.camera))
+
+    def depth_sigma(self, depth: FloatArray) -> FloatArray:
+        """Standard deviations of depths from :meth:`depths`."""
+        if self.frame.right is not None and self.frame.depth is None:
+            return DISPARITY_SIGMA * depth**2 / (self.camera.fx * self.camera.baseline)
+        return depth_sigma(depth)
+
+    def inverse_depths(self, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Inverse depths at the ends of segments (L, 2) and their standard deviations; NaN where unknown."""
+        if self.depth is not None and len(ends):
+            noise = replace(SEGMENT_NOISE, max_depth=self.options.max_depth)
+            return segment_inverse_depths(self.depth, ends, self.camera.params, noise)
+        if self.frame.right is not None and len(ends):
+            assert self.disparities is not None
+            scale = self.camera.fx * self.camera.baseline
+            with np.errstate(divide="ignore"):
+                depth = np.where(self.disparities > 0, np.float32(scale) / self.disparities, np.float32(0.0))
+            noise = replace(SEGMENT_NOISE, constant=0.0, quadratic=2.0 * DISPARITY_SIGMA / scale, max_depth=1e4)
+            return segment_inverse_depths(depth, ends, self.camera.params, noise)
+        unknown = np.full((len(ends), 2), np.nan)
+        return unknown, unknown.copy()
+
+
+def grid_pixels(camera: TrackCamera) -> FloatArray:
+    """Pixels (N, 2) of an even grid over the image, row by row: the middles of cells."""
+    rows, columns = grid_shape(camera)
+    v, u = np.mgrid[0:rows, 0:columns].reshape(2, -1)
+    return (np.column_stack([u, v]) + 0.5) * (camera.width / columns, camera.height / rows)
+
+
+def grid_shape(camera: TrackCamera) -> tuple[int, int]:
+    """Rows and columns of :func:`grid_pixels`."""
+    return max(camera.height // GRID, 2), max(camera.width // GRID, 2)
+
+
+def describe(gray: npt.NDArray[np.uint8], count: int, depths: Callable[[FloatArray], FloatArray]) -> Features:
+    """Find and describe ORB features."""
+    orb = cv2.ORB.create(nfeatures=count, fastThreshold=7)
+    keypoints, descriptor = orb.detectAndCompute(gray, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    if not keypoints:
+        none = np.zeros(0)
+        return Features(np.zeros((0, 2)), none, none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
+    pixel = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64) + 0.5
+    response = np.array([keypoint.response for keypoint in keypoints])
+    scale = orb.getScaleFactor() ** np.array([keypoint.octave for keypoint in keypoints], np.float64)
+    none = np.full(len(pixel), -1)
+    return Features(pixel, response, scale, np.asarray(descriptor, np.uint8), depths(pixel), none)
+
+
+__all__ = ["Descriptors", "DetectedSegments", "Features", "FrameFeatures", "grid_pixels", "grid_shape"]

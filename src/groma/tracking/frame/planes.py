@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Planes that one frame sees, as the tracker wants them: for factors, and with places for telling them apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.factors.contract import Ref
+from groma.factors.observations.plane_observation import PlaneObservation
+from groma.features.depth.noise import DepthNoise
+from groma.features.depth.planes import PlaneSearchOptions, find_depth_planes
+from groma.tracking.frame.camera import TrackCamera
+from groma.tracking.frame.depth import DEPTH_FLOOR, INVERSE_DEPTH_SIGMA, DepthImage
+
+#: Neighbouring samples err alike, and a depth camera bends planes: so many count as one, and no plane is known better
+#: than to this tilt (radians) and distance (scene units).
+NOISE = DepthNoise(DEPTH_FLOOR, INVERSE_DEPTH_SIGMA, 0.0, correlation=100.0, tilt=0.004, shift=0.003)
+OPTIONS = PlaneSearchOptions(min_share=0.015, max_planes=10)
+#: Pixels from one place on a plane to the next.
+SPACING = 20
+#: Places that a plane has at least; thin strips have fewer.
+MIN_PLACES = 8
+
+
+@dataclass(frozen=True)
+class FramePlanes:
+    """Planes seen by one frame, in its camera."""
+
+    #: (K, 4) unit normal towards the camera, and offset.
+    plane: FloatArray
+    #: (K, 3, 3) square root information in the basis of ``PlaneObservation``.
+    sqrt_information: FloatArray
+    #: (K,) pixels on it.
+    support: FloatArray
+    #: (C, 3) places on planes, and the plane of each (C,).
+    places: FloatArray
+    place_plane: IntArray
+
+    def __len__(self) -> int:
+        return len(self.plane)
+
+    def places_of(self, row: int) -> FloatArray:
+        """Places (c, 3) on one plane."""
+        return self.places[self.place_plane == row]
+
+
+def frame_planes(camera: TrackCamera, depth: DepthImage, max_depth: float) -> FramePlanes:
+    """Find the planes of a depth image, largest first."""
+    found = find_depth_planes(depth, camera.params, replace(NOISE, max_depth=max_depth), OPTIONS)
+    planes, step = found.planes, found.step
+    every = max(SPACING // step, 1)
+    labels = found.labels[every // 2 :: every, every // 2 :: every]
+    row, column = np.nonzero(labels >= 0)
+    of = labels[row, column].astype(np.int64)
+    at = np.column_stack([column, row]) * every + every // 2
+    rays = camera.bearings(np.asarray(at * step + step // 2 + 0.5, np.float64))
+    # Where the ray meets the plane, which is less noisy than the depth there.
+    places = rays * (-planes[of, 3] / (planes[of, :3] * rays).sum(axis=1))[:, None]
+    support = found.num_samples.astype(np.float64) * step**2
+    kept = np.flatnonzero(np.bincount(of, minlength=len(planes)) >= MIN_PLACES)
+    renumbered = np.full(len(planes), -1)
+    renumbered[kept] = np.arange(len(kept))
+    on = renumbered[of] >= 0
+    root = _sqrt_information(planes, found.covariances_hesse)
+    return FramePlanes(planes[kept], root[kept], support[kept], places[on], renumbered[of[on]])
+
+
+def _sqrt_information(planes: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Square roots (K, 3, 3) of the information on residuals, from covariances (K, 4, 4) of (n, w)."""
+    none = np.zeros(len(planes), np.int64)
+    basis = np.zeros((len(planes), 4, 3))
+    basis[:, :3, :2] = PlaneObservation(pose=Ref("p", none), plane=Ref("q", none), planes_in_cam=planes).basis
+    basis[:, 3, 2] = 1.0
+    own = basis.transpose(0, 2, 1) @ covariances @ basis
+    return np.asarray(np.linalg.cholesky(np.linalg.inv(own)), np.float64).transpose(0, 2, 1)
+
+
+__all__ = ["FramePlanes", "frame_planes"]

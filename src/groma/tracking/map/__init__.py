@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The growing map: landmarks and keyframes, which segment is which line, and what a keyframe adds."""

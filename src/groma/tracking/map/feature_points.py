@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Described features of keyframes that become points of the map: found again by a later frame, or placed by motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.tracking.frame.camera import TrackCamera
+from groma.tracking.frame.features import Features, FrameFeatures
+from groma.tracking.frame.measurements import PointMeasurements
+from groma.tracking.map.landmarks import ALIVE, DEAD
+from groma.tracking.map.points import PointTracks
+from groma.tracking.map.track_map import Keyframe, TrackMap
+from groma.tracking.map.triangulation import triangulate
+
+#: Hamming distance beyond which descriptors do not match.
+FARTHEST = 64
+
+
+def match_features(first: Features, second: Features) -> tuple[IntArray, IntArray]:
+    """Pair features whose descriptors are nearest to each other, both ways."""
+    if not len(first.pixel) or not len(second.pixel):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(first.descriptor, second.descriptor)
+    pairs = [pair for pair in pairs if pair.distance <= FARTHEST]
+    return np.array([p.queryIdx for p in pairs], np.int64), np.array([p.trainIdx for p in pairs], np.int64)
+
+
+def points_of_features(
+    track_map: TrackMap, keyframe: Keyframe, rows: IntArray, places: FloatArray, depth_sigma: FloatArray, sigma: float
+) -> IntArray:
+    """Make points of the map of a keyframe's features that are none; return their landmarks.
+
+    Parameters
+    ----------
+    track_map, keyframe
+        Where the features are.
+    rows : (n,)
+        Features of the keyframe.
+    places : (n, 3)
+        Where they are in the world.
+    depth_sigma : (n,)
+        Standard deviation of their depths, where known.
+    sigma : float
+        Standard deviation of their pixels, at the finest scale.
+    """
+    points, features = track_map.points, keyframe.features
+    new = points.extend(len(rows))
+    pixel = features.pixel[rows]
+    points.xyz[new], points.state[new] = places, ALIVE
+    points.keyframe[new] = points.first_keyframe[new] = keyframe.index
+    points.pixel[new] = points.first_pixel[new] = pixel
+    features.point[rows] = new
+    unknown = np.full(len(new), np.nan)
+    table = PointMeasurements(new, pixel, sigma * features.scale[rows], features.depth[rows], depth_sigma, unknown)
+    keyframe.measured = replace(keyframe.measured, points=PointMeasurements.stack([keyframe.measured.points, table]))
+    return new
+
+
+def place_by_motion(
+    track_map: TrackMap, camera: TrackCamera, keyframe: Keyframe, data: FrameFeatures, pose: FloatArray, taken: IntArray
+) -> PointTracks:
+    """Place features that a keyframe and a frame both see and that have no place yet; return them as followed points.
+
+    Parameters
+    ----------
+    track_map, camera
+        The map and its camera.
+    keyframe
+        An earlier keyframe.
+    data, pose
+        The frame, and its pose (7,).
+    taken : (n,)
+        Points that are followed already.
+    """
+    points, features, own = track_map.points, data.features, keyframe.features
+    first, second = match_features(own, features)
+    index = own.point[first]
+    placed = index >= 0
+    placed[placed] = points.state[index[placed]] == ALIVE
+    free = ~placed & (features.point[second] < 0)
+    first, second = first[free], second[free]
+    if not len(first):
+        return PointTracks.empty()
+    poses = np.tile(keyframe.pose, (len(first), 1))
+    places, good = triangulate(camera, poses, own.pixel[first], pose, features.pixel[second])
+    first, second, places = first[good], second[good], places[good]
+    index = own.point[first]
+    begun = index >= 0
+    begun[begun] = points.state[index[begun]] != DEAD
+    points.xyz[index[begun]], points.state[index[begun]] = places[begun], ALIVE
+    fresh = ~begun
+    unknown = np.full(int(fresh.sum()), np.nan)
+    sigma = data.options.point_sigma_px
+    index[fresh] = points_of_features(track_map, keyframe, first[fresh], places[fresh], unknown, sigma)
+    features.point[second] = index
+    tracks = PointTracks(index, features.pixel[second])
+    tracks = tracks.take(np.unique(index, return_index=True)[1])
+    return tracks.take(~np.isin(tracks.index, taken))
+
+
+__all__ = ["match_features", "place_by_motion", "points_of_features"]

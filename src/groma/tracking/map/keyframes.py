@@ -1,0 +1,356 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""When a frame becomes a keyframe, and what it then adds to the map: points, lines and planes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from groma._typing import FloatArray, IntArray
+from groma.features.point_tracks import corners, spread
+from groma.geometry import se3
+from groma.scene.landmarks import Lines
+from groma.tracking.frame.camera import TrackCamera, back, into
+from groma.tracking.frame.features import FrameFeatures
+from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.map.feature_points import place_by_motion
+from groma.tracking.map.landmarks import ALIVE, PENDING
+from groma.tracking.map.lines import FollowedSegments, assign, expected_segments, line_ends
+from groma.tracking.map.planes import add_planes, assign_planes, grow
+from groma.tracking.map.points import PointTracks
+from groma.tracking.map.track_map import Keyframe, TrackMap
+from groma.tracking.map.triangulation import triangulate
+from groma.tracking.options import TrackOptions
+
+#: A feature within this distance of a followed point is that point, pixels.
+SAME_FEATURE = 2.0
+#: Below this share of the wanted points, one camera alone places described features by motion.
+FEW = 0.33
+#: A new line must be longer than this share of its depth, and its direction known to this angle.
+LEAST_LENGTH, LINE_ANGLE = 0.04, 0.15
+#: A keyframe within this share of the motion that makes a new one stands for it.
+NEARBY = 0.5
+#: Most frames between keyframes while the camera moves.
+MOST_FRAMES = 30
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What of the map is followed in a frame."""
+
+    points: PointTracks
+    lines: FollowedSegments
+
+    @staticmethod
+    def nothing() -> Followed:
+        """Return nothing."""
+        return Followed(PointTracks.empty(), FollowedSegments.empty())
+
+
+def wants_keyframe(
+    track_map: TrackMap, pose: FloatArray, followed: Followed, frames_since: int, options: TrackOptions
+) -> bool:
+    """Whether a tracked frame should become a keyframe."""
+    last = track_map.near
+    now = len(followed.points)
+    before = max(len(last.measured.points), 1)
+    motion = se3.log(se3.compose(pose[None], se3.inverse(last.pose[None])))[0]
+    depths = into(pose, track_map.points.xyz[followed.points.index[track_map.points.alive[followed.points.index]]])
+    depth = float(np.median(depths[:, 2])) if len(depths) else 1.0
+    shift, turn = float(np.linalg.norm(motion[:3])) / max(depth, 1e-6), float(np.linalg.norm(motion[3:]))
+    if shift > options.keyframe_motion or turn > options.keyframe_turn:
+        return True
+    if frames_since >= 2 and now < options.keyframe_share * before:
+        return True
+    few_lines = options.lines and len(followed.lines.index) < 0.5 * len(last.measured.lines)
+    moved = shift > 0.25 * options.keyframe_motion or turn > 0.25 * options.keyframe_turn
+    return moved and (frames_since >= MOST_FRAMES or (few_lines and frames_since >= 5))
+
+
+def keyframe_nearby(track_map: TrackMap, pose: FloatArray, options: TrackOptions) -> Keyframe | None:
+    """Return the living keyframe that looks most like a pose, if one is near enough to stand for it."""
+    living = [keyframe for keyframe in track_map.living() if keyframe.gray is not None]
+    poses = np.array([keyframe.pose for keyframe in living])
+    motion = se3.log(se3.compose(np.tile(pose, (len(living), 1)), se3.inverse(poses)))
+    depth = np.array([keyframe.depth for keyframe in living])
+    shift = np.linalg.norm(motion[:, :3], axis=1) / depth / options.keyframe_motion
+    turn = np.linalg.norm(motion[:, 3:], axis=1) / options.keyframe_turn
+    far = np.maximum(shift, turn)
+    far[[keyframe.index == track_map.reference for keyframe in living]] = np.inf
+    best = int(far.argmin())
+    return living[best] if far[best] < NEARBY else None
+
+
+def add_keyframe(
+    track_map: TrackMap,
+    camera: TrackCamera,
+    data: FrameFeatures,
+    pose: FloatArray,
+    followed: Followed,
+    options: TrackOptions,
+) -> Followed:
+    """Make a keyframe of a frame whose pose is known; return what is followed from now on."""
+    index = len(track_map.keyframes)
+    tracks = _add_points(track_map, camera, data, pose, followed.points, index, options)
+    segments, lines = followed.lines, LineMeasurements.empty()
+    if options.lines:
+        segments, lines = _add_lines(track_map, camera, data, pose, followed.lines, index, options)
+    planes = _add_planes(track_map, data, pose) if data.planes is not None else PlaneMeasurements.empty()
+    measured = Measurements(measure_points(data, tracks, options, track_map, pose, camera), lines, planes)
+    name, time = data.frame.name, data.frame.timestamp
+    keyframe = Keyframe(index, time, name, pose.copy(), data.gray, measured, data.features, data.depth_grid)
+    alive = measured.points.index[track_map.points.alive[measured.points.index]]
+    if len(alive):
+        keyframe.depth = max(float(np.median(into(pose, track_map.points.xyz[alive])[:, 2])), 1e-6)
+    track_map.keyframes.append(keyframe)
+    track_map.reference = index
+    return Followed(tracks, segments)
+
+
+def measure_points(
+    data: FrameFeatures,
+    tracks: PointTracks,
+    options: TrackOptions,
+    track_map: TrackMap,
+    pose: FloatArray,
+    camera: TrackCamera,
+) -> PointMeasurements:
+    """Return what a frame measures of followed points: pixel, and depth or right column where it has them."""
+    count = len(tracks)
+    unknown = np.full(count, np.nan)
+    depth, right = unknown, unknown.copy()
+    if data.frame.depth is not None:
+        depth = data.depths(tracks.pixel)
+    elif data.frame.right is not None:
+        z = np.where(track_map.points.alive[tracks.index], into(pose, track_map.points.xyz[tracks.index])[:, 2], np.nan)
+        expected = tracks.pixel[:, 0] - camera.fx * camera.baseline / np.where(z > 0, z, np.nan)
+        right = data.right_columns(tracks.pixel, expected)
+    sigma = np.full(count, options.point_sigma_px)
+    return PointMeasurements(tracks.index, tracks.pixel, sigma, depth, data.depth_sigma(depth), right)
+
+
+# ---------------------------------------------------------------------------------------------------------- points
+
+
+def _add_points(track_map, camera, data, pose, tracks: PointTracks, index: int, options) -> PointTracks:
+    """Place followed points whose place has become known, start new ones, and link described features to points."""
+    points = track_map.points
+    features = data.features
+    _place_pending(track_map, camera, data, pose, tracks)
+    if len(tracks):
+        points.keyframe[tracks.index], points.pixel[tracks.index] = index, tracks.pixel
+    if options.points:
+        # Described features near followed points are these points.
+        if len(features.pixel) and len(tracks):
+            found = KDTree(features.pixel).query(tracks.pixel, distance_upper_bound=SAME_FEATURE)
+            distance, nearest = np.asarray(found[0]), np.asarray(found[1])
+            rows = np.flatnonzero(np.isfinite(distance))
+            free = features.point[nearest[rows]] < 0
+            features.point[nearest[rows[free]]] = tracks.index[rows[free]]
+        depthless = data.frame.depth is None and data.frame.right is None
+        if depthless and track_map.keyframes and points.alive[tracks.index].sum() < FEW * options.num_points:
+            # After a wide step hardly any point was followed, but many features are seen again.
+            before = track_map.near
+            tracks = tracks.joined(place_by_motion(track_map, camera, before, data, pose, tracks.index))
+        # New points: described features first, then corners where there are none.
+        room = max(options.num_points - len(tracks), 0)
+        cell = max(12, int(math.sqrt(data.gray.size / options.num_points)))
+        free = np.flatnonzero(features.point < 0)
+        strongest = spread(features.pixel[free], features.response[free], tracks.pixel, data.gray.shape, room, cell)
+        free = free[strongest]
+        new = [features.pixel[free]]
+        room -= len(free)
+        if room > 0:
+            found = corners(data.gray, options.num_points, 0.7 * cell)
+            taken = np.concatenate([tracks.pixel, new[0]])
+            rank = -np.arange(len(found), dtype=float)
+            new.append(found[spread(found, rank, taken, data.gray.shape, room, cell)])
+        pixel = np.concatenate(new)
+        pixel_rows = camera.inside(pixel, 8.0)
+        rows = points.extend(int(pixel_rows.sum()))
+        every = np.full(len(pixel), -1, dtype=np.int64)
+        every[pixel_rows] = rows
+        features.point[free] = every[: len(free)]
+        pixel = pixel[pixel_rows]
+        points.keyframe[rows], points.pixel[rows] = index, pixel
+        points.first_keyframe[rows], points.first_pixel[rows] = index, pixel
+        depth = data.depths(pixel)
+        known = np.isfinite(depth)
+        points.xyz[rows[known]] = back(pose, camera.bearings(pixel[known]) * depth[known, None])
+        points.state[rows[known]] = ALIVE
+        tracks = tracks.joined(PointTracks(rows, pixel))
+    return tracks
+
+
+def _place_pending(track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose, tracks: PointTracks) -> None:
+    """Place followed points that have no place: from this frame's depth, or from motion since they were first seen."""
+    points = track_map.points
+    pending = np.flatnonzero(points.state[tracks.index] == PENDING)
+    if not len(pending):
+        return
+    index, pixel = tracks.index[pending], tracks.pixel[pending]
+    depth = data.depths(pixel)
+    known = np.isfinite(depth)
+    points.xyz[index[known]] = back(pose, camera.bearings(pixel[known]) * depth[known, None])
+    points.state[index[known]] = ALIVE
+    index, pixel = index[~known], pixel[~known]
+    if len(index):
+        first = _poses_of(track_map, points.first_keyframe[index])
+        places, good = triangulate(camera, first, points.first_pixel[index], pose, pixel)
+        points.xyz[index[good]] = places[good]
+        points.state[index[good]] = ALIVE
+
+
+def _poses_of(track_map: TrackMap, keyframes: IntArray) -> FloatArray:
+    """Poses (n, 7) of keyframes, each looked up once."""
+    unique, which = np.unique(keyframes, return_inverse=True)
+    return np.array([track_map.pose_of(int(k)) for k in unique])[which]
+
+
+# ----------------------------------------------------------------------------------------------------------- lines
+
+
+def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index: int, options):
+    """Assign detected segments to followed lines and to lines of the map, and start new lines with the rest."""
+    lines, detected = track_map.lines, data.detected
+    segments = detected.segments
+    of_segment = np.full(len(segments), -1)
+    # Segments of lines that are followed already.
+    rows, hits = assign(followed.ends, segments.ends, 2.5, 0.06)
+    of_segment[hits] = followed.index[rows]
+    # Segments of other lines of the map.
+    alive = np.flatnonzero(lines.alive)
+    alive = alive[~np.isin(alive, of_segment)]
+    expected, seen = expected_segments(camera, lines, alive, pose)
+    alive, expected = alive[seen], expected[seen]
+    free = np.flatnonzero(of_segment < 0)
+    middle = 1.0 / np.maximum(into(pose, lines.segment[alive].mean(axis=1))[:, 2], 1e-6)
+    inverse = detected.inverse_depth.mean(axis=1)
+    rows, hits = assign(expected, segments.ends[free], 5.0, 0.1, middle, inverse[free])
+    of_segment[free[hits]] = alive[rows]
+    # New lines: with a place where the depth is known along the segment, else followed until motion gives one.
+    free = np.flatnonzero(of_segment < 0)[: max(options.num_lines - int((of_segment >= 0).sum()), 0)]
+    new = lines.extend(len(free))
+    of_segment[free] = new
+    lines.strength[new] = segments.strength[free]
+    lines.first_keyframe[new], lines.first_ends[new] = index, segments.ends[free]
+    place_from_depth(track_map, camera, pose, new, segments.ends[free], detected, free)
+    rows = np.flatnonzero(of_segment >= 0)
+    known = of_segment[rows]
+    _place_pending_lines(track_map, camera, pose, known, segments.ends[rows], detected, rows, index)
+    lines.found[known] += 1
+    lines.strength[known] = segments.strength[rows]
+    _extend_lines(track_map, camera, pose, known, segments.ends[rows])
+    sigma = np.maximum(segments.sigma[rows], 0.3)
+    table = LineMeasurements(
+        known, segments.ends[rows], sigma, detected.inverse_depth[rows], detected.inverse_depth_sigma[rows]
+    )
+    # A line is followed by its longest segment only.
+    followed = FollowedSegments(known, segments.ends[rows], sigma, segments.strength[rows])
+    first = np.unique(known, return_index=True)[1]
+    return followed.take(first), table.take(first)
+
+
+def place_from_depth(track_map, camera, pose, index, ends, detected, rows) -> None:
+    """Place lines whose segment has a depth along it that is known well enough."""
+    inverse, sigma = detected.inverse_depth[rows], detected.inverse_depth_sigma[rows]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        depth = 1.0 / inverse
+        noise = (sigma * depth**2).max(axis=1)
+        in_cam = np.stack([camera.bearings(ends[:, :2]), camera.bearings(ends[:, 2:])], axis=1) * depth[..., None]
+        length = np.linalg.norm(in_cam[:, 1] - in_cam[:, 0], axis=1)
+        good = (depth > 0).all(axis=1) & (length > LEAST_LENGTH * depth.mean(axis=1)) & (noise < LINE_ANGLE * length)
+    _place(track_map, index[good], back(pose, in_cam[good]))
+
+
+def _place(track_map: TrackMap, index, segments: FloatArray) -> None:
+    if len(index):
+        table = Lines.through(segments)
+        track_map.lines.plucker[index], track_map.lines.segment[index] = table.plucker, table.segments
+        track_map.lines.state[index] = ALIVE
+
+
+def _place_pending_lines(track_map, camera, pose, known, ends, detected, rows, index) -> None:
+    """Place followed lines: from depth, or where the planes through two camera centres and the segments meet."""
+    lines = track_map.lines
+    pending = np.flatnonzero((lines.state[known] == PENDING) & (lines.first_keyframe[known] < index))
+    if not len(pending):
+        return
+    place_from_depth(track_map, camera, pose, known[pending], ends[pending], detected, rows[pending])
+    pending = pending[lines.state[known[pending]] == PENDING]
+    if not len(pending):
+        return
+    row, segment = known[pending], ends[pending]
+    first = _poses_of(track_map, lines.first_keyframe[row])
+    normal1, center1 = _ray_planes(camera, first, lines.first_ends[row])
+    normal2, center2 = _ray_planes(camera, np.tile(pose, (len(row), 1)), segment)
+    direction = np.cross(normal1, normal2)
+    sine = np.linalg.norm(direction, axis=1)
+    good = sine > 0.03
+    # The rays of the present ends meet the first plane.
+    out = np.zeros((len(row), 2, 3))
+    for k in (0, 1):
+        ray = back(pose, camera.bearings(segment[:, 2 * k : 2 * k + 2])) - center2
+        slope = (ray * normal1).sum(axis=1)
+        share = ((center1 - center2) * normal1).sum(axis=1) / np.where(np.abs(slope) > 1e-9, slope, 1e-9)
+        good &= share > 0
+        out[:, k] = center2 + share[:, None] * ray
+    depth = into(pose, out)[..., 2]
+    length = np.linalg.norm(out[:, 1] - out[:, 0], axis=1)
+    good &= (depth.max(axis=1) < 3.0 * depth.min(axis=1)) & (length > 0.01 * depth.mean(axis=1))
+    _place(track_map, row[good], out[good])
+
+
+def _ray_planes(camera: TrackCamera, poses: FloatArray, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit normals (n, 3) in the world of the planes through camera centres and segments, and the centres."""
+    world = se3.inverse(poses)
+    center = world[:, 4:]
+    one = se3.transform_points(world, camera.bearings(ends[:, :2])) - center
+    two = se3.transform_points(world, camera.bearings(ends[:, 2:])) - center
+    normal = np.cross(one, two)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12), center
+
+
+def _extend_lines(track_map: TrackMap, camera: TrackCamera, pose, index, ends) -> None:
+    """Lengthen lines to what is seen of them now."""
+    lines = track_map.lines
+    alive = np.flatnonzero(lines.alive[index])
+    rows = index[alive]
+    if not len(rows):
+        return
+    seen, good = line_ends(camera, pose, lines.plucker[rows], ends[alive])
+    direction = lines.plucker[rows, 3:]
+    foot = np.cross(direction, lines.plucker[rows, :3])
+    along = np.einsum("lej,lj->le", np.concatenate([lines.segment[rows], seen], axis=1), direction)
+    old = np.abs(along[:, 1] - along[:, 0])
+    low, high = along.min(axis=1), along.max(axis=1)
+    good &= (high - low) < 2.0 * old + 1e-9
+    segment = foot[:, None] + np.stack([low, high], axis=1)[..., None] * direction[:, None]
+    forward = ((lines.segment[rows, 1] - lines.segment[rows, 0]) * direction).sum(axis=1) > 0
+    segment = np.where(forward[:, None, None], segment, segment[:, ::-1])
+    lines.segment[rows[good]] = segment[good]
+
+
+# ---------------------------------------------------------------------------------------------------------- planes
+
+
+def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> PlaneMeasurements:
+    """Assign planes of the frame to planes of the map, which grow, and start new ones with the rest."""
+    seen = data.planes
+    assert seen is not None
+    index, rows = assign_planes(track_map.planes, seen, pose, math.radians(8.0), 0.08)
+    for k, row in zip(index, rows, strict=True):
+        grow(track_map.planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]))
+    rest = np.setdiff1d(np.arange(len(seen)), rows)
+    # Nothing new beside a plane that is there already but did not agree well enough.
+    _, doubtful = assign_planes(track_map.planes, seen, pose, math.radians(15.0), 0.15)
+    rest = np.setdiff1d(rest, doubtful)
+    index = np.concatenate([index, add_planes(track_map.planes, seen, rest, pose)])
+    rows = np.concatenate([rows, rest])
+    return PlaneMeasurements(index, seen.plane[rows], seen.sqrt_information[rows])
+
+
+__all__ = ["Followed", "add_keyframe", "measure_points", "wants_keyframe"]

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Segments of one frame and the lines of the map: which is which.
+
+Between keyframes a line is *followed*: points along its last segment are carried by coarse dense flow and vote for
+where it went, and the edge is then measured in the image (:mod:`groma.features.edge_fit`). At keyframes segments are
+*detected* and assigned to lines by where the map says they are: near, parallel, the dark side on the same hand,
+overlapping, and best for both. A depth measured along the segment must agree too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.features.edge_fit import measure_edges
+from groma.features.images import GrayImage
+from groma.features.matching.flow import Flow
+from groma.geometry import segment2
+from groma.tracking.frame.camera import TrackCamera, into, rotation
+from groma.tracking.map.landmarks import LineTable
+
+#: The coarse flow is computed on images reduced by this factor.
+REDUCTION = 2
+#: Points that vote for where a segment went.
+VOTERS = 12
+#: Standard deviation of segments whose edge could not be fitted, pixels.
+_UNFITTED = 0.45
+
+
+def coarse_flow(image_1: GrayImage, image_2: GrayImage) -> Flow:
+    """Dense flow (h, w, 2) of reduced images, in pixels of the full ones."""
+    height, width = image_1.shape
+    size = (max(width // REDUCTION, 32), max(height // REDUCTION, 32))
+    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (image_1, image_2)]
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    flow = method.calc(small[0], small[1], None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return np.asarray(flow, np.float32) * np.array([width / size[0], height / size[1]], np.float32)
+
+
+@dataclass(frozen=True)
+class FollowedSegments:
+    """Segments of known lines in a frame."""
+
+    #: (n,) landmark of each.
+    index: IntArray
+    #: (n, 4) segments, (n,) standard deviation and edge strength.
+    ends: FloatArray
+    sigma: FloatArray
+    strength: FloatArray
+
+    def joined(self, other: FollowedSegments) -> FollowedSegments:
+        """Return both together."""
+        return FollowedSegments(
+            np.concatenate([self.index, other.index]),
+            np.concatenate([self.ends, other.ends]),
+            np.concatenate([self.sigma, other.sigma]),
+            np.concatenate([self.strength, other.strength]),
+        )
+
+    def take(self, rows: IntArray | BoolArray) -> FollowedSegments:
+        """Return some of them."""
+        return FollowedSegments(self.index[rows], self.ends[rows], self.sigma[rows], self.strength[rows])
+
+    @staticmethod
+    def empty() -> FollowedSegments:
+        """Return none."""
+        return FollowedSegments(np.zeros(0, np.int64), np.zeros((0, 4)), np.zeros(0), np.zeros(0))
+
+
+def carried(flow: Flow, ends: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, BoolArray]:
+    """Segments carried by flow: the line that most of their points vote for, and whether they agree."""
+    t = (np.arange(VOTERS) + 0.5) / VOTERS - 0.5
+    middle, half = 0.5 * (ends[:, :2] + ends[:, 2:]), ends[:, 2:] - ends[:, :2]
+    points = middle[:, None] + t[:, None] * half[:, None]
+    height, width = flow.shape[:2]
+    column = np.clip((points[..., 0] * width / shape[1]).astype(np.int64), 0, width - 1)
+    row = np.clip((points[..., 1] * height / shape[0]).astype(np.int64), 0, height - 1)
+    shift = flow[row, column].astype(np.float64)
+    # Displacement linear along the segment, refitted without the points that disagree.
+    weight = np.ones(shift.shape[:2])
+    base = np.median(shift, axis=1)
+    slope = np.zeros_like(base)
+    for gate in (8.0, 4.0, 3.0):
+        away = np.linalg.norm(shift - base[:, None] - t[:, None] * slope[:, None], axis=2)
+        weight = (away < gate).astype(float)
+        s0, s1, s2 = weight.sum(1), (weight * t).sum(1), (weight * t * t).sum(1)
+        det = np.maximum(s0 * s2 - s1 * s1, 1e-6)
+        r0, r1 = (weight[..., None] * shift).sum(1), ((weight * t)[..., None] * shift).sum(1)
+        base = (s2[:, None] * r0 - s1[:, None] * r1) / det[:, None]
+        slope = (s0[:, None] * r1 - s1[:, None] * r0) / det[:, None]
+    good = weight.sum(axis=1) >= 0.5 * VOTERS
+    return ends + np.hstack([base - 0.5 * slope, base + 0.5 * slope]), good
+
+
+def measured_edges(image: GrayImage, guess: FloatArray, strength: FloatArray) -> tuple[FollowedSegments, IntArray]:
+    """Fit guessed segments to the image; keep those with an edge of the right sign and like strength.
+
+    Returns the segments (their index is the row of the guess), and those rows.
+    """
+    ends, sigma, found = measure_edges(image, guess)
+    same_way = ((ends[:, 2:] - ends[:, :2]) * (guess[:, 2:] - guess[:, :2])).sum(axis=1) > 0
+    good = same_way & (sigma < _UNFITTED) & (found > 0.35 * strength) & (found < 3.0 * strength) & (found > 2.0)
+    rows = np.flatnonzero(good)
+    return FollowedSegments(rows, ends[rows], np.maximum(sigma[rows], 0.15), found[rows]), rows
+
+
+def expected_segments(
+    camera: TrackCamera, lines: LineTable, rows: IntArray, pose: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Where lines of the map should appear (n, 4), and which of them are in view with a length worth looking at."""
+    ends, seen = camera.project_segments(into(pose, lines.segment[rows]), border=4.0)
+    return ends, seen & (segment2.length(ends) > 15.0)
+
+
+def assign(
+    expected: FloatArray,
+    ends: FloatArray,
+    max_distance: float,
+    max_angle: float,
+    expected_inverse: FloatArray | None = None,
+    inverse: FloatArray | None = None,
+    tolerance: float = 0.05,
+) -> tuple[IntArray, IntArray]:
+    """Pair expected segments (N, 4) with detected ones (M, 4): one to one, best for both.
+
+    Parameters
+    ----------
+    expected, ends : (N, 4), (M, 4)
+        Directed segments, pixels.
+    max_distance : float
+        Largest distance of the detected ends and middle from the expected line, pixels.
+    max_angle : float
+        Largest angle, radians.
+    expected_inverse, inverse : (N,), (M,), optional
+        Inverse depths of the middles; where both are known they must agree.
+    tolerance : float
+        ... to this share of their size.
+
+    Returns
+    -------
+    (k,), (k,) int
+        Rows of the pairs.
+    """
+    none = np.zeros(0, np.int64)
+    if not len(expected) or not len(ends):
+        return none, none
+    direction, other = segment2.direction(expected), segment2.direction(ends)
+    normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+    start = expected[:, None, :2]
+    first, second = ends[None, :, :2] - start, ends[None, :, 2:] - start
+    across = np.stack([np.einsum("nmk,nk->nm", p, normal) for p in (first, second)])
+    along = np.stack([np.einsum("nmk,nk->nm", p, direction) for p in (first, second)])
+    length, own = segment2.length(expected)[:, None], segment2.length(ends)[None]
+    overlap = np.minimum(along.max(axis=0), length) - np.maximum(along.min(axis=0), 0.0)
+    offset = np.abs(across).max(axis=0)
+    score = np.abs(across).mean(axis=0) + 0.3 * np.maximum(-overlap, 0)
+    good = (direction @ other.T > np.cos(max_angle)) & (offset < 1.5 * max_distance) & (score < max_distance)
+    good &= overlap > 0.3 * np.minimum(length, own)
+    if expected_inverse is not None and inverse is not None:
+        one, two = expected_inverse[:, None], inverse[None]
+        with np.errstate(invalid="ignore"):
+            good &= ~(np.abs(one - two) > tolerance * np.maximum(one, two) + 0.015)
+    score = np.where(good, score, np.inf)
+    best = np.argmin(score, axis=1)
+    rows = np.flatnonzero(np.isfinite(score[np.arange(len(expected)), best]))
+    mutual = np.argmin(score, axis=0)[best[rows]] == rows
+    # A rival nearly as good makes the pair doubtful; rivals that continue the same line do not.
+    rows = rows[mutual]
+    return rows, best[rows]
+
+
+def line_ends(
+    camera: TrackCamera, pose: FloatArray, plucker: FloatArray, ends: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Points (n, 2, 3) of lines in the world nearest to the rays through their segments' ends, and where defined."""
+    direction = plucker[:, 3:] / np.linalg.norm(plucker[:, 3:], axis=1, keepdims=True)
+    foot = np.cross(direction, plucker[:, :3]) / np.linalg.norm(plucker[:, 3:], axis=1, keepdims=True)
+    R = rotation(pose)
+    center = -R.T @ pose[4:]
+    out = np.zeros((len(ends), 2, 3))
+    good = np.ones(len(ends), dtype=bool)
+    for k in (0, 1):
+        ray = camera.bearings(ends[:, 2 * k : 2 * k + 2]) @ R
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        cosine = (ray * direction).sum(axis=1)
+        away = center - foot
+        sine2 = 1.0 - cosine**2
+        good &= sine2 > 1e-3
+        share = ((away * direction).sum(axis=1) - cosine * (away * ray).sum(axis=1)) / np.maximum(sine2, 1e-3)
+        out[:, k] = foot + share[:, None] * direction
+    good &= (into(pose, out)[..., 2] > 0).all(axis=1)
+    return out, good
+
+
+__all__ = [
+    "FollowedSegments",
+    "assign",
+    "carried",
+    "coarse_flow",
+    "expected_segments",
+    "line_ends",
+    "measured_edges",
+]

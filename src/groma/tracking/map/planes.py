@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Planes of one frame and the planes of the map: which is which, and how the map's grow and merge."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.tracking.frame.camera import back, planes_back, planes_into
+from groma.tracking.frame.planes import FramePlanes
+from groma.tracking.map.landmarks import ALIVE, DEAD, PlaneTable
+
+#: The seen parts of one plane lie within this distance of each other, scene units.
+REACH = 0.6
+
+
+def assign_planes(
+    planes: PlaneTable, seen: FramePlanes, pose: FloatArray, max_angle: float, max_distance: float
+) -> tuple[IntArray, IntArray]:
+    """Pair planes of the map with planes of a frame by angle, distance and overlap.
+
+    The distance is that of the seen part from the map's plane, which does not grow with the distance of the camera.
+
+    Returns
+    -------
+    (k,), (k,) int
+        Planes of the map, and rows of ``seen``; each at most once.
+    """
+    alive = np.flatnonzero(planes.alive)
+    none = np.zeros(0, np.int64)
+    if not len(alive) or not len(seen):
+        return none, none
+    in_cam = planes_into(pose, planes.hesse[alive])
+    cosine = in_cam[:, :3] @ seen.plane[:, :3].T
+    centers = _region_means(seen)
+    distance = np.abs(in_cam[:, :3] @ centers.T + in_cam[:, 3:])
+    good = (cosine > np.cos(max_angle)) & (distance < max_distance)
+    score = np.where(good, np.arccos(np.clip(cosine, -1, 1)) / max_angle + distance / max_distance, np.inf)
+    for i, j in np.argwhere(good):
+        if not _overlap(planes.samples[alive[i]], back(pose, seen.places_of(j))):
+            score[i, j] = np.inf
+    best = score.argmin(axis=1)
+    rows = np.flatnonzero(np.isfinite(score[np.arange(len(alive)), best]))
+    rows = rows[score.argmin(axis=0)[best[rows]] == rows]
+    return alive[rows], best[rows]
+
+
+def add_planes(planes: PlaneTable, seen: FramePlanes, rows: IntArray, pose: FloatArray) -> IntArray:
+    """Make landmarks of planes of a frame; return their indices."""
+    index = planes.extend(len(rows))
+    planes.hesse[index] = planes_back(pose, seen.plane[rows])
+    planes.state[index] = ALIVE
+    for k, row in zip(index, rows, strict=True):
+        grow(planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]))
+    return index
+
+
+def grow(planes: PlaneTable, index: int, places: FloatArray, support: float) -> None:
+    """Add the part of a plane that a frame sees: samples stay spread over all that was seen."""
+    old = planes.samples[index]
+    both = np.concatenate([old[np.isfinite(old[:, 0])], places])
+    # One sample per box; boxes grow until the samples fit.
+    size = 0.15
+    while True:
+        cells = np.floor(both / size).astype(np.int64)
+        rows = np.unique(cells, axis=0, return_index=True)[1]
+        if len(rows) <= planes.samples_kept:
+            break
+        size *= 1.3
+    planes.samples[index] = np.nan
+    planes.samples[index, : len(rows)] = both[rows]
+    planes.support[index] += support
+    planes.found[index] += 1
+
+
+def merge_planes(planes: PlaneTable, max_angle: float = 0.06, max_distance: float = 0.03) -> list[tuple[int, int]]:
+    """Merge planes of the map that have come to lie on each other; return (kept, dropped) pairs."""
+    alive = np.flatnonzero(planes.alive)
+    merged: list[tuple[int, int]] = []
+    for a, first in enumerate(alive):
+        for second in alive[a + 1 :]:
+            if planes.state[first] != ALIVE or planes.state[second] != ALIVE:
+                continue
+            one, two = planes.hesse[first], planes.hesse[second]
+            if one[:3] @ two[:3] < np.cos(max_angle):
+                continue
+            samples = [planes.samples[k][np.isfinite(planes.samples[k][:, 0])] for k in (first, second)]
+            apart = max(
+                float(np.median(np.abs(samples[1] @ one[:3] + one[3]))),
+                float(np.median(np.abs(samples[0] @ two[:3] + two[3]))),
+            )
+            if apart > max_distance or not _overlap(planes.samples[first], samples[1]):
+                continue
+            keep, drop = (first, second) if planes.support[first] >= planes.support[second] else (second, first)
+            grow(planes, int(keep), samples[1] if keep == first else samples[0], float(planes.support[drop]))
+            planes.state[drop] = DEAD
+            planes.merged_into[drop] = keep
+            merged.append((int(keep), int(drop)))
+    return merged
+
+
+def _region_means(seen: FramePlanes) -> FloatArray:
+    count = np.bincount(seen.place_plane, minlength=len(seen))
+    return np.stack(
+        [np.bincount(seen.place_plane, seen.places[:, k], len(seen)) / np.maximum(count, 1) for k in range(3)], axis=1
+    )
+
+
+def _overlap(samples: FloatArray, places: FloatArray) -> bool:
+    samples = samples[np.isfinite(samples[:, 0])]
+    if not len(samples) or not len(places):
+        return False
+    thinned = places[:: max(1, len(places) // 40)]
+    return bool(np.linalg.norm(samples[:, None] - thinned[None], axis=2).min() < REACH)
+
+
+__all__ = ["add_planes", "assign_planes", "grow", "merge_planes"]

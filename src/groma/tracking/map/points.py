@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Points followed from frame to frame, held to the patches of the last keyframe, and found again where the map says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.features.point_tracks import follow
+from groma.tracking.frame.camera import TrackCamera, into
+from groma.tracking.map.track_map import TrackMap
+
+#: A patch of the keyframe may move a followed point by this much, pixels.
+MAX_CORRECTION = 2.5
+#: Keyframes whose patches are looked for in one frame.
+PATCH_KEYFRAMES = 2
+
+
+@dataclass(frozen=True)
+class PointTracks:
+    """Points of the map in a frame."""
+
+    #: (n,) landmark, (n, 2) pixel.
+    index: IntArray
+    pixel: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def take(self, rows: IntArray | BoolArray) -> PointTracks:
+        """Return some of them."""
+        return PointTracks(self.index[rows], self.pixel[rows])
+
+    def joined(self, other: PointTracks) -> PointTracks:
+        """Return both together."""
+        return PointTracks(np.concatenate([self.index, other.index]), np.concatenate([self.pixel, other.pixel]))
+
+    @staticmethod
+    def empty() -> PointTracks:
+        """Return none."""
+        return PointTracks(np.zeros(0, np.int64), np.zeros((0, 2)))
+
+
+def follow_points(
+    track_map: TrackMap,
+    camera: TrackCamera,
+    tracks: PointTracks,
+    before: npt.NDArray[np.uint8],
+    now: npt.NDArray[np.uint8],
+    predicted: FloatArray,
+    previous: FloatArray,
+) -> PointTracks:
+    """Follow points from the frame before; those that the last keyframe saw are then held to its patches."""
+    if not len(tracks):
+        return tracks
+    points = track_map.points
+    guess = tracks.pixel.copy()
+    known = points.alive[tracks.index]
+    if known.any():
+        # What the predicted motion adds to where each point was seen.
+        places = points.xyz[tracks.index[known]]
+        moved = camera.project(into(predicted, places)) - camera.project(into(previous, places))
+        guess[known] += np.where(np.isfinite(moved), moved, 0.0)
+        # Points whose place is not known yet move like their neighbours do.
+        guess[~known] += np.median(np.where(np.isfinite(moved), moved, 0.0), axis=0)
+    pixel, good = follow(before, now, tracks.pixel, guess)
+    rows = np.flatnonzero(good)
+    tracks = PointTracks(tracks.index[rows], pixel[rows])
+    keyframe = track_map.near
+    own = np.flatnonzero(points.keyframe[tracks.index] == keyframe.index)
+    if keyframe.gray is not None and len(own):
+        patch = points.pixel[tracks.index[own]]
+        pixel, good = follow(keyframe.gray, now, patch, tracks.pixel[own], levels=0, round_trip=None)
+        good &= np.linalg.norm(pixel - tracks.pixel[own], axis=1) < MAX_CORRECTION
+        held = tracks.pixel.copy()
+        held[own[good]] = pixel[good]
+        tracks = PointTracks(tracks.index, held)
+    return tracks
+
+
+def find_again(
+    track_map: TrackMap,
+    camera: TrackCamera,
+    now: npt.NDArray[np.uint8],
+    pose: FloatArray,
+    tracks: PointTracks,
+    limit: int,
+    radius: float = 6.0,
+    keyframes: int = PATCH_KEYFRAMES,
+) -> PointTracks:
+    """Look for points of the map that are in view but not followed, by their patches in keyframes."""
+    points = track_map.points
+    wanted = points.alive.copy()
+    wanted[tracks.index] = False
+    # Only what recent and overlapping keyframes saw; the rest of a large map is not looked at in every frame.
+    rows = np.flatnonzero(wanted)
+    if not len(rows):
+        return PointTracks.empty()
+    place = into(pose, points.xyz[rows])
+    pixel = camera.project(place)
+    view = camera.inside(pixel, 12.0)
+    rows, pixel = rows[view], pixel[view]
+    living = np.array([k.alive and k.gray is not None for k in track_map.keyframes])
+    rows, pixel = rows[living[points.keyframe[rows]]], pixel[living[points.keyframe[rows]]]
+    if not len(rows):
+        return PointTracks.empty()
+    count = np.bincount(points.keyframe[rows], minlength=len(living))
+    found = PointTracks.empty()
+    for index in np.argsort(-count, kind="stable")[:keyframes]:
+        of = np.flatnonzero(points.keyframe[rows] == index)[:limit]
+        if len(of) < 5:
+            break
+        patch = track_map.keyframes[index].gray
+        assert patch is not None
+        there, good = follow(patch, now, points.pixel[rows[of]], pixel[of], levels=1)
+        good &= np.linalg.norm(there - pixel[of], axis=1) < radius
+        points.visible[rows[of]] += 1
+        points.misses[rows[of[~good]]] += 1
+        points.misses[rows[of[good]]] = 0
+        found = found.joined(PointTracks(rows[of[good]], there[good]))
+    return found
+
+
+__all__ = ["PointTracks", "find_again", "follow_points"]

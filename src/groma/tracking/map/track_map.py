@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The map of a track: landmarks, keyframes, and which keyframes see the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import FloatArray, IntArray
+from groma.geometry import se3
+from groma.tracking.frame.features import Features
+from groma.tracking.frame.measurements import Measurements
+from groma.tracking.map.landmarks import ALIVE, DEAD, LineTable, MapView, PlaneTable, PointTable
+
+
+@dataclass
+class Keyframe:
+    """A frame that stays: its image for patches, what it measures, and its described features."""
+
+    index: int
+    timestamp: float
+    name: str
+    #: (7,) cam_from_world.
+    pose: FloatArray
+    gray: npt.NDArray[np.uint8] | None
+    measured: Measurements
+    features: Features
+    #: Depths on a grid of pixels; NaN where unknown.
+    depth_grid: FloatArray
+    #: Median depth of its points, scene units.
+    depth: float = 1.0
+    #: False once it was found to repeat what others see; its pose is then told by another's.
+    alive: bool = True
+    parent: int = -1
+    from_parent: FloatArray | None = None
+
+    def forget(self) -> None:
+        """Let go of everything but the pose."""
+        self.gray = None
+        self.measured = Measurements.empty()
+        none = np.zeros(0)
+        self.features = Features(np.zeros((0, 2)), none, none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
+        self.depth_grid = np.full(len(self.depth_grid), np.nan)
+
+
+@dataclass
+class TrackMap:
+    """Everything a track knows about the world. It changes while the track goes on."""
+
+    points: PointTable = field(default_factory=PointTable)
+    lines: LineTable = field(default_factory=LineTable)
+    planes: PlaneTable = field(default_factory=PlaneTable)
+    keyframes: list[Keyframe] = field(default_factory=list)
+    #: Pairs of keyframes joined by loop closures, with the measured first_from_second.
+    loops: list[tuple[int, int, FloatArray]] = field(default_factory=list)
+    #: The keyframe whose patches are followed: the newest, or an older one that was visited again.
+    reference: int = -1
+    #: Keyframes that must not be dropped: they join maps.
+    pinned: set[int] = field(default_factory=set)
+
+    @property
+    def view(self) -> MapView:
+        """The landmarks, as the estimate of a pose takes them."""
+        return MapView(self.points, self.lines, self.planes)
+
+    @property
+    def last(self) -> Keyframe:
+        """The newest keyframe."""
+        return self.keyframes[-1]
+
+    @property
+    def near(self) -> Keyframe:
+        """The keyframe whose patches are followed."""
+        return self.keyframes[self.reference]
+
+    def visit(self, keyframe: Keyframe) -> None:
+        """Follow the patches of a keyframe from now on."""
+        self.reference = keyframe.index
+        table = keyframe.measured.points
+        self.points.keyframe[table.index], self.points.pixel[table.index] = keyframe.index, table.pixel
+
+    def living(self) -> list[Keyframe]:
+        """Keyframes that were not dropped, oldest first."""
+        return [keyframe for keyframe in self.keyframes if keyframe.alive]
+
+    def pose_of(self, index: int) -> FloatArray:
+        """Pose (7,) of a keyframe, also of one that was dropped."""
+        keyframe = self.keyframes[index]
+        if keyframe.from_parent is None:
+            return keyframe.pose
+        return se3.compose(keyframe.from_parent[None], self.pose_of(keyframe.parent)[None])[0]
+
+    def shared(self, keyframe: Keyframe, others: list[Keyframe]) -> IntArray:
+        """How much each of the others sees of what a keyframe sees: points, and lines counted thrice."""
+        seen = np.zeros(len(self.points), dtype=bool)
+        seen[keyframe.measured.points.index] = True
+        lines = np.zeros(len(self.lines), dtype=bool)
+        lines[keyframe.measured.lines.index] = True
+        return np.array(
+            [
+                int(seen[other.measured.points.index].sum()) + 3 * int(lines[other.measured.lines.index].sum())
+                for other in others
+            ],
+            dtype=np.int64,
+        )
+
+    def drop_points(self, rows: IntArray) -> None:
+        """Take points out of the map; measurements of them stay in tables and are ignored."""
+        self.points.state[rows] = DEAD
+
+    def drop_lines(self, rows: IntArray) -> None:
+        """Take lines out of the map."""
+        self.lines.state[rows] = DEAD
+
+    def living_measurements(self, keyframe: Keyframe) -> Measurements:
+        """What a keyframe measures of landmarks that are alive; merged planes under their new number."""
+        points, lines, planes = keyframe.measured.points, keyframe.measured.lines, keyframe.measured.planes
+        if len(planes):
+            index = planes.index.copy()
+            for _ in range(8):
+                moved = self.planes.merged_into[index]
+                if (moved < 0).all():
+                    break
+                index = np.where(moved >= 0, moved, index)
+            planes = replace(planes, index=index)
+        return Measurements(
+            points.take(self.points.state[points.index] == ALIVE),
+            lines.take(self.lines.state[lines.index] == ALIVE),
+            planes.take(self.planes.state[planes.index] == ALIVE),
+        )
+
+
+__all__ = ["Keyframe", "TrackMap"]

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One frame after another: follow points and lines, assign planes, estimate the pose from all of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.features.point_tracks import follow
+from groma.tracking.frame.camera import TrackCamera, into
+from groma.tracking.frame.features import FrameFeatures
+from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.map.keyframes import Followed, measure_points
+from groma.tracking.map.landmarks import DEAD
+from groma.tracking.map.lines import FollowedSegments, carried, coarse_flow, expected_segments, measured_edges
+from groma.tracking.map.points import PointTracks, follow_points
+from groma.tracking.map.track_map import TrackMap
+from groma.tracking.options import TrackOptions
+from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
+from groma.tracking.pose.relocalise import FRAME_GATES, match_planes
+
+#: Below this many followed points, the depth along segments is measured too.
+FEW_POINTS = 120
+#: A followed line may be this far from where the estimated pose says, pixels.
+LINE_GATE = 4.0
+
+
+def follow_frame(
+    track_map: TrackMap,
+    camera: TrackCamera,
+    options: TrackOptions,
+    before: FrameFeatures,
+    data: FrameFeatures,
+    followed: Followed,
+    previous: FloatArray,
+    predicted: FloatArray,
+    prior_sigma: FloatArray,
+    watch,
+) -> tuple[PoseEstimate | None, Followed]:
+    """Return the pose of a frame that follows another, and what is still followed."""
+    tracks, segments = followed.points, followed.lines
+    with watch("points"):
+        tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
+        if options.points:
+            tracks = follow_points(track_map, camera, tracks, before.gray, data.gray, predicted, previous)
+    alive = track_map.points.alive[tracks.index]
+    with watch("depth"):
+        measured = measure_points(data, tracks.take(alive), options, track_map, predicted, camera)
+        if not options.points:
+            measured = PointMeasurements.empty()
+    with watch("lines"):
+        lines = LineMeasurements.empty()
+        if options.lines and len(segments.index):
+            segments = follow_lines(track_map, before, data, segments)
+            lines = measure_lines(track_map, data, segments, few_points=len(measured) < FEW_POINTS)
+    with watch("planes"):
+        planes = PlaneMeasurements.empty()
+        if data.planes is not None:
+            planes = match_planes(track_map, data, predicted, *FRAME_GATES)
+    if len(measured) + 2 * len(lines) + 3 * len(planes) < 6:
+        return None, Followed.nothing()
+    with watch("pose"):
+        estimate = estimate_pose(camera, track_map.view, Measurements(measured, lines, planes), predicted, prior_sigma)
+    # Followed are points that agree, and points without a place; lines likewise.
+    keep = np.ones(len(tracks), dtype=bool)
+    keep[np.flatnonzero(alive)[~estimate.points]] = False
+    wrong = lines.index[~estimate.lines]
+    segments = segments.take(~np.isin(segments.index, wrong))
+    with watch("lines"):
+        if options.lines:
+            segments = _find_lines_again(track_map, camera, data, estimate.pose, segments, options)
+    points, line_table = track_map.points, track_map.lines
+    points.found[tracks.index[keep]] += 1
+    points.visible[tracks.index] += 1
+    line_table.visible[segments.index] += 1
+    return estimate, Followed(tracks.take(keep), segments)
+
+
+def carry(
+    track_map: TrackMap,
+    camera: TrackCamera,
+    before: FrameFeatures,
+    data: FrameFeatures,
+    new: Followed,
+    followed: Followed,
+    pose: FloatArray,
+) -> Followed:
+    """Follow what a frame added to the map to a later frame, which was followed without it; return both together."""
+    points, lines = new.points, new.lines
+    points = points.take(~np.isin(points.index, followed.points.index))
+    place = into(pose, track_map.points.xyz[points.index])
+    expected = camera.project(place)
+    known = track_map.points.alive[points.index] & np.isfinite(expected).all(axis=1)
+    shift = np.median((expected - points.pixel)[known], axis=0) if known.any() else np.zeros(2)
+    guess = np.where(known[:, None], expected, points.pixel + shift)
+    inside = np.flatnonzero(camera.inside(guess, 2.0))
+    pixel, good = follow(before.gray, data.gray, points.pixel[inside], guess[inside], levels=2)
+    points = PointTracks(points.index[inside[good]], pixel[good])
+    lines = lines.take(~np.isin(lines.index, followed.lines.index))
+    if len(lines.index):
+        lines = follow_lines(track_map, before, data, lines)
+    return Followed(followed.points.joined(points), followed.lines.joined(lines))
+
+
+def follow_lines(
+    track_map: TrackMap, before: FrameFeatures, data: FrameFeatures, segments: FollowedSegments
+) -> FollowedSegments:
+    """Carry segments by flow and measure their edges in the new image."""
+    flow = coarse_flow(before.gray, data.gray)
+    guess, agree = carried(flow, segments.ends, data.gray.shape)
+    agree &= track_map.lines.state[segments.index] != DEAD
+    guess, good = _inside(guess, data.gray.shape)
+    rows = np.flatnonzero(agree & good)
+    found, of = measured_edges(data.gray, guess[rows], segments.strength[rows])
+    kept = rows[of]
+    return FollowedSegments(segments.index[kept], found.ends, found.sigma, found.strength)
+
+
+def _inside(ends: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, np.ndarray]:
+    """Cut segments to the image; those of less than 15 pixels are gone."""
+    height, width = shape
+    start, way = ends[:, :2], ends[:, 2:] - ends[:, :2]
+    low, high = np.zeros(len(ends)), np.ones(len(ends))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for axis, size in ((0, width), (1, height)):
+            for side, sign in ((3.0, 1.0), (size - 3.0, -1.0)):
+                share = sign * (side - start[:, axis]) / (sign * way[:, axis])
+                low = np.where(sign * way[:, axis] > 0, np.maximum(low, share), low)
+                high = np.where(sign * way[:, axis] < 0, np.minimum(high, share), high)
+    cut = np.hstack([start + low[:, None] * way, start + high[:, None] * way])
+    inside = ((cut[:, :2] >= 2) & (cut[:, :2] <= (width - 2, height - 2))).all(axis=1)
+    good = inside & ((high - low) * np.linalg.norm(way, axis=1) > 15.0)
+    return np.where(good[:, None], cut, 10.0), good
+
+
+def measure_lines(
+    track_map: TrackMap, data: FrameFeatures, segments: FollowedSegments, few_points: bool
+) -> LineMeasurements:
+    """Return what a frame measures of followed lines whose place is known."""
+    rows = np.flatnonzero(track_map.lines.alive[segments.index])
+    ends = segments.ends[rows]
+    inverse, sigma = np.full((len(rows), 2), np.nan), np.full((len(rows), 2), np.nan)
+    if few_points:
+        inverse, sigma = data.inverse_depths(ends)
+    return LineMeasurements(segments.index[rows], ends, np.maximum(segments.sigma[rows], 0.5), inverse, sigma)
+
+
+def _find_lines_again(
+    track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose: FloatArray, segments: FollowedSegments, options
+) -> FollowedSegments:
+    """Look for lines of the map that are in view but not followed, where the pose says they are."""
+    lines = track_map.lines
+    room = options.num_lines - len(segments.index)
+    if room < 5:
+        return segments
+    wanted = lines.alive.copy()
+    wanted[segments.index] = False
+    rows = np.flatnonzero(wanted)[-400:]
+    expected, seen = expected_segments(camera, lines, rows, pose)
+    rows, expected = rows[seen][-room:], expected[seen][-room:]
+    if not len(rows):
+        return segments
+    found, of = measured_edges(data.gray, expected, lines.strength[rows])
+    away = np.abs(found.ends - expected[of]).max(axis=1)
+    good = (away < LINE_GATE) & (found.sigma < 0.4)
+    return segments.joined(FollowedSegments(rows[of[good]], found.ends[good], found.sigma[good], found.strength[good]))
+
+
+__all__ = ["carry", "follow_frame", "follow_lines", "measure_lines"]

@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Find the pose of a frame without a good prediction: by described features, then by points, lines and planes.
+
+Used when following fails between two frames, and to find the place again after the track was lost. Where a guess of
+the pose exists, features are matched near where it says they are; otherwise each keyframe proposes a pose from all
+matches (perspective from points, with RANSAC). Guesses and proposals are judged by the features and planes that agree
+with them, and the best are estimated from all that agrees: points, lines and planes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.spatial import KDTree
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.geometry import quaternion, se3
+from groma.tracking.frame.camera import TrackCamera, back, into
+from groma.tracking.frame.features import Descriptors, Features, FrameFeatures
+from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.map.feature_points import match_features, points_of_features
+from groma.tracking.map.landmarks import ALIVE
+from groma.tracking.map.lines import FollowedSegments, assign, expected_segments
+from groma.tracking.map.planes import assign_planes
+from groma.tracking.map.points import PointTracks
+from groma.tracking.map.track_map import Keyframe, TrackMap
+from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
+
+#: A feature agrees with a pose within this distance, pixels (features of coarse scales are not precise).
+NEAR = 6.0
+#: Hamming distance beyond which descriptors do not match near where a feature is expected.
+FARTHEST_NEAR = 75
+#: Features are looked for within this share of the image's width around where a guess says.
+SEARCH = 0.07
+#: A pose with this score needs no further proposals.
+STRONG = 70.0
+#: Poses refined at most; one that starts near an earlier result (share of its median depth, radians) is left out.
+MOST_REFINED, SAME_SHARE, SAME_TURN = 4, 0.01, 0.006
+#: Agreements that a line and a plane count for, in points.
+LINE_WEIGHT, PLANE_WEIGHT = 2.0, 6.0
+
+
+@dataclass(frozen=True)
+class KnownFeatures:
+    """Features of some keyframes whose place in the world is known."""
+
+    keyframes: list[Keyframe]
+    #: (n,) which of the keyframes, and which of its features.
+    of: IntArray
+    row: IntArray
+    #: (n, 3) places in the world, (n, 32) descriptors.
+    places: FloatArray
+    descriptor: Descriptors
+
+
+def known_features(track_map: TrackMap, camera: TrackCamera, keyframes: list[Keyframe]) -> KnownFeatures:
+    """Collect the features of keyframes whose place is known."""
+    of, row, places, descriptor = [], [], [], []
+    for k, keyframe in enumerate(keyframes):
+        every = np.arange(len(keyframe.features.pixel))
+        place = feature_places(track_map, camera, keyframe, every)
+        known = np.flatnonzero(np.isfinite(place[:, 0]))
+        of.append(np.full(len(known), k))
+        row.append(known)
+        places.append(place[known])
+        descriptor.append(keyframe.features.descriptor[known])
+    return KnownFeatures(
+        keyframes, np.concatenate(of), np.concatenate(row), np.concatenate(places), np.concatenate(descriptor)
+    )
+
+
+def match_near(
+    camera: TrackCamera, known: KnownFeatures, features: Features, tree: KDTree, pose: FloatArray, radius: float
+) -> IntArray:
+    """Pair known features with features of a frame (n, 2): near where a pose says, and most alike for both."""
+    expected = camera.project(into(pose, known.places))
+    rows = np.flatnonzero(camera.inside(expected, -radius))
+    if not len(rows) or not len(features.pixel):
+        return np.zeros((0, 2), np.int64)
+    near = KDTree(expected[rows]).sparse_distance_matrix(tree, radius, output_type="ndarray")
+    first, second = rows[near["i"]], near["j"]
+    bits = np.bitwise_count(known.descriptor[first] ^ features.descriptor[second]).sum(axis=1, dtype=np.int64)
+    alike = np.flatnonzero(bits <= FARTHEST_NEAR)
+    # Nearest in the image among equals.
+    alike = alike[np.lexsort((near["v"][alike], bits[alike]))]
+    first, second = first[alike], second[alike]
+    best_of_first, best_of_second = np.full(len(known.of), -1), np.full(len(features.pixel), -1)
+    best_of_first[first[::-1]] = np.arange(len(first))[::-1]
+    best_of_second[second[::-1]] = np.arange(len(first))[::-1]
+    mutual = np.flatnonzero(best_of_first[first] == best_of_second[second])
+    return np.column_stack([first[mutual], second[mutual]])
+
+
+def feature_places(track_map: TrackMap, camera: TrackCamera, keyframe: Keyframe, rows: IntArray) -> FloatArray:
+    """Places (n, 3) in the world of a keyframe's features: of the map's point there, else by depth; NaN if unknown."""
+    features, points = keyframe.features, track_map.points
+    point = features.point[rows]
+    mapped = point >= 0
+    mapped[mapped] = points.state[point[mapped]] == ALIVE
+    places = back(keyframe.pose, camera.bearings(features.pixel[rows]) * features.depth[rows, None])
+    places[mapped] = points.xyz[point[mapped]]
+    return places
+
+
+def pose_from_matches(
+    camera: TrackCamera, places: FloatArray, pixel: FloatArray, min_inliers: int = 10, error: float = 4.0
+) -> tuple[FloatArray, BoolArray] | None:
+    """Pose (7,) from places in the world and their pixels, by P3P with RANSAC, and which agree; None without one."""
+    if len(places) < max(min_inliers, 6):
+        return None
+    try:
+        found, turn, shift, inliers = cv2.solvePnPRansac(
+            np.ascontiguousarray(places), np.ascontiguousarray(pixel - 0.5), camera.matrix_opencv, np.zeros(0),
+            iterationsCount=500, reprojectionError=error, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+    except cv2.error:  # its last step asserts that the inliers, not known before, are spread well
+        return None
+    if not found or inliers is None or len(inliers) < min_inliers or not np.isfinite(shift).all():
+        return None
+    turned = quaternion.from_matrix(np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64))
+    pose = np.concatenate([turned, np.asarray(shift, dtype=np.float64).ravel()])
+    agree = np.zeros(len(places), dtype=bool)
+    agree[np.asarray(inliers, dtype=np.int64).ravel()] = True
+    return pose, agree
+
+
+@dataclass(frozen=True)
+class Found:
+    """A pose, what agrees with it, and what can be followed from there."""
+
+    estimate: PoseEstimate
+    known: KnownFeatures
+    #: (n, 2) known features and features of the frame that agree; :func:`promote` makes followed points of them.
+    pairs: IntArray
+    lines: FollowedSegments
+    score: float
+    #: Share of the known features in view that agree: some do so by chance.
+    share: float
+
+
+def find_pose(
+    track_map: TrackMap,
+    camera: TrackCamera,
+    data: FrameFeatures,
+    keyframes: list[Keyframe],
+    guesses: list[FloatArray],
+    predicted: FloatArray,
+    prior_sigma: FloatArray,
+) -> Found | None:
+    """Find the pose of a frame near some keyframes; ``guesses`` are poses to be tried as well."""
+    search = _Search(track_map, camera, data, known_features(track_map, camera, keyframes), predicted, prior_sigma)
+    if guesses:
+        near = [search.proposal_near(guess) for guess in guesses]
+        best = search.best_of([*guesses, *(pose for pose in near if pose is not None)])
+        if best is not None and best.score >= STRONG:
+            return best
+    return search.best_of([pose for pose in map(search.proposal, keyframes) if pose is not None])
+
+
+class _Search:
+    """One frame, the features it is compared with, and the best pose so far."""
+
+    def __init__(self, track_map, camera, data, known, predicted, prior_sigma) -> None:
+        self.track_map, self.camera, self.data, self.known = track_map, camera, data, known
+        self.predicted, self.prior_sigma = predicted, prior_sigma
+        self._tree = KDTree(data.features.pixel if len(data.features.pixel) else np.zeros((1, 2)))
+        self._best: Found | None = None
+        self._tried: list[FloatArray] = []
+
+    def near(self, pose: FloatArray, radius: float) -> IntArray:
+        """Pairs (n, 2) of known features and features of the frame, near where a pose says."""
+        return match_near(self.camera, self.known, self.data.features, self._tree, pose, radius)
+
+    def proposal_near(self, guess: FloatArray) -> FloatArray | None:
+        """Pose from features matched in wide surroundings of where a guess says."""
+        pairs = self.near(guess, SEARCH * self.camera.width)
+        return self._from_pairs(self.known.places[pairs[:, 0]], pairs[:, 1])
+
+    def proposal(self, keyframe: Keyframe) -> FloatArray | None:
+        """Pose from all features that match those of one keyframe."""
+        first, second = match_features(keyframe.features, self.data.features)
+        places = feature_places(self.track_map, self.camera, keyframe, first)
+        known = np.isfinite(places[:, 0])
+        return self._from_pairs(places[known], second[known])
+
+    def _from_pairs(self, places: FloatArray, second: IntArray) -> FloatArray | None:
+        found = pose_from_matches(self.camera, places, self.data.features.pixel[second])
+        return found[0] if found is not None else None
+
+    def best_of(self, starts: list[FloatArray]) -> Found | None:
+        """Refine the starts that most agrees with; return the best pose so far."""
+        planes, seen = self.track_map.planes, self.data.planes
+        judged = [
+            len(self.near(start, 3 * NEAR))
+            + PLANE_WEIGHT * (len(assign_planes(planes, seen, start, 0.15, 0.12)[0]) if seen else 0)
+            for start in starts
+        ]
+        for k in np.argsort(-np.array(judged), kind="stable")[:MOST_REFINED]:
+            if self._is_known(starts[k]):
+                continue
+            found = self._refine(starts[k])
+            self._tried.append(starts[k])
+            if found is not None:
+                self._tried.append(found.estimate.pose)
+                if self._best is None or found.score > self._best.score:
+                    self._best = found
+        return self._best
+
+    def _is_known(self, start: FloatArray) -> bool:
+        """Whether a start is as good as at a pose that was tried."""
+        if not self._tried:
+            return False
+        tried = np.array(self._tried)
+        apart = np.abs(se3.log(se3.compose(np.tile(start, (len(tried), 1)), se3.inverse(tried))))
+        depth = self.track_map.near.depth
+        return bool(((apart[:, :3].max(axis=1) < SAME_SHARE * depth) & (apart[:, 3:].max(axis=1) < SAME_TURN)).any())
+
+    def _refine(self, start: FloatArray) -> Found | None:
+        """Estimate the pose from all that agrees with a start, with narrowing gates."""
+        track_map, camera, data = self.track_map, self.camera, self.data
+        pose, estimate, lines = start, None, FollowedSegments.empty()
+        pairs = np.zeros((0, 2), np.int64)
+        for gate in (3.0, 1.0):
+            pairs = self.near(pose, gate * NEAR)
+            # Features that are no point of the map yet take part by their place alone.
+            temporary, table = _temporary_points(self.known, pairs, data)
+            lines, line_table = match_lines(track_map, camera, data, pose, 8.0 * gate, 0.08 + 0.06 * gate)
+            planes = match_planes(track_map, data, pose, 0.1 + 0.06 * gate, 0.06 + 0.04 * gate)
+            if len(pairs) + len(line_table) + len(planes) < 3:
+                return None
+            view = replace(track_map.view, points=temporary)
+            measured = Measurements(table, line_table, planes)
+            estimate = estimate_pose(camera, view, measured, self.predicted, self.prior_sigma, pose)
+            pose = estimate.pose
+        assert estimate is not None
+        agree = pairs[estimate.points] if data.options.points else pairs[:0]
+        counts = estimate.counts
+        score = counts["points"] + LINE_WEIGHT * counts["lines"] + PLANE_WEIGHT * counts["planes"]
+        in_view = int(camera.inside(camera.project(into(pose, self.known.places))).sum())
+        share = len(agree) / max(in_view, 1)
+        return Found(estimate, self.known, agree, lines.take(estimate.lines), score, share)
+
+
+class _Places:
+    """Just the places of points, where an estimate wants a table of them."""
+
+    def __init__(self, xyz: FloatArray) -> None:
+        self.xyz = xyz
+
+
+def _temporary_points(known: KnownFeatures, pairs: IntArray, data: FrameFeatures):
+    rows = pairs[:, 1] if data.options.points else pairs[:0, 1]
+    count = len(rows)
+    depth = data.features.depth[rows]
+    sigma = data.features.scale[rows] * data.options.point_sigma_px
+    depth_sigma = 1.5 * data.depth_sigma(depth)
+    unknown = np.full(count, np.nan)
+    table = PointMeasurements(np.arange(count), data.features.pixel[rows], sigma, depth, depth_sigma, unknown)
+    return _Places(known.places[pairs[:, 0]]), table
+
+
+def promote(track_map: TrackMap, found: Found, data: FrameFeatures) -> PointTracks:
+    """Make points of the map of features that agree, where they are none yet; return them as followed points."""
+    points, features, known = track_map.points, data.features, found.known
+    tracks = PointTracks.empty()
+    for k, keyframe in enumerate(known.keyframes):
+        pairs = found.pairs[known.of[found.pairs[:, 0]] == k]
+        if not len(pairs):
+            continue
+        own, here = known.row[pairs[:, 0]], pairs[:, 1]
+        index = keyframe.features.point[own]
+        usable = index >= 0
+        usable[usable] = points.state[index[usable]] == ALIVE
+        fresh = np.flatnonzero(~usable & np.isfinite(keyframe.features.depth[own]))
+        if len(fresh):
+            sigma = data.depth_sigma(keyframe.features.depth[own[fresh]])
+            places = known.places[pairs[fresh, 0]]
+            new = points_of_features(track_map, keyframe, own[fresh], places, sigma, data.options.point_sigma_px)
+            index[fresh], usable[fresh] = new, True
+        rows = np.flatnonzero(usable)
+        features.point[here[rows]] = index[rows]
+        tracks = tracks.joined(PointTracks(index[rows], features.pixel[here[rows]]))
+    first = np.unique(tracks.index, return_index=True)[1]
+    return tracks.take(first)
+
+
+def match_lines(
+    track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose: FloatArray, distance: float, angle: float
+) -> tuple[FollowedSegments, LineMeasurements]:
+    """Assign detected segments to lines of the map by where a pose says they are, and how deep."""
+    if not data.options.lines:
+        return FollowedSegments.empty(), LineMeasurements.empty()
+    lines, detected = track_map.lines, data.detected
+    alive = np.flatnonzero(lines.alive)
+    expected, seen = expected_segments(camera, lines, alive, pose)
+    alive, expected = alive[seen], expected[seen]
+    inverse = 1.0 / np.maximum(into(pose, lines.segment[alive].mean(axis=1))[:, 2], 1e-6)
+    segments = detected.segments
+    rows, hits = assign(expected, segments.ends, distance, angle, inverse, detected.inverse_depth.mean(axis=1))
+    sigma = np.maximum(segments.sigma[hits], 0.5)
+    followed = FollowedSegments(alive[rows], segments.ends[hits], sigma, segments.strength[hits])
+    table = LineMeasurements(
+        alive[rows], segments.ends[hits], sigma, detected.inverse_depth[hits], detected.inverse_depth_sigma[hits]
+    )
+    return followed, table
+
+
+def match_planes(
+    track_map: TrackMap, data: FrameFeatures, pose: FloatArray, angle: float, distance: float
+) -> PlaneMeasurements:
+    """Assign planes of a frame to planes of the map."""
+    if data.planes is None:
+        return PlaneMeasurements.empty()
+    index, rows = assign_planes(track_map.planes, data.planes, pose, angle, distance)
+    return PlaneMeasurements(index, data.planes.plane[rows], data.planes.sqrt_information[rows])
+
+
+#: Widest gates of planes between two frames: angle, and distance of the seen part (scene units).
+FRAME_GATES = (math.radians(12.0), 0.12)
+
+__all__ = [
+    "FRAME_GATES",
+    "Found",
+    "KnownFeatures",
+    "feature_places",
+    "find_pose",
+    "match_lines",
+    "match_near",
+    "match_planes",
+    "pose_from_matches",
+    "promote",
+]

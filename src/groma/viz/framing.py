@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Where the 3D view of the page starts: behind the cameras and a little above, as near as the scene allows.
+
+What is far from all the rest (matches gone wrong, the horizon, a stray camera) does not count. What counts fills the
+picture: with :math:`r` and :math:`u` the coordinates of a place to the right and upwards, :math:`b` that towards the
+viewer, and :math:`a` the tangent of half the opening, the viewer at :math:`(p_r, p_u, e)` sees it if
+:math:`|r - p_r| \le a_r (e - b)` and :math:`|u - p_u| \le a_u (e - b)`. The least :math:`e` is that of the two
+extreme places on either side, in closed form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from groma.viz.drawable import Drawable
+
+#: Share of the points, of the lines and of the cameras that count; the rest is farther from the middle than these.
+LANDMARK_SHARE, CAMERA_SHARE = 0.95, 0.98
+#: Nor does count what is farther from the middle than this many times the usual: one in twenty is not always all.
+FAR = 4.0
+#: Share of the landmarks that count on each side of the picture.
+EDGE = 0.997
+#: Tangents of half the opening of the viewer, across and upwards. Its focal length is 1.1 times its height (at most 0.6
+#: of its width), and it is about twice as wide as high.
+OPENING = np.array([0.83, 0.45])
+#: Room around what counts.
+MARGIN = 1.06
+#: Angle aside and above, radians.
+ASIDE, ABOVE = 0.45, 0.38
+
+
+@dataclass(frozen=True)
+class StartingView:
+    """Where the viewer starts: it turns about a pivot."""
+
+    pivot: FloatArray
+    up: FloatArray
+    azimuth: float
+    elevation: float
+    distance: float
+    camera_size: float
+
+
+def starting_view(scene: Drawable, middle: FloatArray) -> StartingView:
+    """Return a view of cameras, points and lines, without what is far from all of them.
+
+    Parameters
+    ----------
+    scene : Drawable
+        What is drawn.
+    middle : (3,) float64
+        A place to look at if the scene has no landmarks.
+    """
+    points, segments = (_finite(places) for places in (scene.points[:, None], scene.segments))
+    landmarks = np.concatenate([points.reshape(-1, 3), segments.reshape(-1, 3)])
+    center = np.median(landmarks, axis=0) if len(landmarks) else middle
+    centers = _finite(scene.centers[:, None])
+    kept = [
+        places[_near(np.linalg.norm(places - center, axis=2).max(axis=1, initial=0.0), share, far)].reshape(-1, 3)
+        for places, share, far in (
+            (points, LANDMARK_SHARE, FAR),
+            (segments, LANDMARK_SHARE, FAR),
+            (centers, CAMERA_SHARE, np.inf),
+        )
+    ]
+    places = np.concatenate(kept)
+    up = upward(scene.world_from_cam_axes[:, 1])
+    back = kept[2].mean(axis=0) - center if len(kept[2]) else np.array([1.0, 1.0, 0.0])
+    first, second = horizontal(up)
+    azimuth, elevation = float(np.arctan2(back @ second, back @ first)) + ASIDE, ABOVE
+    back = np.cos(elevation) * (np.cos(azimuth) * first + np.sin(azimuth) * second) + np.sin(elevation) * up
+    right = np.cross(up, back) / np.cos(elevation)
+    frame = np.stack([right, np.cross(back, right), back])
+    if not len(places):
+        return StartingView(center, up, azimuth, elevation, 1.0, 0.018)
+    pivot, distance = _fitted((np.concatenate(kept[:2]) - center) @ frame.T, (kept[2] - center) @ frame.T)
+    return StartingView(center + pivot @ frame, up, azimuth, elevation, distance, _camera_size(scene, distance))
+
+
+def upward(down: FloatArray) -> FloatArray:
+    """Return the direction (3,) that is up for cameras whose y axes (N, 3) point down; z if that is not clear."""
+    up = -down.sum(axis=0)
+    if np.linalg.norm(up) < 0.3 * max(len(down), 1):
+        return np.array([0.0, 0.0, 1.0])
+    return up / np.linalg.norm(up)
+
+
+def horizontal(up: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return two unit vectors across ``up``, from which the page measures azimuths."""
+    helper = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    first = np.cross(helper, up)
+    first /= np.linalg.norm(first)
+    return first, np.cross(up, first)
+
+
+def _finite(places: FloatArray) -> FloatArray:
+    """Items (N, k, 3) whose places are all known."""
+    return places[np.isfinite(places).all(axis=(1, 2))]
+
+
+def _near(distances: FloatArray, share: float, far: float) -> BoolArray:
+    if not len(distances):
+        return np.zeros(0, dtype=bool)
+    usual = float(np.median(distances))
+    return distances <= min(float(np.quantile(distances, share, method="higher")), far * usual if usual else np.inf)
+
+
+def _fitted(landmarks: FloatArray, cameras: FloatArray) -> tuple[FloatArray, float]:
+    """Return the pivot and the distance from which places (N, 3), right, up and back, just fill the picture."""
+    places = np.concatenate([landmarks, cameras])
+    opening = OPENING / MARGIN
+
+    def reach(sign: float) -> FloatArray:
+        of_landmarks, of_cameras = (sign * part[:, :2] + opening * part[:, 2:] for part in (landmarks, cameras))
+        few = [np.quantile(of_landmarks, EDGE, axis=0)] if len(of_landmarks) else []
+        return np.max([*few, *of_cameras], axis=0)
+
+    high, low = reach(1.0), reach(-1.0)
+    eye = float(((high + low) / (2 * opening)).max())
+    near, far = np.quantile(places[:, 2], [1 - EDGE, EDGE])
+    depth, extent = 0.5 * float(near + far), float(np.ptp(places, axis=0).max())
+    distance = max(eye - depth, 0.3 * extent) or 1.0
+    return np.array([*(0.5 * (high - low)), depth]), distance
+
+
+def _camera_size(scene: Drawable, distance: float) -> float:
+    """Return a size at which cameras can be seen and neighbours do not hide each other."""
+    if len(scene.centers) < 3:
+        return 0.018 * distance
+    from scipy.spatial import KDTree
+
+    gap = float(np.median(KDTree(scene.centers).query(scene.centers, k=2)[0][:, 1]))
+    return float(np.clip(0.4 * gap, 0.004 * distance, 0.018 * distance))

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The report: a scene, a map or a track as one HTML file without network access."""

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the page shows in the photographs: residuals of points, measured segments, images of the 3D segments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.viz.pack import pack, thin
+from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture
+from groma.viz.report.overlays import is_straight, projected_segments
+
+if TYPE_CHECKING:
+    from groma.scene import Scene
+    from groma.viz.drawable import Drawable
+
+#: More residuals of points, and more segments, than this are thinned out evenly.
+MAX_POINT_ROWS = 60_000
+MAX_SEGMENT_ROWS = 40_000
+#: Photographs in the page, the longer side of each, pixels, and what all of them may weigh, characters.
+MAX_PHOTOS = 60
+PHOTO_SIZE = 1100
+PHOTO_BUDGET = 9_000_000
+#: Places along the image of a segment that lens distortion bends.
+_SAMPLES = 6
+
+
+def image_data(scene: Scene, states: Sequence[Drawable], images: ImageFiles | None) -> dict[str, Any]:
+    """Return, for the page, an entry per image that observes something, and the rows that the entries point to.
+
+    ``first`` is the entry to begin with. ``rows`` are points: measured place, then the residual in each state.
+    ``segments`` are 2D segments: measured ends, then the ways from them to the image of their line in each state;
+    ``owners`` their lines as numbers of the table; ``projected`` the images of the 3D segments in the last state,
+    ``samples`` places each, zero where there is none.
+    """
+    after = states[-1]
+    num_points = len(scene.point_observations)
+    seen = scene.line_observations
+    point_rows = _by_image(scene.point_observations.image_idx, scene.num_images, MAX_POINT_ROWS)
+    segment_rows = _by_image(seen.image_idx, scene.num_images, MAX_SEGMENT_ROWS)
+    samples = 2 if all(is_straight(name) for name in scene.cameras.models) else _SAMPLES
+    points_seen = np.bincount(scene.point_observations.image_idx, minlength=scene.num_images)
+    lines_seen = np.bincount(seen.image_idx, minlength=scene.num_images)
+    used = np.flatnonzero(points_seen + lines_seen)
+    photos = _photographs([scene.images.names[image] for image in used], images)
+    entries, projected = [], [np.zeros((0, 2 * samples))]
+    begin = {"rows": 0, "segments": 0}
+    for place, image in enumerate(used.tolist()):
+        mine = segment_rows[image]
+        projected.append(_projected(scene, image, seen.line_idx[mine], samples))
+        left, top, width, height = _frame(after, image)
+        end = {"rows": begin["rows"] + len(point_rows[image]), "segments": begin["segments"] + len(mine)}
+        entries.append(
+            {
+                "name": scene.images.names[image],
+                "rows": [begin["rows"], end["rows"]],
+                "segments": [begin["segments"], end["segments"]],
+                "points_seen": int(points_seen[image]),
+                "lines_seen": int(lines_seen[image]),
+                "frame": [left, top, width, height],
+                "rms": [float(state.rms_by_image[image]) for state in states],
+                "photo": photos[place] if left == top == 0.0 else "",
+            }
+        )
+        begin = end
+    rows = np.concatenate([*(point_rows[image] for image in used), np.zeros(0, np.int64)]).astype(np.int64)
+    segments = np.concatenate([*(segment_rows[image] for image in used), np.zeros(0, np.int64)]).astype(np.int64)
+    ways = [state.residuals[num_points:].reshape(-1, 4)[segments] for state in states]
+    return {
+        "images": entries,
+        "first": _first(entries),
+        "rows": pack(
+            np.concatenate(
+                [after.residual_place[:num_points][rows], *(s.residuals[:num_points][rows] for s in states)], 1
+            )
+        ),
+        "segments": pack(np.concatenate([seen.segment[segments], *ways], axis=1)),
+        "owners": scene.lines.ids[seen.line_idx[segments]].tolist(),
+        "views": pack(np.bincount(seen.line_idx, minlength=scene.num_lines)[seen.line_idx[segments]].astype(float)),
+        "projected": pack(np.concatenate(projected)),
+        "samples": samples,
+    }
+
+
+def _first(entries: Sequence[dict[str, Any]]) -> int:
+    """Return the image to begin with: most lines, then most points; one with a photograph where there are any."""
+    keys = [(bool(entry["photo"]), entry["lines_seen"], entry["points_seen"]) for entry in entries]
+    return keys.index(max(keys)) if keys else 0
+
+
+def _by_image(image_idx: IntArray, num_images: int, limit: int) -> list[IntArray]:
+    """Return the rows of each image, thinned out where there are more than its share of the limit."""
+    order = np.argsort(image_idx, kind="stable")
+    bounds = np.searchsorted(image_idx[order], np.arange(num_images + 1))
+    share = max(40, limit // max(num_images, 1))
+    groups: list[IntArray] = [order[first:last].astype(np.int64) for first, last in pairwise(bounds)]
+    if len(image_idx) > limit:
+        groups = [group[thin(len(group), share)] for group in groups]
+    return groups
+
+
+def _projected(scene: Scene, image: int, lines: IntArray, samples: int) -> FloatArray:
+    """Return the images of 3D segments (n, 2 * samples); zeros where they are not before the camera."""
+    found = np.zeros((len(lines), samples, 2))
+    for row, places in enumerate(projected_segments(scene, image, lines) if len(lines) else []):
+        if len(places) >= 2:
+            at = np.linspace(0.0, len(places) - 1.0, samples)
+            found[row] = np.stack([np.interp(at, np.arange(len(places)), places[:, axis]) for axis in (0, 1)], axis=1)
+    width, height = scene.cameras.width, scene.cameras.height
+    size = float(max(width.max(initial=0), height.max(initial=0))) or np.inf
+    # Far outside, models of distortion are not meant to be used.
+    found[(np.abs(found) > 3.0 * size).any(axis=(1, 2)) if samples > 2 else np.zeros(len(found), bool)] = 0.0
+    return found.reshape(-1, 2 * samples)
+
+
+def _frame(scene: Drawable, index: int) -> tuple[float, float, float, float]:
+    """Return left, top, width, height of the image, or of what was measured in it where the size is unknown."""
+    width, height = scene.image_sizes[index]
+    if width > 0 and height > 0:
+        return 0.0, 0.0, float(width), float(height)
+    mine = scene.residual_place[scene.residual_image == index]
+    low, high = mine.min(axis=0), mine.max(axis=0)
+    margin = 0.03 * max(float((high - low).max()), 1.0)
+    left, top = low - margin
+    width, height = np.maximum(high - low, 1.0) + 2 * margin
+    return float(left), float(top), float(width), float(height)
+
+
+def _photographs(names: Sequence[str], images: ImageFiles | None) -> list[str]:
+    """Return the photographs as data addresses, smaller the more there are; empty where there is none."""
+    found = ["" for _ in names]
+    files = {place: path for place, name in enumerate(names) if (path := image_file(images, name)) is not None}
+    chosen = np.array(list(files))[thin(len(files), MAX_PHOTOS)].tolist() if files else []
+    budget = PHOTO_BUDGET // max(len(chosen), 1)
+    for place in chosen:
+        picture = read_picture(files[place], PHOTO_SIZE)
+        if picture is not None:
+            found[place] = jpeg_address(picture, budget)
+    return found

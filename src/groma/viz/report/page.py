@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A scene, or a scene before and after adjustment, as one self-contained HTML file.
+
+The file needs no network and no server: styles, viewer, data and photographs lie inside. The scene is drawn in 3D on a
+canvas, and so are the photographs with what was measured in them; charts are inline SVG; numbers stand in tables.
+Arrays travel as base64 float32, less a common offset, so that far away coordinates keep their digits.
+"""
+
+from __future__ import annotations
+
+import html
+import os
+import re
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from groma._version import __version__
+from groma.errors import InputError, OutputError
+from groma.viz.drawable import Drawable, drawable
+from groma.viz.pack import script_json
+from groma.viz.pictures import ImageFiles
+from groma.viz.report import tables as _page_tables
+from groma.viz.report.data import scene_data
+from groma.viz.report.images import image_data
+
+if TYPE_CHECKING:
+    from groma.scene import Scene
+
+
+class Report(Protocol):
+    """What the page reads of the report of an adjustment."""
+
+    @property
+    def history(self) -> Sequence[Any]:
+        """Steps: mappings or objects with iteration, cost, accepted."""
+        ...
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Sentences for the user."""
+        ...
+
+    @property
+    def termination(self) -> Any:
+        """An enumeration member with a ``sentence``."""
+        ...
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the numbers of the machine-readable report."""
+        ...
+
+
+def write_report(
+    path: str | os.PathLike[str],
+    scene_before: Scene | None,
+    scene_after: Scene,
+    report: Report | None = None,
+    images: ImageFiles | None = None,
+    title: str = "Adjustment",
+    *,
+    fates: Mapping[str, int] | None = None,
+    explanation: str = "",
+    warnings: Sequence[str] | None = None,
+    diagnosis: Mapping[str, Any] | None = None,
+    cards: str = "",
+    tiles: str | None = None,
+) -> None:
+    """Write a page that opens in any browser.
+
+    Parameters
+    ----------
+    path
+        The HTML file; it is replaced.
+    scene_before, scene_after
+        The same scene before and after; ``scene_before`` may be None to show a single scene.
+    report
+        Report of the adjustment, for the numbers, the convergence curve and the warnings.
+    images
+        Folder of the photographs, or files by image name, shown behind what was measured in them. At most sixty are
+        embedded, and made smaller the more there are.
+    title
+        Heading of the page.
+    fates
+        Numbers of segments by what became of them, of a map.
+    explanation
+        The same in words.
+    warnings
+        Sentences in a box; by default those of the report.
+    diagnosis
+        What the data determine, as :meth:`groma.solver.observability.diagnosis.Diagnosis.to_dict` gives it; by default
+        what the numbers of the report hold under ``diagnosis``.
+    cards
+        HTML before the charts.
+    tiles
+        HTML of the large numbers instead of the usual ones.
+
+    Raises
+    ------
+    InputError
+        If the two scenes do not hold the same landmarks and observations.
+    OutputError
+        If the file cannot be written.
+    """
+    after = drawable(scene_after)
+    before = drawable(scene_before) if scene_before is not None else None
+    if before is not None and not _same_shape(before, after):
+        raise InputError(
+            "scene_before and scene_after must hold the same images, landmarks and observations, in the same order; "
+            "they do not. Pass the input and the result of one adjustment, or scene_before=None."
+        )
+    scenes = [scene for scene in (scene_before, scene_after) if scene is not None]
+    states = [state for state in (before, after) if state is not None]
+    numbers = report.to_dict() if report is not None else None
+    history = [step for step in report.history if _iteration(step) > 0] if report is not None else None
+    sentences = warnings if warnings is not None else report.warnings if report is not None else ()
+    if diagnosis is None and numbers is not None:
+        diagnosis = numbers.get("diagnosis")
+    page = files("groma.viz.report").joinpath("_page.html").read_text(encoding="utf-8")
+    parts = {
+        "TITLE": html.escape(title),
+        "LEAD": _lead(scene_after, after, report),
+        "TILES": _page_tables.tiles(scene_after, before, after, numbers) if tiles is None else tiles,
+        "WARNINGS": "".join(f'<p class="warning">{html.escape(text)}</p>' for text in sentences),
+        "CHARTS": cards
+        + _page_tables.diagnosis_card(diagnosis)
+        + _page_tables.chart_cards(scene_after, before, after, history, _stages(numbers), fates, explanation),
+        "TABLES": _page_tables.number_tables(scene_after, before, after, numbers),
+        "FOOTER": _footer(),
+        "DATA": script_json({**scene_data(scenes, states), **image_data(scene_after, states, images)}),
+    }
+    page = re.sub(r"\{\{([A-Z]+)\}\}", lambda match: parts[match[1]], page)
+    try:
+        Path(path).write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"Cannot write {path}: {error.strerror or error}. Choose another place.") from error
+
+
+def _same_shape(first: Drawable, second: Drawable) -> bool:
+    names = ("points", "segments", "patch_members", "cam_from_world", "residuals", "residual_image")
+    return all(np.shape(getattr(first, name)) == np.shape(getattr(second, name)) for name in names)
+
+
+def _lead(scene: Scene, shown: Drawable, report: Report | None) -> str:
+    counts = _page_tables.words(_page_tables.counts_of(scene, shown))
+    first = f"{counts}. {report.termination.sentence}" if report is not None else f"{counts}."
+    return f'<p class="lead">{html.escape(first)}</p>'
+
+
+def _iteration(step: Any) -> int:
+    return int(step["iteration"] if isinstance(step, Mapping) else step.iteration)
+
+
+def _stages(numbers: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    """Return the stages of an adjustment; one where the report does not tell them apart."""
+    if numbers is None:
+        return []
+    whole = {"loss": "", "initial_cost": numbers["initial_cost"], "first_step": 1}
+    return [{**whole, **stage} for stage in numbers.get("stages") or [whole]]
+
+
+def _footer() -> str:
+    return f"Written by groma {__version__}. Pixels: the centre of the first pixel is (0.5, 0.5)."

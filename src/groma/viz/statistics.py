@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Numbers of every line: how long it is, how many images see it, how far its image lies from what was measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.viz.drawable import drawable, rms_by_group
+
+if TYPE_CHECKING:
+    from groma.scene import Scene
+    from groma.viz.drawable import Drawable
+
+
+@dataclass(frozen=True)
+class LineStatistics:
+    """Numbers of L lines and their M observations, in the order of the scene."""
+
+    #: (L,) lengths of the segments, scene units.
+    length: FloatArray
+    #: (L,) numbers of different images that observe them.
+    num_images: IntArray
+    #: (L,) root mean square distance of the measured ends from the image of the line, pixels; NaN where unobserved.
+    residual_px: FloatArray
+    #: (M, 2, 2) way from each measured end to the image of the line, pixels; NaN where the line has none.
+    end_residuals: FloatArray
+    #: (M,) root mean square distance of the two ends of each observation, pixels.
+    observation_residual_px: FloatArray
+
+
+def line_statistics(scene: Scene, shown: Drawable | None = None) -> LineStatistics:
+    r"""Compute the numbers of all lines at once.
+
+    .. math:: r_l = \sqrt{\frac{1}{2 |O_l|} \sum_{o \in O_l} \sum_{e = 1}^{2} \|\Delta_{oe}\|^2}
+
+    with the ways :math:`\Delta` from the measured ends to the image of the line, across that image.
+
+    Parameters
+    ----------
+    scene : Scene
+        Lines and their observations.
+    shown : Drawable, optional
+        What :func:`groma.viz.drawable.drawable` gives for the same scene, where it is there already.
+
+    Returns
+    -------
+    LineStatistics
+        Numbers by line and by observation.
+    """
+    shown = shown or drawable(scene)
+    seen = scene.line_observations
+    ends = shown.residuals[shown.residual_kind == shown.residual_kinds.index("line ends")].reshape(-1, 2, 2)
+    squares = 0.5 * np.einsum("mei,mei->m", ends, ends)
+    far = np.sqrt(squares)
+    return LineStatistics(
+        length=np.linalg.norm(scene.lines.segments[:, 1] - scene.lines.segments[:, 0], axis=1),
+        num_images=images_of(seen.line_idx, seen.image_idx, scene.num_lines),
+        residual_px=rms_by_group(far, seen.line_idx, scene.num_lines, empty=np.nan),
+        end_residuals=ends,
+        observation_residual_px=far,
+    )
+
+
+def images_of(landmark_idx: IntArray, image_idx: IntArray, num_landmarks: int) -> IntArray:
+    """Return how many different images observe each landmark; one may observe a landmark more than once."""
+    width = int(image_idx.max(initial=0)) + 1
+    pairs = np.unique(landmark_idx.astype(np.int64) * width + image_idx)
+    return np.bincount(pairs // width, minlength=num_landmarks)

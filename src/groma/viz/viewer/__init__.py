@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The viewer: a scene, or a running track, in the browser."""

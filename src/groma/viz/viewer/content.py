@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the viewer draws, as arrays: no server, no browser.
+
+Everything lies in the frame of the viewer: the middle of the scene is the origin, what is up in the photographs is +z,
+and the scene is about ten units wide. Places far from the origin keep their digits that way when they travel as single
+precision, and sizes in the viewer mean the same for every scene. Numbers for people stay in scene units and pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from groma import cameras
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.geometry import quaternion
+from groma.scene.similarity import Similarity
+from groma.viz import colours as _colours
+from groma.viz.colours import Colours
+from groma.viz.drawable import drawable
+from groma.viz.framing import upward
+from groma.viz.statistics import LineStatistics, line_statistics
+
+if TYPE_CHECKING:
+    from groma.scene import Scene
+
+#: Half the size of the scene in the frame of the viewer.
+REACH = 5.0
+#: What lines can be coloured by.
+LINE_MODES = ("length", "reprojection error", "direction", "number of images")
+#: Half the largest opening of a drawn camera, radians; wider ones are drawn with this one.
+_WIDEST = 1.2
+
+
+@dataclass(frozen=True)
+class LineColours:
+    """Colours of the lines, and what the ends of the ramp mean."""
+
+    #: (L, 3)
+    colours: Colours
+    #: Words at the two ends of the ramp; None where colours are no numbers.
+    low: str | None = None
+    high: str | None = None
+    #: A sentence for where they are not.
+    meaning: str = ""
+
+
+@dataclass(frozen=True)
+class ViewContent:
+    """What the viewer draws."""
+
+    scene: Scene
+    statistics: LineStatistics
+    view_from_world: Similarity
+    #: (P, 3) points in a random order: the first of them are an even sample.
+    points: FloatArray
+    #: By mode: (P, 3), in the same order.
+    point_colours: dict[str, Colours]
+    #: (L, 2, 3)
+    segments: FloatArray
+    #: K convex polygons (n, 3), and how many landmarks lie on each.
+    patches: list[FloatArray]
+    patch_members: IntArray
+    #: (D, 3) unit vectors, and how many lines follow each.
+    directions: FloatArray
+    direction_members: IntArray
+    #: (N, 4) quaternions [w x y z] and (N, 3) places of the cameras, ``view_from_cam``.
+    camera_wxyz: FloatArray
+    camera_centers: FloatArray
+    #: (N,) vertical opening, radians, and width over height.
+    camera_openings: FloatArray
+    camera_aspects: FloatArray
+    #: Where to look from, and at what.
+    start_position: FloatArray
+    start_target: FloatArray
+
+    def line_colours(self, mode: str) -> LineColours:
+        """Return the colours of the lines by one of ``LINE_MODES``."""
+        numbers = self.statistics
+        if mode == "length":
+            return _by_number(numbers.length, "", logarithmic=True)
+        if mode == "reprojection error":
+            return _by_number(numbers.residual_px, " px", from_zero=True)
+        if mode == "number of images":
+            return _by_number(numbers.num_images.astype(float), " images")
+        shared = len(self.scene.relations.line_along_direction) > 0
+        meaning = (
+            "One colour per shared direction; others grey." if shared else "Red along x, green along y, blue along z."
+        )
+        return LineColours(_colours.of_lines(self.scene), meaning=meaning)
+
+    def pick(self, origin: FloatArray, direction: FloatArray, tolerance: float, shown: BoolArray) -> int | None:
+        """Return the line under a ray, or None.
+
+        Parameters
+        ----------
+        origin, direction : (3,) float
+            The ray, in the frame of the viewer.
+        tolerance : float
+            Tangent of the angle up to which a line counts as hit.
+        shown : (L,) bool
+            Lines that can be hit.
+        """
+        distance, depth = ray_to_segments(origin, direction, self.segments)
+        distance[~shown] = np.inf
+        nearest = distance.min(initial=np.inf)
+        if not nearest <= tolerance:
+            return None
+        # Of lines that are hit about equally well, the one in front.
+        candidates = np.flatnonzero(distance <= nearest + 0.25 * tolerance)
+        return int(candidates[np.argmin(depth[candidates])])
+
+
+def view_content(scene: Scene) -> ViewContent:
+    """Compute what the viewer draws of a scene."""
+    shown = drawable(scene)
+    frame, position, target = _frame(scene)
+    order = np.random.default_rng(0).permutation(scene.num_points)
+    errors = shown.point_errors[order]
+    known = errors[np.isfinite(errors)]
+    point_colours = {}
+    if scene.points.color.any():
+        point_colours["photographs"] = np.ascontiguousarray(scene.points.color[order])
+    if len(known):
+        point_colours["reprojection error"] = _colours.ramp(errors / max(float(np.percentile(known, 90)), 1e-12))
+    point_colours["plain"] = np.tile(np.array([[96, 104, 116]], np.uint8), (len(order), 1))
+    pose = frame.poses(scene.cam_from_world)
+    world_from_cam = quaternion.conjugate(pose[:, :4])
+    opening, aspect = _openings(scene)
+    return ViewContent(
+        scene=scene,
+        statistics=line_statistics(scene, shown),
+        view_from_world=frame,
+        points=frame.points(scene.points.xyz[order]),
+        point_colours=point_colours,
+        segments=frame.points(scene.lines.segments),
+        patches=[frame.points(patch) for patch in shown.patches],
+        patch_members=shown.patch_members,
+        directions=frame.directions(scene.directions.vectors),
+        direction_members=np.bincount(
+            scene.relations.line_along_direction[:, 1], minlength=scene.num_directions
+        ).astype(np.int64),
+        camera_wxyz=world_from_cam[:, [3, 0, 1, 2]],
+        camera_centers=frame.points(scene.cam_centers_in_world),
+        camera_openings=opening,
+        camera_aspects=aspect,
+        start_position=position,
+        start_target=target,
+    )
+
+
+def ray_to_segments(origin: FloatArray, direction: FloatArray, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far segments (L, 2, 3) are from a ray, as seen from its origin.
+
+    Returns
+    -------
+    distance : (L,) float
+        Tangent of the smallest angle between the ray and a point of the segment; infinite behind the origin.
+    depth : (L,) float
+        Depth along the ray where that is.
+    """
+    forward = np.asarray(direction, float) / np.linalg.norm(direction)
+    side = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+    side /= np.linalg.norm(side)
+    seen = (segments - origin) @ np.stack([side, np.cross(forward, side), forward]).T
+    depth = seen[..., 2]
+    near = 1e-6 * np.maximum(np.abs(depth).max(axis=1, initial=0.0), 1e-12)
+    # Cut off what lies behind; the rest projects to a segment in the plane at depth 1.
+    gap = depth[:, ::-1] - depth
+    share = np.clip((near[:, None] - depth) / np.where(gap == 0.0, 1.0, gap), 0.0, 1.0)
+    cut = np.where((depth < near[:, None])[..., None], seen + share[..., None] * (seen[:, ::-1] - seen), seen)
+    cut[..., 2] = np.maximum(cut[..., 2], near[:, None])
+    flat = cut[..., :2] / cut[..., 2:]
+    way = flat[:, 1] - flat[:, 0]
+    squared = np.einsum("li,li->l", way, way)
+    along = np.clip(-np.einsum("li,li->l", flat[:, 0], way) / np.where(squared > 0.0, squared, 1.0), 0.0, 1.0)
+    distance = np.linalg.norm(flat[:, 0] + along[:, None] * way, axis=1)
+    behind = depth.max(axis=1, initial=-np.inf) <= near
+    # In the picture, inverse depth runs evenly along a segment.
+    inverse = (1.0 - along) / cut[:, 0, 2] + along / cut[:, 1, 2]
+    return np.where(behind, np.inf, distance), 1.0 / inverse
+
+
+def _by_number(values: FloatArray, unit: str, logarithmic: bool = False, from_zero: bool = False) -> LineColours:
+    """Colour by number, from what 5 of 100 stay below to what 95 of 100 do."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return LineColours(_colours.ramp(values), meaning="Not known.")
+    low, high = np.percentile(known, (5, 95))
+    low = 0.0 if from_zero else low
+    if logarithmic and low > 0:
+        share = np.log(np.maximum(values, 1e-300) / low) / max(np.log(high / low), 1e-12)
+    else:
+        share = (values - low) / max(high - low, 1e-12)
+    return LineColours(_colours.ramp(share), f"{low:.3g}{unit}", f"{high:.3g}{unit}")
+
+
+def _openings(scene: Scene) -> tuple[FloatArray, FloatArray]:
+    """Return the vertical opening of each image in radians, and width over height."""
+    count = scene.num_cameras
+    opening, aspect = np.full(count, 0.8), np.full(count, 4 / 3)
+    for index in range(count):
+        width, height = float(scene.cameras.width[index]), float(scene.cameras.height[index])
+        if not (width > 0 and height > 0):
+            continue
+        model = cameras.model(scene.cameras.models[index])
+        params = np.ascontiguousarray(scene.cameras.params[index, : model.num_parameters])
+        edges = np.array([[0.5 * width, 0.0], [0.5 * width, height], [0.0, 0.5 * height], [width, 0.5 * height]])
+        bearings = model.unproject(params, edges)
+        if np.isfinite(bearings).all():
+            up, down, left, right = np.minimum(np.arccos(np.clip(bearings[:, 2], -1.0, 1.0)), _WIDEST)
+            opening[index] = up + down
+            aspect[index] = np.tan(0.5 * (left + right)) / np.tan(0.5 * (up + down))
+    return opening[scene.images.camera_idx], aspect[scene.images.camera_idx]
+
+
+def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:
+    """Return ``view_from_world``, and in the viewer the place to look from and the place to look at."""
+    landmarks = np.concatenate([scene.points.xyz, scene.lines.segments.reshape(-1, 3)])
+    centers = scene.cam_centers_in_world
+    places = landmarks if len(landmarks) else centers
+    middle: FloatArray = np.asarray(np.median(places, axis=0), np.float64) if len(places) else np.zeros(3)
+    # The better part of the landmarks, and the cameras, decide on the size; a few points far away do not.
+    reach = np.percentile(np.linalg.norm(places - middle, axis=1), 85) if len(places) else 1.0
+    if len(centers):
+        reach = max(reach, float(np.median(np.linalg.norm(centers - middle, axis=1))))
+    scale = REACH / reach if reach > 0 else 1.0
+    up = upward(quaternion.to_matrix(scene.cam_from_world[:, :4])[:, 1])
+    away = centers.mean(axis=0) - middle if len(centers) else np.array([1.0, 1.0, 0.0])
+    away = away - (away @ up) * up
+    if np.linalg.norm(away) < 0.15 * reach:
+        # Cameras around the scene: look from where the first one stands.
+        away = centers[0] - middle if len(centers) else np.array([1.0, 1.0, 0.0])
+        away = away - (away @ up) * up
+    if np.linalg.norm(away) < 1e-9 * max(reach, 1e-300):
+        away = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    first: FloatArray = np.asarray(away / np.linalg.norm(away), np.float64)
+    rotation: FloatArray = np.stack([first, np.cross(up, first), up]).astype(np.float64)
+    shift: FloatArray = -scale * (rotation @ middle)
+    frame = Similarity(scale, rotation, shift)
+    # From behind the cameras, from the side and from above.
+    back = np.array([np.cos(0.45) * np.cos(0.4), np.sin(0.45) * np.cos(0.4), np.sin(0.4)])
+    return frame, 2.4 * REACH * back, np.zeros(3)

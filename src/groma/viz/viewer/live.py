@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A running track in the browser: its path, keyframes, points, lines and planes as they come.
+
+``groma track`` keeps what is finished in ``OUT.work`` while it runs, and leaves ``OUT`` at its end. This module reads
+those files again whenever they change, and draws them on a viser server.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from groma._counted import counted
+from groma._typing import FloatArray
+from groma.errors import GromaError
+from groma.geometry import quaternion, se3
+from groma.io import read_scene
+from groma.io.trajectories import read_tum
+from groma.scene.patches import patch_groups, plane_patches, triangle_fans
+from groma.viz import colours as _colours
+from groma.viz.pack import thin
+from groma.viz.viewer import arrays as _view_arrays
+from groma.viz.viewer.scene import silenced, stop_server
+
+if TYPE_CHECKING:
+    import viser
+
+    from groma.scene import Scene
+
+#: Seconds between two looks at the files.
+EVERY = 0.5
+#: A track that wrote nothing for so many seconds is said to be quiet.
+QUIET = 20.0
+WAITING, RUNNING, FINISHED = "waiting", "running", "finished"
+_PATH, _NOW, _KEYFRAMES, _POINTS, _LINES = (40, 110, 220), (230, 60, 40), (120, 126, 134), (96, 104, 116), (20, 130, 90)
+_MOST_CAMERAS = 200
+
+
+class LiveView:
+    """What a track has written so far, on a server.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        Where to draw. It is not stopped here.
+    output : path
+        The folder that ``groma track -o`` was given.
+    """
+
+    def __init__(self, server: viser.ViserServer, output: Path) -> None:
+        self.server = server
+        self._output, self._work = output, output.with_name(output.name + ".work")
+        self._seen: dict[Path, float] = {}
+        self._placed = False
+        self._size = 1.0
+        #: ``waiting``, ``running`` or ``finished``.
+        self.state = WAITING
+        self.num_frames = 0
+        self.scene: Scene | None = None
+        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        server.gui.set_panel_label("groma: a running track")
+        server.gui.main_panel.dock_right()
+        # The world is the first camera, whose y points down.
+        server.scene.set_up_direction("-y")
+        self._words = server.gui.add_markdown("")
+        self._say()
+
+    def refresh(self) -> bool:
+        """Look at the files, draw what is new, and return whether anything was."""
+        running = self._work.is_dir()
+        if not running and not (self._output / "scene.npz").exists():
+            changed = self.state != WAITING
+            self.state = WAITING
+        else:
+            folder = self._work if running else self._output
+            state = RUNNING if running else FINISHED
+            changed = state != self.state
+            self.state = state
+            path = folder / ("frames.txt" if running else "trajectory.txt")
+            with contextlib.suppress(GromaError, OSError, ValueError):
+                # A file that is being replaced is read the next time.
+                if self._is_new(path):
+                    self._draw_path(read_frames(path) if running else read_tum(path).world_from_cam)
+                    changed = True
+                if self._is_new(folder / "scene.npz"):
+                    self._draw_scene(read_scene(folder / "scene.npz"))
+                    changed = True
+        self._say()
+        return changed
+
+    def _is_new(self, path: Path) -> bool:
+        stamp = path.stat().st_mtime_ns
+        if self._seen.get(path) == stamp:
+            return False
+        self._seen[path] = stamp
+        return True
+
+    def _draw_path(self, world_from_cam: FloatArray) -> None:
+        self.num_frames = len(world_from_cam)
+        if not self.num_frames:
+            return
+        centers = world_from_cam[:, 4:]
+        if len(centers) > 1:
+            pieces = np.stack([centers[:-1], centers[1:]], axis=1).astype(np.float32)
+            self._segments("/path", pieces, _PATH, 3.0)
+        self._camera("/now", world_from_cam[-1], _NOW, 1.5)
+
+    def _draw_scene(self, scene: Scene) -> None:
+        self.scene = scene
+        world = se3.inverse(scene.cam_from_world)
+        places = np.concatenate([scene.points.xyz, scene.lines.segments.reshape(-1, 3), world[:, 4:]])
+        if not len(places):
+            return
+        low, high = np.percentile(places, [10, 90], axis=0)
+        self._size = max(float(np.linalg.norm(high - low)), 1e-3)
+        with self.server.atomic():
+            self.server.scene.add_point_cloud(
+                "/points", scene.points.xyz.astype(np.float32),
+                np.tile(np.array(_POINTS, np.uint8), (scene.num_points, 1)),
+                point_size=0.004 * self._size, point_shape="circle", precision="float32",
+            )  # fmt: skip
+            self._segments("/lines", scene.lines.segments.astype(np.float32), _LINES, 2.0)
+            self.server.scene.remove_by_name("/keyframes")
+            for row in thin(len(world), _MOST_CAMERAS):
+                self._camera(f"/keyframes/{row}", world[row], _KEYFRAMES, 1.0)
+            self._draw_planes(scene)
+        if not self._placed:
+            self._placed = True
+            self._look_at(0.5 * (low + high))
+
+    def _draw_planes(self, scene: Scene) -> None:
+        self.server.scene.remove_by_name("/planes")
+        patches, members = plane_patches(scene)
+        group = patch_groups(members) if patches else np.zeros(0, np.int64)
+        for colour in np.unique(group):
+            vertices, faces = triangle_fans([patches[plane] for plane in np.flatnonzero(group == colour)])
+            red, green, blue = (int(channel) for channel in _colours.PALETTE[colour])
+            self.server.scene.add_mesh_simple(
+                f"/planes/{colour}", vertices.astype(np.float32), faces.astype(np.uint32),
+                color=(red, green, blue), opacity=0.28, side="double", flat_shading=True,
+                cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+
+    def _segments(self, name: str, pieces: np.ndarray, colour: tuple[int, int, int], width: float) -> None:
+        ends = _view_arrays.by_end(np.tile(np.array(colour, np.uint8), (len(pieces), 1)))
+        self.server.scene.add_line_segments(name, pieces, ends, thickness=width, thickness_units="screen")
+
+    def _camera(self, name: str, world_from_cam: FloatArray, colour: tuple[int, int, int], size: float) -> None:
+        scene = self.scene
+        opening, aspect = 0.8, 4.0 / 3.0
+        if scene is not None and len(scene.cameras.width):
+            width, height = float(scene.cameras.width[0]), float(scene.cameras.height[0])
+            opening, aspect = 2.0 * float(np.arctan2(0.5 * height, scene.cameras.params[0][1])), width / height
+        self.server.scene.add_camera_frustum(
+            name, fov=opening, aspect=aspect, scale=0.03 * size * self._size, color=colour,
+            thickness=1.5, thickness_units="screen",
+            wxyz=quaternion.to_wxyz(world_from_cam[:4]), position=world_from_cam[4:],
+            cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+
+    def _look_at(self, middle: FloatArray) -> None:
+        """Look from above and behind the first camera; pages that are open already are moved too."""
+        start = middle + self._size * np.array([0.0, -0.8, -1.3])
+        self.server.initial_camera.position, self.server.initial_camera.look_at = start, middle
+        for client in self.server.get_clients().values():
+            with client.atomic():
+                client.camera.position, client.camera.look_at = start, middle
+
+    def _say(self) -> None:
+        lines = {
+            WAITING: f"Waiting for `groma track -o {self._output.name}` to begin.",
+            RUNNING: "**Running.**",
+            FINISHED: "**Finished.** This is the adjusted result.",
+        }[self.state]
+        if self.state == RUNNING and self._seen:
+            silence = time.time() - max(self._seen.values()) * 1e-9
+            if silence > QUIET:
+                lines = f"**Nothing new for {silence:.0f} s.** The track may have been stopped."
+        if self.scene is not None:
+            scene = self.scene
+            lines += f"\n\n{counted(self.num_frames, 'frames')}, {counted(scene.num_images, 'keyframes')}\n\n"
+            lines += ", ".join(counted(getattr(scene, f"num_{kind}"), kind) for kind in ("points", "lines", "planes"))
+        if self._words.content != lines:
+            self._words.content = lines
+
+
+def read_frames(path: Path) -> FloatArray:
+    """Poses (n, 7) world_from_cam of the frames of the map that is followed now; a row that is not complete is left."""
+    rows = [line.split() for line in path.read_text(encoding="utf-8").split("\n")[:-1]]
+    table = np.array([row for row in rows if len(row) == 9], dtype=float).reshape(-1, 9)
+    return np.hstack([table[:, 4:8], table[:, 1:4]])[table[:, 8] == (table[-1, 8] if len(table) else 0)]
+
+
+@contextlib.contextmanager
+def following(output: Path, port: int = 8080, host: str = "127.0.0.1") -> Iterator[LiveView]:
+    """Serve a running track inside a ``with`` block; call :meth:`LiveView.refresh` now and then."""
+    import viser
+
+    with silenced():
+        server: Any = viser.ViserServer(host=host, port=port, label="groma", verbose=False)
+    try:
+        yield LiveView(server, output)
+    finally:
+        stop_server(server)
+
+
+__all__ = ["FINISHED", "RUNNING", "WAITING", "LiveView", "following", "read_frames"]

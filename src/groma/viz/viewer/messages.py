@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the panel of the viewer says, as HTML."""
+
+from __future__ import annotations
+
+import html
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from groma._counted import counted
+from groma.viz import colours as _colours
+from groma.viz.pack import thin
+from groma.viz.pictures import ImageFiles, image_file, read_picture
+from groma.viz.report.overlays import observation_crop, residual_top
+from groma.viz.report.tables import words
+
+if TYPE_CHECKING:
+    from groma.scene import Scene
+    from groma.viz.viewer.content import ViewContent
+
+#: Observations in the list of a line, and pieces of photographs with it.
+MAX_LISTED = 40
+MAX_CROPS = 4
+HINT = "Click a line to see where it was observed."
+_RAMP = "linear-gradient(90deg,#2c6fbb,#3fb6a8,#e8c53a,#d9472b)"
+
+
+def counts(scene: Scene, max_cameras: int) -> str:
+    """Return what a scene holds, and what of it is drawn."""
+    parts = [
+        ("images", scene.num_images),
+        ("points", scene.num_points),
+        ("lines", scene.num_lines),
+        ("planes", scene.num_planes),
+        ("directions", scene.num_directions),
+    ]
+    text = words(parts)
+    thinned = f". {max_cameras} of the cameras are drawn" if scene.num_images > max_cameras else ""
+    return text + thinned
+
+
+def legend(low: str | None, high: str | None, meaning: str, shown: int, count: int) -> str:
+    """Return the ramp of the colours of the lines, and how many of them are drawn."""
+    text = f"{shown:,} of {count:,} lines." if shown < count else ""
+    if low is None:
+        return note(" ".join(part for part in (meaning, text) if part))
+    bar = f"<span style='flex:1;height:8px;border-radius:4px;background:{_RAMP}'></span>"
+    return (
+        f"<div style='padding:0 1em;font-size:0.8em'><div style='display:flex;gap:8px;align-items:center'>"
+        f"{html.escape(low)}{bar}{html.escape(high or '')}</div>{text}</div>"
+    )
+
+
+def note(text: str) -> str:
+    """Return a sentence in small grey letters."""
+    return f"<div style='padding:0.2em 1em;font-size:0.8em;opacity:.7'>{html.escape(text)}</div>"
+
+
+def describe_line(content: ViewContent, line: int, images: ImageFiles | None = None) -> str:
+    """Return the numbers of a line, its observations worst first, and the photographs around some of them."""
+    numbers, scene = content.statistics, content.scene
+    seen = scene.line_observations
+    rows = np.flatnonzero(seen.line_idx == line)
+    order = rows[np.argsort(-np.nan_to_num(numbers.observation_residual_px[rows], nan=np.inf), kind="stable")]
+    top = residual_top(numbers)
+    planes = scene.relations.line_on_plane
+    on = ", ".join(str(scene.planes.ids[plane]) for plane in planes[planes[:, 0] == line, 1])
+    lines = [
+        f"<b>Line {scene.lines.ids[line]}</b>: length {numbers.length[line]:.4g}, "
+        f"{counted(int(numbers.num_images[line]), 'images')}, {_px(numbers.residual_px[line])} rms"
+        + (f", on plane {on}" if on else "")
+    ]
+    for row in order[thin(len(order), MAX_CROPS)]:
+        lines.append(
+            _crop(content, int(row), images, _colours.css(_colours.ramp(numbers.observation_residual_px[row] / top)))
+        )
+    left = "<td style='text-align:left;overflow-wrap:anywhere'>"
+    entries = [f"<tr style='opacity:.6'>{left}image</td><td colspan='2'>ends, px</td><td>long, px</td></tr>"]
+    for row in order[:MAX_LISTED]:
+        first, second = np.linalg.norm(numbers.end_residuals[row], axis=1)
+        length = np.linalg.norm(seen.segment[row, 2:] - seen.segment[row, :2])
+        entries.append(
+            f"<tr>{left}{html.escape(scene.images.names[seen.image_idx[row]])}</td>"
+            f"<td>{first:.2f}</td><td>{second:.2f}</td><td>{length:.0f}</td></tr>"
+        )
+    style = "width:100%;text-align:right;border-spacing:6px 1px;font-variant-numeric:tabular-nums"
+    lines.append(
+        f"<div style='max-height:16em;overflow-y:auto'><table style='{style}'>{''.join(entries)}</table></div>"
+    )
+    if len(order) > MAX_LISTED:
+        lines.append(note(f"and {len(order) - MAX_LISTED} more"))
+    return f"<div style='padding:0.4em 1em;font-size:0.85em'>{''.join(lines)}</div>"
+
+
+def _crop(content: ViewContent, row: int, images: ImageFiles | None, colour: str) -> str:
+    scene, seen = content.scene, content.scene.line_observations
+    image = int(seen.image_idx[row])
+    path = image_file(images, scene.images.names[image])
+    picture = read_picture(path) if path is not None else None
+    if picture is None:
+        return ""
+    camera = scene.images.camera_idx[image]
+    size = float(scene.cameras.width[camera]), float(scene.cameras.height[camera])
+    crop = observation_crop(picture, size, seen.segment[row], content.statistics.end_residuals[row], colour)
+    return f"<div style='margin:6px 0 2px;opacity:.75'>{html.escape(scene.images.names[image])}</div>{crop}"
+
+
+def _px(value: float) -> str:
+    return f"{value:.2f} px" if np.isfinite(value) else "not measured"

@@ -1,0 +1,106 @@
+"""Adjustment in parts on disk: what a part holds, the same result as at once, and what is refused."""
+
+import numpy as np
+import pytest
+
+import groma
+from groma.adjustment.parts import adjust_parts, write_parts
+from groma.errors import InputError, OutputError
+from groma.evaluation import evaluate_poses
+from groma.factors.losses import Cauchy
+from groma.scene import synthetic
+from groma.solver.options import SolverOptions
+
+pytestmark = pytest.mark.kernels
+OPTIONS = SolverOptions(function_tolerance=1e-10, threads=1)
+
+
+@pytest.fixture
+def scene():
+    return synthetic.corridor("tiny").start
+
+
+def test_parts_hold_every_landmark_once_with_its_observations(scene, tmp_path):
+    paths = write_parts(scene, tmp_path / "parts", observations=150)
+    parts = [groma.read_scene(path) for path in paths]
+    assert len(parts) > 3
+    assert all(part.images.names == scene.images.names for part in parts)
+    assert max(part.num_observations for part in parts) < 150 + scene.num_images
+    for name in ("points", "lines"):
+        ids = np.concatenate([getattr(part, name).ids for part in parts])
+        np.testing.assert_array_equal(np.sort(ids), np.sort(getattr(scene, name).ids))
+    measured = {
+        (scene.points.ids[point], image): tuple(pixel)
+        for point, image, pixel in zip(
+            scene.point_observations.point_idx, scene.point_observations.image_idx, scene.point_observations.pixel,
+            strict=True,
+        )
+    }  # fmt: skip
+    for part in parts:
+        table = part.point_observations
+        for point, image, pixel in zip(table.point_idx, table.image_idx, table.pixel, strict=True):
+            assert measured.pop((part.points.ids[point], image)) == tuple(pixel)
+    assert not measured
+
+
+@pytest.mark.parametrize("lines", [False, True])
+def test_result_is_that_of_the_whole_scene(scene, tmp_path, lines):
+    scene = scene if lines else scene.points_only()
+    paths = write_parts(scene, tmp_path / "parts", observations=150)
+    result = adjust_parts(paths, tmp_path / "out", options=OPTIONS)
+    whole = groma.adjust(scene, groma.AdjustOptions(loss="none", planes=False, function_tolerance=1e-10))
+    np.testing.assert_allclose(result.report.final_cost, whole.report.solve.final_cost, rtol=1e-6)
+    for path, source in zip(result.paths, paths, strict=True):
+        part, before = groma.read_scene(path), groma.read_scene(source)
+        assert path.name == source.name
+        # Some of the few lines are weak: the cost of the whole is the same to six digits over millimetres.
+        assert evaluate_poses(part, whole.scene).center_max < (5e-3 if lines else 1e-5)
+        np.testing.assert_array_equal(part.point_observations.pixel, before.point_observations.pixel)
+        np.testing.assert_array_equal(part.cam_from_world, groma.read_scene(result.paths[0]).cam_from_world)
+        assert (part.points.xyz != before.points.xyz).any() or part.num_points == 0
+
+
+def test_a_robust_loss_is_used(scene, tmp_path):
+    table = scene.point_observations
+    pixel = table.pixel.copy()
+    pixel[::40] += 50.0
+    spoiled = scene.points_only().replace(point_observations=table.replace(pixel=pixel))
+    paths = write_parts(spoiled, tmp_path / "parts", observations=200)
+    result = adjust_parts(paths, tmp_path / "out", Cauchy(1.0), OPTIONS)
+    whole = groma.adjust(spoiled, groma.AdjustOptions(loss="cauchy", function_tolerance=1e-10))
+    np.testing.assert_allclose(result.report.final_cost, whole.report.solve.final_cost, rtol=1e-6)
+
+
+def test_intrinsics_are_estimated_if_asked(scene, tmp_path):
+    scene = scene.points_only()
+    paths = write_parts(scene, tmp_path / "parts", observations=200)
+    result = adjust_parts(paths, tmp_path / "out", options=OPTIONS, refine_intrinsics=True)
+    whole = groma.adjust(
+        scene, groma.AdjustOptions(loss="none", refine_intrinsics=True, function_tolerance=1e-10)
+    ).scene
+    for path in result.paths:
+        np.testing.assert_allclose(groma.read_scene(path).cameras.params, whole.cameras.params, rtol=1e-5)
+    assert (whole.cameras.params[0, :2] != scene.cameras.params[0, :2]).all()
+
+
+def test_refuses_what_does_not_belong_together(scene, tmp_path):
+    paths = write_parts(scene, tmp_path / "parts", observations=300)
+    other = write_parts(synthetic.corridor(13).start, tmp_path / "other")
+    with pytest.raises(InputError, match="same file name"):
+        adjust_parts([paths[0], other[0]], tmp_path / "x")
+    with pytest.raises(InputError, match="other images or cameras"):
+        adjust_parts([paths[0], other[0].rename(tmp_path / "other.npz")], tmp_path / "x")
+    with pytest.raises(InputError, match="nothing to adjust"):
+        empty = scene.points_only()
+        empty = empty.replace(points=empty.points.take([]), point_observations=empty.point_observations.take([]))
+        groma.write_scene(empty, tmp_path / "empty.npz")
+        adjust_parts([tmp_path / "empty.npz"], tmp_path / "x")
+    with pytest.raises(InputError, match="at least one observation"):
+        write_parts(scene, tmp_path / "x", observations=0)
+
+
+def test_results_are_not_overwritten_unasked(scene, tmp_path):
+    paths = write_parts(scene, tmp_path / "parts", observations=300)
+    adjust_parts(paths, tmp_path / "out", options=SolverOptions(max_iterations=1))
+    with pytest.raises(OutputError):
+        adjust_parts(paths, tmp_path / "out", options=SolverOptions(max_iterations=1))

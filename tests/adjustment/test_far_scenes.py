@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Scenes in coordinates of the ground, of unusual scale, and with a few points at a great distance: the same result.
+
+Truth is the same scene near the origin.
+"""
+
+import cv2
+import numpy as np
+import pytest
+
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.assemble import AssemblyOptions
+from groma.adjustment.diagnosis import diagnose_scene
+from groma.adjustment.uncertainty import uncertainty
+from groma.mapping import map as mapping
+from groma.mapping.map import MapResult, map_images
+from groma.scene import Similarity
+from groma.scene.local_frame import local_frame
+from groma.scene.synthetic.scenes import holistic
+from groma.solver.termination import Termination
+
+pytestmark = pytest.mark.kernels
+#: Where a scene lies in the coordinates of UTM, metres.
+TO_UTM = Similarity(translation=np.array([4e5, 5.4e6, 200.0]))
+OPTIONS = AdjustOptions(loss="none")
+
+
+@pytest.fixture(scope="module")
+def start():
+    return holistic(8, noise_px=0.5, seed=1).start
+
+
+@pytest.fixture(scope="module")
+def near(start):
+    return adjust(start, OPTIONS)
+
+
+def test_only_far_scenes_are_moved(start):
+    assert local_frame(start) is None
+    move = local_frame(start.transformed(TO_UTM))
+    assert move is not None and move.scale == 1.0
+    assert np.linalg.norm(move.translation + TO_UTM.translation) < 10.0
+    outlier = start.points.xyz.copy()
+    outlier[0] = 1e15
+    assert local_frame(start.with_points(outlier)) is None
+    assert local_frame(start.subset([0], min_observations=10**6)) is None
+
+
+def test_a_scene_in_ground_coordinates_is_adjusted_as_well(start, near):
+    far = adjust(start.transformed(TO_UTM), OPTIONS)
+    assert far.report.termination is near.report.termination
+    assert far.report.solve.final_cost == pytest.approx(near.report.solve.final_cost, rel=1e-6)
+    back = far.scene.transformed(TO_UTM.inverse())
+    np.testing.assert_allclose(back.cam_centers_in_world, near.scene.cam_centers_in_world, atol=1e-5)
+    np.testing.assert_allclose(back.points.xyz, near.scene.points.xyz, atol=1e-4)
+    assert far.problem is not None
+    np.testing.assert_array_equal(far.problem.variables["frames"].state, far.scene.frames.rig_from_world)
+
+
+def test_covariances_are_those_of_the_near_scene(start, near):
+    far = adjust(start.transformed(TO_UTM), OPTIONS)
+    expected = uncertainty(near.scene, problem=near.problem)
+    found = uncertainty(far.scene, problem=far.problem)
+    for kind in ("centers", "points", "segment_ends"):
+        wanted = getattr(expected, kind)
+        np.testing.assert_allclose(getattr(found, kind), wanted, rtol=1e-2, atol=1e-3 * np.abs(wanted).max())
+    for kind, ambient in (("lines", near.scene.lines.plucker), ("planes", near.scene.planes.hesse)):
+        step = 1e-3 * np.ones(ambient.shape[1])
+        move = getattr(TO_UTM, kind)
+        J = np.column_stack([(move(e) - move(-e)) / 2.0 for e in np.diag(step)]) / step
+        wanted = J @ getattr(expected, kind) @ J.T
+        np.testing.assert_allclose(getattr(found, kind), wanted, rtol=2e-2, atol=1e-4 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(
+    "world", [Similarity(scale=1e-4), Similarity(scale=1e4), TO_UTM], ids=["small", "large", "ground"]
+)
+def test_a_diagnosis_does_not_depend_on_the_world(near, world):
+    # the first camera and the scale are held, which says nothing of what the data determine
+    expected = diagnose_scene(near.scene, AssemblyOptions(gauge="first_camera"))
+    found = diagnose_scene(near.scene.transformed(world), AssemblyOptions(gauge="first_camera"))
+    assert found.num_open_directions == expected.num_open_directions
+    assert [finding.kind for finding in found.findings] == [finding.kind for finding in expected.findings]
+
+
+def test_points_at_a_great_distance_do_not_end_the_adjustment(start, near):
+    places = start.points.xyz.copy()
+    places[:3] = 1e14 * places[:3] / np.linalg.norm(places[:3], axis=1, keepdims=True)
+    found = adjust(start.with_points(places), AdjustOptions(loss="cauchy"))
+    assert found.report.termination is not Termination.STEP_CONVERGED
+    expected = adjust(start.keep(points=np.arange(3, start.num_points)), AdjustOptions(loss="cauchy"))
+    assert found.report.solve.iterations >= expected.report.solve.iterations
+
+
+def test_a_map_is_made_near_the_origin_and_moved_back(tmp_path, monkeypatch, start, near):
+    """What is between the two is looked at without photographs."""
+    seen = []
+
+    def mapped(folder, names, model, *others):
+        seen.append(model)
+        return MapResult(near.scene, model, start, near.report, OPTIONS, {}, "", {}, ())
+
+    monkeypatch.setattr(mapping, "_mapped", mapped)
+    for name in start.images.names:
+        cv2.imwrite(str(tmp_path / name), np.zeros((768, 1024), np.uint8))
+    model = start.points_only().transformed(TO_UTM)
+    found = map_images(tmp_path, tmp_path / "work", model)
+    assert local_frame(seen[0]) is None
+    move = local_frame(model)
+    assert move is not None
+    back = move.inverse()
+    np.testing.assert_allclose(found.start.cam_centers_in_world, model.cam_centers_in_world, atol=1e-6)
+    np.testing.assert_allclose(found.scene.points.xyz, back.points(near.scene.points.xyz), atol=1e-6)
+    np.testing.assert_allclose(found.before.lines.segments, back.points(start.lines.segments), atol=1e-6)

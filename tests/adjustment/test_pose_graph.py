@@ -1,0 +1,129 @@
+"""Pose graphs: the true poses come back, whatever the part, the plane and wrong motions."""
+
+import numpy as np
+import pytest
+
+from groma.adjustment.pose_graph import PoseGraphOptions, adjust_pose_graph
+from groma.errors import InputError
+from groma.geometry import quaternion, se3
+from groma.scene.pose_graph import GraphPoses, Motions, PoseGraph
+
+pytestmark = pytest.mark.kernels
+
+
+def ring(rng, count=12, noise=0.0, planar=False):
+    """Poses on a circle that look ahead, with motions to the next two."""
+    angle = 2 * np.pi * np.arange(count) / count
+    turn = np.zeros((count, 3))
+    turn[:, 2] = angle
+    height = np.zeros(count) if planar else np.sin(3 * angle)
+    truth = np.hstack([quaternion.exp(turn), np.column_stack([5 * np.cos(angle), 5 * np.sin(angle), height])])
+    first = np.concatenate([np.arange(count), np.arange(count)])
+    second = np.concatenate([np.arange(1, count + 1), np.arange(2, count + 2)]) % count
+    error = rng.normal(size=(2 * count, 6)) * noise
+    if planar:
+        error[:, 2:5] = 0.0
+    motion = se3.compose(se3.compose(se3.inverse(truth[first]), truth[second]), se3.exp(error))
+    information = np.tile(np.eye(6) / max(noise, 1e-3) ** 2, (2 * count, 1, 1))
+    return truth, PoseGraph(GraphPoses(np.arange(count), truth), Motions(first, second, motion, information), planar)
+
+
+def disturbed(rng, graph, size):
+    step = rng.normal(size=(len(graph.poses), 6)) * size
+    step[0] = 0.0
+    if graph.planar:
+        step[:, 2:5] = 0.0
+    moved = se3.compose(graph.poses.world_from_body, se3.exp(step))
+    return graph.replace(poses=graph.poses.replace(world_from_body=moved))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_true_poses_come_back(rng, planar):
+    truth, graph = ring(rng, planar=planar)
+    result = adjust_pose_graph(disturbed(rng, graph, 0.2))
+    np.testing.assert_allclose(
+        se3.log(se3.compose(se3.inverse(truth), result.graph.poses.world_from_body)), 0, atol=1e-6
+    )
+    assert result.report.converged and result.chi_square.sum() < 1e-6 < result.chi_square_before.sum()
+    assert len(result.doubtful) == 0
+
+
+def test_poses_of_the_plane_stay_there(rng):
+    _, graph = ring(rng, planar=True, noise=0.02)
+    poses = adjust_pose_graph(disturbed(rng, graph, 0.2)).graph.poses.world_from_body
+    np.testing.assert_array_equal(poses[:, 6], 0.0)
+    np.testing.assert_array_equal(poses[:, :2], 0.0)
+
+
+def test_the_cost_of_noise_is_its_redundancy(rng):
+    """Twice the cost has the chi-square distribution of 6 (motions - poses + 1) degrees of freedom."""
+    _, graph = ring(rng, count=40, noise=0.01)
+    report = adjust_pose_graph(graph).report
+    redundancy = 6 * (80 - 39)
+    assert abs(2 * report.final_cost - redundancy) < 4 * np.sqrt(2 * redundancy)
+
+
+def test_held_poses_and_the_first_of_each_part_stay(rng):
+    truth, one = ring(rng, noise=0.01)
+    count = len(truth)
+    motions = one.motions
+    both = PoseGraph(
+        GraphPoses(np.arange(2 * count), np.concatenate([truth, truth]), np.arange(2 * count) == 5),
+        Motions(*(np.concatenate([a, b]) for a, b in zip(
+            (motions.first_idx, motions.second_idx, motions.first_from_second, motions.information),
+            (motions.first_idx + count, motions.second_idx + count, motions.first_from_second, motions.information),
+            strict=True,
+        ))),
+    )  # fmt: skip
+    assert both.parts().tolist() == [0] * count + [1] * count
+    poses = adjust_pose_graph(both).graph.poses.world_from_body
+    moved = np.abs(poses - both.poses.world_from_body).max(axis=1) > 1e-9
+    assert np.flatnonzero(~moved).tolist() == [5, count]
+
+
+def test_a_start_from_the_motions_alone(rng):
+    truth, graph = ring(rng, count=30)
+    lost = graph.replace(poses=graph.poses.replace(world_from_body=np.tile(truth[:1], (30, 1))))
+    np.testing.assert_allclose(lost.chained().poses.world_from_body, truth, atol=1e-12)
+
+
+def test_a_wrong_motion_loses(rng):
+    _, graph = ring(rng, count=30, noise=0.01)
+    motions = graph.motions
+    wrong = PoseGraph(graph.poses, Motions(
+        np.append(motions.first_idx, 3), np.append(motions.second_idx, 18),
+        np.concatenate([motions.first_from_second, se3.exp(np.array([[3.0, 1, 0, 0, 0, 1]]))]),
+        np.concatenate([motions.information, motions.information[:1]]),
+    ))  # fmt: skip
+    without = adjust_pose_graph(graph).graph.poses.world_from_body
+    moved = {}
+    for loss in ("none", "cauchy", "geman_mcclure"):
+        result = adjust_pose_graph(wrong, PoseGraphOptions(loss=loss))
+        moved[loss] = np.abs(result.graph.poses.world_from_body - without)[:, 4:].max()
+        assert result.doubtful.tolist() == ([] if loss == "none" else [60])
+    # robust losses weigh right motions a little, too: the poses would differ by this even without the wrong one
+    assert moved["none"] > 0.5 and max(moved["cauchy"], moved["geman_mcclure"]) < 0.05
+
+
+def test_odometry_keeps_its_weight_unless_told(rng):
+    _, graph = ring(rng, count=30, noise=0.01)
+    assert graph.odometry().sum() == 29
+    bad = graph.motions.first_from_second.copy()
+    bad[4, 4] += 5.0
+    graph = graph.replace(motions=graph.motions.replace(first_from_second=bad))
+    doubted = adjust_pose_graph(graph, PoseGraphOptions(loss="geman_mcclure", trust_odometry=False)).doubtful
+    assert doubted.tolist() == [4]
+    assert 4 not in adjust_pose_graph(graph, PoseGraphOptions(loss="geman_mcclure")).doubtful
+
+
+def test_a_graph_without_motions_is_refused():
+    poses = GraphPoses(np.arange(2), np.tile([0.0, 0, 0, 1, 0, 0, 0], (2, 1)))
+    with pytest.raises(InputError, match="no motions"):
+        adjust_pose_graph(PoseGraph(poses, Motions()))
+    with pytest.raises(InputError, match="Motion 0 has second_idx 2"):
+        PoseGraph(poses, Motions([0], [2], [[0, 0, 0, 1, 0, 0, 0]], [np.eye(6)]))

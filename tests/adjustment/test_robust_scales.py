@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The default losses follow the noise: as good as least squares without outliers, and untouched by outliers."""
+
+import numpy as np
+import pytest
+
+import groma
+from groma.adjustment.adjust import LAST_SCALE_SIGMAS, _wide_enough
+from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.evaluation import evaluate_poses
+from groma.factors.losses import Cauchy, GemanMcClure, Trivial
+from groma.scene import Relations, synthetic
+
+pytestmark = pytest.mark.kernels
+
+
+def _scene(noise_px):
+    scene = synthetic.holistic(20, noise_px=noise_px, seed=2)
+    return scene.truth.replace(relations=Relations()), scene.start.replace(relations=Relations())
+
+
+def test_last_scale_follows_the_noise():
+    truth, _ = _scene(1.5)
+    assembly = assemble(truth, AssemblyOptions(planes=False))
+    wide = _wide_enough(GemanMcClure(2.0), assembly)
+    assert wide.scale == pytest.approx(LAST_SCALE_SIGMAS * 1.5, rel=0.1)
+    assert _wide_enough(GemanMcClure(100.0), assembly).scale == 100.0
+    for other in (Trivial(), Cauchy(1.0)):
+        assert _wide_enough(other, assembly) is other
+
+
+def test_without_outliers_the_default_is_as_good_as_least_squares():
+    truth, start = _scene(1.5)
+    errors = [
+        evaluate_poses(groma.adjust(start, groma.AdjustOptions(loss=loss, planes=False)).scene, truth).center_rmse
+        for loss in ("auto", "none")
+    ]
+    assert errors[0] < 1.03 * errors[1]
+
+
+def test_with_outliers_it_is_far_better():
+    truth, start = _scene(0.5)
+    table = start.point_observations
+    pixel = table.pixel.copy()
+    rows = np.arange(0, len(pixel), 20)
+    pixel[rows] += np.random.default_rng(0).uniform(20.0, 60.0, (len(rows), 2))
+    spoiled = start.replace(point_observations=table.replace(pixel=pixel))
+    robust, plain = (
+        evaluate_poses(groma.adjust(spoiled, groma.AdjustOptions(loss=loss, planes=False)).scene, truth).center_rmse
+        for loss in ("auto", "none")
+    )
+    assert robust < 0.2 * plain

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Mapping many lines: near pairs and lines seen side by side against comparisons of all; unused landmarks; words."""
+
+import inspect
+import re
+
+import numpy as np
+import pytest
+
+from groma.cli.commands.map import map_
+from groma.mapping.distinct import distinct_pairs, num_distinct
+from groma.mapping.lines import merge as _line_merge
+from groma.mapping.lines.build import LineMap, explain
+from groma.mapping.lines.merge import MAX_ANGLE, MIN_OVERLAP
+from groma.mapping.lines.rejection import REMEDIES, WORDS, Fate
+from groma.mapping.unused import without_unused
+from groma.scene import Directions, Relations
+from groma.scene.compare import equal
+from groma.scene.synthetic.scenes import corridor
+
+
+def bundle(rng, count, size):
+    """Lines (L, 2, 3) in all directions in a flat box; every second one is a moved copy of the one before."""
+    middle = rng.uniform(-1, 1, (count, 3)) * [size, size, 1.0]
+    direction = rng.normal(size=(count, 3))
+    direction *= rng.lognormal(0.0, 1.0, (count, 1)) / np.linalg.norm(direction, axis=1, keepdims=True)
+    X = middle[:, None] + np.array([-0.5, 0.5])[:, None] * direction[:, None]
+    X[1::2] = X[::2] + rng.normal(0, 0.05, (count // 2, 2, 3))
+    return X
+
+
+def all_pairs(X, reach):
+    """The pairs that lie near each other, by comparing all with all; the rule in plain words."""
+    found = set()
+    for a in range(len(X)):
+        for b in range(len(X)):
+            d, e = X[a, 1] - X[a, 0], X[b, 1] - X[b, 0]
+            if a == b or abs(d @ e) <= np.cos(MAX_ANGLE) * np.linalg.norm(d) * np.linalg.norm(e):
+                continue
+            t = (X[b] - X[a, 0]) @ d / (d @ d)
+            low, high = max(0.0, t.min()), min(1.0, t.max())
+            if high - low < MIN_OVERLAP * min(1.0, np.ptp(t)):
+                continue
+            places = np.array([low, high])
+            on_b = X[b, 0] + ((places - t[0]) / (t[1] - t[0]))[:, None] * e
+            on_a = X[a, 0] + places[:, None] * d
+            if (np.linalg.norm(on_b - on_a, axis=1) <= min(reach[a], reach[b])).all():
+                found.add((a, b))
+    return found
+
+
+@pytest.mark.kernels
+@pytest.mark.parametrize("size", [2.0, 30.0])
+def test_near_pairs_are_those_of_all_pairs(size):
+    rng = np.random.default_rng(5)
+    X = bundle(rng, 120, size)
+    reach = rng.lognormal(-1.5, 0.7, len(X))
+    pairs, span = _line_merge._candidates(X, reach)
+    either = all_pairs(X, reach)
+    assert len(pairs) == len({tuple(sorted(pair)) for pair in pairs.tolist()})  # each once
+    # The rule is judged from the line that comes first along the scene.
+    assert {tuple(pair) for pair in pairs.tolist()} <= either
+    assert {tuple(sorted(pair)) for pair in pairs.tolist()} >= {
+        pair for pair in either if pair[0] < pair[1] and pair[::-1] in either
+    }
+    assert len(pairs) >= 20
+    assert ((span >= 0.0) & (span <= 1.0)).all()
+
+
+@pytest.mark.kernels
+def test_lines_that_an_image_shows_side_by_side():
+    """Line 0 beside line 1 in image 1, beside line 2 in no image, and on top of line 3."""
+    ends = np.array(
+        [[0, 0, 100, 0], [0, 0, 100, 0], [0, 5, 100, 5], [200, 5, 300, 5], [0, 0.5, 100, 0.5]], dtype=np.float64
+    )
+    image, line_of = np.array([0, 1, 1, 1, 1]), np.array([0, 0, 1, 2, 3])
+    line = np.column_stack([np.zeros(5), np.ones(5), -ends[:, 1]])
+    rows = np.argsort(line_of, kind="stable")
+    pointers = np.searchsorted(line_of[rows], np.arange(5))
+    pairs = np.array([[0, 1], [1, 0], [0, 2], [0, 3]])
+    apart = np.zeros(len(pairs), bool)
+    _line_merge._apart(pairs, pointers, rows, image, ends, line, apart)
+    assert apart.tolist() == [True, True, False, False]
+
+
+def test_distinct_pairs():
+    rng = np.random.default_rng(1)
+    pairs = rng.integers(0, 9, (200, 2))
+    found, counts = distinct_pairs(*pairs.T)
+    expected, number = np.unique(pairs, axis=0, return_counts=True)
+    assert np.array_equal(found, expected) and np.array_equal(counts, number)
+    assert num_distinct(np.zeros(0, np.int64), np.zeros(0, np.int64), 3).tolist() == [0, 0, 0]
+    assert num_distinct(np.array([2, 2, 2, 0]), np.array([7, 7, 1, 7]), 4).tolist() == [1, 0, 2, 0]
+
+
+def test_landmarks_that_nothing_holds_are_left_out():
+    truth = corridor("tiny", seed=0).truth
+    relations = truth.relations
+    few = Relations(
+        point_on_plane=relations.point_on_plane[relations.point_on_plane[:, 1] == 1],
+        line_on_plane=relations.line_on_plane[relations.line_on_plane[:, 1] == 1],
+        line_along_direction=np.array([[0, 1], [1, 1], [2, 0]]),
+    )
+    directions = Directions(np.array([5, 7, 9]), np.eye(3))
+    scene = truth.replace(relations=few, directions=directions)
+    before = scene.replace(relations=Relations(point_on_plane=relations.point_on_plane))
+    kept, also = without_unused(scene, before)
+    assert kept.planes.ids.tolist() == [truth.planes.ids[1]]
+    assert kept.directions.ids.tolist() == [7]
+    assert kept.relations.line_along_direction.tolist() == [[0, 0], [1, 0]]
+    assert kept.relations.point_on_plane[:, 0].tolist() == few.point_on_plane[:, 0].tolist()
+    assert (also.num_planes, also.num_directions) == (1, 1)
+    assert also.relations.point_on_plane[:, 0].tolist() == few.point_on_plane[:, 0].tolist()
+    assert (kept.num_points, kept.num_lines) == (truth.num_points, truth.num_lines)
+    # Points and lines without observations go, with what lies on them.
+    unseen = scene.replace(line_observations=scene.line_observations.take(scene.line_observations.line_idx != 1))
+    (kept,) = without_unused(unseen)
+    assert kept.num_lines == truth.num_lines - 1
+    assert kept.num_directions == 0
+    assert without_unused(kept)[0] is kept or equal(without_unused(kept)[0], kept)
+
+
+def line_map(counts, num_lines=0):
+    """A map of one image with so many segments of each fate."""
+    fates = np.repeat(np.array(list(counts), np.int64), list(counts.values()))
+    empty = {item: np.zeros(0) for item in ("segments", "image_idx", "segment_idx", "line_idx", "residual")}
+    empty |= {item: np.zeros(0) for item in ("num_images", "median_residual", "uncertainty")}
+    return LineMap(lines=np.zeros((num_lines, 6)), **empty, fates=(fates,), neighbors=())
+
+
+@pytest.mark.parametrize("fate", list(WORDS))
+def test_explanations_are_sentences_with_options_that_exist(fate):
+    text = explain(line_map({fate: 3}))
+    assert "3 (100 %) " + WORDS[fate] in text
+    flags = " ".join(str(item.annotation) for item in inspect.signature(map_).parameters.values())
+    names = {"--" + name.replace("_", "-") for name in inspect.signature(map_).parameters}
+    for option in re.findall(r"--[a-z-]+", REMEDIES[fate]):
+        assert option in names or option in flags
+    assert "segments were" not in text
+
+
+def test_explanation_of_a_map_names_the_largest_groups_and_counts_the_rest():
+    counts = {Fate.MAPPED: 5000, Fate.RECOVERED: 500, Fate.NOT_LINKED: 900, Fate.NO_SUPPORT: 800, Fate.AMBIGUOUS: 700}
+    text = explain(line_map(counts | {Fate.OUTLIER: 600, Fate.UNCERTAIN: 20, Fate.NO_MATCH: 10}, num_lines=1200))
+    assert text.startswith("1,200 lines from 5,500 of 8,530 segments in 1 image. Of the other segments: 900 (11 %) had")
+    assert "30 (under 1 %) were lost for other reasons" in text
+    assert text.endswith("What would help most: more photographs of the same parts.")
+    assert "empty" not in text
