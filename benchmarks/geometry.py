@@ -22,7 +22,7 @@ OPERATIONS = ("made", "transformed", "transformed_and_projected")
 #: Image lines pass through the pixels of their points to this fraction of the pixels.
 AGREEMENT = 1e-6
 #: The peer with an object per line gets this many at most.
-MOST_OBJECTS = 2000
+MAX_OBJECTS = 2000
 
 
 def main() -> int:
@@ -35,7 +35,7 @@ def main() -> int:
     if python is None:
         print("spatialmath is left out: run python benchmarks/peers.py spatialmath")
     else:
-        programs["spatialmath"] = (python, min(arguments.number, MOST_OBJECTS))
+        programs["spatialmath"] = (python, min(arguments.number, MAX_OBJECTS))
     runs: dict[str, list[dict]] = {name: [] for name in programs}
     for _ in range(arguments.rounds):
         for name, (interpreter, number) in programs.items():

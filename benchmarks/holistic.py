@@ -45,8 +45,8 @@ PUBLISHED = {
     "wireframe": (4.27, 5.18),
 }
 #: What is promised: most steps, the least factor by which LIMAP takes longer, and how the time of a step may grow.
-MOST_STEPS = {"points": 8, "lines": 8, "planes": 10, "wireframe": 10}
-MOST_GROWTH = 1.2
+MAX_STEPS = {"points": 8, "lines": 8, "planes": 10, "wireframe": 10}
+MAX_GROWTH = 1.2
 #: Errors are compared from this many scenes on; the errors of one scene are as much luck as merit.
 ENOUGH_SCENES = 10
 
@@ -254,8 +254,8 @@ def broken_promises(runs: Runs) -> list[str]:
             for kind in KINDS:
                 mine, peer = rows.get((kind, "groma")), rows.get((kind, "limap"))
                 name = f"{images} images, {views} views, {kind}"
-                if mine and mine["most_iterations"] > MOST_STEPS[kind]:
-                    broken.append(f"{name}: {mine['most_iterations']} steps, {MOST_STEPS[kind]} are promised.")
+                if mine and mine["most_iterations"] > MAX_STEPS[kind]:
+                    broken.append(f"{name}: {mine['most_iterations']} steps, {MAX_STEPS[kind]} are promised.")
                 if mine and peer and peer["cpu_s"] < (least := least_ratio(images)) * mine["cpu_s"]:
                     ratio = peer["cpu_s"] / mine["cpu_s"]
                     broken.append(f"{name}: LIMAP takes {ratio:.1f} times longer, {least:g} are promised.")
@@ -264,7 +264,7 @@ def broken_promises(runs: Runs) -> list[str]:
                         if mine["errors"][field] > 1.001 * peer["errors"][field]:
                             broken.append(f"{name}: {field} is {mine['errors'][field]:.3f}, LIMAP's is lower.")
     for (views, kind), (exponent, _) in growth(runs).items():
-        if exponent > MOST_GROWTH:
+        if exponent > MAX_GROWTH:
             broken.append(f"{views} views, {kind}: the time of a step grows with exponent {exponent:.2f}.")
     return broken
 

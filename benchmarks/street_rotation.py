@@ -25,7 +25,7 @@ except ImportError:
 
 PAIRS = [(0, 2), (0, 4), (0, 6), (10, 20), (20, 30), (30, 39)]
 #: Largest ratio of a match to the second best, reprojection errors and least disparity in pixels.
-RATIO, EPIPOLAR_PX, POSE_PX, LEAST_DISPARITY = 0.8, 0.6, 1.5, 3.0
+RATIO, EPIPOLAR_PX, POSE_PX, MIN_DISPARITY = 0.8, 0.6, 1.5, 3.0
 
 
 class Street:
@@ -64,7 +64,7 @@ class Street:
         left, right, later = self.features(0, i), self.features(1, i), self.features(0, j)
         rows = self.matches(left, right)
         a, b = left[0][rows[:, 0]], right[0][rows[:, 1]]
-        good = (abs(a[:, 1] - b[:, 1]) < 1.0) & (a[:, 0] - b[:, 0] > LEAST_DISPARITY)
+        good = (abs(a[:, 1] - b[:, 1]) < 1.0) & (a[:, 0] - b[:, 0] > MIN_DISPARITY)
         depth = self.K[0, 0] * self.baseline / (a - b)[good, 0]
         rays = np.column_stack([a[good], np.ones(len(depth))]) @ np.linalg.inv(self.K).T
         place = np.full((len(left[0]), 3), np.nan)

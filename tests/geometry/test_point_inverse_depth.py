@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from groma.errors import ShapeError
-from groma.geometry.charts.point_inverse_depth import LARGEST_GROWTH, InverseDepthPoint
+from groma.geometry.charts.point_inverse_depth import MAX_GROWTH, InverseDepthPoint
 
 pytestmark = pytest.mark.kernels
 CHART = InverseDepthPoint()
@@ -23,7 +23,7 @@ def test_steps_along_the_ray_are_linear_in_the_inverse_distance():
 
 def test_growth_is_limited_and_points_stay_on_their_side():
     state = CHART.anchored(np.array([[0.0, 0.0, 2.0]]), np.zeros((1, 3)))
-    assert CHART.retract(state, np.array([[0.0, 0.0, 1e6]]))[0, 2] == pytest.approx(2.0 * LARGEST_GROWTH)
+    assert CHART.retract(state, np.array([[0.0, 0.0, 1e6]]))[0, 2] == pytest.approx(2.0 * MAX_GROWTH)
     assert 0.0 < CHART.retract(state, np.array([[0.0, 0.0, -1e6]]))[0, 2] < 1e-4
 
 

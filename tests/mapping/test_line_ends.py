@@ -8,7 +8,7 @@ from _wireframe import Wireframe, arc, random_lines, true_lines, wireframe
 from groma.adjustment.rescue.restart import with_seen_ends
 from groma.features.segments import Segments
 from groma.geometry import quaternion
-from groma.mapping.lines.build import Fate, LineMap, MapLinesOptions, map_lines
+from groma.mapping.lines.build import LineMap, MapLinesOptions, Outcome, map_lines
 
 pytestmark = pytest.mark.kernels
 
@@ -117,7 +117,7 @@ def test_a_line_that_repeats_another_beside_it_is_dropped(apart, stays):
     found = map_lines(world.scene, segments)
     repeated = len(found.lines) - len(np.unique(true_lines(world, found)))
     assert repeated == (2 if stays else 0)
-    assert (found.fate_counts()[Fate.REPEATED] == 0) == stays
+    assert (found.outcome_counts()[Outcome.REPEATED] == 0) == stays
 
 
 def seen_in_pieces(world: Wireframe, rng: np.random.Generator) -> list[Segments]:

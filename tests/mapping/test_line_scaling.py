@@ -12,7 +12,7 @@ from groma.mapping.distinct import distinct_pairs, num_distinct
 from groma.mapping.lines import merge as _line_merge
 from groma.mapping.lines.build import LineMap, explain
 from groma.mapping.lines.merge import MAX_ANGLE, MIN_OVERLAP
-from groma.mapping.lines.rejection import REMEDIES, WORDS, Fate
+from groma.mapping.lines.outcomes import REMEDIES, WORDS, Outcome
 from groma.mapping.unused import without_unused
 from groma.scene import Directions, Relations
 from groma.scene.compare import equal
@@ -121,27 +121,38 @@ def test_landmarks_that_nothing_holds_are_left_out():
 
 
 def line_map(counts, num_lines=0):
-    """A map of one image with so many segments of each fate."""
-    fates = np.repeat(np.array(list(counts), np.int64), list(counts.values()))
+    """A map of one image with so many segments of each outcome."""
+    outcomes = np.repeat(np.array(list(counts), np.int64), list(counts.values()))
     empty = {item: np.zeros(0) for item in ("segments", "image_idx", "segment_idx", "line_idx", "residual")}
     empty |= {item: np.zeros(0) for item in ("num_images", "median_residual", "uncertainty")}
-    return LineMap(lines=np.zeros((num_lines, 6)), **empty, fates=(fates,), neighbors=())
+    return LineMap(lines=np.zeros((num_lines, 6)), **empty, outcomes=(outcomes,), neighbors=())
 
 
-@pytest.mark.parametrize("fate", list(WORDS))
-def test_explanations_are_sentences_with_options_that_exist(fate):
-    text = explain(line_map({fate: 3}))
-    assert "3 (100 %) " + WORDS[fate] in text
+@pytest.mark.parametrize("outcome", list(WORDS))
+def test_explanations_are_sentences_with_options_that_exist(outcome):
+    text = explain(line_map({outcome: 3}))
+    assert "3 (100 %) " + WORDS[outcome] in text
     flags = " ".join(str(item.annotation) for item in inspect.signature(map_).parameters.values())
     names = {"--" + name.replace("_", "-") for name in inspect.signature(map_).parameters}
-    for option in re.findall(r"--[a-z-]+", REMEDIES[fate]):
+    for option in re.findall(r"--[a-z-]+", REMEDIES[outcome]):
         assert option in names or option in flags
     assert "segments were" not in text
 
 
 def test_explanation_of_a_map_names_the_largest_groups_and_counts_the_rest():
-    counts = {Fate.MAPPED: 5000, Fate.RECOVERED: 500, Fate.NOT_LINKED: 900, Fate.NO_SUPPORT: 800, Fate.AMBIGUOUS: 700}
-    text = explain(line_map(counts | {Fate.OUTLIER: 600, Fate.UNCERTAIN: 20, Fate.NO_MATCH: 10}, num_lines=1200))
+    counts = {
+        Outcome.MAPPED: 5000,
+        Outcome.RECOVERED: 500,
+        Outcome.NOT_LINKED: 900,
+        Outcome.NO_SUPPORT: 800,
+        Outcome.AMBIGUOUS: 700,
+    }
+    text = explain(
+        line_map(
+            counts | {Outcome.OUTLIER: 600, Outcome.UNCERTAIN: 20, Outcome.NO_MATCH: 10},
+            num_lines=1200,
+        )
+    )
     assert text.startswith("1,200 lines from 5,500 of 8,530 segments in 1 image. Of the other segments: 900 (11 %) had")
     assert "30 (under 1 %) were lost for other reasons" in text
     assert text.endswith("What would help most: more photographs of the same parts.")

@@ -12,9 +12,9 @@ from groma.features.matches import LineMatches
 from groma.features.segments import Segments
 from groma.geometry import quaternion
 from groma.mapping.lines.build import (
-    Fate,
     LineMap,
     MapLinesOptions,
+    Outcome,
     _is_sure,
     explain,
     external_matches,
@@ -69,13 +69,13 @@ def test_lines_are_as_good_as_they_say(world, mapped):
 
 def test_result_is_consistent(world, mapped):
     assert mapped.lines.shape == (mapped.num_lines, 6)
-    assert sum(mapped.fate_counts().values()) == sum(len(s) for s in world.segments)
-    assert all((fates >= 0).all() for fates in mapped.fates)
-    counts = mapped.fate_counts()
-    assert counts[Fate.MAPPED] + counts[Fate.RECOVERED] == len(mapped.line_idx)
-    for i, fates in enumerate(mapped.fates):
+    assert sum(mapped.outcome_counts().values()) == sum(len(s) for s in world.segments)
+    assert all((outcomes >= 0).all() for outcomes in mapped.outcomes)
+    counts = mapped.outcome_counts()
+    assert counts[Outcome.MAPPED] + counts[Outcome.RECOVERED] == len(mapped.line_idx)
+    for i, outcomes in enumerate(mapped.outcomes):
         on_lines = np.sort(mapped.segment_idx[mapped.image_idx == i])
-        assert np.array_equal(on_lines, np.flatnonzero(fates <= Fate.RECOVERED))
+        assert np.array_equal(on_lines, np.flatnonzero(outcomes <= Outcome.RECOVERED))
     assert (mapped.num_images >= 3).all()
     assert (np.diff(mapped.line_idx) >= 0).all()
     scene = mapped.add_to(world.scene, world.segments)
@@ -112,8 +112,8 @@ def test_matches(world, form):
     assert (owner >= 0).all()
     assert len(owner) >= 20
     # What is not matched with anything says so.
-    clutter = np.concatenate([f[t < 0] for f, t in zip(result.fates, world.truth, strict=True)])
-    assert (clutter == Fate.NO_MATCH).all()
+    clutter = np.concatenate([f[t < 0] for f, t in zip(result.outcomes, world.truth, strict=True)])
+    assert (clutter == Outcome.NO_MATCH).all()
 
 
 def test_matches_of_a_file(world, mapped):
@@ -161,7 +161,7 @@ def test_matches_from_images(provider):
 def test_lines_that_only_short_segments_show(world):
     short = map_lines(world.scene, world.segments, options=MapLinesOptions(min_longest=1e4))
     assert short.num_lines == 0
-    assert short.fate_counts()[Fate.SHORT_LINE] > 0
+    assert short.outcome_counts()[Outcome.SHORT_LINE] > 0
     assert "min_longest" in explain(short)
 
 
@@ -235,7 +235,7 @@ def test_lines_along_the_motion_need_another_view():
     flat = wireframe(centers, lines, rng, targets=ahead)
     result = map_lines(flat.scene, flat.segments)
     assert result.num_lines == 0
-    assert result.fate_counts()[Fate.DEGENERATE] >= 15
+    assert result.outcome_counts()[Outcome.DEGENERATE] >= 15
     assert "epipolar" in explain(result)
     assert "The map is empty" in explain(result)
     above = np.array([[0.3, -4.0, 1.0], [-0.4, -4.0, -1.1]])
@@ -277,7 +277,7 @@ def test_empty_maps_say_why(world):
     assert "No segments" in explain(map_lines(world.scene, none))
     assert "no images" in explain(map_lines(Scene(), []))
     alone = map_lines(world.scene.subset([0]), world.segments[:1])
-    assert alone.fate_counts()[Fate.NO_NEIGHBOR] == len(world.segments[0])
+    assert alone.outcome_counts()[Outcome.NO_NEIGHBOR] == len(world.segments[0])
     assert "share too few points" in explain(alone)
     short = map_lines(world.scene, world.segments, options=MapLinesOptions(min_length=1e4))
     assert "--min-length" in explain(short)
@@ -304,8 +304,8 @@ def test_lines_of_texture():
     segments = [Segments(s.ends, s.sigma, w) for s, w in zip(world.segments, weak, strict=True)]
     found = map_lines(world.scene, segments)
     every = map_lines(world.scene, segments, options=MapLinesOptions(min_repeatability=0.0))
-    assert found.fate_counts()[Fate.TEXTURE] > 0
-    assert every.fate_counts()[Fate.TEXTURE] == 0
+    assert found.outcome_counts()[Outcome.TEXTURE] > 0
+    assert every.outcome_counts()[Outcome.TEXTURE] == 0
     strong = {n for n in true_lines(world, every) if 0 <= n < 22}
     assert {n for n in true_lines(world, found) if n >= 0} == strong
     assert any(n >= 22 for n in true_lines(world, every))

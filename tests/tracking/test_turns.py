@@ -19,7 +19,7 @@ from groma.tracking.map.track_map import TrackMap
 from groma.tracking.pose.depth_check import depth_agreement
 from groma.tracking.pose.estimate import PoseEstimate
 from groma.tracking.pose.relocalise import pose_from_matches
-from groma.tracking.pose.verification import Belief
+from groma.tracking.pose.verification import PoseVerification
 
 pytestmark = pytest.mark.filterwarnings("error")
 OPTIONS = TrackOptions(num_points=250, num_features=500)
@@ -117,7 +117,7 @@ def test_depth_confirms_a_pose_and_denies_others():
 
 def test_a_pose_far_from_the_prediction_needs_more_that_agrees():
     """Windows that repeat are followed to the next window, and agree among themselves."""
-    belief = Belief(TrackCamera.of(_room.camera()), OPTIONS)
+    verification = PoseVerification(TrackCamera.of(_room.camera()), OPTIONS)
     sigma, none = np.full(6, 0.1), np.zeros(0, bool)
     at = se3.identity()
     away = at + np.array([0, 0, 0, 0, 0.5, 0, 0])
@@ -125,9 +125,9 @@ def test_a_pose_far_from_the_prediction_needs_more_that_agrees():
     def estimate(pose: np.ndarray, agree: int) -> PoseEstimate:
         return PoseEstimate(pose, np.arange(100) < agree, none, none, np.eye(6), ())
 
-    assert belief.is_surprised(estimate(away, 55), at, sigma)
-    assert not belief.is_surprised(estimate(away, 90), at, sigma)
-    assert not belief.is_surprised(estimate(at, 55), at, sigma)
+    assert verification.is_surprised(estimate(away, 55), at, sigma)
+    assert not verification.is_surprised(estimate(away, 90), at, sigma)
+    assert not verification.is_surprised(estimate(at, 55), at, sigma)
 
 
 @pytest.mark.parametrize("kind", ["one place", "two places", "three places", "a line", "nearly one place"])

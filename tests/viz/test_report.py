@@ -217,8 +217,8 @@ def test_tables_of_planes_and_directions(tmp_path):
 
 
 def test_what_became_of_the_segments(tmp_path):
-    fates = {"mapped": 60, "few_images": 40, "of_a_kind_to_come": 1, "outlier": 0}
-    text = _write(tmp_path, None, exact_scene(), fates=fates, explanation="4 lines from <60> segments.")
+    outcomes = {"mapped": 60, "few_images": 40, "of_a_kind_to_come": 1, "outlier": 0}
+    text = _write(tmp_path, None, exact_scene(), outcomes=outcomes, explanation="4 lines from <60> segments.")
     assert "4 lines from &lt;60&gt; segments." in text
     for words in ("observes a line", "line in too few images", "of a kind to come", "59 %"):
         assert words in text

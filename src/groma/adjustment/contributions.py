@@ -20,7 +20,7 @@ from groma.scene import Relations, Scene
 #: What is added, one after the other.
 KINDS = ("points", "lines", "planes and directions", "points on lines")
 #: With more images than this the standard deviations are left out.
-MOST_IMAGES = 300
+MAX_IMAGES = 300
 #: Where a distribution over the images is told: so many of a hundred are below.
 PERCENTILES = (5, 25, 50, 75, 95)
 
@@ -177,8 +177,8 @@ def _percentiles(values: FloatArray) -> tuple[float, ...]:
 
 def _center_sigma(result: AdjustResult) -> tuple[float | None, str, dict[str, int]]:
     """Return the median standard deviation of the camera centres, why there is none, and how much is open by kind."""
-    if result.scene.num_images > MOST_IMAGES:
-        return None, f"more than {MOST_IMAGES} images", {}
+    if result.scene.num_images > MAX_IMAGES:
+        return None, f"more than {MAX_IMAGES} images", {}
     try:
         found = uncertainty(result.scene, gauge="held", problem=result.problem)
     except (InputError, ProblemError) as error:

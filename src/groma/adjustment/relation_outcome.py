@@ -15,7 +15,7 @@ from groma.problem.residuals import squared_norms
 from groma.scene import Scene
 
 #: A relation whose weight under its loss is less than this part of full weight was given up.
-LEAST_WEIGHT = 0.05
+MIN_WEIGHT = 0.05
 
 
 def drop_failed_relations(scene: Scene, problem: Problem) -> tuple[Scene, dict[str, dict[str, int]]]:
@@ -36,7 +36,7 @@ def drop_failed_relations(scene: Scene, problem: Problem) -> tuple[Scene, dict[s
         failed: BoolArray = np.zeros(len(factor), dtype=bool)
         if not isinstance(factor.loss, Trivial):
             squared = squared_norms(factor, problem.variables)
-            failed = np.asarray(factor.loss.evaluate(squared)[1] < LEAST_WEIGHT)
+            failed = np.asarray(factor.loss.evaluate(squared)[1] < MIN_WEIGHT)
         outcome[name] = {"held": int((~failed).sum()), "dropped": int(failed.sum())}
         if failed.any():
             relations = replace(relations, **{name: getattr(relations, name)[~failed]})

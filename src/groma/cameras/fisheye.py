@@ -28,7 +28,7 @@ import math
 
 from groma._numba import kernel
 from groma.cameras.contract import CameraModel, register_camera
-from groma.cameras.pinhole import LARGEST_NORM, SMALLEST_NORM, clear
+from groma.cameras.pinhole import MAX_NORM, MIN_NORM, clear
 
 # --------------------------------------------------------------------------------------------------------- Kernels
 
@@ -43,7 +43,7 @@ def _has_image(X):
     """Whether the point is of representable size and not straight behind."""
     r = abs(X[0]) + abs(X[1])
     norm = r + abs(X[2])
-    return SMALLEST_NORM < norm < LARGEST_NORM and (X[2] > 0.0 or r > ON_AXIS * norm)
+    return MIN_NORM < norm < MAX_NORM and (X[2] > 0.0 or r > ON_AXIS * norm)
 
 
 @kernel

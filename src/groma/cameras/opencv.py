@@ -33,7 +33,7 @@ from groma.cameras.radial import write_point_jacobian
 # --------------------------------------------------------------------------------------------------------- Kernels
 
 #: The smallest denominator of FULL_OPENCV that is divided by.
-SMALLEST_DENOMINATOR = 1e-12
+MIN_DENOMINATOR = 1e-12
 #: Steps of the walk to the start value; each moves by (1 + r) / 32, so they reach a radius of about 2600.
 WALK_STEPS = 256
 
@@ -94,7 +94,7 @@ def _start_radius(params, target):
         following = r + (1.0 + r) / 32.0
         s = following * following
         numerator, denominator = _numerator(params, s), _denominator(params, s)
-        if not denominator > SMALLEST_DENOMINATOR:
+        if not denominator > MIN_DENOMINATOR:
             break
         g = numerator / denominator
         if not g + _ratio_slope(params, s, numerator, denominator) * s > 0.0:
@@ -114,7 +114,7 @@ def _regular_from_centre(params, x, y):
     while r < radius:
         r = min(r + (1.0 + r) / 32.0, radius)
         a, b = x * r / radius, y * r / radius
-        if not _denominator(params, a * a + b * b) > SMALLEST_DENOMINATOR:
+        if not _denominator(params, a * a + b * b) > MIN_DENOMINATOR:
             return False
         _, _, dxx, dxy, dyy = _full_distort(params, a, b)
         if not (dxx + dyy > 0.0 and dxx * dyy > dxy * dxy):
@@ -143,7 +143,7 @@ def _undistort(params, target_x, target_y):
         improved = False
         for _ in range(24):
             new_x, new_y = x - step_x, y - step_y
-            if _denominator(params, new_x * new_x + new_y * new_y) > SMALLEST_DENOMINATOR:
+            if _denominator(params, new_x * new_x + new_y * new_y) > MIN_DENOMINATOR:
                 xd, yd, new_dxx, new_dxy, new_dyy = _full_distort(params, new_x, new_y)
                 new_ex, new_ey = xd - target_x, yd - target_y
                 regular = new_dxx + new_dyy > 0.0 and new_dxx * new_dyy > new_dxy * new_dxy
@@ -200,7 +200,7 @@ def full_opencv_project(params, X, uv):
     if not has_depth(X):
         return False
     x, y = X[0] / X[2], X[1] / X[2]
-    if not abs(_denominator(params, x * x + y * y)) > SMALLEST_DENOMINATOR:
+    if not abs(_denominator(params, x * x + y * y)) > MIN_DENOMINATOR:
         return False
     xd, yd, _, _, _ = _full_distort(params, x, y)
     uv[0], uv[1] = params[0] * xd + params[2], params[1] * yd + params[3]
@@ -218,7 +218,7 @@ def full_opencv_project_jacobian(params, X, uv, J_point, J_params):
     x, y = X[0] * inverse, X[1] * inverse
     s, xy = x * x + y * y, 2.0 * x * y
     numerator, denominator = _numerator(params, s), _denominator(params, s)
-    if not abs(denominator) > SMALLEST_DENOMINATOR:
+    if not abs(denominator) > MIN_DENOMINATOR:
         return False
     xd, yd, dxx, dxy, dyy = _full_distort(params, x, y)
     uv[0], uv[1] = fx * xd + params[2], fy * yd + params[3]

@@ -16,16 +16,16 @@ from groma.cameras.contract import CameraModel, register_camera
 # --------------------------------------------------------------------------------------------------------- Kernels
 
 #: A point projects if |z| is more than this part of |x| + |y| + |z|.
-SMALLEST_DEPTH = 1e-12
+MIN_DEPTH = 1e-12
 #: Points nearer or farther than this are refused: squares and inverses of their coordinates leave the number range.
-SMALLEST_NORM, LARGEST_NORM = 1e-140, 1e140
+MIN_NORM, MAX_NORM = 1e-140, 1e140
 
 
 @kernel
 def has_depth(X):
     """Whether a perspective camera can project ``X`` (3,): of representable size, and not in the plane z = 0."""
     norm = abs(X[0]) + abs(X[1]) + abs(X[2])
-    return SMALLEST_NORM < norm < LARGEST_NORM and abs(X[2]) > SMALLEST_DEPTH * norm
+    return MIN_NORM < norm < MAX_NORM and abs(X[2]) > MIN_DEPTH * norm
 
 
 @kernel

@@ -21,7 +21,7 @@ from groma.geometry.algebra import dot, norm
 #: Neighbours that make a candidate, and that improve it; the one whose distance is the spacing.
 _NEIGHBOURS, RANK = 32, 8
 #: Features for each that is a seed, in large scenes; small ones have as many seeds at least.
-_FEATURES_PER_SEED, _FEWEST_SEEDS = 4, 1536
+_FEATURES_PER_SEED, _MIN_SEEDS = 4, 1536
 #: Most seeds at one feature.
 _REPEATED = 4
 #: Rounds in which a candidate is improved on its neighbourhood.
@@ -29,7 +29,7 @@ _ROUNDS = 3
 #: Nearest segments that a segment is paired with, and pairs of it that become candidates.
 _NEAR_SEGMENTS, _PAIRS = 24, 2
 #: Features that score a candidate, at most.
-_MOST_FOLLOWED = 8192
+_MAX_FOLLOWED = 8192
 #: Pairs looked at together.
 _CHUNK = 16384
 
@@ -140,7 +140,7 @@ def _through_neighbours(places, packed, neighbours, seed, choice, gate, rounds, 
 def from_neighbours(features: Features, gate: float, rng: np.random.Generator) -> tuple[FloatArray, IntArray]:
     """Candidates (H, 4) from a feature and two of its neighbours, improved on the neighbourhood; their homes (H,)."""
     number, near = features.neighbours.shape
-    count = max(number // _FEATURES_PER_SEED, min(_FEWEST_SEEDS, _REPEATED * number))
+    count = max(number // _FEATURES_PER_SEED, min(_MIN_SEEDS, _REPEATED * number))
     seed = rng.permutation(np.repeat(np.arange(number), -(-count // number)))[:count]
     choice = rng.integers(1, near, (count, 2))
     planes = np.empty((count, 4))
@@ -276,7 +276,7 @@ class Scores:
         self._features, self._planes, self._homes = features, planes, homes
         self._gate, self._reach = gate, reach
         self._stamp, self._number = np.zeros(len(features.places), np.int64), 0
-        self._queue = np.empty(_MOST_FOLLOWED, np.int64)
+        self._queue = np.empty(_MAX_FOLLOWED, np.int64)
 
     def of(self, which: IntArray, labels: IntArray) -> tuple[IntArray, FloatArray]:
         """Support (M,) and score (M,) of some candidates among the features without a label."""

@@ -20,7 +20,7 @@ from groma.features.images import to_gray
 from groma.features.merging import merge_collinear
 from groma.features.segments import Segments
 
-SMALLEST_IMAGE = 8  # pixels; LSD needs a few gradients, and no segment fits in less
+MIN_IMAGE = 8  # pixels; LSD needs a few gradients, and no segment fits in less
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class LsdDetector:
             None for images without edges or smaller than 8 x 8.
         """
         gray = to_gray(image)
-        if min(gray.shape) < SMALLEST_IMAGE or gray.min() == gray.max():
+        if min(gray.shape) < MIN_IMAGE or gray.min() == gray.max():
             return Segments.empty()
         detected = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD, self.scale).detect(gray)[0]
         if detected is None or np.size(detected) == 0:

@@ -17,7 +17,7 @@ from groma.features.images import GrayImage
 
 _HALF = np.float32(0.5)
 #: Least correlation of a patch with the one it was followed from: more signal than noise.
-LEAST_ALIKE = 0.5
+MIN_ALIKE = 0.5
 #: Width of the blocks in which corners are rated, pixels; the mean eigenvalue in them that noise of one grey level
 #: makes (OpenCV's units: 12 times 25 samples, by 4, 5 and 255), and how often that a corner must have. Noise alone
 #: reaches three times in an image of 640 x 480.
@@ -74,7 +74,7 @@ def follow(
         good &= ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
     if good.any():
         rows = np.flatnonzero(good)
-        good[rows] = _alike(image_1, image_2, start[rows], there[rows], window) > LEAST_ALIKE
+        good[rows] = _alike(image_1, image_2, start[rows], there[rows], window) > MIN_ALIKE
     if round_trip is not None and good.any():
         settings["maxLevel"] = min(1, levels)
         rows = np.flatnonzero(good)

@@ -31,7 +31,7 @@ from groma.geometry import quaternion
 from groma.geometry.algebra import apply, dot, norm, ratio, unit, vectors
 
 #: Segments whose ends are closer than this have no normal, radians.
-_LEAST_ANGLE = 1e-6
+_MIN_ANGLE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def segment_normals(
     second, second_by_pixel = model.bearing_jacobian(params, np.ascontiguousarray(ends[:, 2:]))
     crossed = np.cross(first, second)
     sine = norm(crossed)
-    usable = (sine > _LEAST_ANGLE) & np.isfinite(first_by_pixel).all((1, 2)) & np.isfinite(second_by_pixel).all((1, 2))
+    usable = (sine > _MIN_ANGLE) & np.isfinite(first_by_pixel).all((1, 2)) & np.isfinite(second_by_pixel).all((1, 2))
     usable &= np.isfinite(spread) & (spread > 0.0)
     normals = ratio(crossed, sine[:, None], usable[:, None], 0.0)
     columns = []

@@ -284,7 +284,7 @@ def _read_segments(path: Path) -> list[Segments]:
         return [Segments(ends, sigma, strength) for ends, sigma, strength in zip(*columns, strict=True)]
 
 
-_LISTS = ("fates", "neighbors")
+_LISTS = ("outcomes", "neighbors")
 
 
 def _write_line_map(line_map: LineMap, path: Path) -> None:

@@ -100,8 +100,8 @@ class MapResult:
     sigma_px: dict[str, float]
     #: What became of the segments, in words.
     explanation: str
-    #: Number of segments with each fate, by name.
-    fates: dict[str, int]
+    #: Number of segments with each outcome, by name.
+    outcomes: dict[str, int]
     #: Sentences for the user.
     warnings: tuple[str, ...]
 
@@ -258,7 +258,7 @@ def map_segments(
         adjusted_with=weighted,
         sigma_px={"points": weighted.point_sigma_px, "lines": weighted.line_sigma_px},
         explanation=explain(line_map),
-        fates={fate.name.lower(): count for fate, count in line_map.fate_counts().items()},
+        outcomes={outcome.name.lower(): count for outcome, count in line_map.outcome_counts().items()},
         warnings=(*missing, *result.report.warnings),
     )
 

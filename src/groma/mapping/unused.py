@@ -8,7 +8,7 @@ import numpy as np
 from groma.scene import Scene
 
 #: Points, a line counting twice, that fix a plane; lines that make a direction a common one.
-_FEWEST_ON_PLANE, _FEWEST_ALONG = 3, 2
+_MIN_ON_PLANE, _MIN_ALONG = 3, 2
 
 
 def without_unused(scene: Scene, *others: Scene) -> tuple[Scene, ...]:
@@ -31,8 +31,8 @@ def without_unused(scene: Scene, *others: Scene) -> tuple[Scene, ...]:
     kept = {
         "points": seen["point"],
         "lines": seen["line"],
-        "planes": on_plane >= _FEWEST_ON_PLANE,
-        "directions": along >= _FEWEST_ALONG,
+        "planes": on_plane >= _MIN_ON_PLANE,
+        "directions": along >= _MIN_ALONG,
     }
     if all(mask.all() for mask in kept.values()):
         return scene, *others

@@ -13,7 +13,7 @@ from groma.tracking.frame.camera import PINHOLE, TrackCamera
 from groma.tracking.map.track_map import TrackMap
 
 #: Points seen in fewer keyframes do not go into the scene.
-LEAST_VIEWS = 2
+MIN_VIEWS = 2
 
 
 def map_to_scene(track_map: TrackMap, camera: TrackCamera) -> Scene:
@@ -36,7 +36,7 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera) -> Scene:
     }
     points = np.concatenate([m.points.index for m in measured])
     pixels = np.concatenate([m.points.pixel for m in measured])
-    often = np.bincount(points, minlength=len(track_map.points)) >= LEAST_VIEWS
+    often = np.bincount(points, minlength=len(track_map.points)) >= MIN_VIEWS
     keep = often[points]
     point_ids, point_idx = np.unique(points[keep], return_inverse=True)
     image_of = image["points"][keep]

@@ -50,7 +50,7 @@ from groma.tracking.pose.following import follow_frame
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import Found, promote
-from groma.tracking.pose.verification import Belief, is_near, score_of
+from groma.tracking.pose.verification import PoseVerification, is_near, score_of
 from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
 
@@ -81,7 +81,7 @@ class Tracker:
         self._mapper = Mapper(self.camera, self.options)
         self._present = Present()
         self._history = History()
-        self._belief = Belief(self.camera, self.options)
+        self._verification = PoseVerification(self.camera, self.options)
         self._lost_for, self._lost_since = 0, 0.0
         #: The frame before, if it was lost, and where it may have been taken.
         self._guess = np.zeros((0, 0), np.uint8), self._present.pose
@@ -134,8 +134,8 @@ class Tracker:
                 prior_sigma, watch,
             )  # fmt: skip
             if estimate is not None:
-                trusted = self._belief.trusts(self.map, data, estimate)
-                if not trusted or self._belief.is_surprised(estimate, predicted, prior_sigma):
+                trusted = self._verification.trusts(self.map, data, estimate)
+                if not trusted or self._verification.is_surprised(estimate, predicted, prior_sigma):
                     doubtful, estimate = estimate, None
         if estimate is None:
             before = present.pose
@@ -149,7 +149,7 @@ class Tracker:
                 found = self._find(data, predicted, prior_sigma, doubtful)
             if found is not None and not (trusted and doubtful is not None and score_of(doubtful) >= found.score):
                 estimate, followed = found.estimate, Followed(promote(self.map, found, data), found.lines)
-            elif doubtful is not None and (trusted or self._belief.confirms(self.map, data, doubtful)):
+            elif doubtful is not None and (trusted or self._verification.confirms(self.map, data, doubtful)):
                 # The new keyframe may have moved the map.
                 found = None
                 moved = se3.compose(se3.inverse(before[None]), present.pose[None])
@@ -213,10 +213,10 @@ class Tracker:
         """Find a pose by described features: near the last keyframes first, then anywhere."""
         if self._lost_for <= NEAR_FRAMES:
             guesses = [predicted, self._present.pose] + ([doubtful.pose] if doubtful is not None else [])
-            found = self._belief.find_near(self.map, data, guesses, predicted, prior_sigma)
+            found = self._verification.find_near(self.map, data, guesses, predicted, prior_sigma)
             if found is not None:
                 return found
-        found = self._belief.find_anywhere(self.map, data)
+        found = self._verification.find_anywhere(self.map, data)
         if found is None or self._lost_for > NEAR_FRAMES:
             return found
         return found if is_near(found.estimate.pose, predicted, prior_sigma) else None

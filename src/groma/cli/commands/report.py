@@ -61,7 +61,7 @@ def report(
             saved,
             images,
             title=source.absolute().name,
-            fates=saved.fates if saved is not None else None,
+            outcomes=saved.outcomes if saved is not None else None,
             explanation=saved.explanation if saved is not None else "",
         )
     console.say(f"Wrote {output}")

@@ -137,7 +137,7 @@ def _write_results(folder: Path, result: MapResult, numbers: dict[str, Any], ima
         result.report,
         images,
         title,
-        fates=result.fates,
+        outcomes=result.outcomes,
         explanation=result.explanation,
         warnings=result.warnings,
         diagnosis=numbers["diagnosis"],
@@ -156,7 +156,7 @@ def _numbers(result: MapResult) -> dict[str, Any]:
         "num_planes": scene.num_planes,
         "num_directions": scene.num_directions,
         "sigma_px": result.sigma_px,
-        "segments": result.fates,
+        "segments": result.outcomes,
         "explanation": result.explanation,
         "warnings": list(result.warnings),
     }

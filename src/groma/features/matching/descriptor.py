@@ -34,8 +34,8 @@ from groma.features.segments import Segments
 Descriptors = npt.NDArray[np.float32]
 BANDS = 9
 DESCRIPTOR_SIZE = 8 * BANDS
-LARGEST_ENTRY = 0.4
-MOST_SAMPLES = 48  # along a segment
+MAX_ENTRY = 0.4
+MAX_SAMPLES = 48  # along a segment
 
 
 # -------------------------------------------------------------------------------------------------------- Kernels
@@ -74,7 +74,7 @@ def _describe_all(gradient_u, gradient_v, ends, band_rows, step, out):
         du, dv = ends[n, 2] - u1, ends[n, 3] - v1
         length = max(math.hypot(du, dv), 1e-9)
         nu, nv = -dv / length, du / length
-        count = min(max(int(length), 4), MOST_SAMPLES)
+        count = min(max(int(length), 4), MAX_SAMPLES)
         for r in range(num_rows):
             offset = (r - 0.5 * (num_rows - 1)) * step
             _row(gradient_u, gradient_v, u1 + offset * nu, v1 + offset * nv, du, dv, count, nu, nv, rows[r])
@@ -138,7 +138,7 @@ def describe(image: npt.NDArray[np.generic], segments: Segments, band_rows: int 
         _describe_all(gradient_u, gradient_v, segments.ends, band_rows, float(scale), raw)
     half = DESCRIPTOR_SIZE // 2
     parts = np.concatenate([_unit(raw[:, :half]), _unit(raw[:, half:])], axis=1)
-    return _unit(np.minimum(_unit(parts), LARGEST_ENTRY)).astype(np.float32)
+    return _unit(np.minimum(_unit(parts), MAX_ENTRY)).astype(np.float32)
 
 
 def _unit(vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

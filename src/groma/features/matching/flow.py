@@ -26,7 +26,7 @@ from groma.features.matches import LineMatches, mutual_best
 from groma.features.segments import Segments
 
 Flow = npt.NDArray[np.float32]
-SMALLEST_IMAGE = 16  # pixels; smaller images give DIS no patch to compare
+MIN_IMAGE = 16  # pixels; smaller images give DIS no patch to compare
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class FlowOptions:
 def dense_flow(image_1: npt.NDArray[np.generic], image_2: npt.NDArray[np.generic]) -> Flow:
     """Dense flow (H, W, 2) in pixels from the first image to the second, which must have the same size."""
     one, two = _pair(image_1, image_2)
-    if min(one.shape) < SMALLEST_IMAGE:
+    if min(one.shape) < MIN_IMAGE:
         return np.zeros((*one.shape, 2), dtype=np.float32)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     found = flow.calc(one, two, None)  # pyright: ignore[reportCallIssue, reportArgumentType]

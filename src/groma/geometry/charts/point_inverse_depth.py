@@ -10,7 +10,7 @@ the rest across it:
 To first order this is :math:`x + \delta`, so factors and normal equations do not change. With k = 1 it is linear in the
 inverse of the distance, as pixels are: a point of small parallax reaches its place, however far, in one or two steps,
 where adding :math:`\delta` needs dozens; and no step takes a point through its anchor to the other side. The distance
-grows at most :data:`LARGEST_GROWTH`-fold in a step. With k = 0 steps are added: that suits points among their cameras,
+grows at most :data:`MAX_GROWTH`-fold in a step. With k = 0 steps are added: that suits points among their cameras,
 which have no common depth.
 
 J. Civera, A. J. Davison, J. M. M. Montiel, *Inverse depth parametrization for monocular SLAM*, T-RO 24, 2008, for the
@@ -29,7 +29,7 @@ from groma.errors import ShapeError
 from groma.geometry.charts.chart import Chart
 
 #: Most that the distance from the anchor grows in one step.
-LARGEST_GROWTH = 10.0
+MAX_GROWTH = 10.0
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -64,7 +64,7 @@ class InverseDepthPoint(Chart):
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move the points by steps (N, 3) in scene units; the anchors stay."""
-        return self._retracted(_retract_all, state, delta, LARGEST_GROWTH)
+        return self._retracted(_retract_all, state, delta, MAX_GROWTH)
 
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         """Increments (N, 3) that lead to the points ``other``; their anchors do not matter.
@@ -79,7 +79,7 @@ class InverseDepthPoint(Chart):
         # along = (1 + (1 - k) a) / (1 - k a), solved for a
         slope = 1.0 - k + k * along
         a = (along - 1.0) / np.where(slope > 0.0, slope, 1.0)
-        reachable = (squared > 1e-200) & (slope > 0.0) & (k * a <= 1.0 - 1.0 / LARGEST_GROWTH) & (k > 0.0)
+        reachable = (squared > 1e-200) & (slope > 0.0) & (k * a <= 1.0 - 1.0 / MAX_GROWTH) & (k > 0.0)
         step = w * (1.0 - k * a)[:, None] - (1.0 - k * a)[:, None] * v
         return np.where(reachable[:, None], step, other[:, :3] - state[:, :3])
 

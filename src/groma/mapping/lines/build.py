@@ -12,7 +12,7 @@ Stages, each on all images before the next begins:
    (:mod:`groma.mapping.lines.texture`); and so are lines that repeat another one beside it
    (:mod:`groma.mapping.lines.duplicates`).
 
-Every segment ends with a :class:`Fate` (:mod:`groma.mapping.lines.rejection`), so that the question why a line is
+Every segment ends with a :class:`Outcome` (:mod:`groma.mapping.lines.outcomes`), so that the question why a line is
 missing has an answer.
 """
 
@@ -29,15 +29,15 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.mapping.lines.consensus import Choice
 from groma.mapping.lines.directions import depth_ratios
-from groma.mapping.lines.duplicates import not_ghosts
+from groma.mapping.lines.duplicates import not_duplicates
 from groma.mapping.lines.kinds import found_again
 from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.lines.matches import MatchProvider, external_matches, flow_matches, wide_baseline_matches
 from groma.mapping.lines.merge import merge_agreeing
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.options import MapLinesOptions
+from groma.mapping.lines.outcomes import UNKNOWN, Outcome
 from groma.mapping.lines.places import choose_places
-from groma.mapping.lines.rejection import UNKNOWN, Fate
 from groma.mapping.lines.texture import edge_odds, num_expected
 from groma.mapping.lines.tracks import Tracks, link
 from groma.mapping.lines.views import LineViews, build_views
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 #: Log odds to be an edge below which a line is dropped: texture with a probability of 95 %.
 TEXTURE_ODDS = float(np.log(0.05 / 0.95))
 #: Segments that no neighbour or geometry lets become part of a line say nothing about others of their kind.
-_IMPOSSIBLE = (Fate.TOO_SHORT, Fate.NO_NEIGHBOR, Fate.DEGENERATE)
+_IMPOSSIBLE = (Outcome.TOO_SHORT, Outcome.NO_NEIGHBOR, Outcome.DEGENERATE)
 
 
 def map_lines(
@@ -111,17 +111,17 @@ def map_lines(
     lap("neighbors")
     views = build_views(scene, segments, options.min_length, options.noise, options.depth_margin)
     lap("views")
-    fate = np.full(len(views.image_idx), UNKNOWN, np.int64)
-    ratios = depth_ratios(scene, segments, views) if options.use_directions else np.zeros((len(fate), 2))
+    outcome = np.full(len(views.image_idx), UNKNOWN, np.int64)
+    ratios = depth_ratios(scene, segments, views) if options.use_directions else np.zeros((len(outcome), 2))
     lap("directions")
-    places = choose_places(scene, views, ratios, neighbors, matches, options, fate, report)
-    fate[~views.usable] = Fate.TOO_SHORT
+    places = choose_places(scene, views, ratios, neighbors, matches, options, outcome, report)
+    outcome[~views.usable] = Outcome.TOO_SHORT
     lap("proposals")
     strength = np.concatenate([np.zeros(0), *(one.strength for one in segments)])
     size = np.column_stack([scene.cameras.width, scene.cameras.height])[scene.images.camera_idx]
-    tracks = _build_tracks(views, strength, size, neighbors, places, options, fate, report)
+    tracks = _build_tracks(views, strength, size, neighbors, places, options, outcome, report)
     lap("tracks")
-    return _result(tracks, neighbors, places, fate, seconds)
+    return _result(tracks, neighbors, places, outcome, seconds)
 
 
 def _build_tracks(
@@ -131,15 +131,15 @@ def _build_tracks(
     neighbors: list[IntArray],
     places: Choice,
     options: MapLinesOptions,
-    fate: IntArray,
+    outcome: IntArray,
     report: Callable[[str, int, int], None],
 ) -> Tracks:
-    """Lines from places; updates the fates."""
+    """Lines from places; updates the outcomes."""
     tracks, sigma = Tracks(views), views.sigma
     center = views.center[views.image_idx]
     safe = np.where(places.found[:, None], places.q, 1.0)
     points = center[:, None] + views.ray / safe[:, :, None]
-    own, left = np.zeros(len(fate), bool), np.zeros(len(fate), bool)
+    own, left = np.zeros(len(outcome), bool), np.zeros(len(outcome), bool)
     for attempt in range(2):
         # The second attempt links what the first left over, for example the smaller part of a group of two lines.
         report("tracks", attempt, 2)
@@ -166,22 +166,24 @@ def _build_tracks(
     merge_agreeing(tracks)
     left[tracks.keep(tracks.num_images() >= 2)] = True
     # Left alone when all others of its line were dropped, or dropped itself; the later word counts for both.
-    fate[left & (tracks.line_of < 0)] = Fate.FEW_IMAGES
-    fate[tracks.dropped & (tracks.line_of < 0)] = Fate.OUTLIER
-    fate[tracks.keep(tracks.num_images() >= options.min_images)] = Fate.FEW_IMAGES
+    outcome[left & (tracks.line_of < 0)] = Outcome.FEW_IMAGES
+    outcome[tracks.dropped & (tracks.line_of < 0)] = Outcome.OUTLIER
+    outcome[tracks.keep(tracks.num_images() >= options.min_images)] = Outcome.FEW_IMAGES
     rows = np.flatnonzero(tracks.line_of >= 0)
     # What was sure stays so when it is joined to another line, whose noise then counts too.
     sure = np.bincount(tracks.line_of[rows], settled[rows], len(tracks.X)) > 0
     sure |= _is_sure(tracks, options)
-    fate[tracks.keep(sure)] = Fate.UNCERTAIN
-    fate[tracks.keep(_not_texture(tracks, strength, sigma, size, neighbors, fate, options))] = Fate.TEXTURE
-    fate[tracks.keep(not_ghosts(tracks, _neighbors_of_neighbors(neighbors), options.min_images))] = Fate.REPEATED
+    outcome[tracks.keep(sure)] = Outcome.UNCERTAIN
+    outcome[tracks.keep(_not_texture(tracks, strength, sigma, size, neighbors, outcome, options))] = Outcome.TEXTURE
+    outcome[tracks.keep(not_duplicates(tracks, _neighbors_of_neighbors(neighbors), options.min_images))] = (
+        Outcome.REPEATED
+    )
     longest = np.zeros(len(tracks.X))
     rows = np.flatnonzero(tracks.line_of >= 0)
     np.maximum.at(longest, tracks.line_of[rows], views.length[rows])
-    fate[tracks.keep(longest >= options.min_longest)] = Fate.SHORT_LINE
+    outcome[tracks.keep(longest >= options.min_longest)] = Outcome.SHORT_LINE
     member = tracks.line_of >= 0
-    fate[member] = np.where(own[member], Fate.MAPPED, Fate.RECOVERED)
+    outcome[member] = np.where(own[member], Outcome.MAPPED, Outcome.RECOVERED)
     return tracks
 
 
@@ -191,14 +193,14 @@ def _not_texture(
     sigma: FloatArray,
     size: IntArray,
     neighbors: list[IntArray],
-    fate: IntArray,
+    outcome: IntArray,
     options: MapLinesOptions,
 ) -> BoolArray:
     """(L,) lines of a kind that is found again, and seen where they should be."""
     if options.min_repeatability <= 0.0 or not len(tracks.X):
         return np.ones(len(tracks.X), bool)
     length = tracks.views.length
-    possible = tracks.views.usable & ~np.isin(fate, _IMPOSSIBLE)
+    possible = tracks.views.usable & ~np.isin(outcome, _IMPOSSIBLE)
     expected = num_expected(tracks, neighbors, size, options.min_length)
     odds = edge_odds(
         (length, strength, sigma), tracks.line_of, possible, tracks.num_images(), expected, options.min_images
@@ -236,7 +238,7 @@ def _distance(tracks: Tracks) -> FloatArray:
 
 
 def _result(
-    tracks: Tracks, neighbors: list[IntArray], places: Choice, fate: IntArray, seconds: dict[str, float]
+    tracks: Tracks, neighbors: list[IntArray], places: Choice, outcome: IntArray, seconds: dict[str, float]
 ) -> LineMap:
     """Collect the result; lines run like most of their segments."""
     views = tracks.views
@@ -262,7 +264,7 @@ def _result(
         num_images=tracks.num_images(),
         median_residual=median,
         uncertainty=tracks.uncertainty,
-        fates=tuple(fate[views.rows(i)] for i in range(len(views.camera))),
+        outcomes=tuple(outcome[views.rows(i)] for i in range(len(views.camera))),
         neighbors=tuple(neighbors),
         assisted={name: int(places.assisted[rows, k].sum()) for k, name in enumerate(("points", "directions"))},
         seconds=seconds,
@@ -270,10 +272,10 @@ def _result(
 
 
 __all__ = [
-    "Fate",
     "LineMap",
     "MapLinesOptions",
     "MatchProvider",
+    "Outcome",
     "explain",
     "external_matches",
     "flow_matches",

@@ -25,7 +25,7 @@ MIN_SHARE = 0.6
 MIN_RATIO = 2
 
 
-def not_ghosts(tracks: Tracks, neighbors: list[IntArray], min_images: int) -> BoolArray:
+def not_duplicates(tracks: Tracks, neighbors: list[IntArray], min_images: int) -> BoolArray:
     """(L,) lines that no other line explains."""
     good, images = np.ones(len(tracks.X), bool), tracks.num_images()
     for reach, ratio in ((REACH, MIN_RATIO), (None, 1.0)):
@@ -43,4 +43,4 @@ def not_ghosts(tracks: Tracks, neighbors: list[IntArray], min_images: int) -> Bo
     return good
 
 
-__all__ = ["not_ghosts"]
+__all__ = ["not_duplicates"]

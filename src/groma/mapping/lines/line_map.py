@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.mapping.lines.rejection import REMEDIES, WORDS, Fate
+from groma.mapping.lines.outcomes import REMEDIES, WORDS, Outcome
 from groma.scene import LineObservations, Lines, Relations, Scene
 
 if TYPE_CHECKING:
@@ -42,8 +42,8 @@ class LineMap:
     median_residual: FloatArray
     #: (L,) largest standard deviation of the end points across the line, scene units.
     uncertainty: FloatArray
-    #: One array per image: the :class:`Fate` of each segment.
-    fates: tuple[IntArray, ...]
+    #: One array per image: the :class:`Outcome` of each segment.
+    outcomes: tuple[IntArray, ...]
     #: One array per image: its neighbours, best first.
     neighbors: tuple[IntArray, ...]
     #: Number of observations whose own proposals include one from known ``points``, or from a point and one of the
@@ -57,10 +57,10 @@ class LineMap:
         """Number of lines."""
         return len(self.lines)
 
-    def fate_counts(self) -> dict[Fate, int]:
-        """Number of segments with each fate."""
-        counts = np.bincount(np.concatenate([*self.fates, np.empty(0, np.int64)]), minlength=len(Fate))
-        return {fate: int(counts[fate]) for fate in Fate}
+    def outcome_counts(self) -> dict[Outcome, int]:
+        """Number of segments with each outcome."""
+        counts = np.bincount(np.concatenate([*self.outcomes, np.empty(0, np.int64)]), minlength=len(Outcome))
+        return {outcome: int(counts[outcome]) for outcome in Outcome}
 
     def add_to(self, scene: Scene, segments: Sequence[Segments]) -> Scene:
         """Return the scene with these lines and their observations in place of its own lines."""
@@ -77,22 +77,22 @@ class LineMap:
 
 def explain(line_map: LineMap) -> str:
     """Say in words how many segments were mapped, where the others were lost, and what would help."""
-    counts = line_map.fate_counts()
+    counts = line_map.outcome_counts()
     total = sum(counts.values())
-    if not line_map.fates:
+    if not line_map.outcomes:
         return "There are no images. Pass a scene with images and poses."
     if total == 0:
         return (
             "No segments were found in any image. The photographs may be blank, blurred or very dark; a smaller least "
             "length (--min-length) finds shorter ones."
         )
-    mapped = counts[Fate.MAPPED] + counts[Fate.RECOVERED]
+    mapped = counts[Outcome.MAPPED] + counts[Outcome.RECOVERED]
     number = f"{line_map.num_lines:,} {'line' if line_map.num_lines == 1 else 'lines'}"
-    head = f"{number} from {mapped:,} of {total:,} segments in {_images(len(line_map.fates))}."
-    lost = sorted(((n, fate) for fate, n in counts.items() if fate > Fate.RECOVERED and n), reverse=True)
+    head = f"{number} from {mapped:,} of {total:,} segments in {_images(len(line_map.outcomes))}."
+    lost = sorted(((n, outcome) for outcome, n in counts.items() if outcome > Outcome.RECOVERED and n), reverse=True)
     if not lost:
         return head
-    parts = [f"{n:,} ({_percent(n, total)}) {WORDS[fate]}" for n, fate in lost[:_NAMED]]
+    parts = [f"{n:,} ({_percent(n, total)}) {WORDS[outcome]}" for n, outcome in lost[:_NAMED]]
     others = sum(n for n, _ in lost[_NAMED:])
     if others:
         parts.append(f"{others:,} ({_percent(others, total)}) were lost for other reasons")

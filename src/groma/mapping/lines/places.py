@@ -17,8 +17,8 @@ from groma.errors import InputError
 from groma.mapping.lines.consensus import Choice, choose
 from groma.mapping.lines.matches import MatchProvider
 from groma.mapping.lines.options import MapLinesOptions
+from groma.mapping.lines.outcomes import UNKNOWN, Outcome
 from groma.mapping.lines.proposals import WEAK, Proposer
-from groma.mapping.lines.rejection import UNKNOWN, Fate
 from groma.mapping.lines.views import LineViews
 from groma.scene import Scene
 
@@ -33,10 +33,10 @@ def choose_places(
     neighbors: list[IntArray],
     matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
     options: MapLinesOptions,
-    fate: IntArray,
+    outcome: IntArray,
     report: Callable[[str, int, int], None],
 ) -> Choice:
-    """The place of every segment of every image; writes the fates of those without one."""
+    """The place of every segment of every image; writes the outcomes of those without one."""
     count = len(views.image_idx)
     places = Choice(
         np.zeros(count, bool),
@@ -53,7 +53,7 @@ def choose_places(
         report("proposals", i, len(neighbors))
         rows = views.rows(i)
         if len(others) == 0:
-            fate[rows] = Fate.NO_NEIGHBOR
+            outcome[rows] = Outcome.NO_NEIGHBOR
             continue
         given = [_given(matches, i, int(j)) for j in others]
         for j, pairs in zip(others, given, strict=True):
@@ -67,9 +67,15 @@ def choose_places(
         places.score[rows], places.rival[rows] = np.where(found, chosen.score, 0.0), chosen.rival
         places.assisted[rows] = found[:, None] & chosen.assisted
         places.supporters[rows, : len(others)] = np.where(found[:, None], chosen.supporters, -1)
-        fate[rows] = np.select(
+        outcome[rows] = np.select(
             [found, ambiguous, proposals.reached > WEAK, proposals.reached == WEAK, proposals.reached < WEAK],
-            [Fate.NOT_LINKED, Fate.AMBIGUOUS, Fate.NO_SUPPORT, Fate.DEGENERATE, Fate.NO_MATCH],
+            [
+                Outcome.NOT_LINKED,
+                Outcome.AMBIGUOUS,
+                Outcome.NO_SUPPORT,
+                Outcome.DEGENERATE,
+                Outcome.NO_MATCH,
+            ],
             UNKNOWN,
         )
     return places

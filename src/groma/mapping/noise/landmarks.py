@@ -23,7 +23,7 @@ from groma.geometry.algebra import apply, dot, norm, perpendicular, ratio, unit
 from groma.scene import Scene
 
 #: Least standard deviation of a measured coordinate, pixels: synthetic scenes may have none.
-_LEAST_SIGMA = 0.02
+_MIN_SIGMA = 0.02
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def _misfit(squares: FloatArray, freedom: IntArray, sigma_px: float | None) -> t
     """Noise of a coordinate, robustly over the landmarks, and each landmark's misfit in units of it."""
     known = freedom > 0
     variance = ratio(squares, freedom.astype(np.float64), known, 0.0)
-    sigma = _LEAST_SIGMA
+    sigma = _MIN_SIGMA
     if sigma_px is not None:
         sigma = sigma_px
     elif known.any():
@@ -179,7 +179,7 @@ def _misfit(squares: FloatArray, freedom: IntArray, sigma_px: float | None) -> t
         cumulated = np.cumsum(freedom[known][order])
         middle = order[np.searchsorted(cumulated, 0.5 * cumulated[-1])]
         sigma = float(np.sqrt(variance[known][middle]))
-    sigma = max(sigma, _LEAST_SIGMA)
+    sigma = max(sigma, _MIN_SIGMA)
     return sigma, np.sqrt(variance) / sigma
 
 

@@ -40,12 +40,12 @@ _MEDIAN = 1.386
 #: Observations of a point that tell its noise from chance, and how many such points tell the noise of all.
 _MANY_VIEWS, _MANY_POINTS = 4, 100
 #: Smallest squared residual, relative to the usual one: its logarithm is taken.
-_LEAST_SQUARE = 1e-4
+_MIN_SQUARE = 1e-4
 #: Half the degrees of freedom lie between these.
 _SHAPES = (0.5, 1e4)
 _STEPS = 20
 #: Beyond this, a correlation of the two ends of segments is not believed.
-_MOST_CORRELATED = 0.8
+_MAX_CORRELATED = 0.8
 
 
 def noise_px(scene: Scene, kind: Literal["points", "lines"], end_correlation: float = 0.0) -> float:
@@ -82,7 +82,7 @@ def line_end_correlation(scene: Scene) -> float:
     if len(first) < _MANY_POINTS:
         return 0.0
     shift, turn = np.median(np.abs(first + second)) ** 2, np.median(np.abs(first - second)) ** 2
-    return float(np.clip((shift - turn) / max(shift + turn, 1e-300), -_MOST_CORRELATED, _MOST_CORRELATED))
+    return float(np.clip((shift - turn) / max(shift + turn, 1e-300), -_MAX_CORRELATED, _MAX_CORRELATED))
 
 
 def moved_px(before: Scene, after: Scene, share: float) -> float:
@@ -119,7 +119,7 @@ def with_point_noise(scene: Scene) -> Scene:
     usual = float(np.median(squares / share)) / _MEDIAN
     if usual < MIN_SIGMA_PX**2:
         return scene
-    squares = np.maximum(squares, _LEAST_SQUARE * usual * share)
+    squares = np.maximum(squares, _MIN_SQUARE * usual * share)
     between, within = _degrees_of_freedom(np.log(squares / share), owner, number)
     variance = np.full(count, usual)
     for _ in range(_STEPS):

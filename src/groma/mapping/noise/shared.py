@@ -30,7 +30,7 @@ _CELLS, _RINGS = 64, (1.0, 2.0, 4.0, 8.0, 16.0)
 #: Fewer observations tell nothing of what they share.
 _FEWEST = 1000
 #: Part of the variance of errors that is left in residuals at least; where there is less, there is no noise.
-_LEAST_SHARE = 0.25
+_MIN_SHARE = 0.25
 #: A covariance must be so many times its own standard deviation.
 _SIGNIFICANT = 3.0
 #: Residuals beyond so many standard deviations are mistakes.
@@ -130,7 +130,7 @@ class _Grid:
 def _covariance(grid: _Grid, cells: IntArray, residual: FloatArray, sigma: FloatArray) -> FloatArray:
     """The shared variance by how far cells lie apart, pixels squared, of the shape of a grid; zero where it is none."""
     # Landmarks follow their observations: residuals are smaller than errors.
-    residual = residual / np.sqrt(max(np.sum(residual**2) / max(residual.size, 1), _LEAST_SHARE))
+    residual = residual / np.sqrt(max(np.sum(residual**2) / max(residual.size, 1), _MIN_SHARE))
     products = np.sum([grid.pairs(grid.sums(cells, along / sigma)) for along in residual.T], axis=0)
     weights = grid.pairs(grid.sums(cells, 1.0 / sigma**2))
     # Without pairs of an observation with itself.

@@ -31,7 +31,7 @@ from groma.mapping.structure import relations as _relations
 from groma.scene import Directions, Planes, Relations, Scene
 
 #: Related lines below which a direction is not one that lines share.
-_FEWEST_PARALLEL = 2
+_MIN_PARALLEL = 2
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def detect_structure(
     along, p_along = _relations.along_directions(
         marks, directions, options.directions.parallel_sigma, level, least_line
     )
-    shared = np.bincount(along[:, 1], minlength=len(directions)) >= _FEWEST_PARALLEL
+    shared = np.bincount(along[:, 1], minlength=len(directions)) >= _MIN_PARALLEL
     directions, new = _only_directions(directions, shared)
     stays_along, along = new[along[:, 1]] >= 0, _renumbered(along, new)
     if not options.points_on_lines:

@@ -25,7 +25,7 @@ from groma.mapping.noise.landmarks import LineNoise, PointNoise
 #: Planes whose normals differ less compete for a landmark, radians. 15 degrees.
 _COMPETING = 0.26
 #: Least half width of the band around a direction, radians. 2 degrees.
-_LEAST_CAP = 0.035
+_MIN_CAP = 0.035
 #: Nearest samples of segments that a point is compared with; least number of samples over all segments, and per
 #: segment on average.
 _NEAREST, _SAMPLES, _PER_SEGMENT = 12, 50_000, 12
@@ -106,7 +106,7 @@ def along_directions(
         spread = np.sqrt(np.linalg.eigvalsh(noise)[:, 1])
         angle = norm(across)
         passing = squared < gate
-        bands[k] = max(_LEAST_CAP, BAND * float(np.median(spread[passing])) if passing.any() else 0.0)
+        bands[k] = max(_MIN_CAP, BAND * float(np.median(spread[passing])) if passing.any() else 0.0)
         near = angle < bands[k]
         tables.append(_with_plane(rows[near], k, angle[near], spread[near], squared[near], gate))
     table = np.concatenate(tables)

@@ -45,7 +45,7 @@ from groma.solver.linear.reduced import Blocks
 from groma.solver.linear.schur import ReducedSystem
 
 #: A scaled variance above this means a direction that the data do not determine.
-LARGEST_VARIANCE = 1e11
+MAX_VARIANCE = 1e11
 #: Relative step of the central differences of functions of variables.
 STEP = 1e-6
 
@@ -159,7 +159,7 @@ class Covariances:
             return None
         inverse = self._fronts.inverse_on_pattern()
         variances = [np.einsum("nii->ni", inverse[c, c][: k.count]) for c, k in enumerate(self._layout.kept)]
-        return inverse if all((part < LARGEST_VARIANCE).all() for part in variances) else None
+        return inverse if all((part < MAX_VARIANCE).all() for part in variances) else None
 
     def _without_open_variables(self, S: Blocks, G: FloatArray, gauge: str) -> Blocks:
         """Hold the variables that the data leave open, and note them and the landmarks they move."""

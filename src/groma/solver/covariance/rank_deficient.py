@@ -24,7 +24,7 @@ from groma.solver.linear.reduced import Blocks
 #: A variable that moves by more than this in a scaled mode of zero cost is loose; this share of the poses may be.
 LOOSE, MAX_LOOSE = 1e-6, 0.2
 #: Modes of zero cost that are sought at most.
-MOST_MODES = 1024
+MAX_MODES = 1024
 
 
 def hold_open_blocks(
@@ -74,7 +74,7 @@ def hold_open_blocks(
 
 def zero_modes(layout: Layout, fronts: Fronts, S: Blocks) -> Modes:
     """Return the smallest modes of a scaled system, so many that not all of them are of zero cost, if that can be."""
-    count, most = MODES, min(MOST_MODES, layout.num_kept_unknowns)
+    count, most = MODES, min(MAX_MODES, layout.num_kept_unknowns)
     modes = smallest(layout, fronts, S, count)
     while modes.num_null == count < most:
         count = min(4 * count, most)

@@ -20,7 +20,7 @@ from groma.solver.linear.reduced import Blocks, multiply
 #: Eigenvalues of the scaled system below this count as zero: rounding reaches about 1e-13.
 NULL_TOLERANCE = 1e-11
 #: Added to the diagonal while modes are sought; raised by tens until the factorisation succeeds.
-SHIFT, LARGEST_SHIFT = 1e-10, 1e-5
+SHIFT, MAX_SHIFT = 1e-10, 1e-5
 MODES, ROUNDS = 16, 4
 
 
@@ -64,7 +64,7 @@ def smallest(layout: Layout, fronts: Fronts, S: Blocks, count: int = MODES) -> M
     shift = SHIFT
     while not fronts.factorize(_shifted(layout, S, shift)):
         shift *= 10.0
-        if shift > LARGEST_SHIFT:  # not a positive matrix at all: a degenerate linearisation
+        if shift > MAX_SHIFT:  # not a positive matrix at all: a degenerate linearisation
             return Modes(np.zeros(0), np.zeros((n, 0)))
     for _ in range(ROUNDS if count < n else 1):
         X = np.linalg.qr(fronts.solve(X))[0]

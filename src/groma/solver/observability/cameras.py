@@ -15,7 +15,7 @@ from groma.solver.observability.inspection import Inspection
 #: its uncertainty this many times the usual.
 LARGE, FEW, FAINT = 3.0, 0.1, 10.0
 #: Cameras with fewer measured numbers than this have few in any case.
-LEAST_NUMBERS = 12
+MIN_NUMBERS = 12
 
 
 def camera_findings(inspection: Inspection, reported: set[tuple[str, int]]) -> list[Finding]:
@@ -28,7 +28,7 @@ def camera_findings(inspection: Inspection, reported: set[tuple[str, int]]) -> l
         rms = np.sqrt(sums / np.maximum(rows, 1))
         usual, typical = float(np.median(rms[seen])), float(np.median(rows[seen]))
         known = np.array([(name, i) in reported for i in range(len(rows))])
-        little = seen & (rows < np.maximum(FEW * typical, LEAST_NUMBERS))
+        little = seen & (rows < np.maximum(FEW * typical, MIN_NUMBERS))
         found = [
             _suspicious(
                 inspection, "camera_residuals", name, seen & (rms > LARGE * usual) & (rms > 1.5),

@@ -15,7 +15,7 @@ import scipy.sparse.linalg
 from groma._typing import BoolArray, FloatArray
 from groma.problem.layout import Layout
 from groma.solver.linear.fronts import Fronts
-from groma.solver.linear.modes import LARGEST_SHIFT, MODES, ROUNDS, SHIFT, Modes, smallest
+from groma.solver.linear.modes import MAX_SHIFT, MODES, ROUNDS, SHIFT, Modes, smallest
 from groma.solver.linear.reduced import Blocks
 
 #: Systems of up to so many unknowns are decomposed completely.
@@ -169,7 +169,7 @@ def _by_iteration(matrix: scipy.sparse.csc_array) -> tuple[FloatArray, FloatArra
             break
         except RuntimeError:  # exactly singular
             shift *= 10.0
-            if shift > LARGEST_SHIFT:
+            if shift > MAX_SHIFT:
                 return np.zeros(0), np.zeros((n, 0))
     for _ in range(ROUNDS):
         X = np.linalg.qr(factors.solve(X))[0]

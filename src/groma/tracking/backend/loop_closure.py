@@ -37,7 +37,7 @@ COMPARED = 25
 #: Strongest features of the new keyframe that vote for older ones.
 VOTERS = 200
 #: Features that must match, and agree on the pose.
-LEAST_MATCHES, LEAST_INLIERS = 60, 35
+MIN_MATCHES, MIN_INLIERS = 60, 35
 #: A keyframe that shares this much with the new one is no loop.
 SHARED = 30
 #: Noise of relative poses: translation (share of the median depth of the map), rotation (radians).
@@ -63,7 +63,7 @@ class LoopSearch:
         out = []
         for k in np.argsort(-votes, kind="stable")[:2]:
             first, second = match_features(self.candidates[k].features, features)
-            if len(first) >= LEAST_MATCHES:
+            if len(first) >= MIN_MATCHES:
                 out.append((self.candidates[k], first, second))
         return out
 
@@ -89,7 +89,7 @@ def close_loop(
     for keyframe, first, second in pairs:
         if not (keyframe.alive and newest.alive):
             continue
-        found = agreeing_pose(track_map, camera, keyframe, newest, first, second, LEAST_INLIERS)
+        found = agreeing_pose(track_map, camera, keyframe, newest, first, second, MIN_INLIERS)
         better = found is not None and (best is None or len(found[1]) > len(best[2]))
         if found is not None and better and _can_be(track_map, keyframe, newest, found[0]):
             best = (keyframe, *found)

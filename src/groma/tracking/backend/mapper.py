@@ -166,7 +166,7 @@ class Mapper:
                     self._close_loop(present, search, search.run())
                 elif self._search is None:
                     self._search = (search, self._pool.submit(search.run))
-        with watch("upkeep"):
+        with watch("culling"):
             drop_unseen(self.map)
             drop_repeating_keyframes(self.map, self._pending.job.keyframes if self._pending else [])
 

@@ -28,15 +28,15 @@ from groma.tracking.map.track_map import TrackMap
 #: Standard deviation of the offset before anything is known, pixels.
 PRIOR_PX = 0.5
 #: Keyframes and measured pairs that an estimate needs.
-LEAST_KEYFRAMES, LEAST_PAIRS = 5, 200
+MIN_KEYFRAMES, MIN_PAIRS = 5, 200
 #: Larger offsets are not a matter of fractions of a pixel, and are left alone.
-LARGEST_PX = 1.5
+MAX_PX = 1.5
 
 
 def estimate_offset(track_map: TrackMap, camera: TrackCamera) -> float:
     """Return by how much columns in the right image are too large, pixels; 0 where the map does not tell."""
     living = track_map.living()
-    if len(living) < LEAST_KEYFRAMES or not camera.baseline > 0:
+    if len(living) < MIN_KEYFRAMES or not camera.baseline > 0:
         return 0.0
     held = np.zeros(len(living), dtype=bool)
     held[0] = True
@@ -45,7 +45,7 @@ def estimate_offset(track_map: TrackMap, camera: TrackCamera) -> float:
         return 0.0
     table, pose = job.point_table, job.point_pose
     rows = np.flatnonzero(np.isfinite(table.right))
-    if len(rows) < LEAST_PAIRS:
+    if len(rows) < MIN_PAIRS:
         return 0.0
     local = np.searchsorted(job.points, table.index)
     single = replace(table, index=local, right=np.full(len(table), np.nan))
@@ -71,7 +71,7 @@ def estimate_offset(track_map: TrackMap, camera: TrackCamera) -> float:
     assert job.solved is not None
     axis = rotation(job.solved.variables["right"].state[0])[:, 2]
     offset = camera.fx * float(axis[0] / axis[2])
-    return offset if abs(offset) < LARGEST_PX else 0.0
+    return offset if abs(offset) < MAX_PX else 0.0
 
 
 def correct_offset(track_map: TrackMap, camera: TrackCamera, offset: float) -> None:

@@ -15,7 +15,7 @@ from groma.scene import Scene
 from groma.scene.landmarks import Lines
 from groma.tracking.backend.loop_closure import (
     COMPARED,
-    LEAST_INLIERS,
+    MIN_INLIERS,
     LoopSearch,
     agreeing_pose,
     join_points,
@@ -69,7 +69,7 @@ def find_joint(
     best: Joint | None = None
     for keyframe, first, second in pairs:
         older = next(k for k, part in enumerate(maps) if keyframe in part.living())
-        found = agreeing_pose(maps[older], camera, keyframe, newest, first, second, LEAST_INLIERS)
+        found = agreeing_pose(maps[older], camera, keyframe, newest, first, second, MIN_INLIERS)
         if found is not None and (best is None or len(found[1]) > len(best.first)):
             pose, first, second = found
             relative = se3.compose(keyframe.pose[None], se3.inverse(pose[None]))[0]

@@ -13,7 +13,7 @@ from groma.io.sequences.frame import Frame
 from groma.tracking.frame.camera import TrackCamera
 
 #: A picture whose grey levels spread less than this shows nothing.
-LEAST_CONTRAST = 4.0
+MIN_CONTRAST = 4.0
 #: A depth image with less than this share of known depths is reported once.
 SPARSE_DEPTH = 0.2
 
@@ -38,7 +38,7 @@ class FrameChecks:
         else:
             small = frame.gray[::8, ::8].astype(np.float32)
             level, contrast = float(small.mean()), float(small.std())
-            if contrast < LEAST_CONTRAST:
+            if contrast < MIN_CONTRAST:
                 reason = "it is black" if level < 60 else "it is overexposed" if level > 200 else "it shows nothing"
             self._last_time = frame.timestamp
             if not reason:

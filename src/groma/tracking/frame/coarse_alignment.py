@@ -21,11 +21,11 @@ SMALL = 64
 #: Steps of the alignment.
 STEPS = 12
 #: Least share of the image that must overlap.
-LEAST_OVERLAP = 0.25
+MIN_OVERLAP = 0.25
 #: Correlation of the surroundings of the points above which a prediction needs no help, and what a turn must gain.
 AGREES, GAIN = 0.8, 0.04
 #: Places that a judgement needs.
-LEAST_PLACES = 8
+MIN_PLACES = 8
 #: Noise of a turn found so, radians.
 TURN_SIGMA = 0.03
 _SmallImage = npt.NDArray[np.float32]
@@ -94,7 +94,7 @@ def _align(K: FloatArray, before: _SmallImage, now: _SmallImage, start: FloatArr
         moved = cv2.warpPerspective(before, homography, (width, height), flags=cv2.INTER_LINEAR)
         both = cv2.warpPerspective(inside, homography, (width, height), flags=cv2.INTER_NEAREST)
         seen = np.asarray(cv2.erode(both, np.ones((3, 3), np.uint8))).ravel() > 0
-        if seen.sum() < LEAST_OVERLAP * seen.size:
+        if seen.sum() < MIN_OVERLAP * seen.size:
             break
         a, b = np.asarray(moved, np.float64).ravel()[seen], now.ravel()[seen].astype(np.float64)
         a, b = a - a.mean(), b - b.mean()
@@ -187,10 +187,10 @@ def turned_prediction(
         moved = pixels + camera.project(into(pose, places)) - camera.project(into(previous, places))
         return surroundings_agree(*small, now.shape, pixels, np.where(np.isfinite(moved), moved, -1e6))
 
-    if len(followed[0]) >= LEAST_PLACES and agree(predicted, *followed)[0] > AGREES:
+    if len(followed[0]) >= MIN_PLACES and agree(predicted, *followed)[0] > AGREES:
         return None
     every = np.concatenate([followed[0], spread[0]]), np.concatenate([followed[1], spread[1]])
-    if len(every[0]) < LEAST_PLACES:
+    if len(every[0]) < MIN_PLACES:
         return None
     expected = agree(predicted, *every)[1]
     turns = [rotation(predicted) @ rotation(previous).T, np.eye(3)]

@@ -20,7 +20,7 @@ DISPARITY_SIGMA = 0.5
 #: Blocks of this width are compared, pixels.
 BLOCK = 13
 #: Largest disparity, as a share of the width of the image.
-LARGEST_SHARE = 0.12
+MAX_SHARE = 0.12
 #: A refined column may be this far from where it was expected, pixels; and this far out of its row.
 MAX_SHIFT, MAX_ROW = 2.5, 1.5
 #: Where to ask for a disparity beside a pixel that has none, nearest first (n, 2), pixels.
@@ -33,7 +33,7 @@ Disparities = npt.NDArray[np.float32]
 
 def dense_disparities(left: GrayImage, right: GrayImage) -> Disparities:
     """Disparities (H, W) in pixels by comparison of blocks; 0 where unknown."""
-    count = 16 * max(1, round(LARGEST_SHARE * left.shape[1] / 16))
+    count = 16 * max(1, round(MAX_SHARE * left.shape[1] / 16))
     if min(left.shape) <= BLOCK or left.shape[1] <= count + BLOCK:
         return np.zeros(left.shape, np.float32)
     matcher = cv2.StereoBM.create(numDisparities=count, blockSize=BLOCK)

@@ -10,7 +10,7 @@ from groma.tracking.map.landmarks import DEAD
 from groma.tracking.map.track_map import Keyframe, TrackMap
 
 #: A point looked for this often in a row and not found is dropped.
-MOST_MISSES = 12
+MAX_MISSES = 12
 #: A keyframe repeats the others if this share of its points is seen by at least this many of them.
 REPEATED, SEEN_BY = 0.85, 3
 #: The newest keyframes are never dropped.
@@ -20,7 +20,7 @@ NEWEST = 4
 def drop_unseen(track_map: TrackMap) -> None:
     """Take out points that were in view many times and not found."""
     points = track_map.points
-    points.state[points.alive & (points.misses > MOST_MISSES)] = DEAD
+    points.state[points.alive & (points.misses > MAX_MISSES)] = DEAD
 
 
 def drop_repeating_keyframes(track_map: TrackMap, busy: list[Keyframe]) -> None:

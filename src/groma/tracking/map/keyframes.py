@@ -30,11 +30,11 @@ SAME_FEATURE = 2.0
 #: Below this share of the wanted points, one camera alone places described features by motion.
 FEW = 0.33
 #: A new line must be longer than this share of its depth, and its direction known to this angle.
-LEAST_LENGTH, LINE_ANGLE = 0.04, 0.15
+MIN_LENGTH, LINE_ANGLE = 0.04, 0.15
 #: A keyframe within this share of the motion that makes a new one stands for it.
 NEARBY = 0.5
 #: Most frames between keyframes while the camera moves.
-MOST_FRAMES = 30
+MAX_FRAMES = 30
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def wants_keyframe(
         return True
     few_lines = options.lines and len(followed.lines.index) < 0.5 * len(last.measured.lines)
     moved = shift > 0.25 * options.keyframe_motion or turn > 0.25 * options.keyframe_turn
-    return moved and (frames_since >= MOST_FRAMES or (few_lines and frames_since >= 5))
+    return moved and (frames_since >= MAX_FRAMES or (few_lines and frames_since >= 5))
 
 
 def keyframe_nearby(track_map: TrackMap, pose: FloatArray, options: TrackOptions) -> Keyframe | None:
@@ -262,7 +262,7 @@ def place_from_depth(track_map, camera, pose, index, ends, detected, rows) -> No
         noise = (sigma * depth**2).max(axis=1)
         in_cam = np.stack([camera.bearings(ends[:, :2]), camera.bearings(ends[:, 2:])], axis=1) * depth[..., None]
         length = np.linalg.norm(in_cam[:, 1] - in_cam[:, 0], axis=1)
-        good = (depth > 0).all(axis=1) & (length > LEAST_LENGTH * depth.mean(axis=1)) & (noise < LINE_ANGLE * length)
+        good = (depth > 0).all(axis=1) & (length > MIN_LENGTH * depth.mean(axis=1)) & (noise < LINE_ANGLE * length)
     _place(track_map, index[good], back(pose, in_cam[good]))
 
 

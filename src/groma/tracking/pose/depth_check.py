@@ -14,7 +14,7 @@ from groma.tracking.frame.features import grid_pixels, grid_shape
 from groma.tracking.map.track_map import Keyframe
 
 #: Depth is asked at so many places at least; this share of them confirms a pose, this share seen through denies it.
-LEAST_PLACES, CONFIRMS, DENIES = 40, 0.8, 0.35
+MIN_PLACES, CONFIRMS, DENIES = 40, 0.8, 0.35
 #: Two depths agree to this share and so many standard deviations.
 DEPTH_SHARE, DEPTH_GATE = 0.04, 3.0
 #: Depth is read between places of the grid that differ by less than this share.
@@ -50,7 +50,7 @@ def depth_agreement(
     rows = camera.inside(pixel)
     measured, expected = _read(camera, grid, pixel[rows]), in_cam[rows, 2]
     known = np.isfinite(measured)
-    if known.sum() < LEAST_PLACES:
+    if known.sum() < MIN_PLACES:
         return np.nan, np.nan
     measured, expected = measured[known], expected[known]
     tolerance = DEPTH_SHARE * measured + DEPTH_GATE * depth_sigma(measured)

@@ -25,9 +25,9 @@ from groma.tracking.map.triangulation import triangulate
 from groma.tracking.options import TrackOptions
 
 #: Landmarks with depth that a first frame must have.
-LEAST_KNOWN = 15
+MIN_KNOWN = 15
 #: Two frames: median displacement (share of the image width), points placed, and their median parallax (radians).
-LEAST_DISPLACEMENT, LEAST_POINTS, LEAST_PARALLAX = 0.02, 60, 0.02
+MIN_DISPLACEMENT, MIN_POINTS, MIN_PARALLAX = 0.02, 60, 0.02
 IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
 
@@ -52,7 +52,7 @@ class Initialiser:
                 known += 2 * int(np.isfinite(data.detected.inverse_depth).all(axis=1).sum())
             if data.planes is not None:
                 known += 5 * len(data.planes)
-            if known < LEAST_KNOWN:
+            if known < MIN_KNOWN:
                 return None
             self._first = data
             return IDENTITY[None]
@@ -62,10 +62,10 @@ class Initialiser:
         assert self._before is not None
         pixel, good = follow(self._before.gray, data.gray, self._pixel)
         self._start, self._pixel, self._before = self._start[good], pixel[good], data
-        if len(self._pixel) < LEAST_POINTS:
+        if len(self._pixel) < MIN_POINTS:
             return self._restart(data)
         away = float(np.median(np.linalg.norm(self._pixel - self._start, axis=1)))
-        if away < LEAST_DISPLACEMENT * self._camera.width:
+        if away < MIN_DISPLACEMENT * self._camera.width:
             return None
         pose = self._relative_pose()
         if pose is None:
@@ -84,19 +84,19 @@ class Initialiser:
         if E is None or E.shape != (3, 3):
             return None
         count, R, t, mask = cv2.recoverPose(E, one, two, K, mask=mask)
-        if count < LEAST_POINTS or count < 0.6 * len(one):
+        if count < MIN_POINTS or count < 0.6 * len(one):
             return None
         pose = np.concatenate([quaternion.from_matrix(np.asarray(R, np.float64)), np.asarray(t, np.float64).ravel()])
         first = np.tile(IDENTITY, (len(one), 1))
         places, good = triangulate(self._camera, first, self._start, pose, self._pixel, 0.01)
-        if good.sum() < LEAST_POINTS:
+        if good.sum() < MIN_POINTS:
             return None
         ray1 = places[good] / np.linalg.norm(places[good], axis=1, keepdims=True)
         center = se3.inverse(pose[None])[0, 4:]
         ray2 = places[good] - center
         ray2 /= np.linalg.norm(ray2, axis=1, keepdims=True)
         parallax = np.arccos(np.clip((ray1 * ray2).sum(axis=1), -1, 1))
-        if np.median(parallax) < LEAST_PARALLAX:
+        if np.median(parallax) < MIN_PARALLAX:
             return None
         pose[4:] /= float(np.median(places[good, 2]))
         return pose

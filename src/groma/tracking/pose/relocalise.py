@@ -38,7 +38,7 @@ SEARCH = 0.07
 #: A pose with this score needs no further proposals.
 STRONG = 70.0
 #: Poses refined at most; one that starts near an earlier result (share of its median depth, radians) is left out.
-MOST_REFINED, SAME_SHARE, SAME_TURN = 4, 0.01, 0.006
+MAX_REFINED, SAME_SHARE, SAME_TURN = 4, 0.01, 0.006
 #: Agreements that a line and a plane count for, in points.
 LINE_WEIGHT, PLANE_WEIGHT = 2.0, 6.0
 
@@ -198,7 +198,7 @@ class _Search:
             + PLANE_WEIGHT * (len(assign_planes(planes, seen, start, 0.15, 0.12)[0]) if seen else 0)
             for start in starts
         ]
-        for k in np.argsort(-np.array(judged), kind="stable")[:MOST_REFINED]:
+        for k in np.argsort(-np.array(judged), kind="stable")[:MAX_REFINED]:
             if self._is_known(starts[k]):
                 continue
             found = self._refine(starts[k])

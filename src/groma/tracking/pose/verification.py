@@ -23,16 +23,16 @@ from groma.tracking.pose.relocalise import LINE_WEIGHT, PLANE_WEIGHT, Found, fin
 #: Keyframes that are tried first, and at most, to find a lost frame.
 NEAREST, MOST = 3, 30
 #: Least number of agreeing measurements (a line counts twice, a plane six times), and least share.
-LEAST_SCORE, LEAST_SHARE = 18.0, 0.35
+MIN_SCORE, MIN_SHARE = 18.0, 0.35
 #: Least share of what the last keyframe measured.
-LEAST_KEPT = 0.12
+MIN_KEPT = 0.12
 #: Least number of agreeing points and lines (counted twice), where either is followed at all; this share of it for a
 #: pose found by features.
-LEAST_EVIDENCE, FOUND_SHARE = 16.0, 0.75
+MIN_EVIDENCE, FOUND_SHARE = 16.0, 0.75
 #: The same where depth confirms a pose, and the share of what was looked at that must then agree.
 CONFIRMED_EVIDENCE, CONFIRMED_SHARE = 6.0, 0.6
 #: A pose found by features needs this score, or this share of the features in view.
-CERTAIN, LEAST_AGREEING = 40.0, 0.03
+CERTAIN, MIN_AGREEING = 40.0, 0.03
 #: A pose found without a prediction needs this score; less where no points are followed. Above the second, no other
 #: keyframe is tried.
 ANYWHERE_SCORE, ENOUGH_SCORE = 36.0, 120.0
@@ -53,12 +53,12 @@ def evidence(counts: dict[str, int]) -> float:
     return counts["points"] + LINE_WEIGHT * counts["lines"]
 
 
-class Belief:
+class PoseVerification:
     """What is asked of a pose, in a track with some options."""
 
     def __init__(self, camera: TrackCamera, options: TrackOptions) -> None:
         self.camera, self.options = camera, options
-        self._least_evidence = LEAST_EVIDENCE if options.points or options.lines else 0.0
+        self._least_evidence = MIN_EVIDENCE if options.points or options.lines else 0.0
 
     def trusts(self, track_map: TrackMap, data: FrameFeatures, estimate: PoseEstimate) -> bool:
         """Whether enough agrees with the pose of a frame that was followed; depth decides where that is not much."""
@@ -66,8 +66,8 @@ class Belief:
         score = score_of(estimate)
         if len(estimate.planes) >= 2 and 2 * counts["planes"] <= len(estimate.planes) and score < DOUBTFUL_SCORE:
             return False
-        enough = score >= LEAST_SCORE and evidence(counts) >= self._least_evidence
-        if not enough or not _keeps(track_map, estimate) or _share(estimate) < LEAST_SHARE or len(estimate.weak) == 6:
+        enough = score >= MIN_SCORE and evidence(counts) >= self._least_evidence
+        if not enough or not _keeps(track_map, estimate) or _share(estimate) < MIN_SHARE or len(estimate.weak) == 6:
             return False
         return score >= DOUBTFUL_SCORE or not self._contradicted([track_map.near], data, estimate)
 
@@ -111,10 +111,10 @@ class Belief:
         if found is None or not is_near(found.estimate.pose, predicted, prior_sigma) or self._denied(data, found):
             return None
         # Rooms are alike at both ends, in depth too: of the features in view some must agree.
-        if not (found.score >= CERTAIN or found.share >= LEAST_AGREEING or not self.options.points):
+        if not (found.score >= CERTAIN or found.share >= MIN_AGREEING or not self.options.points):
             return None
         enough = evidence(found.estimate.counts) >= FOUND_SHARE * self._least_evidence
-        if enough and found.score >= LEAST_SCORE and len(found.estimate.weak) <= 2:
+        if enough and found.score >= MIN_SCORE and len(found.estimate.weak) <= 2:
             return found
         return found if self._confirmed(nearest, data, found.estimate) else None
 
@@ -157,7 +157,7 @@ def is_near(pose: FloatArray, predicted: FloatArray, sigma: FloatArray, gate: fl
 def _keeps(track_map: TrackMap, estimate: PoseEstimate) -> bool:
     """Whether enough is left of what the last keyframe measured."""
     before = track_map.near.measured
-    return estimate.counts["points"] + estimate.counts["lines"] >= LEAST_KEPT * (len(before.points) + len(before.lines))
+    return estimate.counts["points"] + estimate.counts["lines"] >= MIN_KEPT * (len(before.points) + len(before.lines))
 
 
 def _share(estimate: PoseEstimate) -> float:
@@ -166,4 +166,4 @@ def _share(estimate: PoseEstimate) -> float:
     return (estimate.counts["points"] + estimate.counts["lines"]) / looked_at if looked_at else 1.0
 
 
-__all__ = ["Belief", "evidence", "is_near", "score_of"]
+__all__ = ["PoseVerification", "evidence", "is_near", "score_of"]

@@ -62,7 +62,7 @@ def write_report(
     images: ImageFiles | None = None,
     title: str = "Adjustment",
     *,
-    fates: Mapping[str, int] | None = None,
+    outcomes: Mapping[str, int] | None = None,
     explanation: str = "",
     warnings: Sequence[str] | None = None,
     diagnosis: Mapping[str, Any] | None = None,
@@ -84,7 +84,7 @@ def write_report(
         embedded, and made smaller the more there are.
     title
         Heading of the page.
-    fates
+    outcomes
         Numbers of segments by what became of them, of a map.
     explanation
         The same in words.
@@ -127,7 +127,7 @@ def write_report(
         "WARNINGS": "".join(f'<p class="warning">{html.escape(text)}</p>' for text in sentences),
         "CHARTS": cards
         + _page_tables.diagnosis_card(diagnosis)
-        + _page_tables.chart_cards(scene_after, before, after, history, _stages(numbers), fates, explanation),
+        + _page_tables.chart_cards(scene_after, before, after, history, _stages(numbers), outcomes, explanation),
         "TABLES": _page_tables.number_tables(scene_after, before, after, numbers),
         "FOOTER": _footer(),
         "DATA": script_json({**scene_data(scenes, states), **image_data(scene_after, states, images)}),

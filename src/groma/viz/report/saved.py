@@ -42,7 +42,7 @@ class SavedReport:
         return SavedTermination(str(self.numbers["termination_sentence"]))
 
     @property
-    def fates(self) -> Mapping[str, int] | None:
+    def outcomes(self) -> Mapping[str, int] | None:
         """Numbers of segments by what became of them; None where there were none."""
         return self.numbers.get("segments")
 

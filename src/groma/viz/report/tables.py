@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MAX_LISTED_PLANES = 15
 MAX_LISTED_DIRECTIONS = 8
 #: What became of a segment, in words, and in which colour; the rest of the stages follow in greys.
-_FATES = {
+_OUTCOMES = {
     "mapped": ("observes a line", "var(--line)"),
     "recovered": ("found by projecting a line", "#8fcf9f"),
     "too_short": ("too short", "#b9bdc4"),
@@ -90,7 +90,7 @@ def chart_cards(
     after: Drawable,
     history: Sequence[Any] | None,
     stages: Sequence[Mapping[str, Any]],
-    fates: Mapping[str, int] | None,
+    outcomes: Mapping[str, int] | None,
     explanation: str,
 ) -> str:
     """Return the charts, each in a card: residuals by kind, convergence, images, tracks, what became of segments."""
@@ -123,10 +123,10 @@ def chart_cards(
         )
         cards.append(("Tracks", f"In how many images landmarks are observed. {text}", _charts.tracks(lengths)))
     made = "".join(card(name, caption, chart) for name, caption, chart in cards)
-    if fates and sum(fates.values()):
-        parts = [(*_FATES.get(name, (name.replace("_", " "), "#a0a4aa")), count) for name, count in fates.items()]
+    if outcomes and sum(outcomes.values()):
+        parts = [(*_OUTCOMES.get(name, (name.replace("_", " "), "#a0a4aa")), count) for name, count in outcomes.items()]
         chart = _charts.shares([(text, count, colour) for text, colour, count in parts])
-        caption = html.escape(explanation) or f"{sum(fates.values()):,} were found in the images."
+        caption = html.escape(explanation) or f"{sum(outcomes.values()):,} were found in the images."
         made += card("What became of the segments", caption, chart)
     return made
 

@@ -38,7 +38,7 @@ EVERY = 0.5
 QUIET = 20.0
 WAITING, RUNNING, FINISHED = "waiting", "running", "finished"
 _PATH, _NOW, _KEYFRAMES, _POINTS, _LINES = (40, 110, 220), (230, 60, 40), (120, 126, 134), (96, 104, 116), (20, 130, 90)
-_MOST_CAMERAS = 200
+_MAX_CAMERAS = 200
 
 
 class LiveView:
@@ -126,7 +126,7 @@ class LiveView:
             )  # fmt: skip
             self._segments("/lines", scene.lines.segments.astype(np.float32), _LINES, 2.0)
             self.server.scene.remove_by_name("/keyframes")
-            for row in thin(len(world), _MOST_CAMERAS):
+            for row in thin(len(world), _MAX_CAMERAS):
                 self._camera(f"/keyframes/{row}", world[row], _KEYFRAMES, 1.0)
             self._draw_planes(scene)
         if not self._placed:

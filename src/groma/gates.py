@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where the tuned numbers of groma are: fields of frozen dataclasses, each with its unit, meaning and origin.
+
+A class of gates stands in the file whose decisions it makes, or in ``gates.py`` of its room, and its name ends in
+``Gates``. Functions take an instance as an argument with a default, so that a number can be changed without editing
+code, and the page of thresholds in the documentation is made from the classes::
+
+    @dataclass(frozen=True)
+    class FollowingGates:
+        '''Which measurements of a frame agree with its pose.'''
+
+        max_residual: float = gate(3.5, "sigma", "largest residual of a coordinate", "derived from a normal noise model: "
+                                   "exceeded by chance once in 2 000 coordinates")
+
+Where there is a noise model a gate is a quantile at a stated probability (:func:`chi_square_gate`), not a number of
+pixels. Options that a user is meant to change stay in the ``...Options`` classes; numerical guards stay in kernels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import field, fields, is_dataclass
+from functools import lru_cache
+from typing import Any
+
+#: How the origin of a number may begin.
+ORIGINS = ("derived from", "chosen on", "convention:", "cost:")
+
+
+def gate(default: Any, unit: str, meaning: str, origin: str) -> Any:
+    """Declare a tuned number as a field of a frozen dataclass.
+
+    Parameters
+    ----------
+    default
+        The number, or a tuple of numbers.
+    unit
+        For example ``px``, ``rad``, ``sigma``, ``images``, ``share``, ``scene units``, or ``1`` for a ratio.
+    meaning
+        What it decides, as a phrase.
+    origin
+        Begins with one of :data:`ORIGINS`: *derived from* a model, *chosen on* named scenes, a *convention:* of the
+        field, or a bound on *cost:* that no result depends on.
+    """
+    return field(default=default, metadata={"unit": unit, "meaning": meaning, "origin": origin})
+
+
+def is_gate_class(value: object) -> bool:
+    """Whether a value is a class of gates."""
+    return isinstance(value, type) and is_dataclass(value) and value.__name__.endswith("Gates")
+
+
+def table(gates: type) -> list[tuple[str, Any, str, str, str]]:
+    """Return name, number, unit, meaning and origin of every gate of a class."""
+    return [
+        (item.name, item.default, item.metadata["unit"], item.metadata["meaning"], item.metadata["origin"])
+        for item in fields(gates)
+    ]
+
+
+@lru_cache(maxsize=64)
+def chi_square_gate(probability: float, dof: int) -> float:
+    r"""Return the squared normalised residual that noise exceeds with the given probability.
+
+    .. math:: P(\chi^2_{\text{dof}} > \text{gate}) = \text{probability}
+    """
+    from scipy.special import chdtri
+
+    return float(chdtri(dof, probability))
+
+
+__all__ = ["ORIGINS", "chi_square_gate", "gate", "is_gate_class", "table"]
