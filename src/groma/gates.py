@@ -9,8 +9,9 @@ code, and the page of thresholds in the documentation is made from the classes::
     class FollowingGates:
         '''Which measurements of a frame agree with its pose.'''
 
-        max_residual: float = gate(3.5, "sigma", "largest residual of a coordinate", "derived from a normal noise model: "
-                                   "exceeded by chance once in 2 000 coordinates")
+        max_residual: float = gate(
+            3.5, "sigma", "largest residual of a coordinate", "derived from normal noise: exceeded once in 2 000"
+        )
 
 Where there is a noise model a gate is a quantile at a stated probability (:func:`chi_square_gate`), not a number of
 pixels. Options that a user is meant to change stay in the ``...Options`` classes; numerical guards stay in kernels.
