@@ -19,8 +19,9 @@ from groma.problem.gauge import world_motions
 from groma.problem.lay_out import lay_out
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
+from groma.solver.covariance import quantities
 from groma.solver.covariance.datum import unmoved
-from groma.solver.covariance.marginals import Covariances, quantities
+from groma.solver.covariance.marginals import Covariances
 from groma.solver.linear.fronts import Fronts
 from groma.solver.linear.reduced import Dense
 from groma.solver.options import SolverOptions

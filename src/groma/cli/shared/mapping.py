@@ -73,7 +73,7 @@ def map_and_write(
     truth : Scene, optional
         With ``contributions``: poses to compare with.
     """
-    from groma.adjustment.contributions import contributions as find_contributions
+    from groma.adjustment import contributions as find_contributions
     from groma.cli.shared.contributions import describe_contributions
     from groma.cli.shared.diagnosis import diagnosis_of, say_diagnosis
     from groma.cli.shared.interrupt import interruptible
