@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from problems import scene_problem
 
+import groma.solver.reduce.shards as shards_module
 from groma.errors import ProblemError
 from groma.factors.contract import Ref
+from groma.factors.losses import Cauchy
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
 from groma.solver.reduce.shards import Shard, solve_shards
@@ -148,6 +150,17 @@ def test_says_what_is_wrong_with_shards():
         solve_shards(problem.variables, [*shards, shards[0]])
     with pytest.raises(ProblemError, match="names the group 'trees'"):
         solve_shards(problem.variables, [Shard({"trees": slice(0, 1)}, list)])
+
+
+def test_steps_are_longer_under_a_robust_loss(monkeypatch):
+    """Reweighted least squares overestimates the curvature; a step learns that from the one before."""
+    problem = scene_problem(num_cameras=6, num_points=80, loss=Cauchy(1.0))
+    long = solve_shards(problem.variables, cut(problem, 3), TIGHT).report
+    monkeypatch.setattr(shards_module, "MAX_STRETCH", 1.0)
+    short = solve_shards(problem.variables, cut(problem, 3), TIGHT).report
+    visits = [sum(1 if record.accepted else 2 for record in report.history) for report in (long, short)]
+    assert visits[0] < 0.7 * visits[1]
+    np.testing.assert_allclose(long.final_cost, short.final_cost, rtol=1e-4)
 
 
 class Together:

