@@ -12,7 +12,8 @@ from groma.scene import synthetic
 from groma.solver.options import SolverOptions
 
 pytestmark = pytest.mark.kernels
-OPTIONS = SolverOptions(function_tolerance=1e-10, threads=1)
+#: The loop stops when the next step is foreseen not to matter; poses are compared to more digits than the cost needs.
+OPTIONS = SolverOptions(function_tolerance=1e-12, threads=1)
 
 
 @pytest.fixture
