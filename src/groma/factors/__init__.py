@@ -19,6 +19,7 @@ from groma.factors.losses import (
     Truncated,
     Tukey,
     loss,
+    register_loss,
 )
 from groma.factors.observations.line_bearing import LineBearing
 from groma.factors.observations.line_normal import LineNormal
@@ -113,6 +114,7 @@ __all__ = [
     "factor",
     "loss",
     "register",
+    "register_loss",
     "registered",
     "selfcheck",
 ]
