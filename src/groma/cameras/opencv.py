@@ -263,9 +263,7 @@ OPENCV = register_camera(
     opencv_unproject,
 )
 FULL_OPENCV = register_camera(
-    CameraModel(
-        "FULL_OPENCV", (*_EIGHT, "k3", "k4", "k5", "k6"), (0, 1), (2, 3), tuple(range(4, 12)), "FULL_OPENCV"
-    ),
+    CameraModel("FULL_OPENCV", (*_EIGHT, "k3", "k4", "k5", "k6"), (0, 1), (2, 3), tuple(range(4, 12)), "FULL_OPENCV"),
     full_opencv_project,
     full_opencv_project_jacobian,
     full_opencv_unproject,

@@ -228,7 +228,9 @@ def register_loss(name: str, derivatives: LossKernel) -> Callable[[_L], _L]:
     def decorate(cls: _L) -> _L:
         known = _LOSSES.get(name, cls)
         if known.__module__ != cls.__module__ or name == "none":
-            raise InputError(f"A loss named {name!r} is registered already, by {known.__module__}. Choose another name.")
+            raise InputError(
+                f"A loss named {name!r} is registered already, by {known.__module__}. Choose another name."
+            )
         cls.name, cls.number = name, next(_NUMBERS)
         _DERIVATIVES[cls.number + 1] = derivatives
         _LOSSES[name] = cls

@@ -18,7 +18,7 @@ from groma.geometry.manifold import Euclidean
 
 register_chart(Euclidean(3, "point"))
 register_chart(InverseDepthPoint)
-#: Charts of points by name: moved by addition, or linear in the inverse of the distance from an anchor; registered ones.
+#: Charts of points by name: moved by addition, linear in the inverse of the distance from an anchor, registered ones.
 POINT_CHARTS = charts_of("point")
 
 
