@@ -44,6 +44,7 @@ import numpy as np
 from numba.extending import overload
 
 from groma._numba import exact_kernel, kernel, loop
+from groma._numba_digest import ByLength
 from groma._typing import FloatArray
 from groma.errors import InputError
 
@@ -54,8 +55,9 @@ LossKernel = Callable[[tuple[float, ...], float], tuple[float, float, float]]
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
-#: Kernels by length of the tag; filled by :func:`register_loss`.
-_DERIVATIVES: dict[int, LossKernel] = {}
+#: Kernels by length of the tag; filled by :func:`register_loss`. Compiled code on disk depends on the kernels that it was
+#: compiled with, so a number may mean another loss in another process.
+_DERIVATIVES: ByLength[LossKernel] = ByLength()
 
 
 def loss_derivatives(loss_tag, parameters, s):
