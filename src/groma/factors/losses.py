@@ -55,8 +55,8 @@ LossKernel = Callable[[tuple[float, ...], float], tuple[float, float, float]]
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
-#: Kernels by length of the tag; filled by :func:`register_loss`. Compiled code on disk depends on the kernels that it was
-#: compiled with, so a number may mean another loss in another process.
+#: Kernels by length of the tag; filled by :func:`register_loss`. Compiled code on disk depends on the kernels that it
+#: was compiled with, so a number may mean another loss in another process.
 _DERIVATIVES: ByLength[LossKernel] = ByLength()
 
 
