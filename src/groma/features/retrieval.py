@@ -56,7 +56,7 @@ class GradientRetrieval:
 
     def similarity(self, query: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
         """Cosine of descriptions, (N,) between 0 and 1."""
-        return np.asarray(others, np.float64).reshape(len(others), -1) @ query
+        return np.asarray(others, np.float64).reshape(len(others), len(query)) @ query
 
 
 def most_similar(retrieval: ImageRetrieval, query: Any, others: Sequence[Any], count: int) -> IntArray:

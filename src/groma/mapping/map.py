@@ -27,8 +27,8 @@ from pathlib import Path
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, AdjustReport, adjust
 from groma.errors import InputError
-from groma.features.external import ExternalMatches
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
+from groma.features.external import ExternalMatches
 from groma.features.matches import LineMatches
 from groma.features.registry import DETECTORS
 from groma.features.segments import Segments

@@ -44,7 +44,7 @@ def map_(
         typer.Option(
             "--line-matcher",
             metavar="NAME",
-            help="Match segments by wide_baseline, flow, or a matcher of an installed package. Default: by poses alone.",
+            help="Match segments by wide_baseline, flow, or a matcher of an installed package. Default: poses alone.",
         ),
     ] = None,
     min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
