@@ -29,7 +29,8 @@ def adjust(
         str,
         typer.Option(
             metavar="NAME",
-            help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron or truncated. auto: robust "
+            help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron, truncated, or one of an installed "
+            "package. auto: robust "
             "(Cauchy, then Geman-McClure) for what comes from matching, none for BAL files.",
         ),
     ] = "auto",
