@@ -60,10 +60,9 @@ def check_detector(detector: SegmentDetector) -> None:
     _require(np.array_equal(found.ends, again.ends), name, "the same image gives other segments the second time")
     finite = bool(np.isfinite(found.ends).all() and np.isfinite(found.sigma).all())
     _require(finite and bool((found.sigma > 0.0).all()), name, "end points and sigma must be finite, sigma positive")
-    distance = _distances(found.ends, _edges())
-    hit = (distance < 1.0).any(axis=0)
+    near = _distances(found.ends, _edges()) < 1.0
+    hit, on_edge = np.any(near, axis=0), np.any(near, axis=1)
     _require(hit.mean() >= 0.5, name, f"only {hit.sum()} of {len(hit)} edges are found; first pixel's centre at 0.5?")
-    on_edge = (distance < 1.0).any(axis=1)
     _require(on_edge.mean() >= 0.9, name, f"{(~on_edge).sum()} of {len(found)} segments lie on no edge")
     darker = _left_is_darker(image, found.ends[on_edge])
     _require(darker.mean() >= 0.9, name, "the darker side must lie to the left of the way from first to second end")

@@ -44,7 +44,7 @@ class SceneFormat:
     #: only if the third argument is true. Where ``keeps_structures``, a fourth is what :func:`write_scene` calls like.
     write: Callable[..., None] | None = None
     #: Raises InputError if the format cannot hold a scene.
-    check: Callable[[Scene], None] | None = None
+    check: Callable[[Scene], object] | None = None
     #: Whether ``write`` takes the LIMAP structures that the scene came from.
     keeps_structures: bool = False
 

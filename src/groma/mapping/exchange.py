@@ -104,7 +104,7 @@ def similar_neighbors(
     for i, query in enumerate(described):
         known = shared[i] if shared else np.zeros(0, np.int64)
         ranked = most_similar(retrieval, query, described, len(described))
-        new = ranked[~np.isin(ranked, [i, *known])]
+        new = ranked[~np.isin(ranked, np.append(known, i))]
         neighbors.append(np.concatenate([known, new])[:num_neighbors].astype(np.int64))
     return neighbors
 
