@@ -2,7 +2,7 @@
 """``groma adjust``: bundle adjustment of a COLMAP model, a BAL file or a groma archive; of a pose graph, too."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -10,7 +10,14 @@ from groma.cli.shared import options as _options
 from groma.cli.shared.adjusting import CovarianceGauge, Wanted, adjust_and_write
 from groma.errors import InputError
 
-LinearSolver = Literal["auto", "dense", "sparse", "pcg"]
+
+def _linear_solver(name: str) -> str:
+    """Return the name of a linear solver that is registered."""
+    from groma.solver.linear.choice import linear_solver_names
+
+    if name not in linear_solver_names():
+        raise typer.BadParameter(f"{name!r} is not one of {', '.join(linear_solver_names())}.")
+    return name
 
 
 def adjust(
@@ -57,7 +64,14 @@ def adjust(
     max_iterations: Annotated[
         int | None, typer.Option(min=0, metavar="N", help="Stop after N steps. Default: 50, for pose graphs 100.")
     ] = None,
-    linear_solver: Annotated[LinearSolver, typer.Option(help="How each step is solved.")] = "auto",
+    linear_solver: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            callback=_linear_solver,
+            help="How each step is solved: auto, dense, sparse, pcg, or a solver that was registered.",
+        ),
+    ] = "auto",
     line_chart: Annotated[
         str | None,
         typer.Option(
