@@ -247,7 +247,7 @@ def test_a_full_disk_ends_the_command_in_one_line_and_loses_nothing(tmp_path, co
 
     command += ["--model", str(images.parent / "model.npz"), "--no-planes"]
     with monkeypatch.context() as patch:  # while the results are written
-        patch.setattr("groma.viz.report.page.write_report", full)
+        patch.setattr("groma.mapping.result.write_report", full)
         assert run(command) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1

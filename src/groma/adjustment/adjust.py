@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +36,11 @@ from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
 from groma.solver.solve import solve
 from groma.solver.termination import Termination
+
+if TYPE_CHECKING:
+    from groma.adjustment.contributions import Contribution
+    from groma.adjustment.uncertainty import SceneUncertainty
+    from groma.solver.observability.diagnosis import Diagnosis
 
 #: The default for what comes from matching: first a loss that pulls from afar, then one that ignores what stayed far.
 #: Losses by name and scale in pixels; see the page *How to choose* for the measurements behind them.
@@ -202,6 +207,24 @@ class AdjustResult:
     report: AdjustReport
     #: The problem at its solution, for covariances and diagnosis; None in a result read from a file.
     problem: Problem | None = None
+
+    def diagnose(self) -> Diagnosis:
+        """Say in words what the observations determine, at the noise and with the loss of the adjustment."""
+        from groma.adjustment.diagnosis import diagnose_scene
+
+        return diagnose_scene(self.scene, problem=self.problem)
+
+    def uncertainty(self, gauge: str = "auto", sigma0: float = 1.0) -> SceneUncertainty:
+        """Return the covariances of the scene: :func:`groma.uncertainty` of the problem that was solved."""
+        from groma.adjustment.uncertainty import uncertainty
+
+        return uncertainty(self.scene, gauge=gauge, sigma0=sigma0, problem=self.problem)
+
+    def summary(self, diagnosis: Diagnosis | None = None, contributions: Sequence[Contribution] = ()) -> dict[str, Any]:
+        """Return all numbers as plain values, as ``groma adjust --json`` writes them."""
+        from groma.adjustment.summary import summarize
+
+        return summarize(self.report, diagnosis, contributions)
 
 
 def adjust(
