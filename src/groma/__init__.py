@@ -32,12 +32,13 @@ if TYPE_CHECKING:
         tracking,
         viz,
     )
-    from groma.adjustment.adjust import AdjustOptions, AdjustResult, adjust
+    from groma.adjustment.adjust import AdjustOptions, adjust
     from groma.adjustment.contributions import contributions
     from groma.adjustment.covariance_files import write_covariances
     from groma.adjustment.diagnosis import diagnose_scene as diagnose
     from groma.adjustment.parts import adjust_parts, write_parts
     from groma.adjustment.pose_graph import PoseGraphOptions, PoseGraphResult, adjust_pose_graph
+    from groma.adjustment.report import AdjustResult
     from groma.adjustment.uncertainty import uncertainty
     from groma.errors import FileFormatError, GromaError, InputError, OutputError, ProblemError, ShapeError
     from groma.evaluation.lines import evaluate_lines
@@ -73,7 +74,7 @@ if TYPE_CHECKING:
 #: above the only place to touch when one is added.
 _HOME = {
     "AdjustOptions": "groma.adjustment.adjust",
-    "AdjustResult": "groma.adjustment.adjust",
+    "AdjustResult": "groma.adjustment.report",
     "FileFormatError": "groma.errors",
     "GromaError": "groma.errors",
     "InputError": "groma.errors",

@@ -13,7 +13,7 @@ import groma
 from groma import _numba_cache
 from groma._counted import counted
 from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
-from groma.adjustment.summary import why_steps_ran_out
+from groma.adjustment.report import why_steps_ran_out
 from groma.cli.main import run
 from groma.cli.shared.compilation import Compilation, compilation_time, spent
 from groma.errors import ProblemError

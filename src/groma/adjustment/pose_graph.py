@@ -20,7 +20,7 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.adjust import Progress
+from groma.adjustment.report import Progress
 from groma.errors import InputError
 from groma.factors.contract import Ref
 from groma.factors.losses import loss as make_loss

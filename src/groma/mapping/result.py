@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from groma._json import json_text
-from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions, AdjustReport
+from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.contributions import Contribution, contributions
 from groma.adjustment.diagnosis import diagnose_scene
+from groma.adjustment.report import AdjustReport
 from groma.adjustment.stages import with_loss
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
