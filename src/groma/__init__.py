@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from groma import (
         adjustment,
         cameras,
+        compilation,
         errors,
         estimators,
         evaluation,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from groma.adjustment.pose_graph import PoseGraphOptions, PoseGraphResult, adjust_pose_graph
     from groma.adjustment.report import AdjustResult
     from groma.adjustment.uncertainty import uncertainty
+    from groma.compilation.warmup import warm_up
     from groma.errors import FileFormatError, GromaError, InputError, OutputError, ProblemError, ShapeError
     from groma.evaluation.lines import evaluate_lines
     from groma.evaluation.planes import evaluate_planes
@@ -123,6 +125,7 @@ _HOME = {
     "solve": "groma.solver.solve",
     "track": "groma.tracking",
     "uncertainty": "groma.adjustment.uncertainty",
+    "warm_up": "groma.compilation.warmup",
     "write_covariances": "groma.adjustment.covariance_files",
     "write_parts": "groma.adjustment.parts",
     "write_report": "groma.viz.report.page",
@@ -131,6 +134,7 @@ _HOME = {
 _SUBPACKAGES = (
     "adjustment",
     "cameras",
+    "compilation",
     "errors",
     "estimators",
     "evaluation",
@@ -184,6 +188,7 @@ __all__ = [
     "adjust_pose_graph",
     "adjustment",
     "cameras",
+    "compilation",
     "contributions",
     "convert",
     "diagnose",
@@ -214,6 +219,7 @@ __all__ = [
     "tracking",
     "uncertainty",
     "viz",
+    "warm_up",
     "write_covariances",
     "write_parts",
     "write_report",

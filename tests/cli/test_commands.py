@@ -15,7 +15,8 @@ from groma._counted import counted
 from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
 from groma.adjustment.report import why_steps_ran_out
 from groma.cli.main import run
-from groma.cli.shared.compilation import Compilation, compilation_time, spent
+from groma.cli.shared.sentences import spent
+from groma.compilation.time import Compilation, compilation_time
 from groma.errors import ProblemError
 from groma.factors.losses import Cauchy, GemanMcClure, Huber
 from groma.io import read_scene, write_scene

@@ -47,8 +47,8 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     from groma.adjustment.adjust import adjust
     from groma.adjustment.contributions import contributions
     from groma.adjustment.covariance_files import write_covariances
-    from groma.cli.shared.compilation import compilation_time
     from groma.cli.shared.diagnosis import try_diagnosis
+    from groma.compilation.time import compilation_time
     from groma.io import check_target, read_scene, structures_of, write_scene
     from groma.viz.report.page import write_report
     from groma.viz.report.tables import contributions_card

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from groma._counted import counted
-from groma.cli.shared.compilation import compilation_time, spent
 from groma.cli.shared.console import Console
+from groma.cli.shared.sentences import spent
 from groma.errors import InputError
 
 
@@ -40,6 +40,7 @@ def adjust_graph_and_write(
         raise InputError(f"A pose graph is written as .g2o or .g2o.gz; got {output}.")
 
     from groma.adjustment.pose_graph import PoseGraphOptions, adjust_pose_graph
+    from groma.compilation.time import compilation_time
     from groma.io.g2o import read_g2o, write_g2o
 
     graph = read_g2o(source)

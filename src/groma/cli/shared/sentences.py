@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from groma._counted import counted
-from groma.cli.shared.compilation import spent
 
 _SIGMAS = (
     ("centres", "center", ""),
@@ -93,3 +92,17 @@ def describe_contributions(entries: Sequence[Mapping[str, Any]]) -> list[str]:
             parts.append(f"{entry['num_dropped']:,} of {entry['num_relations']:,} relations given up")
         lines.append(f"  {('and ' if number else '') + entry['added']:<26}{', '.join(parts)}")
     return lines
+
+
+def spent(total: float, compilation: float, compiled: bool) -> str:
+    """Return for example ``0.13 s, and 0.98 s to load compiled code``.
+
+    Parameters
+    ----------
+    total, compilation : float
+        Seconds of the work as a whole, and those of them that went into compiled code.
+    compiled : bool
+        Whether it was compiled, and not only loaded.
+    """
+    apart = f", and {compilation:.2f} s to {'compile' if compiled else 'load compiled code'}"
+    return f"{max(total - compilation, 0.0):.2f} s{apart if compilation >= 0.005 else ''}"
