@@ -23,7 +23,7 @@ from typing import IO, Any, Self, TypeVar
 import numpy as np
 
 from groma._typing import IntArray
-from groma.adjustment.adjust import AdjustReport, AdjustResult
+from groma.adjustment.report import AdjustReport, AdjustResult
 from groma.errors import FileFormatError, OutputError
 from groma.features.segments import Segments
 from groma.io import atomic_output, read_archive, write_archive

@@ -25,7 +25,7 @@ from functools import partial
 from pathlib import Path
 
 from groma._version import __version__
-from groma.adjustment.adjust import AdjustOptions, AdjustReport, adjust
+from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.errors import InputError
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches
@@ -41,6 +41,7 @@ from groma.mapping.noise.observations import line_end_correlation, moved_px, noi
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.photographs import check_images, check_names, image_files, read_gray
 from groma.mapping.refine_points import PointRefinementOptions, refine_points
+from groma.mapping.result import MapResult
 from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.unused import without_unused
@@ -89,29 +90,6 @@ class MapOptions:
     camera_model: str = "SIMPLE_RADIAL"
     camera_params: tuple[float, ...] | None = None
     seed: int = 0
-
-
-@dataclass(frozen=True)
-class MapResult:
-    """The map and how it came about."""
-
-    #: Points, lines, planes, poses.
-    scene: Scene
-    #: The scene that went in: the given model, or the reconstruction of the points.
-    start: Scene
-    #: The map before its last joint adjustment, with the same landmarks as ``scene``.
-    before: Scene
-    #: Report of the last joint adjustment, and what it was told: noise, losses, what is estimated.
-    report: AdjustReport
-    adjusted_with: AdjustOptions
-    #: Estimated standard deviations, pixels: of points, and of segment end points.
-    sigma_px: dict[str, float]
-    #: What became of the segments, in words.
-    explanation: str
-    #: Number of segments with each outcome, by name.
-    outcomes: dict[str, int]
-    #: Sentences for the user.
-    warnings: tuple[str, ...]
 
 
 def map_images(

@@ -96,7 +96,8 @@ def map_(
     if truth is not None and not contributions:
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
 
-    from groma.cli.shared.mapping import map_and_write
+    from groma.cli.shared.diagnosis import try_diagnosis
+    from groma.cli.shared.mapping import run_map, say_map, write_map
     from groma.features.external import read_matches
     from groma.io import read_scene
     from groma.mapping.map import MapOptions
@@ -114,19 +115,15 @@ def map_(
         threads=threads,
         seed=seed,
     )
-    numbers = map_and_write(
-        console,
-        images,
-        output,
-        read_scene(model) if model is not None else None,
-        options,
-        force,
-        f"Map of {images.absolute().name}",
-        line_matches=read_matches(line_matches) if line_matches is not None else None,
-        diagnose=diagnosis,
-        contributions=contributions,
-        truth=read_scene(truth) if truth is not None else None,
-    )
+    start = read_scene(model) if model is not None else None
+    matches = read_matches(line_matches) if line_matches is not None else None
+    true = read_scene(truth) if truth is not None else None
+    work = output.with_name(output.name + ".work")
+    result = run_map(console, images, work, start, options, matches)
+    found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
+    numbers = result.summary(found, result.contributions(true) if contributions else ())
+    write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
+    say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
 
