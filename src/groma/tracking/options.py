@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from groma.errors import InputError
+from groma.tracking.gates import TrackingGates
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class TrackOptions:
     relations: bool = True
     #: Adjust the window in a thread of its own; its result is taken up two frames later, so runs repeat exactly.
     threaded: bool = True
+    #: Tuned numbers: thresholds, with unit, meaning and origin.
+    gates: TrackingGates = field(default_factory=TrackingGates)
 
     def __post_init__(self) -> None:
         if not (self.points or self.lines or self.planes):
