@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray
-from groma.features.depth.lines import fit_depth_lines
+from groma.features.depth.lines import DepthLineGates, fit_depth_lines
 from groma.features.depth.noise import DepthNoise
 from groma.tracking.gates import DEFAULT, DepthGates
 
@@ -47,7 +47,8 @@ def segment_inverse_depths(
     gates: DepthGates = DEFAULT.depth,
 ) -> tuple[FloatArray, FloatArray]:
     """Inverse depths (L, 2) at the ends of segments and their standard deviations; NaN where unknown."""
-    found = fit_depth_lines(ends, image, pinhole, noise, near=gates.near, far=gates.far, max_relative_sigma=1.0)
+    own = DepthLineGates(near=gates.near, far=gates.far, max_relative_sigma=1.0)
+    found = fit_depth_lines(ends, image, pinhole, noise, gates=own)
     sigma = np.sqrt(np.diagonal(found.inverse_depth_covariances, axis1=1, axis2=2))
     good = found.good[:, None]
     return np.where(good, found.inverse_depth, np.nan), np.where(good, sigma, np.nan)
