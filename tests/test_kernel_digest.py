@@ -20,7 +20,7 @@ from numba.extending import overload
 
 import groma
 from groma import _numba_cache, _numba_digest
-from groma.cameras import _dispatch
+from groma.cameras import dispatch as _dispatch
 
 pytestmark = [
     pytest.mark.kernels,
