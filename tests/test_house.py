@@ -27,7 +27,6 @@ LONG_FUNCTIONS = {
     "groma.features.depth.lines._fit_all",
     "groma.features.patch_alignment._align_all",
     "groma.solver.observability.landmarks.landmark_findings",
-    "groma.solver.solve._solve_jointly",
 }
 BORROWED: set[tuple[str, str]] = set()
 
