@@ -85,7 +85,7 @@ class AdjustOptions:
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in a step.
     function_tolerance: float = 1e-6
-    #: ``auto``, ``dense``, ``sparse`` or ``pcg``.
+    #: ``auto``, ``dense``, ``sparse``, ``pcg``, or a solver that was registered.
     linear_solver: str = "auto"
     #: ``cartesian``, ``orthonormal_right``, ``orthonormal_left``, ``free_right`` or ``free_left``.
     line_chart: str = "cartesian"

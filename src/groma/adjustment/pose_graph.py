@@ -55,7 +55,7 @@ class PoseGraphOptions:
     trust_odometry: bool = True
     #: Most steps.
     max_iterations: int = 100
-    #: ``auto``, ``dense``, ``sparse`` or ``pcg``.
+    #: ``auto``, ``dense``, ``sparse``, ``pcg``, or a solver that was registered.
     linear_solver: str = "auto"
     #: Threads; None takes one for small graphs and all cores for large ones.
     threads: int | None = None

@@ -9,8 +9,16 @@ import typer
 from groma.cli.shared import options as _options
 from groma.errors import InputError
 
-LinearSolver = Literal["auto", "dense", "sparse", "pcg"]
 CovarianceGauge = Literal["auto", "inner", "held"]
+
+
+def _linear_solver(name: str) -> str:
+    """Return the name of a linear solver that is registered."""
+    from groma.solver.linear.choice import linear_solver_names
+
+    if name not in linear_solver_names():
+        raise typer.BadParameter(f"{name!r} is not one of {', '.join(linear_solver_names())}.")
+    return name
 
 
 def adjust(
@@ -29,7 +37,8 @@ def adjust(
         str,
         typer.Option(
             metavar="NAME",
-            help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron or truncated. auto: robust "
+            help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron, truncated, or one of an installed "
+            "package. auto: robust "
             "(Cauchy, then Geman-McClure) for what comes from matching, none for BAL files.",
         ),
     ] = "auto",
@@ -56,7 +65,14 @@ def adjust(
     max_iterations: Annotated[
         int | None, typer.Option(min=0, metavar="N", help="Stop after N steps. Default: 50, for pose graphs 100.")
     ] = None,
-    linear_solver: Annotated[LinearSolver, typer.Option(help="How each step is solved.")] = "auto",
+    linear_solver: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            callback=_linear_solver,
+            help="How each step is solved: auto, dense, sparse, pcg, or a solver that was registered.",
+        ),
+    ] = "auto",
     line_chart: Annotated[
         str | None,
         typer.Option(

@@ -38,6 +38,15 @@ def map_(
             metavar="NPZ", help="Segments and their matches from elsewhere; the documentation has the layout."
         ),
     ] = None,
+    line_detector: _options.LineDetector = "lsd",
+    line_matcher: Annotated[
+        str | None,
+        typer.Option(
+            "--line-matcher",
+            metavar="NAME",
+            help="Match segments by wide_baseline, flow, or a matcher of an installed package. Default: poses alone.",
+        ),
+    ] = None,
     min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
     refine_poses: Annotated[
@@ -81,6 +90,9 @@ def map_(
     if model is not None and (camera_params is not None or camera_model != "SIMPLE_RADIAL"):
         raise InputError("--camera-model and --camera-params are for images without a model. Leave them out.")
 
+    if line_matches is not None and line_matcher is not None:
+        raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
+
     if truth is not None and not contributions:
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
 
@@ -92,6 +104,8 @@ def map_(
 
     options = MapOptions(
         min_segment_length=min_length,
+        detector=line_detector,
+        matcher=line_matcher,
         find_planes=planes,
         refine_points=refine_points,
         refine_poses=refine_poses,

@@ -34,6 +34,7 @@ def track(
     ] = None,
     points: Annotated[bool, typer.Option("--points/--no-points", help="Follow points.")] = True,
     lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Follow line segments.")] = True,
+    line_detector: _options.LineDetector = "lsd",
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Find planes in depth images.")] = True,
     loops: Annotated[bool, typer.Option("--loops/--no-loops", help="Close loops.")] = True,
     max_frames: Annotated[
@@ -88,7 +89,10 @@ def track(
         max_frames=max_frames,
         kind=cast("Literal['rgbd', 'stereo', 'mono'] | None", kind),
     )
-    options = TrackOptions(points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth)
+    options = TrackOptions(
+        points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth, detector=line_detector
+    )
+    options.make_detector()  # refuses a wrong name now
     console.announce_compilation()
     work = output.with_name(output.name + ".work")
     with console.stages() as stages:
