@@ -125,7 +125,8 @@ def refine_lines(
     found = solve_batch(TWO_POINT_LINE, data, pointers, active, begin, max_iterations, tolerance, floor=0.0)
     chart = _Chart(found.states, found.frames)
     hessian = np.swapaxes(chart.motion, 1, 2) @ found.information @ chart.motion
-    refined = to_world(stack(np.cross(chart.foot, chart.along), chart.along), scale, origin)
+    moment = np.asarray(np.cross(chart.foot, chart.along), dtype=np.float64)
+    refined = to_world(stack(moment, chart.along), scale, origin)
     eigenvalues = np.asarray(np.linalg.eigvalsh(hessian), dtype=np.float64)
     largest = eigenvalues[:, -1]
     determined = np.sqrt(np.clip(ratio(eigenvalues[:, 0], largest, largest > 0.0, 0.0), 0.0, 1.0))
