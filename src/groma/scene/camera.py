@@ -79,7 +79,7 @@ class Sensors(Table):
 
     noun: ClassVar[str] = "sensor"
     #: (S,) the rig it is mounted on.
-    rig_idx: IntArray = column(np.int64)
+    rig_idx: IntArray = column(np.int64, refers="rigs")
     #: (S,) ``CAMERA`` (0) or ``OTHER`` (1, for example an inertial unit; carried along, not used).
     kind: IntArray = column(np.int64)
     #: (S,) identifier; for cameras that of the camera.
@@ -87,7 +87,7 @@ class Sensors(Table):
     #: (S,) the camera; -1 for other sensors.
     camera_idx: IntArray = column(np.int64)
     #: (S, 7) pose [qx qy qz qw tx ty tz]; the identity for reference sensors and where unknown.
-    cam_from_rig: FloatArray = column(np.float64, 7)
+    cam_from_rig: FloatArray = column(np.float64, 7, length=(0, 0, 0, 0, 1, 1, 1))
     #: (S,) 1 for the reference sensor of its rig.
     is_reference: IntArray = column(np.int64)
     #: (S,) 1 where ``cam_from_rig`` is known.
