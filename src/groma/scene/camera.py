@@ -56,6 +56,11 @@ class Cameras(Table):
         known = {name: camera_models.model(name).num_parameters for name in set(self.models)}
         return [known[name] for name in self.models]
 
+    def by_model(self) -> dict[str, IntArray]:
+        """Return the rows of the cameras of each model."""
+        models = np.array(self.models, dtype=object)
+        return {str(name): np.flatnonzero(models == name) for name in dict.fromkeys(models)}
+
     def params_of(self, camera_idx: int) -> FloatArray:
         """Return the parameters of one camera, without padding."""
         return self.params[camera_idx, : self.num_params[camera_idx]].copy()
