@@ -36,7 +36,9 @@ class PointObservations(Table):
         check_sigma("PointObservations.sigma", self.sigma)
 
     @classmethod
-    def numbered(cls, image_idx: npt.ArrayLike, point_idx: npt.ArrayLike, pixel: npt.ArrayLike) -> Self:
+    def numbered(
+        cls, image_idx: npt.ArrayLike, point_idx: npt.ArrayLike, pixel: npt.ArrayLike, sigma: npt.ArrayLike = ()
+    ) -> Self:
         """Return observations whose 2D points are numbered 0, 1, 2, ... within each image, in the order given.
 
         Parameters
@@ -45,6 +47,8 @@ class PointObservations(Table):
             The image and the point of each.
         pixel : (N, 2) float
             Measured places, pixels.
+        sigma : (N,) float, optional
+            Standard deviations, relative to the usual one.
         """
         image = np.asarray(image_idx)
         order = np.argsort(image, kind="stable")

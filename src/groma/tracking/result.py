@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from groma.scene import Scene
+from groma.scene import Relations, Scene
 from groma.scene.camera import Cameras
 from groma.tracking.frame.camera import PINHOLE, TrackCamera
 from groma.tracking.frame.measurements import LineMeasurements, PlaneMeasurements, PointMeasurements
@@ -56,7 +56,7 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
     point_ids, point_idx = np.unique(points.index, return_inverse=True)
     line_ids, line_idx = np.unique(lines.index, return_inverse=True)
     plane_ids = np.flatnonzero(track_map.planes.alive)
-    scene = map_scene(
+    return map_scene(
         camera,
         track_map.view,
         np.array([keyframe.pose for keyframe in living]),
@@ -64,8 +64,8 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
         SeenPoints(point_ids, replace(points, index=point_idx), image["points"][keep]),
         SeenLines(line_ids, replace(lines, index=line_idx), image["lines"]),
         SeenPlanes(plane_ids, replace(planes, index=np.searchsorted(plane_ids, planes.index)), image["planes"]),
+        relations=find_relations(track_map, line_ids, plane_ids) if relations else Relations(),
     )
-    return scene.replace(relations=find_relations(track_map, line_ids, plane_ids)) if relations else scene
 
 
 __all__ = ["map_to_scene"]

@@ -15,7 +15,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.geometry import se3
 from groma.problem.problem import Problem
-from groma.scene.landmarks import Lines
+from groma.scene import Lines, Relations
 from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
 from groma.solver.solve import solve
@@ -204,9 +204,8 @@ def job_of(
         SeenPoints(point_ids, replace(points, index=point_local), point_pose),
         SeenLines(line_ids, replace(lines, index=line_local), line_pose),
         SeenPlanes(plane_ids, replace(planes, index=plane_local), pose["planes"]),
+        relations=find_relations(track_map, line_ids, plane_ids) if relations else Relations(),
     )
-    if relations:
-        scene = scene.replace(relations=find_relations(track_map, line_ids, plane_ids))
     problem = assemble(scene, replace(options, held_frames=held)).problem
     if not problem.factors:
         return None

@@ -20,9 +20,11 @@ from groma.scene import (
     PointDepths,
     PointObservations,
     Points,
+    Relations,
     RightColumns,
     Scene,
 )
+from groma.scene.table import Table
 from groma.tracking.frame.camera import PINHOLE, TrackCamera
 from groma.tracking.frame.measurements import DEPTH_BASELINE, LineMeasurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.landmarks import MapView
@@ -73,6 +75,7 @@ def map_scene(
     points: SeenPoints,
     lines: SeenLines,
     planes: SeenPlanes,
+    **more: Table | Relations,
 ) -> Scene:
     """Return the scene of some images, their landmarks, and everything measured of them.
 
@@ -88,6 +91,8 @@ def map_scene(
         Of the images.
     points, lines, planes
         What the images measure.
+    **more
+        Further tables of the scene.
     """
     cameras = Cameras(
         np.array([1]), (PINHOLE,), camera.params[None], np.array([camera.width]), np.array([camera.height])
@@ -106,12 +111,13 @@ def map_scene(
         plane_observations=PlaneObservations(
             planes.image, planes.table.index, planes.table.plane, planes.table.sqrt_information
         ),
+        **more,
     )
 
 
 def _point_tables(camera: TrackCamera, table: PointMeasurements, image: IntArray) -> dict[str, object]:
     tables: dict[str, object] = {
-        "point_observations": PointObservations.numbered(image, table.index, table.pixel).replace(sigma=table.sigma)
+        "point_observations": PointObservations.numbered(image, table.index, table.pixel, table.sigma)
     }
     rows = np.flatnonzero(np.isfinite(table.depth))
     if len(rows):

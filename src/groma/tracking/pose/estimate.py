@@ -34,6 +34,9 @@ Table = TypeVar("Table", PointMeasurements, LineMeasurements, PlaneMeasurements)
 GATE = 3.5
 #: What counts as a well-known direction: share of the median depth, and radians.
 WEAK_SHARE, WEAK_ANGLE = 0.02, math.radians(1.0)
+#: Losses, one after the other, under held landmarks.
+_LOSSES = (Cauchy(1.5), GemanMcClure(3.0))
+_ASSEMBLY = replace(TRACKING, refine_landmarks=False, loss=_LOSSES[0])
 _SOLVER = SolverOptions(
     max_iterations=8, function_tolerance=1e-3, initial_damping=1e-6, threads=1, eliminate=("frames",)
 )
@@ -95,10 +98,10 @@ def estimate_pose(
         SeenPoints(tables[0].index, _renumbered(tables[0]), image[0]),
         SeenLines(tables[1].index, _renumbered(tables[1]), image[1]),
         SeenPlanes(tables[2].index, _renumbered(tables[2]), image[2]),
-    ).replace(pose_priors=PosePriors([0], predicted[None], prior_sigma[None]))  # type: ignore[arg-type]
-    assembly = assemble(scene, replace(TRACKING, refine_landmarks=False))
-    problem = assembly.problem
-    for loss in (Cauchy(1.5), GemanMcClure(3.0)):
+        pose_priors=PosePriors(np.zeros(1, np.int64), predicted[None], prior_sigma[None]),
+    )
+    problem = assemble(scene, _ASSEMBLY).problem
+    for loss in _LOSSES:
         staged = Problem(problem.variables, [with_loss(factor, loss) for factor in problem.factors])
         solution = solve(staged, _SOLVER)
         problem = solution.problem
