@@ -11,6 +11,8 @@ from groma.cli.shared.adjusting import CovarianceGauge, Wanted, adjust_and_write
 from groma.errors import InputError
 
 LinearSolver = Literal["auto", "dense", "sparse", "pcg"]
+LineResidual = Literal["endpoints", "bearing", "normal"]
+PlaneResidual = Literal["normal_offset", "quaternion"]
 
 
 def adjust(
@@ -64,6 +66,17 @@ def adjust(
             help="How lines move: cartesian (default), orthonormal_left, orthonormal_right, free_left or free_right.",
         ),
     ] = None,
+    line_residual: Annotated[
+        LineResidual,
+        typer.Option(
+            help="How segments are compared with lines: endpoints, distances in the image; bearing, angles of rays; "
+            "normal, the plane through camera and segment, also against the ray to the line's anchor.",
+        ),
+    ] = "endpoints",
+    plane_residual: Annotated[
+        PlaneResidual,
+        typer.Option(help="How measured planes are compared: normal_offset, in the camera; quaternion, in the world."),
+    ] = "normal_offset",
     gauge: Annotated[
         str | None,
         typer.Option(
@@ -169,6 +182,8 @@ def adjust(
         lines=lines,
         planes=planes,
         linear_solver=linear_solver,
+        line_residual=line_residual,
+        plane_residual=plane_residual,
         **{name: value for name, value in chosen.items() if value is not None},  # type: ignore[arg-type]
     )
     wanted = Wanted(
