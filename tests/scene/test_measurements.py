@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Tables of measurements: what they refer to goes along, units follow the world, files hold them; mistakes are named."""
+"""Tables of measurements: what they refer to goes along, units follow the world, files hold them."""
 
 import zipfile
 
