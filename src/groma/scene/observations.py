@@ -122,7 +122,7 @@ class Relations:
             value = convert(f"Relations.{item.name}", getattr(self, item.name), item)
             if owner := item.metadata["of"]:
                 count = len(getattr(self, owner))
-                value = np.full(count, item.metadata["fill"]) if len(value) == 0 else value
+                value = value if value.any() else np.zeros(count)  # none of its own is as if left out
                 if len(value) != count:
                     raise ShapeError(f"Relations.{item.name} must have one row for each of {count}; got {len(value)}.")
                 if count and value.min() < 0.0:

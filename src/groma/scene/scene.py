@@ -21,9 +21,8 @@ Each column declares in its table what it refers to and how it changes when the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cache
 from typing import Any, Self
 
 import numpy as np
@@ -38,9 +37,8 @@ from groma.scene.landmarks import Directions, Lines, Planes, Points
 from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
-from groma.scene.table import check_index, rows_of
+from groma.scene.table import check_index, check_quaternions, moved_column, new_index_of, references, rows_of
 
-_QUATERNION_TOLERANCE = 1e-6
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
 
@@ -86,16 +84,16 @@ class Scene:
     pose_priors: PosePriors = field(default_factory=PosePriors)
 
     def __post_init__(self) -> None:
-        for name, column, side, target in _references():
+        for name, column, side, target in references(Scene):
             index = getattr(getattr(self, name), column)
             where = f"{name}.{column}" if side is None else f"{name}.{column}[:, {side}]"
             index = index if side is None else index[:, side]
             check_index(where, index, len(getattr(self, target)), target.replace("_", " "))
         is_camera = self.sensors.kind == CAMERA
         check_index("sensors.camera_idx", self.sensors.camera_idx[is_camera], len(self.cameras), "cameras")
-        _check_quaternions("frames.rig_from_world", self.frames.rig_from_world)
-        _check_quaternions("sensors.cam_from_rig", self.sensors.cam_from_rig)
-        _check_quaternions("pose_priors.rig_from_world", self.pose_priors.rig_from_world)
+        check_quaternions("frames.rig_from_world", self.frames.rig_from_world)
+        check_quaternions("sensors.cam_from_rig", self.sensors.cam_from_rig)
+        check_quaternions("pose_priors.rig_from_world", self.pose_priors.rig_from_world)
         if len(self.images):
             sensor = self.images.sensor_idx
             if (self.sensors.camera_idx[sensor] != self.images.camera_idx).any() or (~is_camera[sensor]).any():
@@ -254,7 +252,7 @@ class Scene:
         InputError
             If a table of observations gets another number of rows while measurements refer to the old ones.
         """
-        for name, column, _, target in _references():
+        for name, column, _, target in references(Scene):
             if target.endswith("_observations") and target in tables and name not in tables:
                 before, after = len(getattr(self, target)), len(tables[target])
                 if before != after and len(getattr(self, name)):
@@ -322,7 +320,7 @@ class Scene:
         for item in fields(self):
             table = getattr(self, item.name)
             columns = {
-                column.name: _moved(getattr(table, column.name), column.metadata, new_from_old)
+                column.name: moved_column(getattr(table, column.name), column.metadata, new_from_old)
                 for column in fields(table)
                 if (column.metadata.get("world") or column.metadata.get("length")) and len(getattr(table, column.name))
             }
@@ -348,7 +346,10 @@ class Scene:
             "frames": self.frames.take(kept_frames),
             "images": self.images.take(chosen).replace(frame_idx=frame_idx),
         }
-        new_index = {"frames": _new_index(kept_frames, self.num_frames), "images": _new_index(chosen, self.num_images)}
+        new_index = {
+            "frames": new_index_of(kept_frames, self.num_frames),
+            "images": new_index_of(chosen, self.num_images),
+        }
         seen = self._with(tables, new_index)
         points = np.bincount(seen.point_observations.point_idx, minlength=self.num_points)
         lines = np.bincount(seen.line_observations.line_idx, minlength=self.num_lines)
@@ -380,7 +381,7 @@ class Scene:
             if rows is not None:
                 table = getattr(self, name)
                 kept = rows_of(name, rows, len(table), name.replace("_", " "))
-                tables[name], new_index[name] = table.take(kept), _new_index(kept, len(table))
+                tables[name], new_index[name] = table.take(kept), new_index_of(kept, len(table))
         return self._with(tables, new_index)
 
     def _with(self, tables: dict[str, Any], new_index: dict[str, IntArray]) -> Self:
@@ -393,42 +394,5 @@ class Scene:
                 tables[name] = table
             if kept is not None:
                 first = new_index.get(name, np.arange(len(before)))
-                new_index[name] = np.append(_new_index(kept, len(before)), -1)[first]
+                new_index[name] = np.append(new_index_of(kept, len(before)), -1)[first]
         return self.replace(**tables)
-
-
-@cache
-def _references() -> tuple[tuple[str, str, int | None, str], ...]:
-    """Return (table, column, side of a pair or None, table it refers to) of all columns of indices."""
-    return tuple(
-        (table.name, item.name, side if len(item.metadata["refers"]) > 1 else None, target)
-        for table in fields(Scene)
-        for item in fields(table.default_factory)  # type: ignore[arg-type]  # the factories are the classes
-        for side, target in enumerate(item.metadata["refers"])
-    )
-
-
-def _moved(values: FloatArray, about: Mapping[str, Any], new_from_old: Similarity) -> FloatArray:
-    """Return a column seen from another world, or in another unit of length, as its declaration says."""
-    if about["world"]:
-        return getattr(new_from_old, about["world"])(values)
-    return values * new_from_old.scale ** np.asarray(about["length"], float)
-
-
-def _new_index(kept: IntArray, size: int) -> IntArray:
-    index = np.full(size, -1, np.int64)
-    index[kept] = np.arange(len(kept))
-    return index
-
-
-def _check_quaternions(name: str, poses: FloatArray) -> None:
-    if len(poses) == 0:
-        return
-    with np.errstate(over="ignore"):
-        deviation = np.abs(np.einsum("ij,ij->i", poses[:, :4], poses[:, :4]) - 1)
-    if deviation.max() > 2 * _QUATERNION_TOLERANCE:
-        row = int(deviation.argmax())
-        raise InputError(
-            f"{name} must begin with a unit quaternion [qx qy qz qw]; row {row} has {poses[row, :4].tolist()}. "
-            "Divide it by its length."
-        )

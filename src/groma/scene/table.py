@@ -11,13 +11,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, replace
-from typing import Any, ClassVar, Self
+from functools import cache
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
+
+if TYPE_CHECKING:
+    from groma.scene.similarity import Similarity
+
+#: How far a stored quaternion may be from length one.
+_QUATERNION_TOLERANCE = 1e-6
 
 
 def column(
@@ -215,6 +222,31 @@ def rows_of(name: str, chosen: npt.ArrayLike, size: int, target: str) -> IntArra
     return rows
 
 
+@cache
+def references(scene: type) -> tuple[tuple[str, str, int | None, str], ...]:
+    """Return (table, column, side of a pair or None, table it refers to) of all columns of indices of a scene."""
+    return tuple(
+        (table.name, item.name, side if len(item.metadata["refers"]) > 1 else None, target)
+        for table in fields(scene)
+        for item in fields(table.default_factory)  # type: ignore[arg-type]  # the factories are the classes
+        for side, target in enumerate(item.metadata["refers"])
+    )
+
+
+def moved_column(values: FloatArray, about: Mapping[str, Any], new_from_old: Similarity) -> FloatArray:
+    """Return a column seen from another world, or in another unit of length, as its declaration says."""
+    if about["world"]:
+        return getattr(new_from_old, about["world"])(values)
+    return values * new_from_old.scale ** np.asarray(about["length"], float)
+
+
+def new_index_of(kept: IntArray, size: int) -> IntArray:
+    """Return the new row of each of ``size`` old ones, -1 for those that are not kept."""
+    index = np.full(size, -1, np.int64)
+    index[kept] = np.arange(len(kept))
+    return index
+
+
 def check_sigma(name: str, sigma: FloatArray) -> None:
     """Raise when a standard deviation, or another number, is not positive."""
     if len(sigma) and not sigma.min() > 0.0:
@@ -241,3 +273,17 @@ def check_index(name: str, index: IntArray, size: int, target: str) -> None:
     raise InputError(
         f"{name}[{row}] is {index[row]}, which is not in the scene ({there}). Drop that row or add what it refers to."
     )
+
+
+def check_quaternions(name: str, poses: FloatArray) -> None:
+    """Raise when poses (N, 7) do not begin with unit quaternions."""
+    if len(poses) == 0:
+        return
+    with np.errstate(over="ignore"):
+        deviation = np.abs(np.einsum("ij,ij->i", poses[:, :4], poses[:, :4]) - 1)
+    if deviation.max() > 2 * _QUATERNION_TOLERANCE:
+        row = int(deviation.argmax())
+        raise InputError(
+            f"{name} must begin with a unit quaternion [qx qy qz qw]; row {row} has {poses[row, :4].tolist()}. "
+            "Divide it by its length."
+        )

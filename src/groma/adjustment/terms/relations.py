@@ -98,8 +98,7 @@ def _factors(draft: Draft) -> Iterator[Group]:
     """Yield the factors of the relations whose landmarks take part."""
     for kind, make in _MAKERS.items():
         groups = next(item.metadata["refers"] for item in fields(Relations) if item.name == kind)
-        rows = metric_rows(draft, kind) if set(groups) <= draft.variables.keys() else ()
-        if len(rows):
+        if set(groups) <= draft.variables.keys() and len(rows := metric_rows(draft, kind)):
             yield Group(make(draft, rows))
 
 

@@ -103,10 +103,9 @@ def estimate_pose(
     problem = assemble(scene, _ASSEMBLY).problem
     for loss in _LOSSES:
         staged = Problem(problem.variables, [with_loss(factor, loss) for factor in problem.factors])
-        solution = solve(staged, _SOLVER)
-        problem = solution.problem
+        problem = solve(staged, _SOLVER).problem
     every = problem.factors[:-1]  # all but the prior
-    pose = solution["frames"][0]
+    pose = problem.variables["frames"].state[0]
     kept = [
         _agreeing(problem, [factor for factor in every if factor.type_name in names], len(table))
         for names, table in zip(_TELLING, tables, strict=True)
