@@ -58,6 +58,11 @@ def table(gates: type) -> list[tuple[str, Any, str, str, str]]:
     ]
 
 
+def numbers(gates: Any) -> tuple[float, ...]:
+    """Return the numbers of gates in the order of their fields, as kernels take them."""
+    return tuple(float(getattr(gates, item.name)) for item in fields(gates))
+
+
 @lru_cache(maxsize=64)
 def chi_square_gate(probability: float, dof: int) -> float:
     r"""Return the squared normalised residual that noise exceeds with the given probability.
@@ -69,4 +74,4 @@ def chi_square_gate(probability: float, dof: int) -> float:
     return float(chdtri(dof, probability))
 
 
-__all__ = ["ORIGINS", "chi_square_gate", "gate", "is_gate_class", "table"]
+__all__ = ["ORIGINS", "chi_square_gate", "gate", "is_gate_class", "numbers", "table"]

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.adjustment.adjust import AdjustOptions, AdjustResult, adjust
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.report import AdjustResult
 from groma.adjustment.uncertainty import position_sigma, uncertainty
 from groma.errors import InputError, ProblemError
 from groma.evaluation.alignment import align_poses, camera_centers
@@ -121,9 +122,7 @@ def _variants(scene: Scene, options: AdjustOptions) -> list[tuple[str, Scene, Ad
     if with_lines:
         steps.append(("lines", Relations(), True, False))
     if with_planes:
-        steps.append(
-            ("planes and directions", all_of.take(point_on_line=[]), with_lines, True)
-        )
+        steps.append(("planes and directions", all_of.take(point_on_line=[]), with_lines, True))
     if with_lines and len(all_of.point_on_line):
         steps.append(("points on lines", all_of, True, with_planes))
     return [

@@ -23,7 +23,7 @@ from typing import IO, Any, Self, TypeVar
 import numpy as np
 
 from groma._typing import IntArray
-from groma.adjustment.adjust import AdjustReport, AdjustResult
+from groma.adjustment.report import AdjustReport, AdjustResult
 from groma.errors import FileFormatError, OutputError
 from groma.features.segments import Segments
 from groma.io import atomic_output, read_archive, write_archive
@@ -50,7 +50,7 @@ def _feed(update: Callable[[bytes], None], value: Any) -> None:
         update(f"{value.dtype}{value.shape}".encode())
         update(np.ascontiguousarray(value).tobytes())
     elif is_dataclass(value) and not isinstance(value, type):
-        update(type(value).__name__.encode())
+        update(f"{type(value).__module__}.{type(value).__qualname__}".encode())
         _feed(update, {item.name: getattr(value, item.name) for item in fields(value)})
     elif isinstance(value, Mapping):
         _feed(update, sorted(value.items(), key=lambda item: repr(item[0])))

@@ -25,20 +25,23 @@ from functools import partial
 from pathlib import Path
 
 from groma._version import __version__
-from groma.adjustment.adjust import AdjustOptions, AdjustReport, adjust
+from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.errors import InputError
+from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches
-from groma.features.lsd import LsdDetector
 from groma.features.matches import LineMatches
+from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
 from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
 from groma.mapping.checkpoints import Stages, digest, digest_files
+from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
 from groma.mapping.lines.build import MapLinesOptions, MatchProvider, explain, map_lines
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.photographs import check_images, check_names, image_files, read_gray
 from groma.mapping.refine_points import PointRefinementOptions, refine_points
+from groma.mapping.result import MapResult
 from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.unused import without_unused
@@ -65,6 +68,12 @@ class MapOptions:
 
     #: Shortest segment, pixels.
     min_segment_length: float = 12.0
+    #: What finds the segments: an object, or a name of :data:`groma.features.registry.DETECTORS`.
+    detector: str | SegmentDetector = "lsd"
+    #: What matches them, likewise; None: the geometry of the poses alone.
+    matcher: str | SegmentMatcher | None = None
+    #: What tells which images to compare where they share too few points, likewise; None: nothing does.
+    retrieval: str | ImageRetrieval | None = None
     #: Place the observations of points anew by the grey levels around them: three times less noise, which pays where
     #: the calibration is as good.
     refine_points: bool = False
@@ -81,29 +90,6 @@ class MapOptions:
     camera_model: str = "SIMPLE_RADIAL"
     camera_params: tuple[float, ...] | None = None
     seed: int = 0
-
-
-@dataclass(frozen=True)
-class MapResult:
-    """The map and how it came about."""
-
-    #: Points, lines, planes, poses.
-    scene: Scene
-    #: The scene that went in: the given model, or the reconstruction of the points.
-    start: Scene
-    #: The map before its last joint adjustment, with the same landmarks as ``scene``.
-    before: Scene
-    #: Report of the last joint adjustment, and what it was told: noise, losses, what is estimated.
-    report: AdjustReport
-    adjusted_with: AdjustOptions
-    #: Estimated standard deviations, pixels: of points, and of segment end points.
-    sigma_px: dict[str, float]
-    #: What became of the segments, in words.
-    explanation: str
-    #: Number of segments with each outcome, by name.
-    outcomes: dict[str, int]
-    #: Sentences for the user.
-    warnings: tuple[str, ...]
 
 
 def map_images(
@@ -143,7 +129,7 @@ def map_images(
     OutputError
         If another run works in ``work``, or it cannot be written.
     """
-    options = options or MapOptions()
+    options = with_parts(options or MapOptions())
     say = progress or (lambda stage, done, total: None)
     folder = Path(images)
     files = image_files(folder)
@@ -184,7 +170,6 @@ def _mapped(
     if options.refine_points:
         raw = points
         points = store.scene("measured", lambda: _measured(folder, raw, options, say), options.refine_points)
-    matches = _by_index(line_matches, start)
     given = None if line_matches is None else digest(line_matches)
     # From here on every stage depends on all options.
     segments = store.segments(
@@ -193,7 +178,8 @@ def _mapped(
         dataclasses.replace(options, threads=None),
         given,
     )
-    result = map_segments(points, segments, matches, options, store, say)
+    matches = matches_for(options, folder, points, segments, line_matches)
+    result = map_segments(points, segments, matches, options, store, say, neighbors_for(options, folder))
     say("done", 1, 1)
     left_out = _not_in_model(names, start, given=model_given)
     return dataclasses.replace(result, start=start, warnings=(*left_out, *result.warnings))
@@ -216,6 +202,7 @@ def map_segments(
     options: MapOptions,
     store: Stages,
     say: StageProgress,
+    neighbors: NeighborChooser | None = None,
 ) -> MapResult:
     """Map lines and planes from segments and an adjusted model of points: the stages from ``lines`` on.
 
@@ -225,7 +212,7 @@ def map_segments(
     # Each point's noise is estimated from the given standard deviations, not from an estimate before.
     given_sigma = points.point_observations.sigma
     noisy = with_point_noise(points)
-    line_map = store.line_map("lines", lambda: map_lines(noisy, segments, matches, options.lines, say))
+    line_map = store.line_map("lines", lambda: map_lines(noisy, segments, matches, options.lines, say, neighbors))
     lined = line_map.add_to(noisy, segments)
     weighted = _weighted(robust, lined)
     for turn in range(MAX_ROUNDS if options.refine_poses and lined.num_lines else 0):
@@ -235,7 +222,9 @@ def map_segments(
         joint = with_point_noise(joint.replace(point_observations=table.replace(sigma=given_sigma)))
         # The lines as mapped are good starts, and only the adjusted ones tell the noise of the segments.
         weighted = _weighted(robust, joint)
-        line_map = store.line_map(f"final-lines{tag}", partial(map_lines, joint, segments, matches, options.lines, say))
+        line_map = store.line_map(
+            f"final-lines{tag}", partial(map_lines, joint, segments, matches, options.lines, say, neighbors)
+        )
         lined = line_map.add_to(joint, segments)
         if lined.num_lines == 0 or moved_px(first, joint, MOVED_SHARE) <= options.lines.noise:
             break
@@ -298,18 +287,13 @@ def _not_in_model(names: list[str], start: Scene, given: bool) -> list[str]:
     return [f"{len(left)} of {len(names)} images {have} not used: {which}.{remedy}"]
 
 
-def _by_index(line_matches: ExternalMatches | None, scene: Scene) -> Callable[[int, int], LineMatches] | None:
-    if line_matches is None:
-        return None
-    return lambda i, j: line_matches.match(scene.images.names[i], scene.images.names[j])
-
-
 def _segments(
     folder: Path, scene: Scene, options: MapOptions, say: StageProgress, line_matches: ExternalMatches | None
 ) -> list[Segments]:
     if line_matches is not None:
         return given_segments(folder, scene, line_matches, say)
-    return detect_segments(folder, scene, LsdDetector(min_length=options.min_segment_length), say)
+    detector = DETECTORS.make(options.detector, min_length=options.min_segment_length, max_segments=0)
+    return detect_segments(folder, scene, detector, say)
 
 
 def _measured(folder: Path, points: Scene, options: MapOptions, say: StageProgress) -> Scene:

@@ -32,7 +32,7 @@ from groma.mapping.lines.directions import depth_ratios
 from groma.mapping.lines.duplicates import not_duplicates
 from groma.mapping.lines.kinds import found_again
 from groma.mapping.lines.line_map import LineMap, explain
-from groma.mapping.lines.matches import MatchProvider, external_matches, flow_matches, wide_baseline_matches
+from groma.mapping.lines.matches import MatchProvider, external_matches, segment_matches
 from groma.mapping.lines.merge import merge_agreeing
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.options import MapLinesOptions
@@ -60,6 +60,7 @@ def map_lines(
     matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None = None,
     options: MapLinesOptions | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    neighbors: Callable[[Scene], list[IntArray]] | None = None,
 ) -> LineMap:
     """Build 3D lines from the segments of posed images.
 
@@ -77,6 +78,9 @@ def map_lines(
         Lengths, gates and counts.
     progress : callable, optional
         Called with stage, number done, number in all.
+    neighbors : callable, optional
+        Chooses for every image of a scene which others it is compared with, the best first, in place of
+        :func:`~groma.mapping.lines.neighbors.covisible_neighbors`.
 
     Returns
     -------
@@ -107,21 +111,24 @@ def map_lines(
         now = time.perf_counter()
         seconds[stage], clock = seconds.get(stage, 0.0) + now - clock, now
 
-    neighbors = covisible_neighbors(scene, options.num_neighbors, options.min_shared)
+    if neighbors is None:
+        compared = covisible_neighbors(scene, options.num_neighbors, options.min_shared)
+    else:
+        compared = neighbors(scene)
     lap("neighbors")
     views = build_views(scene, segments, options.min_length, options.noise, options.depth_margin)
     lap("views")
     outcome = np.full(len(views.image_idx), UNKNOWN, np.int64)
     ratios = depth_ratios(scene, segments, views) if options.use_directions else np.zeros((len(outcome), 2))
     lap("directions")
-    places = choose_places(scene, views, ratios, neighbors, matches, options, outcome, report)
+    places = choose_places(scene, views, ratios, compared, matches, options, outcome, report)
     outcome[~views.usable] = Outcome.TOO_SHORT
     lap("proposals")
     strength = np.concatenate([np.zeros(0), *(one.strength for one in segments)])
     size = np.column_stack([scene.cameras.width, scene.cameras.height])[scene.images.camera_idx]
-    tracks = _build_tracks(views, strength, size, neighbors, places, options, outcome, report)
+    tracks = _build_tracks(views, strength, size, compared, places, options, outcome, report)
     lap("tracks")
-    return _result(tracks, neighbors, places, outcome, seconds)
+    return _result(tracks, compared, places, outcome, seconds)
 
 
 def _build_tracks(
@@ -278,7 +285,6 @@ __all__ = [
     "Outcome",
     "explain",
     "external_matches",
-    "flow_matches",
     "map_lines",
-    "wide_baseline_matches",
+    "segment_matches",
 ]

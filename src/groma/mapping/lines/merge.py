@@ -22,7 +22,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.mapping.lines.fit import across_basis, line_residuals
+from groma.estimators.two_point_line import across_basis, line_residuals
 from groma.mapping.lines.tracks import Tracks
 
 #: Squared Mahalanobis distance up to which two lines agree: 99.7 % for four degrees of freedom.

@@ -26,7 +26,7 @@ from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_ends import trim
 from groma.mapping.distinct import distinct_pairs, num_distinct
-from groma.mapping.lines.fit import find_on_lines, refine
+from groma.mapping.lines.fit import find_on_lines, fit_lines
 from groma.mapping.lines.views import LineViews
 
 #: Sum of squares of an observation's two distances over sigma up to which it belongs to a line: 99.7 %.
@@ -203,12 +203,9 @@ class Tracks:
         views = self.views
         rows, pointers = self.table()
         active, squared, front = np.ones(len(rows), bool), np.zeros(len(rows)), np.zeros(len(rows), bool)
-        self.uncertainty, self.unchecked = np.zeros(len(self.X)), np.zeros(len(self.X))
         for k in range(rounds):
-            refine(
-                views.camera, views.image_idx, views.ends, views.sigma, pointers, rows, active, self.X, squared,
-                self.uncertainty, self.unchecked,
-            )  # fmt: skip
+            fit = fit_lines(views, pointers, rows, active, self.X)
+            self.X, squared, self.uncertainty, self.unchecked = fit.X, fit.squared, fit.uncertainty, fit.unchecked
             trim(views.center, views.image_idx, views.ray, views.length, pointers, rows, active, self.X, front)
             fits = (squared < GATE) & front
             if k == rounds - 1:
