@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -23,14 +24,27 @@ from groma.errors import InputError
 from groma.features.external import ExternalMatches
 from groma.features.images import GrayImage
 from groma.features.segments import Segments
+from groma.gates import gate
 from groma.geometry import segment2
 from groma.mapping.photographs import read_gray
+from groma.mapping.work import map_work
 from groma.scene import Scene
 
-#: A lens that moves no pixel by more than this is taken as it is; pixels.
-NEGLIGIBLE = 0.05
-#: The resampled image is at most so much larger than the original, per side; wide lenses lose their corners.
-MAX_GROWTH = 2.0
+
+@dataclass(frozen=True)
+class LensGates:
+    """When images are resampled without the distortion of their lens, and how large they may become."""
+
+    negligible: float = gate(
+        0.05, "px", "movement of pixels by a lens that is taken as it is", "derived from the noise of segments: a third"
+    )
+    max_growth: float = gate(
+        2.0, "1", "side of the resampled image over that of the original", "cost: wide lenses lose their corners"
+    )
+    max_fold: float = gate(0.5, "px", "of a pixel that is bent and straightened again", "convention: half a pixel")
+
+
+GATES = LensGates()
 #: Places looked at along a segment, to find the part of it inside the image.
 _SAMPLES = 65
 
@@ -64,9 +78,9 @@ class Straightener:
         border = np.concatenate([border, *(np.column_stack([np.full(33, side), v]) for side in (0.0, width))])
         straight = model.undistort_pixels(params, border)
         straight = straight[np.isfinite(straight).all(1)]
-        if len(straight) == len(border) and np.abs(straight - border).max() <= NEGLIGIBLE:
+        if len(straight) == len(border) and np.abs(straight - border).max() <= GATES.negligible:
             return None
-        growth = 0.5 * (MAX_GROWTH - 1.0) * np.array([width, height])
+        growth = 0.5 * (GATES.max_growth - 1.0) * np.array([width, height])
         corner = np.array([width, height], float)
         low = np.maximum(np.floor(straight.min(0, initial=0.0)), np.floor(-growth))
         high = np.minimum(np.ceil(straight.max(0, initial=0.0)), np.ceil(corner + growth))
@@ -111,7 +125,7 @@ class Straightener:
         inside = np.all((bent >= 0.0) & (bent <= np.array(self.size)), axis=1)
         # Far out a polynomial lens model folds the plane back into the image; only what comes back was seen there.
         back = self.model.undistort_pixels(self.params, bent[inside]) + self._shift
-        inside[inside] = np.all(np.abs(back - pixels[inside]) < 0.5, axis=1)
+        inside[inside] = np.all(np.abs(back - pixels[inside]) < GATES.max_fold, axis=1)
         return inside
 
     @property
@@ -125,20 +139,18 @@ def detect_segments(
 ) -> list[Segments]:
     """Find the segments of every image of a scene; pixels of the images as they are."""
     straighteners: dict[int, Straightener | None] = {}
-    found = []
-    for i, name in enumerate(scene.images.names):
-        say("finding segments", i, scene.num_images)
-        image = read_gray(folder / name)
-        camera = int(scene.images.camera_idx[i])
+
+    def of_image(i: int) -> Segments:
+        image, camera = read_gray(folder / scene.images.names[i]), int(scene.images.camera_idx[i])
         if camera not in straighteners:
             model = camera_models.model(scene.cameras.models[camera])
             # One is kept: it is larger than the image, and there may be a camera for every image.
-            straighteners = {
-                camera: Straightener.of(model, scene.cameras.params_of(camera), image.shape[1], image.shape[0])
-            }
+            straighteners.clear()
+            straighteners[camera] = Straightener.of(model, scene.cameras.params_of(camera), *image.shape[::-1])
         straightener = straighteners[camera]
-        found.append(detector.detect(image) if straightener is None else straightener.detect(detector, image))
-    return found
+        return detector.detect(image) if straightener is None else straightener.detect(detector, image)
+
+    return map_work(of_image, range(scene.num_images), partial(say, "finding segments"))
 
 
 def given_segments(
@@ -165,11 +177,11 @@ def given_segments(
             f"The line matches refer to segments of {min(used - known)!r}, but do not hold them. Add an array "
             f"'segments|{min(used - known)}'."
         )
-    found = []
-    for i, name in enumerate(scene.images.names):
-        say("reading segments", i, scene.num_images)
-        found.append(external.segments_of(name, read_gray(folder / name)) if name in known else Segments.empty())
-    return found
+
+    def of_image(name: str) -> Segments:
+        return external.segments_of(name, read_gray(folder / name)) if name in known else Segments.empty()
+
+    return map_work(of_image, scene.images.names, partial(say, "reading segments"))
 
 
 __all__ = ["Straightener", "detect_segments", "given_segments"]

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import LINE_FACTORS, POINT_FACTORS
-from groma.adjustment.rescue.restart import STEPS, SUSPICIOUS, triangulated_anew, went_elsewhere, with_cameras
+from groma.adjustment.rescue.restart import GATES, triangulated_anew, went_elsewhere, with_cameras
 from groma.factors.contract import Factor, Ref
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
@@ -63,7 +63,9 @@ def settle_clusters(scene: Scene, problem: Problem, threads: int | None = None) 
         name: _joined(group, chosen[name], second[name]) if name in chosen else replace(group, constant=True)
         for name, group in variables.items()
     }
-    settled = solve(Problem(starts, doubled), SolverOptions(max_iterations=STEPS, threads=threads)).problem.variables
+    settled = solve(
+        Problem(starts, doubled), SolverOptions(max_iterations=GATES.max_steps, threads=threads)
+    ).problem.variables
     ends = np.zeros(2 * count)
     mine = [label[kept] for label, kept in zip(labels, rows, strict=True) if len(kept)]
     for factor, label in zip(doubled, mine, strict=True):
@@ -114,7 +116,7 @@ def _doubtful(factors, labels: list[IntArray], count: int, variables: Mapping[st
     per_view = (cost / np.maximum(views, 1.0))[:count]
     seen = views[:count] > 0
     usual = float(np.median(per_view[seen])) if seen.any() else 0.0
-    return np.append(seen & (per_view > SUSPICIOUS * max(usual, 1e-12)), False)
+    return np.append(seen & (per_view > GATES.suspicious * max(usual, 1e-12)), False)
 
 
 def _costs(factor: Factor, label: IntArray, count: int, variables: Mapping[str, Variables]) -> FloatArray:

@@ -14,7 +14,7 @@ back to where the others want it; the false one then counts as what it is, an ou
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,18 +22,28 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.trimming import trim_to_ray
 from groma.factors.observations.line_bearing import LineBearing
 from groma.factors.observations.line_reprojection import LineReprojection
+from groma.gates import gate
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
 Observing = LineReprojection | LineBearing
 
-#: A segment this many times nearer to its camera than usual for its line is not seen there.
-NEAREST = 0.01
-#: Most steps of a line on its own.
-STEPS = 20
-#: Sine of the angle from which on a line has turned: its old end points then say little about the new ones.
-TURNED = 0.02
+
+@dataclass(frozen=True)
+class SlipGates:
+    """Which observations are false, and which lines turned."""
+
+    nearest: float = gate(
+        0.01, "1", "depth of a segment over the usual one of its line, below which it is false", "chosen on wireframes"
+    )
+    turned: float = gate(
+        0.02, "rad", "angle by which a line turned, if its old end points say little", "chosen on wireframes"
+    )
+    max_steps: int = gate(20, "steps", "of a line on its own", "cost: most need two or three")
+
+
+GATES = SlipGates()
 
 
 def without_slips(problem: Problem, threads: int | None = None) -> tuple[Problem, IntArray]:
@@ -65,11 +75,11 @@ def without_slips(problem: Problem, threads: int | None = None) -> tuple[Problem
         factors.append(factor.take(np.flatnonzero(keep)))
     used = {ref.group for factor in factors for _, ref in factor.references()} - {"lines"}
     held = {name: replace(problem.variables[name], constant=True) for name in used}
-    options = SolverOptions(max_iterations=STEPS, threads=threads)
+    options = SolverOptions(max_iterations=GATES.max_steps, threads=threads)
     settled = solve(Problem({**held, "lines": lines}, factors), options).problem.variables["lines"]
     before, after = (group.ambient()[mine, 3:] for group in (lines, settled))
     sine = np.linalg.norm(np.cross(before, after), axis=1)
-    turned = sine > TURNED * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    turned = sine > GATES.turned * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
     return Problem({**problem.variables, "lines": settled}, problem.factors), mine[turned]
 
 
@@ -83,7 +93,7 @@ def _slipped(problem: Problem, factors: list[Observing]) -> list[BoolArray]:
     usual = np.zeros(len(count))
     seen = count > 0
     usual[seen] = depth[order[(first + count // 2)[seen]]]  # of two, the farther
-    limit = np.where(usual > 0, NEAREST * usual, -np.inf)
+    limit = np.where(usual > 0, GATES.nearest * usual, -np.inf)
     return [z < limit[factor.line.index] for z, factor in zip(depths, factors, strict=True)]
 
 

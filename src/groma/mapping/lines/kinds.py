@@ -23,14 +23,24 @@ little, and then little is asked.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.gates import gate
 
-#: What is at most asked of a line, over what the best kind of segment reaches.
-TOP_SHARE = 0.6
-#: The quantile of p that stands for the best kind.
-TOP_QUANTILE = 0.9
+
+@dataclass(frozen=True)
+class KindGates:
+    """What is asked of the kind of a line's segments, beside ``MapLinesOptions.min_repeatability``."""
+
+    top_share: float = gate(
+        0.6, "1", "asked at most, over what the best kind of segment reaches", "chosen on ETH3D facades"
+    )
+    top_quantile: float = gate(0.9, "quantile", "of p that stands for the best kind", "chosen on ETH3D facades")
+
+
 #: Newton steps of the fit at most.
 _STEPS = 50
 
@@ -63,7 +73,13 @@ def repeatability(length: FloatArray, strength: FloatArray, eligible: BoolArray,
 
 
 def found_again(
-    length: FloatArray, strength: FloatArray, line_of: IntArray, eligible: BoolArray, num_lines: int, least: float
+    length: FloatArray,
+    strength: FloatArray,
+    line_of: IntArray,
+    eligible: BoolArray,
+    num_lines: int,
+    least: float,
+    gates: KindGates = KindGates(),
 ) -> BoolArray:
     """Lines whose segments are of a kind that is found again.
 
@@ -79,6 +95,8 @@ def found_again(
         Number of lines.
     least : float
         The mean probability asked of a line where most segments are part of one; 0 keeps all lines.
+    gates : KindGates, optional
+        What is asked of a line beside.
 
     Returns
     -------
@@ -89,12 +107,11 @@ def found_again(
     if least <= 0.0 or not member.any():
         return np.ones(num_lines, bool)
     p = repeatability(length, strength, eligible, member)
-    asked = min(
-        max(least, 1.0 - float(member[eligible].mean())), TOP_SHARE * float(np.quantile(p[eligible], TOP_QUANTILE))
-    )
+    best = gates.top_share * float(np.quantile(p[eligible], gates.top_quantile))
+    asked = min(max(least, 1.0 - float(member[eligible].mean())), best)
     number = np.bincount(line_of[member], minlength=num_lines)
     mean = np.bincount(line_of[member], p[member], minlength=num_lines) / np.maximum(number, 1)
     return mean >= asked
 
 
-__all__ = ["features_of", "found_again", "repeatability"]
+__all__ = ["KindGates", "features_of", "found_again", "repeatability"]

@@ -18,12 +18,25 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.cameras import model as camera_model
+from groma.gates import gate
 from groma.geometry import quaternion
 from groma.geometry.algebra import apply, dot, norm, perpendicular, ratio, unit
 from groma.scene import Scene
 
-#: Least standard deviation of a measured coordinate, pixels: synthetic scenes may have none.
-_MIN_SIGMA = 0.02
+
+@dataclass(frozen=True)
+class LandmarkNoiseGates:
+    """What is believed of the noise of a landmark."""
+
+    min_sigma_px: float = gate(
+        0.02, "px", "deviation of a coordinate at least", "convention: synthetic scenes may have none"
+    )
+    max_share: float = gate(
+        3.0, "1", "lengths of a line from its middle, where a ray still tells where it ends", "chosen on wireframes"
+    )
+
+
+GATES = LandmarkNoiseGates()
 
 
 @dataclass(frozen=True)
@@ -153,7 +166,7 @@ def _share_on_line(scene: Scene, image_idx: IntArray, measured: FloatArray, ends
     slope = dot(normal, along)
     share = ratio(dot(normal, center - ends[:, 0]), slope, np.abs(slope) > 1e-12 * dot(along, along))
     # Rays nearly along the line say nothing; far points would only disturb.
-    return np.where(np.abs(share - 0.5) < 3.0, share, np.nan)
+    return np.where(np.abs(share - 0.5) < GATES.max_share, share, np.nan)
 
 
 def _by_model(scene: Scene, image_idx: IntArray):
@@ -170,7 +183,7 @@ def _misfit(squares: FloatArray, freedom: IntArray, sigma_px: float | None) -> t
     """Noise of a coordinate, robustly over the landmarks, and each landmark's misfit in units of it."""
     known = freedom > 0
     variance = ratio(squares, freedom.astype(np.float64), known, 0.0)
-    sigma = _MIN_SIGMA
+    sigma = GATES.min_sigma_px
     if sigma_px is not None:
         sigma = sigma_px
     elif known.any():
@@ -179,7 +192,7 @@ def _misfit(squares: FloatArray, freedom: IntArray, sigma_px: float | None) -> t
         cumulated = np.cumsum(freedom[known][order])
         middle = order[np.searchsorted(cumulated, 0.5 * cumulated[-1])]
         sigma = float(np.sqrt(variance[known][middle]))
-    sigma = max(sigma, _MIN_SIGMA)
+    sigma = max(sigma, GATES.min_sigma_px)
     return sigma, np.sqrt(variance) / sigma
 
 

@@ -19,6 +19,7 @@ on a rounded corner, is off as a whole. Which of the two prevails is told by the
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -27,25 +28,44 @@ from scipy.special import polygamma
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.pixel_residuals import squared_residuals_px
+from groma.gates import gate
 from groma.mapping.noise.landmarks import project_points
 from groma.problem.residuals import residuals_of
 from groma.scene import Scene
 
-#: Residuals smaller than this are not believed, pixels: synthetic scenes may have none.
-MIN_SIGMA_PX = 0.02
-#: Fewer observations tell nothing; this is assumed then, pixels.
-_FEWEST, _UNKNOWN_PX = 10, 1.0
-#: The median of the squared norm of two Gaussian coordinates, in variances.
+
+@dataclass(frozen=True)
+class ObservationNoiseGates:
+    """From how many residuals noise is estimated, and what is believed of it."""
+
+    min_sigma_px: float = gate(0.02, "px", "noise at least", "convention: synthetic scenes may have none")
+    min_observations: int = gate(
+        10, "observations", "fewer tell nothing", "derived from a third of the noise as its error"
+    )
+    unknown_px: float = gate(1.0, "px", "noise where nothing tells it", "convention: a pixel")
+    max_fitted: float = gate(
+        0.8, "share", "of the residuals that landmarks take at most", "derived from five tracks of two"
+    )
+    min_views: int = gate(
+        4, "observations", "of a landmark that tells its noise from chance", "derived from one degree of freedom in two"
+    )
+    min_landmarks: int = gate(
+        100, "landmarks", "of so many views, that tell the noise of all", "derived from 10 % of its error"
+    )
+    min_square: float = gate(
+        1e-4, "1", "smallest squared residual, over the usual one", "convention: a logarithm is taken"
+    )
+    shapes: tuple[float, float] = gate(
+        (0.5, 1e4), "1", "bounds of half the degrees of freedom", "convention: heavy tails to normal"
+    )
+    max_correlation: float = gate(0.8, "1", "of the two ends of segments", "chosen on ETH3D facades")
+
+
+GATES = ObservationNoiseGates()
+#: The median of the squared norm of two normal coordinates, in variances: twice the logarithm of two.
 _MEDIAN = 1.386
-#: Observations of a point that tell its noise from chance, and how many such points tell the noise of all.
-_MANY_VIEWS, _MANY_POINTS = 4, 100
-#: Smallest squared residual, relative to the usual one: its logarithm is taken.
-_MIN_SQUARE = 1e-4
-#: Half the degrees of freedom lie between these.
-_SHAPES = (0.5, 1e4)
+#: Rounds of expectation maximisation.
 _STEPS = 20
-#: Beyond this, a correlation of the two ends of segments is not believed.
-_MAX_CORRELATED = 0.8
 
 
 def noise_px(scene: Scene, kind: Literal["points", "lines"], end_correlation: float = 0.0) -> float:
@@ -60,11 +80,11 @@ def noise_px(scene: Scene, kind: Literal["points", "lines"], end_correlation: fl
     )
     assembly = assemble(scene, options)
     squares = squared_residuals_px(assembly, weighted=True).get(kind)
-    if squares is None or len(squares) < _FEWEST:
-        return _UNKNOWN_PX
+    if squares is None or len(squares) < GATES.min_observations:
+        return GATES.unknown_px
     unknowns = 3 * scene.num_points if kind == "points" else 4 * scene.num_lines
-    share = 1.0 - min(unknowns / (2 * len(squares)), 0.8)
-    return max(float(np.sqrt(np.median(squares) / _MEDIAN / share)), MIN_SIGMA_PX)
+    share = 1.0 - min(unknowns / (2 * len(squares)), GATES.max_fitted)
+    return max(float(np.sqrt(np.median(squares) / _MEDIAN / share)), GATES.min_sigma_px)
 
 
 def line_end_correlation(scene: Scene) -> float:
@@ -76,13 +96,13 @@ def line_end_correlation(scene: Scene) -> float:
     images = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
     ends = [np.zeros((0, 2))]
     for factor in problem.factors:
-        told = images[factor.line.index] >= _MANY_VIEWS  # type: ignore[attr-defined]
+        told = images[factor.line.index] >= GATES.min_views  # type: ignore[attr-defined]
         ends.append((residuals_of(factor, problem.variables) * np.asarray(factor.sqrt_information)[:, None])[told])
     first, second = np.concatenate(ends).T
-    if len(first) < _MANY_POINTS:
+    if len(first) < GATES.min_landmarks:
         return 0.0
     shift, turn = np.median(np.abs(first + second)) ** 2, np.median(np.abs(first - second)) ** 2
-    return float(np.clip((shift - turn) / max(shift + turn, 1e-300), -_MAX_CORRELATED, _MAX_CORRELATED))
+    return float(np.clip((shift - turn) / max(shift + turn, 1e-300), -GATES.max_correlation, GATES.max_correlation))
 
 
 def moved_px(before: Scene, after: Scene, share: float) -> float:
@@ -111,15 +131,15 @@ def with_point_noise(scene: Scene) -> Scene:
     seen = np.isfinite(residual).all(axis=1)
     squares, owner = (residual[seen] ** 2).sum(axis=1), table.point_idx[seen]
     number = np.bincount(owner, minlength=count)
-    if np.count_nonzero(number >= _MANY_VIEWS) < _MANY_POINTS:
+    if np.count_nonzero(number >= GATES.min_views) < GATES.min_landmarks:
         return scene
     # Fitting a point takes three of the two coordinates per observation; what is left is as if they all were smaller.
     freedom = np.maximum(2 * number - 3, 1)
     share = (freedom / np.maximum(2 * number, 1))[owner]
     usual = float(np.median(squares / share)) / _MEDIAN
-    if usual < MIN_SIGMA_PX**2:
+    if usual < GATES.min_sigma_px**2:
         return scene
-    squares = np.maximum(squares, _MIN_SQUARE * usual * share)
+    squares = np.maximum(squares, GATES.min_square * usual * share)
     between, within = _degrees_of_freedom(np.log(squares / share), owner, number)
     variance = np.full(count, usual)
     for _ in range(_STEPS):
@@ -135,9 +155,9 @@ def _degrees_of_freedom(levels: FloatArray, owner: IntArray, number: IntArray) -
 
     Few make them rather infinite than small: each is what is left of a variance that chance explains.
     """
-    chosen = number[owner] >= _MANY_VIEWS
+    chosen = number[owner] >= GATES.min_views
     levels, owner = levels[chosen], owner[chosen]
-    points = np.flatnonzero(number >= _MANY_VIEWS)
+    points = np.flatnonzero(number >= GATES.min_views)
     mean = np.bincount(owner, levels, len(number)) / np.maximum(number, 1)
     within = float(((levels - mean[owner]) ** 2).sum() / (number[points] - 1).sum())
     between = float(np.var(mean[points]) - within * np.mean(1.0 / number[points]))
@@ -146,7 +166,7 @@ def _degrees_of_freedom(levels: FloatArray, owner: IntArray, number: IntArray) -
 
 def _inverse_trigamma(value: float) -> float:
     """Where the trigamma function, which falls, has a value; the nearer end where that is out of bounds."""
-    shapes = np.geomspace(*_SHAPES, 1000)[::-1]
+    shapes = np.geomspace(*GATES.shapes, 1000)[::-1]
     return float(np.interp(value, polygamma(1, shapes), shapes))
 
 

@@ -25,7 +25,7 @@ from groma.errors import InputError
 from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines, orthogonal_pairs
 from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
 from groma.geometry.algebra import norm
-from groma.mapping.distinct import num_distinct
+from groma.mapping.groups import num_distinct
 from groma.mapping.noise.landmarks import line_noise, point_noise
 from groma.mapping.structure import relations as _relations
 from groma.scene import Directions, Planes, Relations, Scene

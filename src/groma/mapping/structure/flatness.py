@@ -15,18 +15,28 @@ are few or noisy it stays large.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.terms.relations import lengths_per_pixel
+from groma.gates import gate
 from groma.mapping.noise.landmarks import line_noise, point_noise
 from groma.mapping.structure.find import StructureOptions
 from groma.scene import Scene
 
-#: Least deviation, pixels. Tighter ties change little any more, and slow an adjustment down.
-_LEAST = 0.02
-#: Deviations that are tried from the least to the most.
-_TRIED = 100
+
+@dataclass(frozen=True)
+class FlatnessGates:
+    """Between which deviations that of surfaces is sought."""
+
+    min_sigma: float = gate(
+        0.02, "px", "deviation at least", "cost: tighter ties change little, and slow an adjustment down"
+    )
+    num_tried: int = gate(100, "values", "deviations that are tried", "cost: five per cent from one to the next")
+
+
 #: Unknowns of a plane.
 _UNKNOWNS = 3
 #: Plane, height, variance and length of a pixel of landmarks.
@@ -34,7 +44,7 @@ _Heights = tuple[IntArray, FloatArray, FloatArray, FloatArray]
 _NOTHING: _Heights = np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0)
 
 
-def surface_noise_px(scene: Scene, options: StructureOptions) -> float:
+def surface_noise_px(scene: Scene, options: StructureOptions, gates: FlatnessGates = FlatnessGates()) -> float:
     """Return the standard deviation of landmarks from the planes that they lie on, as a length in the images, pixels.
 
     Parameters
@@ -44,6 +54,8 @@ def surface_noise_px(scene: Scene, options: StructureOptions) -> float:
     options : StructureOptions
         What they were found with. No more than its ``surface_sigma_px`` is returned, and that where nothing is on a
         plane.
+    gates : FlatnessGates, optional
+        Which deviations are tried.
     """
     heights = [_of_points(scene, options.point_sigma_px), _of_lines(scene, options.line_sigma_px)]
     plane, height, variance, length = (np.concatenate(column) for column in zip(*heights, strict=True))
@@ -52,8 +64,8 @@ def surface_noise_px(scene: Scene, options: StructureOptions) -> float:
     variance, length = variance[told], length[told]
     squared = height[told] ** 2 * count[told] / (count[told] - _UNKNOWNS)
     most = options.surface_sigma_px
-    tried = np.geomspace(min(_LEAST, most), most, _TRIED)
-    surprise = np.empty(_TRIED)
+    tried = np.geomspace(min(gates.min_sigma, most), most, gates.num_tried)
+    surprise = np.empty(gates.num_tried)
     for k, sigma in enumerate(tried):
         total = variance + (sigma * length) ** 2
         surprise[k] = (np.log(total) + squared / total).sum()
