@@ -5,7 +5,7 @@ Lines of known place are seen by known cameras on a path, with noise, and are st
 is a least-squares problem of its own, solved by Levenberg-Marquardt in each chart; so what differs is the chart alone.
 Varied are the noise, the baseline (length of the path over the distance) and the distance of the scene from the origin.
 
-    python benchmarks/charts.py [--json FILE]     the tables of docs/charts.md, under a minute
+    python benchmarks/charts.py [--json FILE]     the tables of docs/evidence/line-charts.md, under a minute
     python benchmarks/charts.py --why             the table of reasons there, some seconds
 """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Put the tables of the latest results into ``docs/benchmarks.md``.
+"""Put the tables of the latest results into ``docs/evidence/speed.md``.
 
     python benchmarks/tables.py
 
@@ -14,7 +14,7 @@ import sys
 
 from _workshop import RESULTS, ROOT
 
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "evidence" / "speed.md"
 
 
 def main() -> int:

@@ -82,7 +82,7 @@ def start():
     return synthetic.holistic(10, seed=1).start
 
 
-@pytest.mark.parametrize("page", ["python.md", "uncertainty.md", "large-scenes.md"])
+@pytest.mark.parametrize("page", ["python.md", "uncertainty.md", "large-scenes.md", "evidence/uncertainty.md"])
 def test_python_of_the_pages_runs(page, start, tmp_path, monkeypatch, capsys):
     """In a folder with a model, and with a scene at hand."""
     import groma

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Compiled functions on disk: found again, compiled again after any change, harmless where nothing can be written,
-whole when several processes write at once."""
+"""Compiled functions on disk: found again, compiled again after a change, harmless where nothing can be written, whole
+when several processes write at once. What counts as a change: ``test_kernel_digest.py``."""
 
 import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,8 @@ import numpy as np
 import pytest
 from numba.core import caching
 
-from groma import _numba_cache
+import groma
+from groma import _numba_cache, _numba_digest
 
 pytestmark = [
     pytest.mark.kernels,
@@ -33,6 +35,11 @@ def total(values):
     for i in range(values.shape[0]):
         result += double(values[i])
     return result
+"""
+
+TOTAL = """
+def total(values):
+    return total_of(double, values)
 """
 
 #: What a process that compiles something real prints: the numbers as bits, and what was compiled.
@@ -94,7 +101,7 @@ def test_other_argument_types_have_files_of_their_own(fresh):
 def test_an_upgrade_compiles_again_and_leaves_nothing_behind(fresh, monkeypatch, tmp_path):
     fresh()
     files = _files(tmp_path)
-    monkeypatch.setattr(_numba_cache, "source_stamp", lambda: "another version")
+    monkeypatch.setattr(_numba_digest, "environment", lambda: "another version")
     assert fresh()[1] > 0
     assert _files(tmp_path) == files
     assert fresh()[1] == 0
@@ -104,6 +111,13 @@ def test_a_changed_function_is_not_served_from_its_older_self(fresh):
     assert fresh()[0] == 6.0
     fresh.path.write_text(SOURCE.replace("result += double", "result += 2.0 * double"))
     assert fresh()[0] == 12.0
+
+
+def test_a_function_that_is_given_functions_is_not_kept(fresh, tmp_path):
+    """The address of an argument would name it, and hold for one process only."""
+    fresh.path.write_text(SOURCE.replace("total(values)", "total_of(f, values)").replace("double(v", "f(v") + TOTAL)
+    assert fresh()[0] == fresh()[0] == 6.0
+    assert not [path for path in _files(tmp_path) if "total_of" in path.name]
 
 
 @pytest.mark.parametrize("damage", [lambda content: content[:-20], lambda content: b"", lambda content: b"x" * 500])
@@ -170,3 +184,36 @@ def test_four_processes_at_once_then_another_processor(tmp_path):
     # another processor compiles for itself, and does not disturb the first
     assert _finish(_start(tmp_path, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES=""))[1] > 0
     assert _finish(_start(tmp_path)) == (first[0][0], 0)
+
+
+ONE_PIXEL_EACH = """
+import numpy as np
+from groma import cameras
+from groma._numba_cache import counts
+for name, params in (("PINHOLE", [500, 480, 320, 240]), ("RADIAL", [500, 320, 240, -0.1, 0.02])):
+    before = counts.compiled
+    pixel = cameras.model(name).project(np.array(params, dtype=float), np.array([[1.0, 2.0, 4.0]]))
+    print(name, *pixel[0], counts.compiled - before)
+"""
+
+
+def test_an_edited_camera_model_of_groma(tmp_path):
+    """On a copy of the sources."""
+    shutil.copytree(Path(groma.__file__).parent, tmp_path / "groma", ignore=shutil.ignore_patterns("__pycache__"))
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+
+    def run():
+        output = subprocess.check_output(
+            [sys.executable, "-c", ONE_PIXEL_EACH], text=True, env=environment, cwd=tmp_path
+        )
+        return [line.split() for line in output.splitlines()]
+
+    first, again = run(), run()
+    assert again == [[*line[:3], "0"] for line in first]
+    path = tmp_path / "groma" / "cameras" / "radial.py"
+    text = path.read_text()
+    path.write_text(text.replace("scale * x + cx, ", "scale * x + cx + 7.0, "))
+    edited = run()
+    assert edited[0] == again[0]
+    assert float(edited[1][1]) == pytest.approx(float(again[1][1]) + 7.0)
+    assert int(edited[1][3]) > 0

@@ -5,11 +5,15 @@
 sources; Numba's folder of the user (``~/.cache/numba`` on Linux), for installations that are read-only. Where none can
 be written, functions are compiled in every process; nothing fails.
 
-**When.** One file per function and argument types. It opens with a digest of all that it depends on: Numba's version,
-the processor and its instructions, the argument types, the function, and every file of the package that holds compiled
-code. The last is needed because kernels are inlined into their callers: Numba's own cache compares the file of the
-caller alone and would return old numbers after an edit or an upgrade. A file whose digest or checksum is wrong is
-compiled again and replaced, so that a cache shared by several versions or processors is never wrong.
+**When.** One file per function and argument types. It opens with a digest of all that it depends on: versions, the
+processor and its instructions, the argument types, the function and everything it calls, inlines or reads as a constant
+(:mod:`groma._numba_digest`). Numba's own cache compares the file of the function alone and would return old numbers
+after a kernel in another file was edited. Here an edit compiles what uses the edited kernel again, and nothing else. A
+file whose digest or checksum is wrong is compiled again and replaced, so that a cache shared by several versions or
+processors is never wrong.
+
+The name of the file holds the function, the argument types, the processor, and where the types stand for a camera model
+the names of its kernels: two models that have the same number in two processes keep files of their own.
 
 **Several processes.** Files are written under another name and moved into place, so a reader finds a whole file or
 none. There is no index: Numba's own keeps one per function, and two processes that compile the same function for
@@ -30,10 +34,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numba
+from numba.core import sigutils
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
+
+from groma import _numba_digest
 
 #: A file that contains one of these holds compiled code, or chooses it.
 _MARKS = (b"_numba import", b"njit(", b"numba.extending", b"llvmlite")
@@ -43,7 +49,7 @@ _DIGEST, _CHECKSUM = 64, 8
 
 @lru_cache(maxsize=1)
 def source_stamp() -> str:
-    """Return a digest of all files of the package that hold compiled code."""
+    """Return a digest of all files of the package that hold compiled code; it changes if any compiled function does."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         content = path.read_bytes()
@@ -70,6 +76,16 @@ _used: set[Path] = set()
 _lock = threading.Lock()
 
 
+@dataclass(frozen=True)
+class _Key:
+    """What tells the compiled forms of one function apart."""
+
+    #: Of argument types, processor and camera model: the same function replaces its older self.
+    name: str
+    #: Of everything.
+    content: str
+
+
 class _Files:
     """The files of one function; takes the place of Numba's index and data files."""
 
@@ -81,8 +97,10 @@ class _Files:
         for path in self._folder.glob(f"{self._stem}.*{_SUFFIX}"):
             path.unlink(missing_ok=True)
 
-    def load(self, key: tuple) -> Any:
+    def load(self, key: _Key | None) -> Any:
         """Return what was compiled for a key, or None."""
+        if key is None:
+            return None
         path = self._path(key)
         try:
             content = path.read_bytes()
@@ -93,15 +111,17 @@ class _Files:
             return None
         try:
             found = pickle.loads(payload)
-        except ImportError:  # it calls a function of a module that is not there any more
+        except (ImportError, AttributeError):  # it calls a function that is not there any more
             return None
         with _lock:
             counts.loaded += 1
             _used.add(path)
         return found
 
-    def save(self, key: tuple, data: Any) -> None:
+    def save(self, key: _Key | None, data: Any) -> None:
         """Write what was compiled for a key."""
+        if key is None:
+            return
         path, payload = self._path(key), dumps(data)
         draft = path.with_name(f"{path.name}.{uuid.uuid4().hex[:16]}.tmp")  # unique on a shared drive too
         try:
@@ -114,35 +134,44 @@ class _Files:
             counts.compiled += 1
             _used.add(path)
 
-    def _path(self, key: tuple) -> Path:
-        """Name the file by argument types and processor only, so that the same function replaces its older self."""
-        return self._folder / f"{self._stem}.{_digest(key[:2])[:16]}{_SUFFIX}"
+    def _path(self, key: _Key) -> Path:
+        return self._folder / f"{self._stem}.{key.name[:16]}{_SUFFIX}"
 
 
 def _digest(content: object) -> str:
     return hashlib.sha256(repr(content).encode()).hexdigest()
 
 
-def _head(key: tuple, payload: bytes) -> bytes:
-    depends_on = (numba.__version__, sys.version_info[:3], source_stamp(), key)
-    return f"{_digest(depends_on)}{zlib.crc32(payload):08x}".encode()
+def _head(key: _Key, payload: bytes) -> bytes:
+    return f"{key.content}{zlib.crc32(payload):08x}".encode()
 
 
 def environment_digest() -> str:
     """Return a digest of all that compiled functions depend on besides themselves and their arguments."""
     target: Any = cpu_target.target_context
     processor = target.codegen().magic_tuple()
-    return _digest((numba.__version__, sys.version_info[:3], source_stamp(), processor))
+    return _digest((_numba_digest.environment(), source_stamp(), processor))
 
 
 class _Cache(FunctionCache):
     _impl_class = CompileResultCacheImpl
 
-    def __init__(self, function: Any) -> None:
+    def __init__(self, function: Any, dispatcher: Any = None) -> None:
         super().__init__(function)
+        self._compiled = function if dispatcher is None else dispatcher
         python = f"py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, 'abiflags', '')}"
         stem = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}-{python}"
         self._cache_file = _Files(self.cache_path, stem.replace("<", "").replace(">", ""))
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        """Return a key; None where functions or objects are arguments, whose types hold for this process only."""
+        kinds = repr(sig)
+        if " at 0x" in kinds or "jitclass." in kinds:
+            return None
+        found = _numba_digest.dependence(self._compiled, sigutils.normalize_signature(sig)[0])
+        processor = codegen.magic_tuple()
+        content = _digest((_numba_digest.environment(), kinds, processor, found.content))
+        return _Key(_digest((kinds, processor, found.selected)), content)
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save; a full disk, or a folder that became read-only, costs time in the next process and nothing else."""
@@ -157,7 +186,7 @@ def keep_on_disk(dispatcher: Any) -> Any:
     """Let a compiled function be kept on disk where some folder can be written; return it."""
     if hasattr(dispatcher, "py_func"):  # a plain function without the compiler
         try:
-            dispatcher._cache = _Cache(dispatcher.py_func)
+            dispatcher._cache = _Cache(dispatcher.py_func, dispatcher)
         except RuntimeError:  # Numba found no folder that can be written
             pass
     return dispatcher

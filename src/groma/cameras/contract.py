@@ -332,8 +332,8 @@ def register_camera(
     Parameters
     ----------
     camera : CameraModel
-        The model. Its number must be free; groma uses 0 to 15. Keep it the same from run to run: compiled loops are
-        cached on disk by this number. Empty Numba's cache folder after changing the kernels.
+        The model. Its number must be free; groma uses 0 to 15. Keep it the same from run to run: compiled loops on disk
+        are found again under the same number only.
     project, project_jacobian, unproject : callable
         Kernels (decorated with ``groma._numba.kernel``) as described in :mod:`groma.cameras.dispatch`, without the
         tag.

@@ -25,14 +25,17 @@ from collections.abc import Callable
 
 from numba.extending import overload
 
-# --------------------------------------------------------------------------------------------------------- Kernels
-# Kernels by length of the tag. Filled by set_kernels.
+from groma._numba_digest import ByLength
 
-_PROJECT: dict[int, Callable[..., bool]] = {}
-_PROJECT_JACOBIAN: dict[int, Callable[..., bool]] = {}
-_UNPROJECT: dict[int, Callable[..., bool]] = {}
-_PINHOLE: dict[int, Callable[..., None]] = {}
-_PINHOLE_JACOBIAN: dict[int, Callable[..., None]] = {}
+# --------------------------------------------------------------------------------------------------------- Kernels
+# Kernels by length of the tag. Filled by set_kernels. Compiled code on disk depends on the kernels that it was compiled
+# with, so a number may mean another model in another process.
+
+_PROJECT: ByLength[Callable[..., bool]] = ByLength()
+_PROJECT_JACOBIAN: ByLength[Callable[..., bool]] = ByLength()
+_UNPROJECT: ByLength[Callable[..., bool]] = ByLength()
+_PINHOLE: ByLength[Callable[..., None]] = ByLength()
+_PINHOLE_JACOBIAN: ByLength[Callable[..., None]] = ByLength()
 
 
 def project(model_tag, params, X, uv):
