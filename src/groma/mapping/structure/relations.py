@@ -61,6 +61,34 @@ class Landmarks:
     end_spacing: FloatArray
 
 
+@dataclass(frozen=True)
+class Pairs:
+    """Landmarks and the structures they belong to."""
+
+    #: (M, 2) number of the landmark, number of the structure.
+    pairs: IntArray
+    #: (M,) probability that the landmark is no clutter.
+    probability: FloatArray
+
+    @staticmethod
+    def none() -> Pairs:
+        """No pairs."""
+        return Pairs(np.zeros((0, 2), np.int64), np.zeros(0))
+
+    def take(self, rows: IntArray | BoolArray) -> Pairs:
+        """Return some of the pairs."""
+        return Pairs(self.pairs[rows], self.probability[rows])
+
+    def counts(self, num: int) -> IntArray:
+        """(num,) landmarks of each structure."""
+        return np.bincount(self.pairs[:, 1], minlength=num)
+
+    def renumbered(self, new: IntArray) -> Pairs:
+        """Return the pairs with other numbers of structures, without those whose new number is -1."""
+        structure = new[self.pairs[:, 1]]
+        return Pairs(np.column_stack([self.pairs[:, 0], structure]), self.probability).take(structure >= 0)
+
+
 def spacings(
     points: FloatArray, segments: FloatArray, gates: RelationGates = RelationGates()
 ) -> tuple[FloatArray, FloatArray]:
@@ -78,8 +106,8 @@ def on_planes(
     level: float,
     least: tuple[float, float],
     gates: RelationGates = RelationGates(),
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Pairs (point, plane) and (line, plane), and their probabilities, which have to exceed the least of their kind."""
+) -> tuple[Pairs, Pairs]:
+    """Points on planes and lines on planes; their probabilities have to exceed the least of their kind."""
     num = len(found)
     points, lines = [_nothing()], [_nothing()]
     point_gate, line_gate = chi_square_gate(1.0 - level, 1), chi_square_gate(1.0 - level, 2)
@@ -100,11 +128,8 @@ def on_planes(
     results = []
     for table, enough in zip((np.concatenate(points), np.concatenate(lines)), least, strict=True):
         probability, _ = inlier_probability(table[:, 2], table[:, 3], table[:, 1].astype(np.int64), found.band)
-        passed = (table[:, 4] < table[:, 5]) & (probability > enough)
-        pairs, probability = table[passed, :2].astype(np.int64), probability[passed]
-        kept = _best_of_competing(pairs, probability, competing, num)
-        results.append((pairs[kept], probability[kept]))
-    return results[0][0], results[1][0], results[0][1], results[1][1]
+        results.append(_best_of_competing(_passing(table, probability, enough), competing, num))
+    return results[0], results[1]
 
 
 def along_directions(
@@ -114,11 +139,11 @@ def along_directions(
     level: float,
     least: float,
     gates: RelationGates = RelationGates(),
-) -> tuple[IntArray, FloatArray]:
-    """Pairs (line, direction), at most one for each line, and their probabilities."""
+) -> Pairs:
+    """Lines along directions, at most one direction for each line."""
     rows = np.flatnonzero(marks.line_usable)
     if len(rows) == 0 or len(found) == 0:
-        return np.zeros((0, 2), np.int64), np.zeros(0)
+        return Pairs.none()
     extent = marks.segments[rows, 1] - marks.segments[rows, 0]
     own = marks.line_noise.directions(norm(marks.segments[:, 1] - marks.segments[:, 0]))[rows]
     basis = np.stack(perpendicular(unit(extent)), axis=1)
@@ -136,20 +161,15 @@ def along_directions(
         tables.append(_with_plane(rows[near], k, angle[near], spread[near], squared[near], largest))
     table = np.concatenate(tables)
     probability, _ = inlier_probability(table[:, 2], table[:, 3], table[:, 1].astype(np.int64), bands)
-    passed = (table[:, 4] < table[:, 5]) & (probability > least)
-    pairs, probability = table[passed, :2].astype(np.int64), probability[passed]
-    kept = _best_of_competing(pairs, probability, np.ones((len(found), len(found)), bool), len(found))
-    return pairs[kept], probability[kept]
+    return _best_of_competing(_passing(table, probability, least), np.ones((len(found), len(found)), bool), len(found))
 
 
-def on_lines(
-    marks: Landmarks, level: float, least: float, gates: RelationGates = RelationGates()
-) -> tuple[IntArray, FloatArray]:
-    """Pairs (point, line) and their probabilities: points on the segments, not on their continuations."""
+def on_lines(marks: Landmarks, level: float, least: float, gates: RelationGates = RelationGates()) -> Pairs:
+    """Points on lines: on the segments, not on their continuations."""
     rows = np.flatnonzero(marks.line_usable)
     tested = np.flatnonzero(marks.point_usable)
     if len(rows) == 0 or len(tested) == 0:
-        return np.zeros((0, 2), np.int64), np.zeros(0)
+        return Pairs.none()
     pairs = _near_segments(marks.points[tested], marks.segments[rows], gates)
     point, line = tested[pairs[:, 0]], rows[pairs[:, 1]]
     start, along = marks.segments[line, 0], marks.segments[line, 1] - marks.segments[line, 0]
@@ -176,7 +196,7 @@ def on_lines(
     # On a wall full of points the clutter beside a line is spread over one dimension, not two.
     probability, _ = inlier_probability(distance[near], spread[near], line, band, gates.pooled)
     passed = (squared < largest) & (probability > least)
-    return np.column_stack([point, line])[passed], probability[passed]
+    return Pairs(np.column_stack([point, line]), probability).take(passed)
 
 
 # --------------------------------------------------------------------------------------------------------- Distances
@@ -240,11 +260,18 @@ def _near_segments(points: FloatArray, segments: FloatArray, gates: RelationGate
     return distinct_pairs(np.repeat(np.arange(len(points)), nearest), owner[index.reshape(len(points), -1)].ravel())[0]
 
 
-def _best_of_competing(pairs: IntArray, probability: FloatArray, competing: BoolArray, num: int) -> IntArray:
-    """Rows to keep where a landmark is claimed by structures of which only one can be right."""
+def _passing(table: FloatArray, probability: FloatArray, least: float) -> Pairs:
+    """Pairs of a table that pass the chi-square test and are probable enough."""
+    passed = (table[:, 4] < table[:, 5]) & (probability > least)
+    return Pairs(table[:, :2].astype(np.int64), probability).take(passed)
+
+
+def _best_of_competing(found: Pairs, competing: BoolArray, num: int) -> Pairs:
+    """The likeliest pairs where a landmark is claimed by structures of which only one can be right."""
+    pairs = found.pairs
     if len(pairs) == 0:
-        return np.zeros(0, np.int64)
-    order = np.lexsort((-probability, pairs[:, 0]))
+        return found
+    order = np.lexsort((-found.probability, pairs[:, 0]))
     kept = np.zeros(len(pairs), dtype=bool)
     # Claims of one landmark follow each other, the likeliest first: compare rank by rank with those kept before.
     landmark = pairs[order, 0]
@@ -257,7 +284,7 @@ def _best_of_competing(pairs: IntArray, probability: FloatArray, competing: Bool
         free = ~(taken[owner] & competing[structure]).any(axis=1)
         kept[rows[free]] = True
         taken[owner[free], structure[free]] = True
-    return np.flatnonzero(kept)
+    return found.take(kept)
 
 
-__all__ = ["Landmarks", "RelationGates", "along_directions", "on_lines", "on_planes", "spacings"]
+__all__ = ["Landmarks", "Pairs", "RelationGates", "along_directions", "on_lines", "on_planes", "spacings"]
