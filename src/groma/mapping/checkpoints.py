@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Finished stages of a long pipeline, kept in a folder so that an interrupted run goes on from them.
+"""Checkpoints of a long pipeline: an interrupted run continues after the last finished stage.
 
-A stage is a file whose name ends in a key: the hash of the input, of everything that came before and of the options of
-the stage. A file is there whole or not at all, and one with the right key is right; nothing else needs to be
-remembered. Results are read back after they were written, so that a run that goes on computes with the same bits as
-one that was never interrupted. The folder is locked while somebody works in it; the lock goes with the process,
-however it ends.
+The result of a stage is a file whose name ends in a key: the hash of the input, of all stages before it and of the
+options that the stage depends on. Files are written atomically, so a file with the right key is valid and no other
+state is needed. Results are read back after they are written; a continued run therefore computes with the same bits as
+an uninterrupted one. The folder is locked while a process works in it.
 """
 
 from __future__ import annotations

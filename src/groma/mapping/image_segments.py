@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The segments of all images, one image in memory at a time; where a lens bends lines, found where they are straight.
+"""The segments of all images, with one image in memory at a time, detected without lens distortion.
 
-A straight edge seen through a distorting lens is an arc. A detector of straight segments breaks it into short chords
-beside it. Images of such cameras are therefore resampled without distortion, with the same camera matrix; segments are
-found there, and their end points taken back to the image as it is, which is what the rest of groma measures in.
+A lens with distortion images a straight edge as an arc, which a detector of straight segments breaks into short chords.
+Images of such cameras are therefore resampled without distortion, with the same camera matrix. Segments are detected
+there, and their end points are mapped back to the original image, in which the rest of groma measures.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Detector(Protocol):
 
 @dataclass(frozen=True)
 class Straightener:
-    """Resamples the images of one camera without distortion, and takes segments back."""
+    """Resamples the images of one camera without distortion, and maps segments back."""
 
     model: camera_models.CameraModel
     params: FloatArray
@@ -72,7 +72,7 @@ class Straightener:
 
     @staticmethod
     def of(model: camera_models.CameraModel, params: FloatArray, width: int, height: int) -> Straightener | None:
-        """Make one for a camera; None if its lens bends nothing worth the effort."""
+        """Return the one of a camera; None if its distortion is negligible."""
         u, v = np.linspace(0.0, width, 33), np.linspace(0.0, height, 33)
         border = np.concatenate([np.column_stack([u, np.full(33, side)]) for side in (0.0, height)])
         border = np.concatenate([border, *(np.column_stack([np.full(33, side), v]) for side in (0.0, width))])

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Measure the points of a scene again in its photographs.
 
-A detector places the keypoints of a track one by one. Here one observation of each point, the one most like the others,
-defines it by the grey levels around it; the others are found by aligning that patch to their images
-(:mod:`groma.features.patch_alignment`), from the place where they were and with the shape that poses and a plane facing
-the cameras predict. Every place found comes with its standard deviation, so that an adjustment can weight it.
+A detector localises the keypoints of a track independently. Here one observation of each point, the one most similar to
+the others in viewpoint, becomes the reference, with the patch of grey levels around it. The other observations are
+refined by aligning this patch to their images (:mod:`groma.features.patch_alignment`), starting at the detected pixel
+and with the affine shape that the poses and a plane facing the cameras predict. Every refined pixel has a standard
+deviation, so that an adjustment can weight it.
 
-The error of the defining observation is no error of the others: it only says which physical point is meant. It carries
-no noise but what no image can tell.
+An error of the reference pixel does not affect the others: it only selects which physical point is meant. The reference
+therefore has the smallest standard deviation, that of effects which no image shows.
 
-Images are read twice, one per thread at a time; templates are held for a bounded number of points.
+Each image is read twice, and each thread holds one; templates are held for a bounded number of points.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Lines find their place together with the points that lie on them, under held cameras.
+"""Restart of lines together with the points that lie on them, with cameras held.
 
-A line and the points tied to it are a *cluster*: neither has a place of its own. In a wrong minimum the points hold the
-line and the line holds the points, so that triangulating one of them anew does not help
-(:mod:`groma.adjustment.rescue.restart` moves lines alone). A cluster that fits far worse than clusters usually do is
-solved twice, as it is and with its lines triangulated anew, and the better of the two ends is kept. Cameras and planes
-are held, so clusters do not depend on each other; all that are in doubt are one small problem.
+A line and the points related to it form a *cluster*. In a wrong local minimum they hold each other in place, so moving
+the line alone (:mod:`groma.adjustment.rescue.restart`) does not help. A cluster that fits much worse than the median is
+solved twice, from its present state and with its lines triangulated again, and the better result is kept. With cameras
+and planes held, clusters are independent; all suspicious ones form one small problem.
 """
 
 from __future__ import annotations
@@ -30,15 +29,15 @@ from groma.solver.solve import solve
 
 
 def settle_clusters(scene: Scene, problem: Problem, threads: int | None = None) -> tuple[Problem, IntArray]:
-    """Return the problem with clusters in doubt at the better of two minima, and their lines that moved.
+    """Return the problem with suspicious clusters at the better of two minima, and their lines that moved.
 
     Parameters
     ----------
     scene : Scene
         What the problem was made from.
     problem : Problem
-        A problem at any state, its lines in the order of the scene; without points tied to free lines it comes back as
-        it is.
+        A problem at any state, with its lines in the order of the scene; returned unchanged if no point is related to
+        a free line.
     threads : int, optional
         Threads; None takes one for small problems and all cores for large ones.
     """

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Lines get a second chance between two stages of an adjustment, and settle, under held cameras.
+r"""Restart of lines in wrong local minima, between two stages of an adjustment, with cameras held.
 
-The reprojection cost of a line has several local minima: a start on the wrong side of a short baseline ends in one that
-small steps never leave. A few such lines hold up the whole adjustment, because cameras move to please them. With the
-cameras nearly right the linear triangulation of a line is near its global minimum. A line that fits
-much worse than lines usually do goes on from there, too, and the better of its two ends is kept.
+The reprojection cost of a line has several local minima. A start on the wrong side of a short baseline converges to one
+that small steps never leave, and a few such lines hold up the whole adjustment because cameras adapt to them. Once the
+cameras are nearly right, the linear triangulation of a line is close to its global minimum. A line that fits much worse
+than the median is therefore solved from there as well, and the better of the two results is kept.
 
-A line that is seen nearly along its length is strongly bent: Gauss-Newton steps of it overshoot, and joint steps of all
-variables are refused because of one line. Lines that start in the minimum that the cameras at hand give them hardly
-move in later steps.
+The cost of a line that is seen almost along its length is strongly nonlinear: Gauss-Newton steps overshoot, and joint
+steps of all variables are rejected because of one line. Lines that start at their minimum for the current cameras
+hardly move in later steps.
 
-All lines, and the second starts of some as lines beside them, are one problem whose variables do not depend on each
-other: it is laid out once, and each line stops when it has converged.
+All lines, and the second starts as additional lines, are one problem of independent variables. It is laid out once, and
+each line stops when it has converged.
 """
 
 from __future__ import annotations
@@ -61,14 +61,14 @@ GATES = RestartGates()
 
 
 def renew_lines(scene: Scene, problem: Problem, threads: int | None = None) -> tuple[Problem, IntArray]:
-    """Return the problem with each line at a minimum of its own cost, all else held, and suspicious lines that moved.
+    """Return the problem with each line at a minimum of its cost, all else held, and the restarted lines that moved.
 
     Parameters
     ----------
     scene : Scene
         What the problem was made from.
     problem : Problem
-        A problem at any state, its lines in the order of the scene; without free lines it comes back as it is.
+        A problem at any state, with its lines in the order of the scene; returned unchanged if no line is free.
     threads : int, optional
         Threads; None takes one for small problems and all cores for large ones.
     """
@@ -180,8 +180,8 @@ def triangulated_anew(scene: Scene, lines: IntArray) -> tuple[FloatArray, BoolAr
 def with_seen_ends(scene: Scene, lines: IntArray) -> Scene:
     """Return the scene with new end points of lines that went elsewhere: where its images end them.
 
-    The feet of the old end points may lie anywhere on such a line. The rule is that of mapping
-    (:mod:`groma.estimators.line_ends`), from where the medians of the segments' ends are.
+    The projections of the old end points may lie anywhere on such a line. New ones follow the rule of mapping
+    (:mod:`groma.estimators.line_ends`), starting at the medians of the ends of the segments.
     """
     table = scene.line_observations
     rows = np.flatnonzero(np.isin(table.line_idx, lines))

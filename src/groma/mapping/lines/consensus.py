@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Which of a segment's proposals several images agree on.
+r"""The place of a segment on which most of its neighbours agree.
 
 Proposals q, q' of different neighbours with covariances support each other by
 :math:`(q - q')^\top (\Sigma + \Sigma')^{-1} (q - q')`. The best supported ones are fused in information form,
 
 .. math:: \Sigma_f^{-1} = \sum w_j \Sigma_j^{-1}, \qquad \Sigma_f^{-1} q_f = \sum w_j \Sigma_j^{-1} q_j,
 
-one proposal per neighbour, compared again, and the place that most neighbours agree on is kept. What the image itself
-proposes, from points or a vanishing direction, takes part like a neighbour, but cannot make up for one.
+with one proposal per neighbour, and compared with all proposals again; the place with the largest support is kept.
+Proposals from points and vanishing directions take part like those of a neighbour, but do not replace one.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
+from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.proposals import Proposals
 
 
@@ -27,9 +28,6 @@ from groma.mapping.lines.proposals import Proposals
 class ConsensusGates:
     """When proposals agree."""
 
-    outlier_probability: float = gate(
-        0.003, "probability", "of two proposals of one place to disagree", "convention: three standard deviations"
-    )
     num_seeds: int = gate(
         3, "proposals", "per segment that are fused with what agrees, and compared", "cost: the best is among the first"
     )
@@ -37,11 +35,6 @@ class ConsensusGates:
     half_weight: float = gate(
         4.0, "sigma^2", "squared distance at which a proposal counts half in the fused place", "chosen on wireframes"
     )
-
-    @property
-    def max_squared(self) -> float:
-        """Largest squared Mahalanobis distance of two proposals that agree; two degrees of freedom."""
-        return 11.6
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -186,14 +179,14 @@ def choose(
     """Choose the place of each segment by the summed support of distinct neighbours."""
     by_segment = np.lexsort([proposals.values[:, 0], proposals.segment])
     pointers = np.searchsorted(proposals.segment[by_segment], np.arange(num_segments + 1))
-    total = np.zeros(len(proposals.segment))
-    _support(pointers, by_segment, proposals.neighbor, proposals.values, num_neighbors, gates.max_squared, total)
+    total, max_squared = np.zeros(len(proposals.segment)), AGREEMENT.max_squared(2)
+    _support(pointers, by_segment, proposals.neighbor, proposals.values, num_neighbors, max_squared, total)
     q, covariance = np.zeros((num_segments, 2)), np.zeros((num_segments, 3))
     score, rival = np.zeros(num_segments), np.zeros(num_segments)
     supporters = np.full((num_segments, num_neighbors), -1, np.int64)
     _choose(
         pointers, by_segment, proposals.neighbor, proposals.other, proposals.values, total, num_neighbors,
-        gates.max_squared, gates.half_weight, gates.num_seeds, gates.fusing_rounds, min_support, q, covariance, score,
+        max_squared, gates.half_weight, gates.num_seeds, gates.fusing_rounds, min_support, q, covariance, score,
         supporters, rival,
     )  # fmt: skip
     return Choice(score > 0.0, q, covariance, score, rival, supporters)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""What the vanishing points of an image say about its segments: how the depth changes along them.
+r"""The change of depth along each segment, from the vanishing points of its image.
 
 A segment whose line has direction d, with rays :math:`f_1, f_2` of its ends and :math:`n = f_1 \times f_2`, satisfies
 :math:`f_2/q_2 - f_1/q_1 \parallel d`, so the inverse depths have a known ratio,
@@ -7,7 +7,8 @@ A segment whose line has direction d, with rays :math:`f_1, f_2` of its ends and
 .. math:: r = \frac{q_2}{q_1} = \frac{n^\top (f_2 \times d)}{n^\top (f_1 \times d)}, \qquad
           \sigma_r = \sigma_d\,\frac{\|n \times f_2 - r\,n \times f_1\|}{|n^\top (f_1 \times d)|}
 
-One known point on the segment then gives its place; two views that see little of a segment's length say more with it.
+One known point on the segment then determines its place, and two views that share a short part of it determine it
+better.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which of the lines stay: a list of filters, each with the reason it gives for what it rejects.
+"""Filters of finished lines, as a list of named steps.
 
-A filter looks at the lines that the filters before it kept. It returns which of them stay, (L,), and what becomes of
-the segments of the others.
+A filter gets the lines that passed the filters before it. It returns which of them it keeps, (L,), and the rejection
+reason for the segments of the others.
 """
 
 from __future__ import annotations

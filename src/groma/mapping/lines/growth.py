@@ -20,10 +20,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import ndtri
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.lines.fit import find_on_lines
+from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.link import join_once, link
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.places import Places
@@ -67,7 +69,7 @@ def linked(tracks: Tracks, places: Places) -> Tracks:
     """Return the tracks with lines of the free segments whose places agree."""
     views = tracks.views
     free = views.usable & (tracks.line_of < 0)
-    members, representative = link(views, tracks.sigma, places, free, tracks.gates.max_squared)
+    members, representative = link(views, tracks.sigma, places, free, AGREEMENT.max_squared(2))
     return tracks.with_groups(members, representative, places.ends_in_space(views))
 
 
@@ -81,7 +83,7 @@ def recovered(tracks: Tracks, neighbors: list[IntArray], directed: bool) -> Trac
     if tracks.num_lines == 0:
         return tracks
     forward = tracks.direction() if directed else np.zeros(tracks.num_lines)
-    hit, distance = _on_lines(tracks, neighbors, tracks.sigma, forward, tracks.gates.max_squared)
+    hit, distance = _on_lines(tracks, neighbors, tracks.sigma, forward, AGREEMENT.max_squared(2))
     alias = _same_lines(tracks, hit)
     rows, line = tracks.members()
     line_of = tracks.line_of.copy()
@@ -99,7 +101,7 @@ def near_lines(tracks: Tracks, neighbors: list[IntArray], reach: float | None = 
     """Lines and segments (M, 2) whose ends lie within ``reach`` pixels of the line, or within their noise."""
     undirected = np.zeros(tracks.num_lines)
     if reach is None:
-        return _on_lines(tracks, neighbors, tracks.sigma, undirected, tracks.gates.max_squared)[0]
+        return _on_lines(tracks, neighbors, tracks.sigma, undirected, AGREEMENT.max_squared(2))[0]
     # Both ends at the reach: twice its square.
     return _on_lines(tracks, neighbors, np.full(len(tracks.line_of), reach), undirected, 2.0)[0]
 
@@ -126,7 +128,7 @@ def _on_lines(
         while True:
             needed = find_on_lines(
                 views.camera[image], tracks.lines, reach[image], rows, views.ends, sigma, views.usable, forward,
-                max_squared, tracks.gates.min_overlap, tracks.gates.min_overlap_px, hits, distances,
+                max_squared, AGREEMENT.min_overlap, tracks.gates.min_overlap_px, hits, distances,
             )  # fmt: skip
             if needed <= len(hits):
                 return hits[:needed], distances[:needed]
@@ -146,7 +148,7 @@ def _same_lines(tracks: Tracks, hit: IntArray) -> IntArray:
     """
     owner, alias = tracks.line_of[hit[:, 1]], np.arange(tracks.num_lines)
     pairs, votes = votes_for_same(tracks, hit, (owner >= 0) & (owner != hit[:, 0]))
-    enough = tracks.gates.min_common_share * tracks.num_images()[pairs[:, 1]]
+    enough = AGREEMENT.min_common * tracks.num_images()[pairs[:, 1]]
     good = (votes >= tracks.gates.min_common_images) & (votes >= enough)
     pairs, votes = pairs[good], votes[good]
     join_once(pairs[np.argsort(-votes, kind="stable")], alias, np.zeros(tracks.num_lines, np.bool_))
@@ -168,7 +170,7 @@ def _noise_scale(tracks: Tracks) -> float:
         return 1.0
     freedom = 2.0 - 4.0 / number
     spread = 2.0 / (9.0 * freedom)
-    expected = freedom * (1.0 - spread + 0.6745 * np.sqrt(spread)) ** 3
+    expected = freedom * (1.0 - spread + ndtri(tracks.gates.noise_quantile) * np.sqrt(spread)) ** 3
     return float(np.sqrt(np.quantile(tracks.squared[rows] / expected, tracks.gates.noise_quantile)))
 
 

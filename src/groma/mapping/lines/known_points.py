@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Proposals that an image makes itself: lines through known points that lie on a segment.
+r"""Proposals without another segment: lines through known points that lie on a segment in the image.
 
 With the position t along the segment, 0 at its first end and 1 at its second, the inverse depth of a straight line is
-affine in t. Two points apart from each other fix it, and a third one confirms it. Where the ratio of the inverse depths
+affine in t. Two points determine it, and a third one confirms it. Where the ratio of the inverse depths
 at the two ends is known from a vanishing point, :math:`q(t) = q_1 (1 + (r - 1) t)`, one point is enough.
 """
 

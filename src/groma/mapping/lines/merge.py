@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""One line where several were mapped along the same edge.
+r"""Merging of lines that were mapped along the same edge.
 
 An edge is mapped more than once where its darker side changes with the view, where occlusions separate the images that
-see it, and where poses are bent: around a loop the same edge lies elsewhere. Two lines are one if they agree in space,
+see it, and where drift of the poses displaces it around a loop. Two lines are merged if they agree in space,
 
 .. math:: \delta^\top (\Sigma_a + \Sigma_b + \tau^2 I)^{-1} \delta \le \gamma,
 
 with :math:`\delta` the offsets of line b from line a across it at both ends of their overlap (four numbers) and
-:math:`\Sigma` their covariances; and if no image shows them as two segments side by side. The deviation
-:math:`\tau` stands for the poses. It is a floor in pixels at the lines' distance, or what the pairs that may be one
-line disagree by, if that is more.
+:math:`\Sigma` their covariances; and if no image shows them as two segments side by side. The deviation :math:`\tau`
+accounts for errors of the poses. It is estimated from the disagreement of the candidate pairs, with a lower bound in
+pixels at the distance of the lines.
 
-Pairs that prefer each other are joined, fitted again, and compared again.
+Pairs of mutually best candidates are merged and fitted, and the comparison is repeated.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
 from groma.mapping.lines.fit import across_basis, line_residuals
+from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.tracks import Tracks
 
@@ -33,28 +34,12 @@ from groma.mapping.lines.tracks import Tracks
 class MergeGates:
     """When two lines are one."""
 
-    outlier_probability: float = gate(
-        0.003, "probability", "of two mappings of one edge to disagree", "convention: three standard deviations"
-    )
     pose_px: tuple[float, float] = gate(
         (0.3, 2.5), "px", "bounds of the deviation that poses add", "chosen on ETH3D facades, and bent loops"
     )
     min_pairs: int = gate(5, "pairs", "fewer do not tell the deviation of the poses", "chosen on ETH3D facades")
     max_distance: float = gate(8.0, "px", "between lines that are compared", "cost: pairs to be compared")
     max_angle: float = gate(0.2, "rad", "between lines that are compared", "cost: pairs to be compared")
-    min_overlap: float = gate(0.2, "share", "of the shorter line that overlaps along the other", "chosen on wireframes")
-    same_edge: float = gate(
-        1.0, "px", "segments of an image nearer to each other show one edge twice", "derived from the width of an edge"
-    )
-    side_overlap: float = gate(
-        0.3, "share", "of the shorter of two segments that lie side by side", "chosen on wireframes"
-    )
-    rounds: int = gate(6, "rounds", "of joining pairs that prefer each other", "cost: few are left to join")
-
-    @property
-    def max_squared(self) -> float:
-        """Largest squared Mahalanobis distance of two lines that agree; four degrees of freedom."""
-        return 16.3
 
 
 #: Median of the mean of four squared normal numbers, half of them independent.
@@ -173,15 +158,15 @@ def merge_agreeing(tracks: Tracks, gates: MergeGates = MergeGates()) -> Tracks:
     The segments of joined lines get the deviation of the poses added to their own, so that the fit keeps them.
     """
     pose_px = None
-    for _ in range(gates.rounds):
+    while True:  # every round leaves fewer lines
         pairs = _compare(tracks, gates)
-        pairs = pairs.take(~seen_apart(tracks, pairs.lines, gates))
+        pairs = pairs.take(~seen_apart(tracks, pairs.lines))
         if len(pairs.lines) == 0:
             break
         if pose_px is None:
             pose_px = _pose_deviation(pairs, tracks.num_lines, gates)
         distance = pairs.squared_distance(pose_px)
-        good = _preferred(pairs.lines, distance, tracks.num_lines) & (distance < gates.max_squared)
+        good = _preferred(pairs.lines, distance, tracks.num_lines) & (distance < AGREEMENT.max_squared(4))
         if not good.any():
             break
         tracks = _joined(tracks, pairs.take(good), pose_px, gates)
@@ -258,7 +243,7 @@ def _candidates(X: FloatArray, reach: FloatArray, gates: MergeGates = MergeGates
     pairs, span = np.empty((4096, 2), np.int64), np.empty((4096, 2))
     while True:
         needed = _near_pairs(
-            pointers, members, first_bin, low, X, reach, gates.max_angle, gates.min_overlap, pairs, span
+            pointers, members, first_bin, low, X, reach, gates.max_angle, AGREEMENT.min_overlap, pairs, span
         )
         if needed <= len(pairs):
             break
@@ -283,14 +268,13 @@ def _pixel_size(tracks: Tracks) -> FloatArray:
     return size[order][np.minimum(middle, len(rows) - 1)]
 
 
-def seen_apart(tracks: Tracks, pairs: IntArray, gates: MergeGates = MergeGates()) -> BoolArray:
+def seen_apart(tracks: Tracks, pairs: IntArray) -> BoolArray:
     """Whether an image shows both lines of a pair as segments side by side."""
     views = tracks.views
     rows, pointers = tracks.table()
     apart = np.zeros(len(pairs), np.bool_)
-    _apart(
-        pairs, pointers, rows, views.image_idx, views.ends, views.line, gates.side_overlap, gates.same_edge, apart
-    )  # fmt: skip
+    limits = AGREEMENT.min_overlap, AGREEMENT.same_edge
+    _apart(pairs, pointers, rows, views.image_idx, views.ends, views.line, *limits, apart)
     return apart
 
 

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Which images look at the same part of the scene from usefully different places.
+r"""Neighbours: images that see the same part of the scene from sufficiently different positions.
 
 Images are compared through the points they share. Pair (i, j) scores
 
 .. math:: n_{ij}\,\min(1,\ \alpha_{ij}/\alpha_0)\,\min(1,\ \alpha_1/\alpha_{ij})
 
 with :math:`n_{ij}` the number of shared points and :math:`\alpha_{ij}` the median angle under which their rays meet:
-too small an angle says nothing about depth, too large an angle changes what is seen. Where a scene has no points, the
-angle between viewing directions and the distance of the cameras take their place.
+small angles do not determine depth, and large angles change the appearance. Scenes without points use the angle between
+viewing directions and the distance of the cameras instead.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Where each segment may lie in space.
+r"""Hypotheses for the place of each segment in space, from one other image at a time.
 
 A 3D segment behind a segment of image i is two numbers: the inverse depths :math:`q = (q_1, q_2)` of its end points on
 their rays :math:`f_1, f_2`. A segment of image j with line :math:`l` proposes the q at which the reference segment's
@@ -7,14 +7,14 @@ plane meets the plane of :math:`l`. With the epipole :math:`a = P_j [c_i; 1]` an
 
 .. math:: l^\top (q_k a + b_k) = 0 \quad\Rightarrow\quad q_k = -\frac{l^\top b_k}{l^\top a},
 
-linear, without an intersection to solve. Its covariance follows from the distance of the projected end point to l,
+which is linear in the image line. Its covariance follows from the distance of the projected end point to l,
 :math:`\partial \mathrm{dist}_k / \partial q_k = l^\top a / x_{k,3}`, and from the noise of both segments' end points.
-Where the line runs along the epipolar line, :math:`l^\top a \to 0`: the covariance explodes, and the proposal is left
-out of the decision; the track picks such segments up again when others have fixed the line. Where only the change of
-depth along the segment is uncertain, because the other image sees a small part of it, its vanishing point supplies it.
+Where the line is parallel to the epipolar line, :math:`l^\top a \to 0` and the covariance grows without bound. Such
+proposals are discarded; the segment can still join a line that other segments determine. Where only the change of depth
+along the segment is uncertain, because the other image sees a small part of it, the vanishing point of the segment
+supplies it (:mod:`groma.mapping.lines.directions`).
 
-The image itself proposes, too: the line through known points that lie on the segment, and the line through one of them
-in the direction of the segment's vanishing point (:mod:`groma.mapping.lines.directions`).
+Known points on a segment give further proposals, without another segment (:mod:`groma.mapping.lines.known_points`).
 
 References
 ----------
@@ -31,13 +31,14 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.gates import gate
+from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.known_points import lines_through_points
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.views import LineViews
 
 #: Bins of the angle about the baseline: only how long it takes depends on them.
 _NUM_BINS = 2048
-# Why a candidate was refused; the furthest any candidate of a segment got is reported.
+# How far a candidate got; the best of all candidates of a segment is reported.
 NOTHING, OUT_OF_BEAM, WEAK, PROPOSED = 0, 1, 2, 3
 #: Proposals of a pair of images for which there is room at first.
 _ROOM = 1 << 14
@@ -47,22 +48,17 @@ _ROOM = 1 << 14
 class ProposalGates:
     """Which pairs of segments propose a place."""
 
-    min_change: float = gate(
-        3.0, "sigma", "movement of a segment's image over the whole range of depths", "convention: three sigma"
-    )
     end_margin: float = gate(
         2.0,
         "1",
         "factor by which the ends of a segment may leave the range of depths of its middle",
         "chosen on wireframes",
     )
-    max_direction_squared: float = gate(
-        9.0, "sigma^2", "disagreement of a proposal with the vanishing direction", "convention: three sigma"
-    )
 
     def limits(self) -> tuple[float, float, float]:
-        """In the order in which the kernels take them."""
-        return self.min_change, self.end_margin, self.max_direction_squared
+        """Least change over the range of depths, margin of the ends, squared disagreement with a direction."""
+        largest = AGREEMENT.max_squared(1)
+        return math.sqrt(largest), self.end_margin, largest
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Edges and texture told apart by how many of the images that should show a line do show it.
+r"""Edges and texture are distinguished by the fraction of images that show a line among those that should.
 
-An edge is in most images that look at it, until something stands before it. Where the border of a blotch or a blade of
-grass gives a segment, another view gives another one, and what agrees in three images agrees in few others. A line
-that is seen in k images of the m that should show it (in view, and as long there as segments are) is therefore taken
-for a draw from one of two urns,
+An edge is detected in most images that see it, except where it is occluded. A segment of texture is detected in few:
+what agrees in three images by chance agrees in few others. Let a line be observed in k of the m images that should show
+it (where it is in view, and longer than the shortest segments). It is drawn from one of two populations,
 
 .. math:: P(k \mid m, c) \propto \binom{m-1}{k-1}
           \frac{B(k - 1 + r_c s_c,\; m - k + (1 - r_c)\, s_c)}{B(r_c s_c,\; (1 - r_c)\, s_c)},
 
 with the mean rates :math:`r_c` and concentrations :math:`s_c` of :class:`TextureGates`, given that k is at
-least what a line needs. Which urn a line is from depends on its segments, long and strong ones being edges,
+least what a line needs. The population of a line depends on its segments, long and strong ones being edges,
 
 .. math:: P(\text{edge}) = \frac{1}{1 + \exp(-w_0 - w_1 \log l - w_2 \log s - w_3 \log \sigma)},
 
-and few of the segments that texture gives become part of a line at all: a share :math:`\pi_c` does. Weights and shares
-are those that make lines and leftover segments of these images most likely (maximum posterior with wide priors). Where
-nothing looks like texture, as on plain boxes, the shares leave no room for it, and lines seen in few images stay.
+and a fraction :math:`\pi_c` of the segments becomes part of a line, which is small for texture. Weights and fractions
+are the maximum a posteriori estimate, with wide priors, from the lines and the remaining segments of these images.
+Scenes without texture, such as plain boxes, keep their lines that are seen in few images.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from groma.mapping.lines.tracks import Tracks
 
 @dataclass(frozen=True)
 class TextureGates:
-    """The two urns, and what is known before about which one a line is from."""
+    """The two populations, and the priors."""
 
     edge: tuple[float, float] = gate(
         (0.6, 6.0), "1", "mean and concentration of the rate at which images show an edge", "chosen on ETH3D facades"
@@ -101,7 +100,7 @@ def edge_odds(
     min_images : int
         Lines of fewer images were dropped.
     gates : TextureGates, optional
-        The urns and the priors.
+        The two populations, and the priors.
     """
     member = line_of >= 0
     features = features_of(eligible | member, *kinds)

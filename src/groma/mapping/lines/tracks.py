@@ -15,6 +15,7 @@ from groma.estimators.line_ends import trim
 from groma.gates import gate
 from groma.mapping.groups import grouped, num_distinct
 from groma.mapping.lines.fit import refine
+from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import LineViews
 
@@ -23,23 +24,14 @@ from groma.mapping.lines.views import LineViews
 class TrackGates:
     """Which segments observe a line, and which lines are one."""
 
-    outlier_probability: float = gate(
-        0.003, "probability", "a right observation is rejected so often", "convention: three standard deviations"
-    )
     fitting_rounds: int = gate(
         3, "rounds", "how often a line is fitted and its observations tested again", "cost: most change in the first"
     )
 
-    min_overlap: float = gate(
-        0.3, "share", "of a segment and a projected line, the part of the shorter that overlaps", "chosen on wireframes"
-    )
     min_overlap_px: float = gate(
         5.0, "px", "shortest projection of a line, and shortest overlap with a segment", "chosen on wireframes"
     )
     min_common_images: int = gate(2, "images", "images that show that two lines are one", "chosen on wireframes")
-    min_common_share: float = gate(
-        0.6, "share", "of the images of a line, that show it is another", "chosen on wireframes"
-    )
     min_observations: int = gate(
         4, "observations", "of a line whose residuals tell the noise", "derived from two of four numbers being left"
     )
@@ -47,11 +39,6 @@ class TrackGates:
     noise_quantile: float = gate(
         0.75, "quantile", "of the residuals, compared with that of normal ones", "chosen on wireframes: tails are heavy"
     )
-
-    @property
-    def max_squared(self) -> float:
-        """Largest sum of squares of the two end points' distances over sigma; two degrees of freedom."""
-        return 11.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +142,7 @@ class Tracks:
                 uncertainty, unchecked,
             )  # fmt: skip
             trim(views.center, views.image_idx, views.ray, views.length, pointers, rows, active, lines, front)
-            fits = (squared < self.gates.max_squared) & front
+            fits = (squared < AGREEMENT.max_squared(2)) & front
             if k == self.gates.fitting_rounds - 1:
                 fits &= active
             if (fits == active).all():

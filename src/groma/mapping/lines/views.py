@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Segments of all images as one table, with the rays, lines and depths that mapping needs.
+r"""The segments of all images as one table, with their rays, image lines and depth ranges.
 
-Pixels are undistorted once, here: an image is then a pinhole camera :math:`P = K [R\,|\,t]`, and a segment has two rays
+Pixels are undistorted here, once. An image is then a pinhole camera :math:`P = K [R\,|\,t]`, and a segment has two rays
 :math:`f = R^\top K^{-1} [u, v, 1]^\top`, so that :math:`X = c + z f = c + f/q` lies at depth z, inverse depth q.
-Along a segment of a straight line q is affine in the pixel, which is why everything is done in inverse depths.
+Along the image of a straight line q is an affine function of the pixel; mapping therefore works with inverse depths.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""Covariances of points and lines from the noise of their observations, poses and intrinsics held.
 
-Each landmark is on its own then: the inverse of its information matrix :math:`\sum J^\top J/\sigma^2`. Lines are
-described by where their segment's two ends move across the line, four numbers :math:`(a_1, b_1, a_2, b_2)` along two
-unit vectors; a point at the share :math:`\lambda` of the segment moves by
-:math:`(1-\lambda)\delta_1 + \lambda\delta_2`.
-The image of a measured end point is that of the line's point closest to its ray, and only its displacement across the
-image line is measured. Any camera model will do.
+With cameras held, landmarks are independent, and the covariance of each is the inverse of its information matrix
+:math:`\sum J^\top J/\sigma^2`. A line has four parameters :math:`(a_1, b_1, a_2, b_2)`: the displacements of the two
+ends of its segment across it, along two unit vectors. The point at the fraction :math:`\lambda` of the segment moves by
+:math:`(1-\lambda)\delta_1 + \lambda\delta_2`. A measured end point corresponds to the point of the line that is closest
+to its ray; only its displacement across the image line is measured. Any camera model can be used.
 """
 
 from __future__ import annotations

@@ -1,24 +1,27 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""The noise of the observations of a scene, from their residuals.
 
-Some points are seen sharply in all their images, others in none: fine corners and large blobs, the rims of shadows,
-what is not quite one place. Squared residuals differ far more between points than within one. So each point :math:`i`
-is given a variance of its own, :math:`v_i`, around the usual :math:`s^2`, and Student's distribution for the sake of
-mistakes. With :math:`q_{ij}` the squared norm of a residual of two coordinates,
+Some points, such as fine corners, are localised well in every image; others, such as large blobs and the rims of
+shadows, in none. Squared residuals therefore differ far more between points than within a point. Each point :math:`i`
+has its own variance :math:`v_i`, scattered around a common :math:`s^2`, and residuals follow Student's distribution,
+which allows for outliers. With :math:`q_{ij}` the squared norm of a residual of two coordinates,
 
 .. math:: \frac{\nu_b s^2}{v_i} \sim \chi^2_{\nu_b}, \qquad \frac{q_{ij}}{2 v_i} \sim F_{2, \nu_w}.
 
-Logarithms tell the two apart: :math:`\log q` varies by :math:`\psi_1(1) + \psi_1(\nu_w / 2)` within the points, and
-their levels by :math:`\psi_1(\nu_b / 2)`, where :math:`\psi_1` is the trigamma function. The variances follow by
-expectation maximisation. Noise of one size gives an infinite :math:`\nu_b`, and all points the same variance.
+The logarithms separate the two: :math:`\log q` has the variance :math:`\psi_1(1) + \psi_1(\nu_w / 2)` within a
+point, and the point means have :math:`\psi_1(\nu_b / 2)`, where :math:`\psi_1` is the trigamma function. The
+variances follow by expectation maximisation. Homogeneous noise gives an infinite :math:`\nu_b`, and all points the
+same variance.
 
-The two ends of a segment are not independent. A line fitted to the many pixels of an edge knows its middle better than
-its ends, whose errors then have a correlation of -1/2; an edge that is not quite where it is seen from elsewhere, as
-on a rounded corner, is off as a whole. Which of the two prevails is told by the residuals.
+The errors of the two ends of a segment are correlated. A line fitted to the pixels of an edge is more certain in its
+middle than at its ends, whose errors then have a correlation of -1/2; an edge that appears displaced from view to view,
+as on a rounded corner, is displaced as a whole, with a correlation of 1. The residuals show which of the two
+prevails.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -29,6 +32,7 @@ from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.gates import gate
+from groma.mapping.noise.landmarks import GATES as LANDMARK_GATES
 from groma.mapping.noise.landmarks import project_points
 from groma.problem.residuals import residuals_of
 from groma.scene import Scene
@@ -38,7 +42,6 @@ from groma.scene import Scene
 class ObservationNoiseGates:
     """From how many residuals noise is estimated, and what is believed of it."""
 
-    min_sigma_px: float = gate(0.02, "px", "noise at least", "convention: synthetic scenes may have none")
     min_observations: int = gate(
         10, "observations", "fewer tell nothing", "derived from a third of the noise as its error"
     )
@@ -62,18 +65,18 @@ class ObservationNoiseGates:
 
 
 GATES = ObservationNoiseGates()
-#: The median of the squared norm of two normal coordinates, in variances: twice the logarithm of two.
-_MEDIAN = 1.386
+#: The median of the squared norm of two normal coordinates, in variances.
+_MEDIAN = 2.0 * math.log(2.0)
 #: Rounds of expectation maximisation.
 _STEPS = 20
 
 
 def noise_px(scene: Scene, kind: Literal["points", "lines"], end_correlation: float = 0.0) -> float:
-    """Return the standard deviation of the usual coordinate of one kind of landmark, robustly, pixels.
+    r"""Return the standard deviation of the usual coordinate of one kind of landmark, robustly, pixels.
 
-    The median of the squared norm of two Gaussian coordinates is 1.386 variances; fitted landmarks take their share.
-    The observations' own standard deviations are relative to what is returned. For lines it is that of an end point,
-    given how the errors of the two ends are correlated.
+    The squared norm of two normal coordinates has the median :math:`2 \log 2` variances. The residuals that are left
+    after the fit are scaled by their degrees of freedom. Observations carry standard deviations relative to the
+    returned one. For lines the result is that of an end point, given the correlation of the errors of the two ends.
     """
     options = AssemblyOptions(
         points=kind == "points", lines=kind == "lines", planes=False, line_end_correlation=end_correlation
@@ -84,7 +87,7 @@ def noise_px(scene: Scene, kind: Literal["points", "lines"], end_correlation: fl
         return GATES.unknown_px
     unknowns = 3 * scene.num_points if kind == "points" else 4 * scene.num_lines
     share = 1.0 - min(unknowns / (2 * len(squares)), GATES.max_fitted)
-    return max(float(np.sqrt(np.median(squares) / _MEDIAN / share)), GATES.min_sigma_px)
+    return max(float(np.sqrt(np.median(squares) / _MEDIAN / share)), LANDMARK_GATES.min_sigma_px)
 
 
 def line_end_correlation(scene: Scene) -> float:
@@ -137,7 +140,7 @@ def with_point_noise(scene: Scene) -> Scene:
     freedom = np.maximum(2 * number - 3, 1)
     share = (freedom / np.maximum(2 * number, 1))[owner]
     usual = float(np.median(squares / share)) / _MEDIAN
-    if usual < GATES.min_sigma_px**2:
+    if usual < LANDMARK_GATES.min_sigma_px**2:
         return scene
     squares = np.maximum(squares, GATES.min_square * usual * share)
     between, within = _degrees_of_freedom(np.log(squares / share), owner, number)

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""Errors that neighbours in an image share, and what they leave of the weight of many.
 
-What a calibration leaves of the bending of a lens, or air, or a rolling shutter moves all that is seen in one part of
-an image alike, points and lines. A thousand observations there then do not tell a thousand times as much as one. Let
-the shared error of two observations at the distance :math:`d` have the covariance :math:`\tau^2(d)` beside the noise of
-their own. Where the information of all, :math:`J = \sum 1/\sigma^2`, lies within the reach of the shared error,
-least squares with the whole covariance :math:`\mathrm{diag}(\sigma^2) + \tau^2 1 1^T` weighs each by
+Residual lens distortion, refraction and a rolling shutter displace everything in one part of an image alike, points and
+lines. A thousand observations there do not hold a thousand times the information of one. Let the shared errors of two
+observations at the distance :math:`d` have the covariance :math:`\tau^2(d)`, in addition to their own noise. Where all
+observations, with the information :math:`J = \sum 1/\sigma^2`, lie within the range of the shared error, least squares
+with the full covariance :math:`\mathrm{diag}(\sigma^2) + \tau^2 1 1^T` weights each by
 
 .. math:: \frac{1}{\sigma_i^2 f^2}, \qquad f^2 = 1 + \tau^2 J,
 
-and with a covariance that falls slowly by :math:`f_i^2 = 1 + \sum_j \tau^2(d_{ij}) / \sigma_j^2`. The covariance is
-that of the residuals of points, ring by ring of distances, over all pairs of all images; sums over pairs are
-correlations of images of a few pixels, done by Fourier transforms.
+and, for a covariance that decreases slowly with distance, by :math:`f_i^2 = 1 + \sum_j \tau^2(d_{ij}) / \sigma_j^2`.
+The covariance is estimated from the residuals of points, over all pairs of all images, for one ring of distances after
+another. Sums over pairs are correlations of coarse grids, computed by Fourier transforms.
 
-Some points are found at one and the same pixel, as where a detector gives a spot two orientations: one measurement,
-counted twice. They share its weight.
+Points at the same pixel, as where a detector gives a keypoint two orientations, are one measurement counted twice. They
+share its weight.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ GATES = SharedNoiseGates()
 
 
 def with_shared_noise(scene: Scene, point_sigma_px: float, line_sigma_px: float) -> Scene:
-    """Return the scene with observations that share errors with many others made less sure than those alone.
+    """Return the scene with larger standard deviations where observations share errors with many others.
 
     Parameters
     ----------

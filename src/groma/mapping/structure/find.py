@@ -8,8 +8,8 @@ From a scene with poses, points and perhaps lines:
    (:mod:`groma.estimators.directions`), with covariances;
 3. relations, each a statistical test: point on plane, line on plane, line along direction, point on line.
 
-Nothing has a tolerance in pixels or in scene units: how near is near follows from the noise. What is too uncertain to
-tell is left alone, for a missing relation costs little and a wrong one bends the scene.
+There are no tolerances in pixels or scene units; all tests use the covariances. Uncertain pairs are left out: a missing
+relation costs little, a wrong one bends the scene.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ class StructureOptions:
     level: float = 0.95
     #: Least probability that a related landmark is no clutter.
     min_probability: float = 0.7
-    #: The same for lines on planes and along directions. A wrong relation bends a whole line, and these probabilities
-    #: are too high: errors that the images share, such as those of an edge that is a groove, are in no covariance.
+    #: The same for lines on planes and along directions. It is higher, as a wrong relation bends a whole line, and as
+    #: covariances do not contain errors that images share, such as those of an edge that is a groove.
     min_line_probability: float = 0.9
     #: Landmarks seen in fewer images take no part: nothing checks their matches.
     min_views: int = 3
     #: Landmarks whose reprojection error is so many times the usual one take no part.
     max_misfit: float = 3.0
-    #: How well points and lines keep to what they lie on at worst, as a length in the images, pixels: walls are not
-    #: flat, and what was measured very well would show it. Added to the noise of points and lines. How well they really
-    #: do, which an adjustment has to know, is told by what was found: :mod:`groma.mapping.structure.flatness`.
+    #: Largest deviation of landmarks from the surfaces they lie on, as a length in the images, pixels: walls are not
+    #: flat. Added to the noise of points and lines while relations are tested; the actual deviation is then estimated
+    #: for the adjustment (:mod:`groma.mapping.structure.flatness`).
     surface_sigma_px: float = SURFACE_SIGMA_PX
     #: Standard deviations of points and of segment end points, pixels; None: from the residuals.
     point_sigma_px: float | None = None
@@ -124,7 +124,7 @@ def find_structure(
 
     Notes
     -----
-    The poses are taken as right. Adjust the scene before: a bent reconstruction has bent walls, which are no planes.
+    Poses are held. Adjust the scene first: in a distorted reconstruction walls are not planar.
     """
     return detect_structure(scene, options, candidates, progress).scene
 
@@ -137,7 +137,7 @@ def detect_structure(
 ) -> Structure:
     """Find planes, directions and relations, and return them with covariances and probabilities.
 
-    Parameters and errors as for :func:`find_structure`.
+    Parameters and exceptions are those of :func:`find_structure`.
     """
     options = options or StructureOptions()
     _check(options)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Which points and lines lie on planes, along directions, on lines: chi-square tests with the landmarks' covariances.
 
-A pair is related if it passes three tests: the distance is within the noise of both (chi-square); it is *probably* not
-clutter that happens to be there (:mod:`groma.estimators.association`), so that landmarks too uncertain to tell are left
-alone; and the landmark lies where the structure has been seen, not on its continuation.
+A pair is related if it passes three tests: the distance is within the noise of both (chi-square test); the landmark is
+probably not clutter near the structure (:mod:`groma.estimators.association`), which leaves out landmarks that are too
+uncertain to decide; and it lies where the structure was observed, not on its extension.
 """
 
 from __future__ import annotations
