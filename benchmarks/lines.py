@@ -27,7 +27,7 @@ from groma.features import Segments
 from groma.features.matches import LineMatches
 from groma.geometry import quaternion, segment2
 from groma.mapping.checkpoints import Stages
-from groma.mapping.lines.build import MapLinesOptions, map_lines, wide_baseline_matches
+from groma.mapping.lines.build import MapLinesOptions, map_lines, segment_matches
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.map import MapOptions, adjust_points, map_segments
 from groma.scene import Scene
@@ -75,7 +75,7 @@ def prepare(source: LineScene, matching: str) -> Task:
     neighbors = covisible_neighbors(source.scene, options.num_neighbors, options.min_shared)
     matches = {}
     if matching == "wide":
-        provider = wide_baseline_matches(source.scene, segments, lambda i: source.images[i])
+        provider = segment_matches(source.scene, segments, lambda i: source.images[i])
         pairs = {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(neighbors) for j in row}
         matches = {pair: provider(*pair) for pair in sorted(pairs)}
     return Task(source, segments, neighbors, options, matches)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from groma import (
         adjustment,
         cameras,
+        compilation,
         errors,
         estimators,
         evaluation,
@@ -32,12 +33,20 @@ if TYPE_CHECKING:
         tracking,
         viz,
     )
-    from groma.adjustment.adjust import AdjustOptions, AdjustResult, adjust
+    from groma.adjustment.adjust import AdjustOptions, adjust
+    from groma.adjustment.contributions import contributions
+    from groma.adjustment.covariance_files import write_covariances
     from groma.adjustment.diagnosis import diagnose_scene as diagnose
     from groma.adjustment.parts import adjust_parts, write_parts
-    from groma.adjustment.pose_graph import PoseGraphOptions, adjust_pose_graph
+    from groma.adjustment.pose_graph import PoseGraphOptions, PoseGraphResult, adjust_pose_graph
+    from groma.adjustment.report import AdjustResult
     from groma.adjustment.uncertainty import uncertainty
+    from groma.compilation.warmup import warm_up
     from groma.errors import FileFormatError, GromaError, InputError, OutputError, ProblemError, ShapeError
+    from groma.evaluation.lines import evaluate_lines
+    from groma.evaluation.planes import evaluate_planes
+    from groma.evaluation.poses import evaluate_poses
+    from groma.evaluation.trajectory import score_trajectory as evaluate_trajectory
     from groma.factors.contract import Ref
     from groma.factors.losses import loss
     from groma.factors.observations.line_bearing import LineBearing
@@ -48,23 +57,26 @@ if TYPE_CHECKING:
     from groma.factors.relations.line_on_plane import LineOnPlane
     from groma.factors.relations.point_on_plane import PointOnPlane
     from groma.factors.user import factor
-    from groma.io import read_scene, write_scene
+    from groma.io import read_scene, read_trajectory, write_scene
+    from groma.io.convert import convert
+    from groma.io.sequences import open_sequence
     from groma.mapping.map import MapOptions, map_images
+    from groma.mapping.result import MapResult
     from groma.problem.problem import Problem
     from groma.problem.variables import Variables
-    from groma.scene import Scene
+    from groma.scene import Scene, Similarity
     from groma.solver.options import SolverOptions
     from groma.solver.report import SolveReport
     from groma.solver.solve import Solution, solve
     from groma.solver.termination import Termination
-    from groma.tracking import Tracker, TrackOptions
+    from groma.tracking import Tracker, TrackOptions, TrackResult, track
     from groma.viz.report.page import write_report
 
 #: Where each public name lives, and after a colon its name there if that is another; with ``__all__`` and the imports
 #: above the only place to touch when one is added.
 _HOME = {
     "AdjustOptions": "groma.adjustment.adjust",
-    "AdjustResult": "groma.adjustment.adjust",
+    "AdjustResult": "groma.adjustment.report",
     "FileFormatError": "groma.errors",
     "GromaError": "groma.errors",
     "InputError": "groma.errors",
@@ -72,34 +84,49 @@ _HOME = {
     "LineOnPlane": "groma.factors.relations.line_on_plane",
     "LineReprojection": "groma.factors.observations.line_reprojection",
     "MapOptions": "groma.mapping.map",
+    "MapResult": "groma.mapping.result",
     "OutputError": "groma.errors",
     "PlaneObservation": "groma.factors.observations.plane_observation",
     "PointOnPlane": "groma.factors.relations.point_on_plane",
     "PointReprojection": "groma.factors.observations.point_reprojection",
     "PoseGraphOptions": "groma.adjustment.pose_graph",
+    "PoseGraphResult": "groma.adjustment.pose_graph",
     "PosePrior": "groma.factors.priors.pose_prior",
     "Problem": "groma.problem.problem",
     "ProblemError": "groma.errors",
     "Ref": "groma.factors.contract",
     "Scene": "groma.scene",
     "ShapeError": "groma.errors",
+    "Similarity": "groma.scene",
     "Solution": "groma.solver.solve",
     "SolveReport": "groma.solver.report",
     "SolverOptions": "groma.solver.options",
     "Termination": "groma.solver.termination",
     "TrackOptions": "groma.tracking",
+    "TrackResult": "groma.tracking",
     "Tracker": "groma.tracking",
     "Variables": "groma.problem.variables",
     "adjust": "groma.adjustment.adjust",
     "adjust_parts": "groma.adjustment.parts",
     "adjust_pose_graph": "groma.adjustment.pose_graph",
+    "contributions": "groma.adjustment.contributions",
+    "convert": "groma.io.convert",
     "diagnose": "groma.adjustment.diagnosis:diagnose_scene",
+    "evaluate_lines": "groma.evaluation.lines",
+    "evaluate_planes": "groma.evaluation.planes",
+    "evaluate_poses": "groma.evaluation.poses",
+    "evaluate_trajectory": "groma.evaluation.trajectory:score_trajectory",
     "factor": "groma.factors.user",
     "loss": "groma.factors.losses",
     "map_images": "groma.mapping.map",
+    "open_sequence": "groma.io.sequences",
     "read_scene": "groma.io",
+    "read_trajectory": "groma.io",
     "solve": "groma.solver.solve",
+    "track": "groma.tracking",
     "uncertainty": "groma.adjustment.uncertainty",
+    "warm_up": "groma.compilation.warmup",
+    "write_covariances": "groma.adjustment.covariance_files",
     "write_parts": "groma.adjustment.parts",
     "write_report": "groma.viz.report.page",
     "write_scene": "groma.io",
@@ -107,6 +134,7 @@ _HOME = {
 _SUBPACKAGES = (
     "adjustment",
     "cameras",
+    "compilation",
     "errors",
     "estimators",
     "evaluation",
@@ -133,22 +161,26 @@ __all__ = [
     "LineOnPlane",
     "LineReprojection",
     "MapOptions",
+    "MapResult",
     "OutputError",
     "PlaneObservation",
     "PointOnPlane",
     "PointReprojection",
     "PoseGraphOptions",
+    "PoseGraphResult",
     "PosePrior",
     "Problem",
     "ProblemError",
     "Ref",
     "Scene",
     "ShapeError",
+    "Similarity",
     "Solution",
     "SolveReport",
     "SolverOptions",
     "Termination",
     "TrackOptions",
+    "TrackResult",
     "Tracker",
     "Variables",
     "adjust",
@@ -156,9 +188,16 @@ __all__ = [
     "adjust_pose_graph",
     "adjustment",
     "cameras",
+    "compilation",
+    "contributions",
+    "convert",
     "diagnose",
     "errors",
     "estimators",
+    "evaluate_lines",
+    "evaluate_planes",
+    "evaluate_poses",
+    "evaluate_trajectory",
     "evaluation",
     "factor",
     "factors",
@@ -168,15 +207,20 @@ __all__ = [
     "loss",
     "map_images",
     "mapping",
+    "open_sequence",
     "problem",
     "read_scene",
+    "read_trajectory",
     "scene",
     "solve",
     "solver",
     "testing",
+    "track",
     "tracking",
     "uncertainty",
     "viz",
+    "warm_up",
+    "write_covariances",
     "write_parts",
     "write_report",
     "write_scene",

@@ -14,6 +14,7 @@ _RENAMED = {
     "groma.pipelines": "groma.adjustment (adjust, uncertainty, pose graphs) and groma.mapping (lines, structure)",
     "groma.frontend": "groma.features",
     "groma.solver.dogleg": "gone: Levenberg-Marquardt serves every solve",
+    "groma.solver.linear.reduced": "groma.solver.linear.choice (which solver), .dense, .sparse and .pcg",
     "groma.tracking.motion": "groma.tracking.pose.estimate",
     "groma.tracking.observations": "groma.tracking.frame.measurements",
     "groma.tracking.belief": "groma.tracking.pose.verification",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The two decorators for compiled code. Nothing else in groma calls ``numba.njit``.
+"""The decorators for compiled code. Nothing else in groma calls ``numba.njit``.
 
 ``@kernel`` marks scalar code on one item: floats and small arrays in, results written to a passed-in array. It is
 always inlined into the loops that call it.
@@ -27,12 +27,14 @@ _OPTIONS = {
 
 def _compiled(**options: Any) -> Callable[[Callable], Any]:
     def decorate(function: Callable) -> Any:
-        return keep_on_disk(njit(**_OPTIONS, **options)(function))
+        return keep_on_disk(njit(**{**_OPTIONS, **options})(function))
 
     return decorate
 
 
 kernel = _compiled(forceinline=True)
+#: A kernel whose operations are done as written: its result is the same whatever loop it is inlined into.
+exact_kernel = _compiled(forceinline=True, fastmath=False)
 loop = _compiled()
 
 

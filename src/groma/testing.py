@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Conformance checks: does a chart, a camera model or a factor keep its contract?
+r"""Conformance checks: does a chart, camera model, factor, loss, detector, matcher or format keep its contract?
 
-The tests of groma run these over everything that is registered; they are public for charts, cameras and factors that
-live elsewhere. Each raises an ``AssertionError`` that shows what was expected and what came.
+The tests of groma run these over everything that is registered; they are public for those that live elsewhere.
+Each raises an ``AssertionError`` that shows what was expected and what came.
 
 >>> import numpy as np
 >>> from groma.geometry.charts.pose_charts import PoseLeft
@@ -25,12 +25,23 @@ from groma.geometry.manifold import AMBIENT_SIZE, FACTOR_COLUMNS, Manifold
 if TYPE_CHECKING:
     from groma.cameras.check import check_camera
     from groma.factors.checks.check import check_factor
+    from groma.factors.checks.loss import check_loss
+    from groma.features.check import check_detector, check_matcher, check_retrieval
+    from groma.io.check import check_format
 
 #: Step of the differences through ``retract``: their truncation error is of order 1e-12, their rounding 1e-13.
 _STEP = 1e-3
 #: Size of the increments in the round trips, from rounding noise to a tenth of a radian.
 _MAGNITUDES = (1e-12, 1e-6, 1e-1)
-_HOME = {"check_camera": "groma.cameras.check", "check_factor": "groma.factors.checks.check"}
+_HOME = {
+    "check_camera": "groma.cameras.check",
+    "check_detector": "groma.features.check",
+    "check_factor": "groma.factors.checks.check",
+    "check_format": "groma.io.check",
+    "check_loss": "groma.factors.checks.loss",
+    "check_matcher": "groma.features.check",
+    "check_retrieval": "groma.features.check",
+}
 
 
 def __getattr__(name: str) -> object:
@@ -247,4 +258,13 @@ def _check_awkward(manifold: Manifold, rng: np.random.Generator, tolerance: floa
                 _fail(manifold, f"numbers at {ambient} are not finite", np.zeros(()), result)
 
 
-__all__ = ["check_camera", "check_factor", "check_manifold"]
+__all__ = [
+    "check_camera",
+    "check_detector",
+    "check_factor",
+    "check_format",
+    "check_loss",
+    "check_manifold",
+    "check_matcher",
+    "check_retrieval",
+]

@@ -12,7 +12,7 @@ import pytest
 import groma
 from groma.adjustment.contributions import KINDS, contributions
 from groma.cli.main import run
-from groma.cli.shared.contributions import describe_contributions
+from groma.cli.shared.sentences import describe_contributions
 from groma.scene import Planes, Relations, Similarity, synthetic
 from groma.viz.report.charts import spreads
 from groma.viz.report.tables import contributions_card

@@ -13,13 +13,14 @@ import groma
 from groma import _numba_cache
 from groma._counted import counted
 from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
+from groma.adjustment.report import why_steps_ran_out
 from groma.cli.main import run
-from groma.cli.shared.compilation import Compilation, compilation_time, spent
-from groma.cli.shared.diagnosis import why_steps_ran_out
-from groma.cli.shared.mapping import last_loss
+from groma.cli.shared.sentences import spent
+from groma.compilation.time import Compilation, compilation_time
 from groma.errors import ProblemError
 from groma.factors.losses import Cauchy, GemanMcClure, Huber
 from groma.io import read_scene, write_scene
+from groma.mapping.result import last_loss
 from groma.scene import Relations, compare, synthetic
 
 pytestmark = pytest.mark.kernels
@@ -138,20 +139,20 @@ def test_a_map_is_diagnosed_at_its_own_noise(scenes):
     """Twice the noise, twice as weak."""
     from types import SimpleNamespace
 
-    from groma.cli.shared.mapping import _diagnosis
+    from groma.mapping.result import MapResult
 
     scene = read_scene(scenes / "truth.npz").replace(relations=Relations())  # these have a noise of their own
     weakness = []
     for sigma in (20.0, 10.0):
         told = AdjustOptions(point_sigma_px=sigma, line_sigma_px=sigma)
         result: Any = SimpleNamespace(scene=scene, adjusted_with=told)
-        weakness.append(_diagnosis(result).weakness["points"])
+        weakness.append(MapResult.diagnose(result).weakness["points"])
     # The loss, which is twelve times as wide as the noise, takes hardly anything off residuals of half a pixel.
     np.testing.assert_allclose(weakness[0], 2 * weakness[1], rtol=1e-3)
 
 
 def test_many_images_are_diagnosed_when_asked(scenes, here, capsys, monkeypatch):
-    monkeypatch.setattr("groma.cli.shared.diagnosis.MANY_IMAGES", 5)
+    monkeypatch.setattr("groma.adjustment.diagnosis.MANY_IMAGES", 5)
     arguments = ["adjust", str(scenes / "points.npz"), "--max-iterations", "1", "-f", "--json", "r.json"]
     assert run([*arguments, "--verbose"]) == 0
     assert "--diagnosis asks for it" in capsys.readouterr().out

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from groma.cli.main import run
-from groma.cli.shared import cabinet as _cabinet
+from groma.evaluation import cabinet as _cabinet
 from groma.io import read_scene
 from groma.scene import Lines, Similarity
 

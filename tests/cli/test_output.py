@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groma.cli.shared.output import atomic_output, check_json, check_output, check_outputs, plain, write_json
+from groma._json import plain
+from groma.cli.shared.output import atomic_output, check_json, check_output, check_outputs, write_json
 from groma.errors import OutputError
 
 

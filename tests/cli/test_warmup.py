@@ -15,8 +15,8 @@ import pytest
 
 from groma import _numba_cache, cameras
 from groma.cli.main import run
-from groma.cli.shared import warmup as _warmup
-from groma.cli.shared import warmup_runs as _warmup_runs
+from groma.compilation import runs as _warmup_runs
+from groma.compilation import warmup as _warmup
 from groma.factors.contract import registered
 
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")

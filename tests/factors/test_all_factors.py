@@ -1,33 +1,22 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Every registered factor: the conformance check, invariance when the world moves, the registry, and that the check
-notices broken factors."""
+"""Every registered factor: the conformance check, what it notices when the world moves, the registry, and that the
+check notices broken factors."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 
+import groma
 import groma.factors
-from groma.factors import check_factor, registered
-from groma.factors._examples import random_poses
-from groma.factors._record import poses_from_states
+from groma.factors import Invariance, Slot, check_factor, contract, registered
 from groma.factors.checks.check import _ambients, _linearize, _residuals
+from groma.factors.checks.world import WorldMotion, moved_world
 from groma.factors.relations.point_on_plane import PointOnPlane
+from groma.geometry import so3
 
 pytestmark = pytest.mark.kernels
 NAMES = sorted(registered())
-
-#: Factors that measure in world coordinates, and why.
-TIED_TO_THE_WORLD = {
-    "line_normal": "the anchor of a line is its point closest to the world origin",
-    "line_on_plane": "anchors are world points",
-    "plane_quaternion": "the angle between 4-vectors depends on the world origin",
-    "pose_prior": "a prior fixes the world",
-    "position_prior": "a prior fixes the world",
-    "segment_on_plane": "ends are world points",
-    "segment_on_plane_pixels": "ends are world points",
-    "vector_prior": "a prior fixes the world",
-}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -39,59 +28,89 @@ def test_keeps_the_contract(name, seed):
     assert max(check.worst.values()) < 1e-6
 
 
-def hat(t):
-    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+def move(name, motion):
+    """Residuals of an example before and after a motion of the world."""
+    example = registered()[name].example(np.random.default_rng(4))
+    slots, ambients = [slot for slot, _ in example.factor.references()], _ambients(example)
+    return _residuals(example.factor, ambients), _residuals(example.factor, moved_world(slots, ambients, motion))
 
 
-def move_world(kind, ambient, S):
-    """Apply the motion ``S`` (4, 4) of the world to what factors read."""
-    R, t = S[:3, :3], S[:3, 3]
-    if kind == "pose":
-        moved = ambient.reshape(-1, 3, 4) @ np.linalg.inv(S)
-        return np.ascontiguousarray(moved).reshape(-1, 12)
-    if kind == "point":
-        return ambient @ R.T + t
-    if kind == "line":
-        return np.hstack([ambient[:, :3] @ R.T + ambient[:, 3:] @ (hat(t) @ R).T, ambient[:, 3:] @ R.T])
-    if kind == "plane":
-        return ambient @ np.linalg.inv(S)
-    if kind == "direction":
-        return ambient @ R.T
-    return ambient
+#: Factors that measure in world coordinates, and those that do not mind how large the world is.
+TIED = {"line_normal", "line_on_plane", "plane_quaternion", "pose_prior", "position_prior", "segment_on_plane"}
+TIED |= {"segment_on_plane_pixels", "vector_prior"}
+WITHOUT_SIZE = {name for name in NAMES if name.startswith(("parallel_", "orthogonal_")) or "_parallel_" in name}
+WITHOUT_SIZE |= {name for name in NAMES if "_perpendicular_" in name}
+WITHOUT_SIZE |= {"line_bearing", "line_direction", "line_normal", "line_reprojection", "line_to_pixel"}
+WITHOUT_SIZE |= {"point_on_plane_pixels", "point_reprojection", "point_to_image_line"}
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name not in TIED_TO_THE_WORLD])
+def test_what_is_declared_about_motions_of_the_world():
+    """The conformance check finds every declaration true; here they are listed."""
+    assert {name for name, cls in registered().items() if not cls.invariance.translation} == TIED
+    assert {name for name, cls in registered().items() if cls.invariance.rotation is not True} == TIED - {"line_normal"}
+    assert {name for name, cls in registered().items() if cls.invariance.scale} == WITHOUT_SIZE
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in TIED])
 def test_residual_does_not_change_when_the_world_moves(name):
-    rng = np.random.default_rng(4)
-    example = registered()[name].example(rng)
-    S = np.vstack([poses_from_states(random_poses(rng, 1, rotation=2.0)).reshape(3, 4), [0, 0, 0, 1]])
-    slots = [slot for slot, _ in example.factor.references()]
-    moved = tuple(
-        ambient if slot.name == "extrinsics" else move_world(slot.kind, ambient, S)
-        for slot, ambient in zip(slots, _ambients(example), strict=True)
-    )
-    before, after = _residuals(example.factor, _ambients(example)), _residuals(example.factor, moved)
-    if "pose" not in [slot.kind for slot in slots]:  # a vector in the world, such as the offset of a point from a line
+    rotation = so3.exp(np.array([[0.9, -1.3, 1.1]]))[0]
+    before, after = move(name, WorldMotion("all at once", True, rotation, np.array([0.3, -0.4, 0.5])))
+    if "pose" not in [slot.kind for slot in registered()[name].slots]:  # a vector in the world
         before, after = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
     np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-10 * max(1.0, np.abs(before).max()))
 
 
-@pytest.mark.parametrize("name", sorted(set(TIED_TO_THE_WORLD) & set(NAMES)))
+@pytest.mark.parametrize("name", sorted(TIED - {"vector_prior"}))
 def test_the_exceptions_are_real(name):
-    """Otherwise the list above would hide factors from the test."""
-    rng = np.random.default_rng(4)
-    example = registered()[name].example(rng)
-    S = np.eye(4)
-    S[:3, 3] = [0.3, -0.4, 0.5]
-    slots = [slot for slot, _ in example.factor.references()]
-    kinds = [
-        "point" if slot.kind == "vector" and a.shape[1] == 3 else slot.kind
-        for slot, a in zip(slots, _ambients(example), strict=True)
-    ]
-    if "vector" in kinds:
-        return  # numbers that do not live in the world at all
-    moved = tuple(move_world(kind, ambient, S) for kind, ambient in zip(kinds, _ambients(example), strict=True))
-    assert not np.allclose(_residuals(example.factor, moved), _residuals(example.factor, _ambients(example)))
+    before, after = move(name, WorldMotion("away", False, np.eye(3), np.array([0.3, -0.4, 0.5])))
+    assert not np.allclose(before, after)
+
+
+def up_in_camera(invariance):
+    """A factor that measures the world's vertical in a camera, with one declaration or another; not registered."""
+
+    @groma.factor("up_in_camera", slots=[("pose", "pose")], residual_size=3, data_size=3, invariance=invariance)
+    def UpInCamera(data, pose, out):  # noqa: N802
+        for i in range(3):
+            out[i] = pose[i, 2] - data[i]
+
+    return UpInCamera
+
+
+@pytest.fixture
+def registry(monkeypatch):
+    monkeypatch.setattr(contract, "_REGISTRY", dict(contract._REGISTRY))
+
+
+def test_a_factor_may_be_tied_to_the_vertical_of_the_world(registry):
+    check_factor(up_in_camera(Invariance(rotation=(0.0, 0.0, 1.0))))
+
+
+@pytest.mark.parametrize(
+    ("invariance", "message"),
+    [
+        (Invariance(), "a rotation of the world changes its residuals"),
+        (Invariance(rotation=(1.0, 0.0, 0.0)), r"a rotation about \(1.0, 0.0, 0.0\) of the world changes"),
+        (Invariance(False, (0.0, 0.0, 1.0)), "a translation of the world leaves its residuals as they are"),
+    ],
+)
+def test_check_notices_a_wrong_word_about_motions_of_the_world(registry, invariance, message):
+    with pytest.raises(AssertionError, match=message):
+        check_factor(up_in_camera(invariance))
+
+
+def test_check_notices_a_wrong_word_about_scale():
+    with pytest.raises(AssertionError, match="a scaling of the world changes its residuals"):
+        check_factor(broken(invariance=Invariance(scale=True)))
+
+
+def test_a_slot_that_is_not_in_the_world_stays():
+    """Otherwise cameras on rigs would seem to notice every motion."""
+    motion = WorldMotion("away", True, np.eye(3), np.ones(3), 2.0)
+    pose = np.hstack([np.eye(3), [[1.0], [2.0], [3.0]]]).reshape(1, 12)
+    moved = moved_world([Slot("a", "pose"), Slot("b", "pose", in_world=False)], (pose, pose), motion)
+    np.testing.assert_array_equal(moved[0][0, 3::4], [1.0, 3.0, 5.0])
+    np.testing.assert_array_equal(moved[1][0, 3::4], [2.0, 4.0, 6.0])
 
 
 def test_registry_holds_what_the_package_exports():

@@ -98,7 +98,7 @@ def test_kernel_and_method_agree_and_shape_is_kept():
     s = S.reshape(3, 3)
     value = member.evaluate(s)[0]
     assert value.shape == (3, 3)
-    assert loss_value(member.code, *member.parameters, s[1, 1]) == value[1, 1]
+    assert loss_value(member.tag, member.parameters, s[1, 1]) == value[1, 1]
 
 
 def test_by_name():
@@ -108,7 +108,7 @@ def test_by_name():
     assert loss("barron", 2.0, alpha=-1.0) == Barron(-1.0, 2.0)
     for name in LOSSES:
         assert loss(name).name == name
-    assert len({cls.code for cls in LOSSES.values()}) == len(LOSSES)
+    assert len({cls.number for cls in LOSSES.values()}) == len(LOSSES)
 
 
 def test_errors_say_what_to_do():

@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 from groma.errors import InputError, ShapeError
-from groma.geometry import se3, sim3
+from groma.geometry import se3, sim3, transform
 
 ANGLES = [0.0, 1e-300, 1e-9, 1e-4, 0.1, 2.0, math.pi - 1e-9]
 SIGMAS = [0.0, 1e-300, 1e-9, -1e-4, 0.1, -2.0, 4.0]
@@ -145,3 +145,28 @@ def test_unusable_input_is_refused():
         sim3.inverse(se3.identity())
     with pytest.raises(ShapeError, match=r"\(\.\.\., 7\)"):
         sim3.exp(np.zeros(6))
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
+def test_parts_and_back(batch):
+    """Of any shape; every function that moves by a similarity takes the same array."""
+    rng = np.random.default_rng(1)
+    S = sim3.exp(rng.normal(size=(*batch, 7)))
+    scale, rotation, translation = sim3.to_parts(S)
+    assert scale.shape == batch and rotation.shape == (*batch, 3, 3) and translation.shape == (*batch, 3)
+    np.testing.assert_allclose(
+        sim3.to_matrix(sim3.from_parts(scale, rotation, translation)), sim3.to_matrix(S), atol=1e-14
+    )
+    points = rng.normal(size=(*batch, 3))
+    np.testing.assert_allclose(transform.similarity_points(S, points), sim3.apply(S, points), atol=1e-13)
+
+
+def test_parts_broadcast_and_are_checked():
+    assert sim3.from_parts(2.0, np.eye(3), np.zeros((5, 3))).shape == (5, 8)
+    assert sim3.from_parts(np.ones(4), np.eye(3), np.zeros(3)).shape == (4, 8)
+    with pytest.raises(ShapeError, match=r"rotation must have shape \(\.\.\., 3, 3\)"):
+        sim3.from_parts(1.0, np.eye(4), np.zeros(3))
+    with pytest.raises(InputError, match="positive"):
+        sim3.from_parts(0.0, np.eye(3), np.zeros(3))
+    with pytest.raises(ShapeError, match="got a tuple"):
+        sim3.inverse((1.0, np.eye(3), np.zeros(3)))

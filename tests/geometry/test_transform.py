@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError, ShapeError
-from groma.geometry import line3, plane3, se3, transform
+from groma.geometry import line3, plane3, se3, sim3, transform
 
 COUNT = 60
 
@@ -39,7 +39,7 @@ def test_rigid_and_similarity_move_the_points_of_the_object(rng):
             transform.similarity_points,
             transform.similarity_lines,
             transform.similarity_planes,
-            (scale, rotation, translation),
+            sim3.from_parts(scale, rotation, translation),
         ),
     ):
         a2, b2, c2 = (points(motion, x) for x in (a, b, c))
@@ -70,10 +70,10 @@ def test_a_similarity_is_a_homography(rng):
     homography[:, :3, 3] = translation
     homography[:, 3, 3] = 1.0
     moved = transform.projective_lines(homography, line)
-    similar = transform.similarity_lines((scale, rotation, translation), line)
+    similar = transform.similarity_lines(sim3.from_parts(scale, rotation, translation), line)
     np.testing.assert_allclose(moved, scale[:, None] * similar, atol=1e-11)
     moved = transform.projective_planes(homography, plane)
-    similar = transform.similarity_planes((scale, rotation, translation), plane)
+    similar = transform.similarity_planes(sim3.from_parts(scale, rotation, translation), plane)
     np.testing.assert_allclose(scale[:, None] * moved, similar, atol=1e-11)
 
 
@@ -135,13 +135,15 @@ def test_one_motion_moves_many_and_many_move_one(rng):
     assert transform.rigid_lines(pose[0], line).shape == (COUNT, 6)
     assert transform.rigid_planes(pose, plane[0]).shape == (COUNT, 4)
     assert transform.rigid_lines(pose[:, None], line[None]).shape == (COUNT, COUNT, 6)
-    assert transform.similarity_lines((2.0, np.eye(3), np.zeros(3)), line).shape == (COUNT, 6)
+    assert transform.similarity_lines(sim3.from_parts(2.0, np.eye(3), np.zeros(3)), line).shape == (COUNT, 6)
 
 
 def test_errors():
     with pytest.raises(ShapeError, match="b_from_a"):
         transform.rigid_points(np.zeros(6), np.zeros(3))
     with pytest.raises(InputError, match="positive"):
-        transform.similarity_points((-1.0, np.eye(3), np.zeros(3)), np.zeros(3))
+        transform.similarity_points(np.array([0.0, 0, 0, 1, 0, 0, 0, -1]), np.zeros(3))
+    with pytest.raises(ShapeError, match=r"got a tuple.*sim3\.from_parts\(s, R, t\)"):  # the form it had once
+        transform.similarity_lines((2.0, np.eye(3), np.zeros(3)), np.ones(6))
     with pytest.raises(InputError, match="rank 4"):
         transform.projective_planes(np.zeros((4, 4)), np.zeros(4))

@@ -251,7 +251,7 @@ def test_a_full_disk_ends_the_command_in_one_line_and_loses_nothing(tmp_path, co
 
     command += ["--model", str(images.parent / "model.npz"), "--no-planes"]
     with monkeypatch.context() as patch:  # while the results are written
-        patch.setattr("groma.viz.report.page.write_report", full)
+        patch.setattr("groma.mapping.result.write_report", full)
         assert run(command) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1
@@ -472,3 +472,28 @@ def test_church_front(shared_data, tmp_path, monkeypatch):
     again = map_images(folder / "images", tmp_path / "work", start, MapOptions())
     np.testing.assert_array_equal(again.scene.lines.plucker, scene.lines.plucker)
     np.testing.assert_array_equal(again.scene.frames.rig_from_world, scene.frames.rig_from_world)
+
+
+def test_the_command_is_one_call(tmp_path, corner, monkeypatch):
+    """The same files byte by byte; pages and summaries apart from times."""
+    images, model = corner
+    monkeypatch.chdir(tmp_path)
+    result = map_images(images, "work", model, MapOptions(find_planes=False))
+    numbers = result.summary(result.diagnose())
+    result.write("called", images, "Map of images", summary=numbers)
+    command = ["map", str(images), "-o", "commanded", "--model", str(images.parent / "model.npz"), "--no-planes"]
+    assert run([*command, "--quiet"]) == 0
+    names = sorted(path.relative_to("called") for path in Path("called").rglob("*") if path.is_file())
+    assert names == sorted(path.relative_to("commanded") for path in Path("commanded").rglob("*") if path.is_file())
+    assert {"scene.npz", "lines.ply", "report.html", "summary.json"} <= {name.as_posix() for name in names}
+    for name in names:
+        if name.suffix not in (".html", ".json"):
+            assert ("called" / name).read_bytes() == ("commanded" / name).read_bytes(), name
+    ours, theirs = (json.loads((Path(folder) / "summary.json").read_text()) for folder in ("called", "commanded"))
+    assert list(ours) == list(theirs) and ours["diagnosis"]["sentences"]
+    assert ours["diagnosis"].pop("seconds") and theirs["diagnosis"].pop("seconds")
+    assert [name for name in ours if ours[name] != theirs[name]] == ["seconds", "history"]
+    with pytest.raises(OutputError, match="exists already"):
+        result.write("called")
+    result.write("called", force=True)
+    assert json.loads(Path("called/summary.json").read_text())["diagnosis"] is None

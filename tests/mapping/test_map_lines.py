@@ -19,9 +19,8 @@ from groma.mapping.lines.build import (
     Outcome,
     explain,
     external_matches,
-    flow_matches,
     map_lines,
-    wide_baseline_matches,
+    segment_matches,
 )
 from groma.mapping.lines.directions import depth_ratios
 from groma.mapping.lines.filters import is_certain
@@ -133,9 +132,9 @@ def test_matches_of_a_file(world, mapped):
         external_matches(world.scene, world.segments, wrong)
 
 
-@pytest.mark.parametrize("provider", [wide_baseline_matches, flow_matches])
-def test_matches_from_images(provider):
-    """A tiled floor seen from a camera that moves sideways: the providers' matches are the same edges."""
+@pytest.mark.parametrize("matcher", ["wide_baseline", "flow"])
+def test_matches_from_images(matcher):
+    """A tiled floor seen from a camera that moves sideways: the matches are the same edges."""
     rng = np.random.default_rng(9)
     image = np.full((300, 420), 110.0, np.float32)
     for _ in range(14):
@@ -150,14 +149,14 @@ def test_matches_from_images(provider):
     scene = Scene.from_images(cameras, [f"{k}.png" for k in range(4)], np.zeros(4, int), poses)
     detector = LsdDetector(min_length=20)
     segments = [detector.detect(picture) for picture in images]
-    found = provider(scene, segments, lambda k: images[k])(0, 2)
+    found = segment_matches(scene, segments, lambda k: images[k], matcher)(0, 2)
     assert len(found) >= 0.5 * min(len(segments[0]), len(segments[2]))
     shift = segments[0].midpoint[found.pairs[:, 0]] - segments[2].midpoint[found.pairs[:, 1]]
     along = segments[0].direction[found.pairs[:, 0]]
     across = np.abs((shift[:, 0] - 24.0) * along[:, 1] - shift[:, 1] * along[:, 0])
     assert (across < 1.0).mean() >= 0.95
     with pytest.raises(InputError, match="one set per image"):
-        provider(scene, segments[:2], lambda k: images[k])
+        segment_matches(scene, segments[:2], lambda k: images[k], matcher)
 
 
 def test_lines_that_only_short_segments_show(world):

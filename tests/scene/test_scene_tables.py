@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from groma.errors import InputError, ShapeError
-from groma.geometry import quaternion, se3
+from groma.evaluation.trajectory import apply_similarity
+from groma.geometry import quaternion, se3, sim3, transform
 from groma.scene import (
     Cameras,
     Directions,
@@ -251,3 +252,21 @@ def test_choices_by_number_and_by_mask_are_the_same():
     mask = np.array([True, False, True, False, False, True])
     assert equal(scene.subset(mask), scene.subset([0, 2, 5]))
     assert len(scene.images.take([])) == 0 and len(scene.images.take(np.int32(3))) == 1
+
+
+def test_a_similarity_has_one_array():
+    """The form of :mod:`groma.geometry.sim3`, both ways; scenes and poses take either."""
+    array = sim3.exp(np.array([0.3, -1.0, 2.0, 0.4, 0.5, -0.6, 0.7]))
+    friendly = Similarity.from_array(array)
+    np.testing.assert_allclose(friendly.to_array(), array, atol=1e-15)
+    np.testing.assert_allclose(friendly.inverse().to_array(), sim3.inverse(array), atol=1e-14)
+    made = holistic(3, seed=1).truth
+    moved, same = made.transformed(friendly), made.transformed(array)
+    np.testing.assert_array_equal(moved.points.xyz, same.points.xyz)
+    np.testing.assert_allclose(moved.points.xyz, sim3.apply(array, made.points.xyz), atol=1e-12)
+    np.testing.assert_allclose(moved.lines.plucker, transform.similarity_lines(array, made.lines.plucker), atol=1e-12)
+    np.testing.assert_allclose(moved.planes.hesse, transform.similarity_planes(array, made.planes.hesse), atol=1e-12)
+    poses = se3.inverse(made.cam_from_world)
+    np.testing.assert_array_equal(apply_similarity(array, poses), apply_similarity(friendly, poses))
+    with pytest.raises(ShapeError, match=r"shape \(8,\)"):
+        Similarity.from_array(array[:7])

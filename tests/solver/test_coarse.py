@@ -8,7 +8,8 @@ from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import Workers
 from groma.solver.linear import coarse as _coarse
-from groma.solver.linear.reduced import ConjugateGradients, Dense
+from groma.solver.linear.dense import Dense
+from groma.solver.linear.pcg import ConjugateGradients
 from groma.solver.linear.schur import ReducedSystem
 
 pytestmark = pytest.mark.kernels

@@ -22,8 +22,8 @@ from groma.problem.variables import Variables
 from groma.solver.covariance import quantities
 from groma.solver.covariance.datum import unmoved
 from groma.solver.covariance.marginals import Covariances
+from groma.solver.linear.dense import Dense
 from groma.solver.linear.fronts import Fronts
-from groma.solver.linear.reduced import Dense
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 

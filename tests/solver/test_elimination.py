@@ -8,12 +8,12 @@ from groma.factors.losses import Cauchy
 from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import Workers
-from groma.solver.levenberg_marquardt import LevenbergMarquardt
-from groma.solver.linear.reduced import choose
-from groma.solver.linear.reduction import Reduction
+from groma.solver.joint import JointProblem
+from groma.solver.linear.choice import linear_solver
 from groma.solver.linear.schur import LANDMARK_DAMPING, MIN_DIAGONAL, ReducedSystem
+from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport, Stopwatch
-from groma.solver.steps import Step, curvature, diagonal, gradient, retract
+from groma.solver.steps import Step, gradient, retract
 
 pytestmark = pytest.mark.kernels
 
@@ -38,7 +38,7 @@ def eliminated_step(problem, damping, solver="dense", threads=1, eliminate="auto
     equations.linearize(states, equations.prepare(states))
     system.eliminate(damping)
     system.assemble(damping)
-    linear = choose(layout, solver)
+    linear = linear_solver(layout, solver)
     if solver == "pcg":
         linear.model_tolerance = 0.0
     kept = linear.solve(system.S, system.rhs)
@@ -86,7 +86,7 @@ def test_compact_equations_give_the_same_step(case):
     inputs = equations.prepare(states)
     equations.linearize(states, inputs, lambda share, chunk: system.eliminate_chunk(share, chunk, 1e-2))
     system.assemble(1e-2)
-    kept = choose(layout, "dense").solve(system.S, system.rhs)
+    kept = linear_solver(layout, "dense").solve(system.S, system.rhs)
     for got, wanted in zip(kept, expected.kept, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-12 * np.abs(wanted).max())
     assert all(W.dtype == np.float32 for blocks in equations.W for W in blocks.values())
@@ -149,37 +149,38 @@ def test_held_coordinates_do_not_move():
         np.testing.assert_allclose(got[name], expected[name], atol=1e-8 * np.abs(expected[name]).max())
 
 
+def flat(layout, columns, parts):
+    by_group = step_by_group(layout, parts)
+    return np.concatenate([by_group[name].reshape(-1) for name in columns])
+
+
 @pytest.mark.parametrize("case", ["points", "planes"])
 def test_quadratic_model(case):
-    """Gradient, diagonal and curvature agree with the dense matrices."""
+    """Gradient and diagonal agree with the dense matrices."""
     problem = scene_problem(**CASES[case])
-    layout, equations, system, _states, step = eliminated_step(problem, 1e-2)
+    layout, equations, system, *_ = eliminated_step(problem, 1e-2)
     H, g, columns = dense_normal_equations(problem)
-
-    def flat(parts):
-        by_group = step_by_group(layout, parts)
-        return np.concatenate([by_group[name].reshape(-1) for name in columns])
-
-    delta = flat(step)
-    np.testing.assert_allclose(flat(gradient(equations)), g, atol=1e-9 * np.abs(g).max())
-    np.testing.assert_allclose(flat(diagonal(equations, system)), np.maximum(np.diag(H), MIN_DIAGONAL), rtol=1e-9)
-    np.testing.assert_allclose(curvature(equations, system, step), delta @ H @ delta, rtol=1e-9)
+    np.testing.assert_allclose(flat(layout, columns, gradient(equations)), g, atol=1e-9 * np.abs(g).max())
+    dofs = [e.dof for e in layout.eliminated]
+    landmarks = [V.reshape(-1, n * n)[:, :: n + 1].reshape(-1) for V, n in zip(equations.V, dofs, strict=True)]
+    diagonal = Step([system.diagonal(c).reshape(-1) for c in range(len(layout.kept))], landmarks)
+    np.testing.assert_allclose(flat(layout, columns, diagonal), np.diag(H), rtol=1e-9)
 
 
 @pytest.mark.parametrize("solver", ["dense", "pcg"])
 def test_promised_decrease_is_that_of_the_quadratic_model(solver):
     """Points are damped less than lines and cameras, and conjugate gradients stop early; the promise holds for both."""
-    layout = lay_out(scene_problem(num_lines=8), chunk_size=16)
-    equations, states = NormalEquations(layout, Workers(1)), to_solver_order(layout)
-    system = ReducedSystem(equations)
-    strategy = LevenbergMarquardt(Reduction(equations, system, choose(layout, solver), Stopwatch(SolveReport())), 0.1)
-    cost = strategy.linearize(states, equations.prepare(states))
-    np.testing.assert_allclose(cost, equations.cost(equations.prepare(states)), rtol=1e-12)
-    proposal = strategy.propose()
-    assert proposal is not None
-    step, promised = proposal
-    expected = -gradient(equations).dot(step) - 0.5 * curvature(equations, system, step)
-    np.testing.assert_allclose(promised, expected, rtol=1e-9)
+    problem = scene_problem(num_lines=8)
+    layout = lay_out(problem, chunk_size=16)
+    options = SolverOptions(linear_solver=solver, initial_damping=0.1)
+    joint = JointProblem(layout, Workers(1), options, Stopwatch(SolveReport()))
+    start = joint.start()
+    np.testing.assert_allclose(start.cost, joint.equations.cost(start.inputs), rtol=1e-12)
+    trial = joint.try_step()
+    H, g, columns = dense_normal_equations(problem)
+    delta = flat(layout, columns, trial.step)
+    np.testing.assert_allclose(trial.promised, -g @ delta - 0.5 * delta @ H @ delta, rtol=1e-9)
+    np.testing.assert_allclose(trial.gain_ratio, (start.cost - trial.cost) / trial.promised, rtol=1e-12)
 
 
 def test_linearisation_predicts_the_cost():
@@ -188,7 +189,5 @@ def test_linearisation_predicts_the_cost():
     layout, equations, _system, states, step = eliminated_step(problem, 1e-2)
     g = gradient(equations)
     h = 1e-6
-    costs = [
-        equations.cost(equations.prepare(retract(layout, states, step.blend(sign * h, step, 0.0)))) for sign in (1, -1)
-    ]
+    costs = [equations.cost(equations.prepare(retract(layout, states, step.scaled(sign * h)))) for sign in (1, -1)]
     np.testing.assert_allclose((costs[0] - costs[1]) / (2 * h), g.dot(step), rtol=1e-6)

@@ -14,8 +14,7 @@ from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import Workers
 from groma.solver.options import SolverOptions
 from groma.solver.refinement import landmark_refiner
-from groma.solver.steps import Step
-from groma.solver.trial import Trial
+from groma.solver.trial import JointTrial, evaluated
 
 ONLY_LINES = SolverOptions(landmark_steps=1, landmark_groups=("lines",))
 
@@ -37,9 +36,7 @@ def spoilt(seed):
     points = states["points"].copy()
     points[::3] += np.random.default_rng(seed).normal(0, 0.5, points[::3].shape)
     moved = {**states, "points": points}
-    inputs = equations.prepare(moved)
-    cost = equations.cost(inputs)
-    trial = Trial(Step([], []), moved, inputs, cost, 0.0, 1.0, 1.0, equations.costs, equations.hidden)
+    trial = JointTrial(**evaluated(equations, moved))
     return layout, workers, equations, states, start, trial
 
 

@@ -1,13 +1,17 @@
 """Solves in shards: the same minimum as at once, however landmarks are cut; merged blocks; what is held; odd cases."""
 
 import dataclasses
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from problems import scene_problem
 
+import groma.solver.reduce.shards as shards_module
 from groma.errors import ProblemError
 from groma.factors.contract import Ref
+from groma.factors.losses import Cauchy
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
 from groma.solver.reduce.shards import Shard, solve_shards
@@ -146,3 +150,67 @@ def test_says_what_is_wrong_with_shards():
         solve_shards(problem.variables, [*shards, shards[0]])
     with pytest.raises(ProblemError, match="names the group 'trees'"):
         solve_shards(problem.variables, [Shard({"trees": slice(0, 1)}, list)])
+
+
+def test_steps_are_longer_under_a_robust_loss(monkeypatch):
+    """Reweighted least squares overestimates the curvature; a step learns that from the one before."""
+    problem = scene_problem(num_cameras=6, num_points=80, loss=Cauchy(1.0))
+    long = solve_shards(problem.variables, cut(problem, 3), TIGHT).report
+    monkeypatch.setattr(shards_module, "MAX_STRETCH", 1.0)
+    short = solve_shards(problem.variables, cut(problem, 3), TIGHT).report
+    visits = [sum(1 if record.accepted else 2 for record in report.history) for report in (long, short)]
+    assert visits[0] < 0.7 * visits[1]
+    np.testing.assert_allclose(long.final_cost, short.final_cost, rtol=1e-4)
+
+
+class Together:
+    """The reducer of several threads that play machines."""
+
+    def __init__(self, count):
+        self._barrier, self._given, self._count = threading.Barrier(count), {}, count
+        self.own = threading.local()
+
+    def _gather(self, values):
+        self._given[self.own.number] = values
+        self._barrier.wait(60)
+        found = [self._given[number] for number in range(self._count)]
+        self._barrier.wait(60)
+        return found
+
+    def sum(self, values):
+        return np.sum(self._gather(values), axis=0)
+
+    def union(self, numbers):
+        return np.unique(np.concatenate(self._gather(numbers)))
+
+
+def test_machines_with_shards_of_their_own_solve_one_problem():
+    problem = scene_problem(num_cameras=6, num_points=60, num_lines=20, shared_intrinsics=True)
+    shards = cut(problem, 4)
+    alone = solve_shards(problem.variables, shards, TIGHT)
+    reducer = Together(2)
+
+    def work(number):
+        reducer.own.number = number
+        return solve_shards(problem.variables, shards[number::2], TIGHT, reducer=reducer)
+
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(work, range(2))
+    for name in ("poses", "intrinsics"):
+        np.testing.assert_array_equal(first.variables[name].state, second.variables[name].state)
+    assert first.report.num_residuals == alone.report.num_residuals
+    np.testing.assert_allclose(first.report.final_cost, alone.report.final_cost, rtol=1e-9)
+    rows = shards[1].landmarks["points"]
+    np.testing.assert_array_equal(first.variables["points"].state[rows], problem.variables["points"].state[rows])
+    assert np.abs(second.variables["points"].state[rows] - problem.variables["points"].state[rows]).min() > 0
+
+
+def test_gauss_newton_in_shards():
+    problem = scene_problem(num_cameras=6, num_points=60, noise=0.1, disturb=1e-3)
+    held = np.zeros(6, bool)
+    held[:2] = True
+    variables = {**problem.variables, "poses": dataclasses.replace(problem.variables["poses"], constant=held)}
+    options = dataclasses.replace(TIGHT, method="gauss_newton")
+    report = solve_shards(variables, cut(problem, 3), options).report
+    assert report.converged and report.iterations <= 5
+    assert solve_shards(problem.variables, cut(problem, 3), options).report.termination is Termination.SINGULAR

@@ -1,4 +1,4 @@
-"""Whole solves: convergence, strategies, robust losses, motion only, structure only, and every odd case."""
+"""Whole solves: convergence, robust losses, motion only, structure only, and every odd case."""
 
 import dataclasses
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from problems import INTRINSICS, dense_normal_equations, pixels_of, scene_problem
 
+import groma.solver.joint as joint_module
 import groma.solver.linear.schur as schur_module
-import groma.solver.solve as solve_module
 from groma.errors import ProblemError
 from groma.factors import PointOnLine, PointReprojection, VectorPrior
 from groma.factors.contract import Example, Factor, Ref, Slot
@@ -21,11 +21,10 @@ from groma.solver.solve import solve
 from groma.solver.termination import Termination
 
 
-@pytest.mark.parametrize("strategy", ["levenberg_marquardt", "dogleg"])
 @pytest.mark.parametrize("linear_solver", ["dense", "sparse", "pcg"])
-def test_reaches_the_noise_floor(strategy, linear_solver):
+def test_reaches_the_noise_floor(linear_solver):
     problem = scene_problem(num_cameras=6, num_points=150, num_lines=40, disturb=0.02)
-    options = SolverOptions(strategy=strategy, linear_solver=linear_solver, function_tolerance=1e-10)
+    options = SolverOptions(linear_solver=linear_solver, function_tolerance=1e-10)
     solution = solve(problem, options)
     report = solution.report
     assert report.converged
@@ -36,11 +35,10 @@ def test_reaches_the_noise_floor(strategy, linear_solver):
     assert np.abs(g).max() < 1e-2 * np.abs(dense_normal_equations(problem)[1]).max()
 
 
-def test_same_minimum_from_every_solver_and_strategy():
+def test_same_minimum_from_every_solver():
     problem = scene_problem(num_cameras=6, num_points=60, shared_intrinsics=True)
     costs = [
-        solve(problem, SolverOptions(strategy=s, linear_solver=k, function_tolerance=1e-12, max_iterations=100)).report
-        for s in ("levenberg_marquardt", "dogleg")
+        solve(problem, SolverOptions(linear_solver=k, function_tolerance=1e-12, max_iterations=100)).report
         for k in ("dense", "sparse", "pcg")
     ]
     np.testing.assert_allclose([r.final_cost for r in costs], costs[0].final_cost, rtol=1e-6)
@@ -239,12 +237,11 @@ def test_points_are_not_hidden_behind_the_camera():
     assert solution.report.num_degenerate.get("point_reprojection", 0) <= 2
 
 
-@pytest.mark.parametrize("strategy", ["levenberg_marquardt", "dogleg"])
-def test_single_precision_blocks_reach_the_same_minimum(monkeypatch, strategy):
+def test_single_precision_blocks_reach_the_same_minimum(monkeypatch):
     problem = scene_problem(num_lines=6, disturb=0.05)  # far enough that steps are refused
-    options = SolverOptions(strategy=strategy, function_tolerance=1e-12, max_iterations=100)
+    options = SolverOptions(function_tolerance=1e-12, max_iterations=100)
     plain = solve(problem, options).report
-    monkeypatch.setattr(solve_module, "COMPACT_FROM", 0)
+    monkeypatch.setattr(joint_module, "COMPACT_FROM", 0)
     compact = solve(problem, options).report
     assert compact.final_cost == pytest.approx(plain.final_cost, rel=1e-9)
 

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import groma
 from groma.cli.app import app
+from groma.errors import OutputError
 from groma.io import read_scene
 from groma.io.trajectories import read_tum
 from groma.tracking import Tracker, TrackOptions
@@ -112,6 +114,46 @@ def test_finished_keyframes_are_on_disk_while_it_runs(tmp_path):
     assert read_scene(tmp_path / "work" / "scene.npz").num_images >= 1
     assert len(read_tum(tmp_path / "work" / "trajectory.txt")) >= 1
     tracker.finish()
+
+
+def _same_files(first, second):
+    """Names of the files in two folders, after a look whether those that hold no times are equal byte by byte."""
+    names = [{path.relative_to(folder) for path in folder.rglob("*") if path.is_file()} for folder in (first, second)]
+    assert names[0] == names[1]
+    for name in names[0]:
+        if name.suffix not in (".html", ".json"):
+            assert (first / name).read_bytes() == (second / name).read_bytes(), name
+    return {name.as_posix() for name in names[0]}
+
+
+def test_the_command_is_one_call(sequence, tmp_path):
+    opened = groma.open_sequence(sequence, camera=CAMERA)
+    events = []
+    result = groma.track(opened, progress=events.append, work=tmp_path / "work", name=str(sequence))
+    result.write(tmp_path / "called")
+    assert _run(sequence, "-o", tmp_path / "commanded", "--camera", CAMERA).exit_code == 0
+    assert "trajectory.txt" in _same_files(tmp_path / "called", tmp_path / "commanded")
+    ours, theirs = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("called", "commanded"))
+    times = ("milliseconds", "final_adjustment")
+    assert list(ours) == list(theirs)
+    assert all(ours[name] == theirs[name] for name in ours if name not in times)
+    assert [event.done for event in events if event.frame] == list(range(1, 17)) and events[0].total == 16
+    assert [event.frame for event in events if event.frame] == list(result.frames)
+    assert len(read_tum(tmp_path / "work" / "keyframes.txt")) >= 1
+    with pytest.raises(OutputError, match="exists already"):
+        result.write(tmp_path / "called")
+
+
+@pytest.mark.parametrize("how", ["the callback returns False", "Ctrl-C"])
+def test_a_track_that_is_ended_early_has_what_there_is(sequence, how):
+    def stop(event):
+        if event.done == 6 and how == "Ctrl-C":
+            raise KeyboardInterrupt
+        return event.done < 6
+
+    result = groma.track(groma.open_sequence(sequence, camera=CAMERA), TrackOptions(lines=False), stop)
+    assert result.interrupted and result.summary()["interrupted"]
+    assert len(result.frames) == len(result.trajectory) == 6
 
 
 #: ``groma track`` that kills itself in the middle of a frame.

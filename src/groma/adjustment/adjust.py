@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from groma.adjustment.assemble import (
 )
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.relation_outcome import drop_failed_relations
+from groma.adjustment.report import AdjustReport, AdjustResult, Progress
 from groma.adjustment.rescue.clusters import settle_clusters
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
@@ -35,7 +35,6 @@ from groma.scene.local_frame import local_frame
 from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
 from groma.solver.solve import solve
-from groma.solver.termination import Termination
 
 #: The default for what comes from matching: first a loss that pulls from afar, then one that ignores what stayed far.
 #: Losses by name and scale in pixels; see the page *How to choose* for the measurements behind them.
@@ -86,7 +85,7 @@ class AdjustOptions:
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in a step.
     function_tolerance: float = 1e-6
-    #: ``auto``, ``dense``, ``sparse`` or ``pcg``.
+    #: ``auto``, ``dense``, ``sparse``, ``pcg``, or a solver that was registered.
     linear_solver: str = "auto"
     #: ``cartesian``, ``orthonormal_right``, ``orthonormal_left``, ``free_right`` or ``free_left``.
     line_chart: str = "cartesian"
@@ -102,106 +101,6 @@ class AdjustOptions:
         for name in ("point_sigma_px", "line_sigma_px", "structure_sigma_px"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise InputError(f"{name} must be a positive number of pixels; got {getattr(self, name)}.")
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a progress callback gets after every step."""
-
-    #: Steps tried so far, and the most there may be.
-    iteration: int
-    max_iterations: int
-    #: The cost after this step.
-    cost: float
-
-
-@dataclass(frozen=True)
-class AdjustReport:
-    """Outcome of :func:`adjust` in the terms of the scene; as a string, its main figures."""
-
-    #: What took part.
-    num_images: int
-    num_points: int
-    num_lines: int
-    num_planes: int
-    num_observations: int
-    #: Root mean square residual by kind of landmark, pixels: {kind: {before, after}}, without the loss.
-    rmse_px: dict[str, dict[str, float]]
-    #: How the solver got there.
-    solve: SolveReport
-    #: Sentences for the user.
-    warnings: tuple[str, ...]
-    #: One entry per loss that was solved with, in order: loss, initial_cost, first_step. Costs of different stages
-    #: cannot be compared.
-    stages: tuple[dict[str, Any], ...] = ()
-    #: Relations between landmarks by kind: how many held, and how many the loss gave up, which the scene then drops.
-    relations: dict[str, dict[str, int]] = field(default_factory=dict)
-
-    def __str__(self) -> str:
-        counts = {"images": self.num_images, "points": self.num_points, "lines": self.num_lines}
-        counts |= {"planes": self.num_planes, "observations": self.num_observations}
-        rows = [", ".join(counted(number, kind) for kind, number in counts.items() if number)]
-        rows += [
-            f"{kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms)"
-            for kind, rmse in self.rmse_px.items()
-            if None not in rmse.values()
-        ]
-        return "\n".join([*rows, str(self.solve), *(f"warning: {sentence}" for sentence in self.warnings)])
-
-    @property
-    def termination(self) -> Termination:
-        """Why the solve stopped."""
-        return self.solve.termination
-
-    @property
-    def history(self) -> list[dict[str, Any]]:
-        """One entry per step tried: iteration, stage, cost, accepted, damping, step_norm, seconds and more."""
-        firsts = [stage["first_step"] for stage in self.stages]
-        return [
-            {**asdict(record), "stage": sum(first <= record.iteration for first in firsts)}
-            for record in self.solve.history
-        ]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the report as plain numbers and words, for JSON."""
-        solve = self.solve
-        return {
-            "num_images": self.num_images,
-            "num_points": self.num_points,
-            "num_lines": self.num_lines,
-            "num_planes": self.num_planes,
-            "num_observations": self.num_observations,
-            "num_residuals": solve.num_residuals,
-            "num_unknowns": solve.num_unknowns,
-            "initial_cost": solve.initial_cost,
-            "final_cost": solve.final_cost,
-            "initial_costs": solve.initial_costs,
-            "final_costs": solve.final_costs,
-            "reduced_chi_square": solve.reduced_chi_square,
-            "iterations": solve.iterations,
-            "termination": solve.termination.key,
-            "termination_sentence": solve.termination.sentence,
-            "converged": solve.converged,
-            "linear_solver": solve.linear_solver,
-            "threads": solve.threads,
-            "seconds": dict(solve.seconds),
-            "rmse_px": self.rmse_px,
-            "relations": self.relations,
-            "stages": list(self.stages),
-            "num_degenerate": solve.num_degenerate,
-            "num_underdetermined_landmarks": solve.num_underdetermined_landmarks,
-            "history": self.history,
-        }
-
-
-@dataclass(frozen=True)
-class AdjustResult:
-    """The adjusted scene and the report."""
-
-    scene: Scene
-    report: AdjustReport
-    #: The problem at its solution, for covariances and diagnosis; None in a result read from a file.
-    problem: Problem | None = None
 
 
 def adjust(

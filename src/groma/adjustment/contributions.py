@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.adjustment.adjust import AdjustOptions, AdjustResult, adjust
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.report import AdjustResult
 from groma.adjustment.uncertainty import position_sigma, uncertainty
 from groma.errors import InputError, ProblemError
 from groma.evaluation.alignment import align_poses, camera_centers

@@ -9,6 +9,9 @@ from groma.scene import Scene
 from groma.scene.local_frame import local_frame
 from groma.solver.observability.diagnosis import Diagnosis, diagnose
 
+#: Larger scenes are diagnosed by commands only when asked for.
+MANY_IMAGES = 300
+
 
 def diagnose_scene(
     scene: Scene, options: AssemblyOptions | None = None, problem: Problem | None = None, threads: int = 1
@@ -52,4 +55,4 @@ def diagnose_scene(
     return diagnose(problem, name, threads=threads)
 
 
-__all__ = ["diagnose_scene"]
+__all__ = ["MANY_IMAGES", "diagnose_scene"]

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from groma._counted import counted
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.adjust import Progress
+from groma.adjustment.report import Progress
 from groma.errors import InputError
 from groma.factors.contract import Ref
 from groma.factors.losses import loss as make_loss
@@ -54,7 +55,7 @@ class PoseGraphOptions:
     trust_odometry: bool = True
     #: Most steps.
     max_iterations: int = 100
-    #: ``auto``, ``dense``, ``sparse`` or ``pcg``.
+    #: ``auto``, ``dense``, ``sparse``, ``pcg``, or a solver that was registered.
     linear_solver: str = "auto"
     #: Threads; None takes one for small graphs and all cores for large ones.
     threads: int | None = None
@@ -71,6 +72,42 @@ class PoseGraphResult:
     chi_square: FloatArray
     #: Motions beyond the scale of the loss after the adjustment; none for plain least squares.
     doubtful: IntArray
+
+    @property
+    def num_parts(self) -> int:
+        """Number of connected parts of the graph."""
+        return int(self.graph.parts().max()) + 1
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences for the user."""
+        if self.num_parts == 1:
+            return tuple(self.report.warnings)
+        parts = f"The graph falls into {self.num_parts} parts; each keeps the frame of its held or first pose."
+        return (*self.report.warnings, parts)
+
+    def summary(self) -> dict[str, Any]:
+        """Return all numbers as plain values, as ``groma adjust --json`` writes them."""
+        report, graph = self.report, self.graph
+        ids, motions = graph.poses.ids, graph.motions
+        return {
+            "num_poses": len(graph.poses),
+            "num_motions": len(motions),
+            "num_parts": self.num_parts,
+            "planar": graph.planar,
+            "initial_cost": report.initial_cost,
+            "final_cost": report.final_cost,
+            "iterations": report.iterations,
+            "termination": report.termination.key,
+            "converged": report.converged,
+            "linear_solver": report.linear_solver,
+            "seconds": dict(report.seconds),
+            "chi_square": {"before": float(self.chi_square_before.sum()), "after": float(self.chi_square.sum())},
+            "doubtful_motions": [
+                [int(ids[motions.first_idx[row]]), int(ids[motions.second_idx[row]])] for row in self.doubtful
+            ],
+            "warnings": list(self.warnings),
+        }
 
 
 def adjust_pose_graph(

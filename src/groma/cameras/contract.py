@@ -10,8 +10,9 @@ are repeated here.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from groma._numba import loop
 from groma._typing import FloatArray
 from groma.cameras.dispatch import (
     has_pinhole_kernels,
+    kernel_module,
     pinhole_parameters,
     pinhole_parameters_jacobian,
     project,
@@ -75,8 +77,6 @@ class CameraModel:
 
     #: Name, as options and files spell it.
     name: str
-    #: Number of the model. It selects the kernels at compile time, so it must not change between two runs.
-    number: int
     #: Names of the k parameters, in order.
     parameter_names: tuple[str, ...]
     #: Which parameters are focal lengths in pixels: one, or two (x, y).
@@ -89,6 +89,8 @@ class CameraModel:
     colmap_name: str | None = None
     #: Whether points at and behind the image plane have an image of their own (fisheye), so that z > 0 is no test.
     sees_behind: bool = False
+    #: Given by :func:`register_camera`, which sets it; it selects the kernels when loops are compiled.
+    number: int = -1
 
     @property
     def num_parameters(self) -> int:
@@ -98,6 +100,11 @@ class CameraModel:
     @property
     def tag(self) -> tuple[int, ...]:
         """What compiled loops take to select this model, see :mod:`groma.cameras.dispatch`."""
+        if self.number < 0:
+            raise InputError(
+                f"The camera model {self.name!r} has no kernels yet. Use the model that "
+                "groma.cameras.register_camera returns."
+            )
         return (0,) * (self.number + 1)
 
     @property
@@ -317,6 +324,8 @@ class CameraModel:
 
 
 _MODELS: dict[str, CameraModel] = {}
+#: One for every registration of this process.
+_NUMBERS = itertools.count()
 
 
 def register_camera(
@@ -332,31 +341,30 @@ def register_camera(
     Parameters
     ----------
     camera : CameraModel
-        The model. Its number must be free; groma uses 0 to 15. Keep it the same from run to run: compiled loops on disk
-        are found again under the same number only.
+        The model.
     project, project_jacobian, unproject : callable
-        Kernels (decorated with ``groma._numba.kernel``) as described in :mod:`groma.cameras.dispatch`, without the
-        tag.
+        Kernels (decorated with :func:`groma.compiled.kernel`) as described in :mod:`groma.cameras.dispatch`, without
+        the tag.
     pinhole_parameters, pinhole_parameters_jacobian : callable, optional
         For models without distortion only.
 
     Returns
     -------
     CameraModel
-        The same model.
+        The model with the number that selects its kernels.
 
     Raises
     ------
     InputError
-        If the name or the number belongs to another model.
+        If the name belongs to a model of another module.
     """
-    for other in _MODELS.values():
-        if (other.name == camera.name) != (other.number == camera.number):
-            raise InputError(
-                f"A camera model needs a name and a number of its own; got {camera.name!r} and {camera.number}, "
-                f"but {other.name!r} has number {other.number}. Choose a free number from 16 upwards."
-            )
-    _MODELS[camera.name] = camera
+    known = _MODELS.get(camera.name)
+    if known is not None and kernel_module(known.number + 1) != project.__module__:
+        raise InputError(
+            f"A camera model named {camera.name!r} is registered already, by {kernel_module(known.number + 1)}. "
+            "Choose another name."
+        )
+    camera = _MODELS[camera.name] = replace(camera, number=next(_NUMBERS))
     kernels = project, project_jacobian, unproject, pinhole_parameters, pinhole_parameters_jacobian
     set_kernels(camera.number + 1, *kernels)
     return camera
@@ -373,8 +381,8 @@ def model(name: str) -> CameraModel:
 
 
 def models() -> tuple[CameraModel, ...]:
-    """All registered camera models, by number."""
-    return tuple(sorted(_MODELS.values(), key=lambda camera: camera.number))
+    """All registered camera models, in the order of their registration."""
+    return tuple(_MODELS.values())
 
 
 def _rows(array: FloatArray, columns: int, name: str) -> FloatArray:

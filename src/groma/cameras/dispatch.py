@@ -6,7 +6,7 @@ argument, a tuple of zeros whose length is one more than the number of the model
 type, and the length is part of the type, so the loop calls the model's kernel directly: no branch, no function
 pointer, and Numba's disk cache works. Without the compiler the same names are plain Python functions::
 
-    from groma._numba import loop
+    from groma.compiled import loop
 
     @loop
     def project_all(model_tag, params, points, pixels):
@@ -110,6 +110,11 @@ def set_kernels(
         _PINHOLE[length], _PINHOLE_JACOBIAN[length] = pinhole_parameters, pinhole_parameters_jacobian
 
 
+def kernel_module(length: int) -> str:
+    """Name the module that holds the kernels a tag of ``length`` selects."""
+    return _PROJECT[length].__module__
+
+
 def has_pinhole_kernels(length: int) -> bool:
     """Whether a tag of ``length`` selects a model without distortion."""
     return length in _PINHOLE
@@ -117,6 +122,7 @@ def has_pinhole_kernels(length: int) -> bool:
 
 __all__ = [
     "has_pinhole_kernels",
+    "kernel_module",
     "pinhole_parameters",
     "pinhole_parameters_jacobian",
     "project",

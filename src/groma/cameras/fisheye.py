@@ -164,7 +164,6 @@ def opencv_fisheye_unproject(params, uv, bearing):
 OPENCV_FISHEYE = register_camera(
     CameraModel(
         "OPENCV_FISHEYE",
-        5,
         ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
         (0, 1),
         (2, 3),

@@ -257,15 +257,13 @@ def opencv_unproject(params, uv, bearing):
 
 _EIGHT = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 OPENCV = register_camera(
-    CameraModel("OPENCV", 4, _EIGHT, (0, 1), (2, 3), (4, 5, 6, 7), "OPENCV"),
+    CameraModel("OPENCV", _EIGHT, (0, 1), (2, 3), (4, 5, 6, 7), "OPENCV"),
     opencv_project,
     opencv_project_jacobian,
     opencv_unproject,
 )
 FULL_OPENCV = register_camera(
-    CameraModel(
-        "FULL_OPENCV", 6, (*_EIGHT, "k3", "k4", "k5", "k6"), (0, 1), (2, 3), tuple(range(4, 12)), "FULL_OPENCV"
-    ),
+    CameraModel("FULL_OPENCV", (*_EIGHT, "k3", "k4", "k5", "k6"), (0, 1), (2, 3), tuple(range(4, 12)), "FULL_OPENCV"),
     full_opencv_project,
     full_opencv_project_jacobian,
     full_opencv_unproject,

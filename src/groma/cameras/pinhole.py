@@ -149,7 +149,7 @@ def pinhole_parameters_jacobian(params, J):
 # ---------------------------------------------------------------------------------------------------------- Public
 
 SIMPLE_PINHOLE = register_camera(
-    CameraModel("SIMPLE_PINHOLE", 0, ("f", "cx", "cy"), (0,), (1, 2), (), "SIMPLE_PINHOLE"),
+    CameraModel("SIMPLE_PINHOLE", ("f", "cx", "cy"), (0,), (1, 2), (), "SIMPLE_PINHOLE"),
     simple_pinhole_project,
     simple_pinhole_project_jacobian,
     simple_pinhole_unproject,
@@ -157,7 +157,7 @@ SIMPLE_PINHOLE = register_camera(
     simple_pinhole_parameters_jacobian,
 )
 PINHOLE = register_camera(
-    CameraModel("PINHOLE", 1, ("fx", "fy", "cx", "cy"), (0, 1), (2, 3), (), "PINHOLE"),
+    CameraModel("PINHOLE", ("fx", "fy", "cx", "cy"), (0, 1), (2, 3), (), "PINHOLE"),
     pinhole_project,
     pinhole_project_jacobian,
     pinhole_unproject,

@@ -218,19 +218,19 @@ def bal_unproject(params, uv, bearing):
 # ---------------------------------------------------------------------------------------------------------- Public
 
 SIMPLE_RADIAL = register_camera(
-    CameraModel("SIMPLE_RADIAL", 2, ("f", "cx", "cy", "k"), (0,), (1, 2), (3,), "SIMPLE_RADIAL"),
+    CameraModel("SIMPLE_RADIAL", ("f", "cx", "cy", "k"), (0,), (1, 2), (3,), "SIMPLE_RADIAL"),
     simple_radial_project,
     simple_radial_project_jacobian,
     simple_radial_unproject,
 )
 RADIAL = register_camera(
-    CameraModel("RADIAL", 3, ("f", "cx", "cy", "k1", "k2"), (0,), (1, 2), (3, 4), "RADIAL"),
+    CameraModel("RADIAL", ("f", "cx", "cy", "k1", "k2"), (0,), (1, 2), (3, 4), "RADIAL"),
     radial_project,
     radial_project_jacobian,
     radial_unproject,
 )
 BAL = register_camera(
-    CameraModel("BAL", 7, ("f", "k1", "k2"), (0,), (), (1, 2), None),
+    CameraModel("BAL", ("f", "k1", "k2"), (0,), (), (1, 2), None),
     bal_project,
     bal_project_jacobian,
     bal_unproject,

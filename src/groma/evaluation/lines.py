@@ -132,23 +132,34 @@ def score_lines(
 
 
 def evaluate_lines(
-    estimate: Scene, reference: Scene, thresholds: Sequence[float] | None = None, align: bool = False
+    estimate: Scene | Geometry,
+    reference: Scene | Geometry,
+    thresholds: Sequence[float] | None = None,
+    align: bool = False,
 ) -> LineScores:
-    """Compare the segments of two scenes.
+    """Compare the segments of a scene with those of another, or with edges, a mesh or points.
 
     Parameters
     ----------
-    estimate, reference : Scene
-        The scene to judge, and the one taken for true.
+    estimate, reference : Scene or Geometry
+        What is judged, and what is taken for true; :func:`groma.io.reference.read_reference` reads geometry from files.
     thresholds : sequence of float, optional
         See :func:`score_lines`.
     align : bool
-        First bring the estimate into the reference's frame by the poses of the images that are in both.
+        First bring the estimate into the reference's frame by the poses of the images that are in both scenes.
+
+    Raises
+    ------
+    InputError
+        If geometry without poses is to be aligned, and as :func:`score_lines`.
     """
-    segments = estimate.lines.segments
+    segments = estimate.segments if isinstance(estimate, Geometry) else estimate.lines.segments
     if align:
+        if isinstance(estimate, Geometry) or isinstance(reference, Geometry):
+            raise InputError("Alignment takes the poses of two scenes; geometry alone has none. Pass align=False.")
         segments = evaluate_poses(estimate, reference).alignment.points(segments)
-    return score_lines(segments, Geometry(segments=reference.lines.segments), thresholds)
+    target = reference if isinstance(reference, Geometry) else Geometry(segments=reference.lines.segments)
+    return score_lines(segments, target, thresholds)
 
 
 def _ratio(part: FloatArray, whole: float) -> FloatArray:

@@ -218,8 +218,10 @@ def in_order(trajectory: Trajectory) -> Trajectory:
     return trajectory.take(np.argsort(trajectory.timestamps, kind="stable"))
 
 
-def apply_similarity(new_from_old: Similarity, world_from_cam: npt.ArrayLike) -> FloatArray:
+def apply_similarity(new_from_old: Similarity | FloatArray, world_from_cam: npt.ArrayLike) -> FloatArray:
     r"""Return poses (N, 7) in another world: :math:`R' = R_s R`, :math:`t' = s R_s t + t_s`."""
+    if not isinstance(new_from_old, Similarity):
+        new_from_old = Similarity.from_array(new_from_old)
     poses = np.asarray(world_from_cam, float)
     turn = np.broadcast_to(quaternion.from_matrix(new_from_old.rotation), poses[:, :4].shape)
     turned = quaternion.normalize(quaternion.multiply(turn, poses[:, :4]))

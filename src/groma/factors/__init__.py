@@ -6,7 +6,17 @@ Importing this package registers every factor of groma; nothing is compiled befo
 
 from groma.factors.checks.check import FactorCheck, check_factor
 from groma.factors.checks.selfcheck import SelfCheckReport, SelfCheckRow, selfcheck
-from groma.factors.contract import Example, Factor, Ref, Slot, register, registered
+from groma.factors.contract import (
+    ANY_SIMILARITY,
+    WORLD_FIXED,
+    Example,
+    Factor,
+    Invariance,
+    Ref,
+    Slot,
+    register,
+    registered,
+)
 from groma.factors.losses import (
     LOSSES,
     Barron,
@@ -19,6 +29,7 @@ from groma.factors.losses import (
     Truncated,
     Tukey,
     loss,
+    register_loss,
 )
 from groma.factors.observations.line_bearing import LineBearing
 from groma.factors.observations.line_normal import LineNormal
@@ -58,7 +69,9 @@ from groma.factors.relations.point_to_image_line import PointToImageLine
 from groma.factors.user import UserFactor, factor
 
 __all__ = [
+    "ANY_SIMILARITY",
     "LOSSES",
+    "WORLD_FIXED",
     "Barron",
     "Cauchy",
     "Example",
@@ -66,6 +79,7 @@ __all__ = [
     "FactorCheck",
     "GemanMcClure",
     "Huber",
+    "Invariance",
     "LineBearing",
     "LineDirection",
     "LineNormal",
@@ -113,6 +127,7 @@ __all__ = [
     "factor",
     "loss",
     "register",
+    "register_loss",
     "registered",
     "selfcheck",
 ]

@@ -11,11 +11,7 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import ProblemError
 from groma.factors.contract import Example, Factor
 from groma.geometry import se3
-from groma.geometry.charts.line_charts import LINE_CHARTS
-from groma.geometry.charts.plane_charts import PLANE_CHARTS
-from groma.geometry.charts.point3 import POINT_CHARTS
-from groma.geometry.charts.pose_charts import POSE_CHARTS
-from groma.geometry.charts.unit3 import DIRECTION_CHARTS
+from groma.geometry.charts import charts_of
 from groma.geometry.manifold import Manifold
 
 #: Factors in one example.
@@ -24,14 +20,7 @@ COUNT = 6
 
 def charts(kind: str) -> tuple[Manifold, ...]:
     """Return every chart known for ``kind``, the default first; none for kinds of any size."""
-    tables = {
-        "point": POINT_CHARTS,
-        "pose": POSE_CHARTS,
-        "line": LINE_CHARTS,
-        "plane": PLANE_CHARTS,
-        "direction": DIRECTION_CHARTS,
-    }
-    return tuple(tables[kind].values()) if kind in tables else ()
+    return tuple(charts_of(kind).values())
 
 
 def indices(rng: np.random.Generator, count: int) -> IntArray:

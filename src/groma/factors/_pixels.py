@@ -19,7 +19,7 @@ from groma.cameras import CameraModel, model
 from groma.errors import InputError, ShapeError
 from groma.factors._examples import make_example, visible_scene
 from groma.factors._rig import CameraFactor
-from groma.factors.contract import Example, Ref
+from groma.factors.contract import ANY_SIMILARITY, Example, Invariance, Ref
 from groma.geometry.manifold import Euclidean
 
 
@@ -52,6 +52,7 @@ class PixelFactor(CameraFactor):
 
     #: Whether the formula holds without distortion only.
     pinhole_only: ClassVar[bool] = False
+    invariance: ClassVar[Invariance] = ANY_SIMILARITY
 
     def __post_init__(self) -> None:
         """Look the model up."""
@@ -92,6 +93,7 @@ class StereoFactor(PixelFactor):
     baseline: float | FloatArray
 
     pinhole_only: ClassVar[bool] = True
+    invariance: ClassVar[Invariance] = Invariance()
 
     def __post_init__(self) -> None:
         """Make the baseline a float or (N,); raise unless all are finite and positive."""

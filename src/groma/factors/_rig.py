@@ -30,7 +30,7 @@ from groma.factors.contract import Factor, Ref, Slot
 from groma.geometry.se3 import compose_kernel
 
 POSE = Slot("pose", "pose")
-EXTRINSICS = Slot("extrinsics", "pose", optional=True)
+EXTRINSICS = Slot("extrinsics", "pose", optional=True, in_world=False)
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels

@@ -62,6 +62,29 @@ class Slot:
     kind: str
     #: Whether the field may be None (the slot is then absent from :meth:`Factor.references`).
     optional: bool = False
+    #: Whether the variable moves when the world moves. A camera's place on its rig does not, though it is a pose.
+    in_world: bool = True
+
+
+@dataclass(frozen=True)
+class Invariance:
+    """Motions of all variables together that leave the residuals of a factor as they are.
+
+    Without a camera among the variables, residuals may be vectors in the world: then their lengths count.
+    """
+
+    #: Any translation; not where positions in the world are measured.
+    translation: bool = True
+    #: Any rotation; or rotations about one axis (x, y, z) of the world only, as where gravity is measured; or none.
+    rotation: bool | tuple[float, float, float] = True
+    #: Any scaling; not where lengths are measured.
+    scale: bool = False
+
+
+#: Of factors that tie the world down: surveyed positions, priors of poses.
+WORLD_FIXED = Invariance(translation=False, rotation=False)
+#: Of factors that measure angles only, in images or between directions.
+ANY_SIMILARITY = Invariance(scale=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +101,8 @@ class Factor(ABC):
     type_name: ClassVar[str] = ""
     #: The variables touched, in order.
     slots: ClassVar[tuple[Slot, ...]]
+    #: Which motions of the world it does not notice; None: not declared, and not checked.
+    invariance: ClassVar[Invariance | None] = Invariance()
 
     @property
     @abstractmethod

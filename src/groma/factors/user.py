@@ -62,7 +62,7 @@ from groma.errors import InputError, ShapeError
 from groma.factors._examples import indices, make_example
 from groma.factors._record import set_rows
 from groma.factors._user_loops import Loops
-from groma.factors.contract import Example, Factor, Ref, Slot, register
+from groma.factors.contract import Example, Factor, Invariance, Ref, Slot, register
 from groma.geometry.manifold import AMBIENT_SIZE, Euclidean
 
 #: Kinds whose size is not fixed; their slot is (name, kind, size).
@@ -90,6 +90,8 @@ class UserFactor(Factor):
 
     #: Numbers per row of `data`.
     data_size: ClassVar[int] = 0
+    #: Not declared unless :func:`factor` is told.
+    invariance: ClassVar[Invariance | None] = None
     #: Rows of one residual.
     rows: ClassVar[int] = 0
     #: The user's function, before compilation.
@@ -181,6 +183,7 @@ def factor(
     derivative: str = "central",
     jacobian: Callable | None = None,
     example: Callable[[type[Factor], np.random.Generator], Example] | None = None,
+    invariance: Invariance | None = None,
 ) -> Callable[[Callable], type[UserFactor]]:
     """Turn a function into a registered factor type; used as a decorator (see the top of this module).
 
@@ -201,6 +204,8 @@ def factor(
         six columns for a pose (the left twist, translation first), as many as numbers for other kinds.
     example : callable, optional
         ``example(cls, rng)`` returning an :class:`~groma.factors.Example`, where random variables and data will not do.
+    invariance : Invariance, optional
+        Which motions of the world the residual does not notice; :func:`groma.testing.check_factor` then checks it.
 
     Returns
     -------
@@ -235,6 +240,7 @@ def factor(
             "slots": read_slots,
             "rows": residual_size,
             "data_size": data_size,
+            "invariance": invariance,
             "function": staticmethod(function),
             "_loops": Loops(name, function, jacobian, kind_of_derivative, read_slots, sizes, residual_size),
             "_make_example": staticmethod(example) if example is not None else None,

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Lines in images: detect, describe, match."""
 
-from groma.features.contract import SegmentDetector
+from groma.features.contract import ImageRetrieval, ImageView, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches, read_matches, write_matches
 from groma.features.lsd import LsdDetector
 from groma.features.matches import LineMatches
@@ -14,10 +14,13 @@ from groma.features.segments import Segments
 __all__ = [
     "ExternalMatches",
     "FlowOptions",
+    "ImageRetrieval",
+    "ImageView",
     "LineMatches",
     "LsdDetector",
     "NearbyPoints",
     "SegmentDetector",
+    "SegmentMatcher",
     "Segments",
     "WideBaselineOptions",
     "dense_flow",

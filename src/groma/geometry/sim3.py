@@ -25,6 +25,7 @@ adjoint; there the order is (rho, omega, sigma), too).
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
@@ -35,6 +36,11 @@ _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 
 
 def _similarities(similarity: FloatArray) -> FloatArray:
+    if isinstance(similarity, tuple):
+        raise ShapeError(
+            "A similarity is one array (..., 8), quaternion x y z w, translation, scale; got a tuple. Of scale, "
+            "rotation matrix and translation groma.geometry.sim3.from_parts(s, R, t) makes it."
+        )
     similarity = np.asarray(similarity, dtype=np.float64)
     if similarity.ndim == 0 or similarity.shape[-1] != 8:
         raise ShapeError(
@@ -56,6 +62,24 @@ def _tangents(zeta: FloatArray) -> FloatArray:
 def identity(*batch: int) -> FloatArray:
     """Identity similarities (*batch, 8)."""
     return np.broadcast_to(np.array([0.0, 0, 0, 1, 0, 0, 0, 1]), (*batch, 8)).copy()
+
+
+def from_parts(scale: npt.ArrayLike, rotation: npt.ArrayLike, translation: npt.ArrayLike) -> FloatArray:
+    """Similarities (..., 8) of scales (...), rotations (..., 3, 3) and translations (..., 3); they broadcast."""
+    s, R, t = (np.asarray(part, dtype=np.float64) for part in (scale, rotation, translation))
+    if R.shape[-2:] != (3, 3) or t.shape[-1:] != (3,):
+        raise ShapeError(f"A rotation must have shape (..., 3, 3), a translation (..., 3); got {R.shape}, {t.shape}.")
+    leading = np.broadcast_shapes(s.shape, R.shape[:-2], t.shape[:-1])
+    q = quaternion.from_matrix(R)
+    parts = [(q, 4), (t, 3), (s[..., None], 1)]
+    return _similarities(np.concatenate([np.broadcast_to(part, (*leading, size)) for part, size in parts], axis=-1))
+
+
+def to_parts(similarity: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Scales (...), rotation matrices (..., 3, 3) and translations (..., 3); the quaternion may be of any length."""
+    similarity = _similarities(similarity)
+    rotation = quaternion.to_matrix(quaternion.normalize(similarity[..., :4]))
+    return similarity[..., 7], rotation, similarity[..., 4:7]
 
 
 def to_matrix(similarity: FloatArray) -> FloatArray:
@@ -213,6 +237,7 @@ __all__ = [
     "compose",
     "exp",
     "from_matrix",
+    "from_parts",
     "hat",
     "identity",
     "inverse",
@@ -222,5 +247,6 @@ __all__ = [
     "right_jacobian",
     "right_jacobian_inverse",
     "to_matrix",
+    "to_parts",
     "vee",
 ]

@@ -6,7 +6,7 @@ map            given as                                          points
 =============  ================================================  ==================================================
 rigid          pose (..., 7) = [qx qy qz qw tx ty tz], or        :math:`X_b = R X_a + t`
                a pair (R (..., 3, 3), t (..., 3))
-similarity     a triple (s (...), R, t), s > 0                   :math:`X_b = s R X_a + t`
+similarity     (..., 8) = [qx qy qz qw tx ty tz s], s > 0        :math:`X_b = s R X_a + t`; :mod:`~groma.geometry.sim3`
 projective     homography H (..., 4, 4)                          :math:`\tilde X_b \sim H \tilde X_a`, homogeneous
 =============  ================================================  ==================================================
 
@@ -24,14 +24,12 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import InputError
-from groma.geometry import line3, quaternion
+from groma.geometry import line3, quaternion, sim3
 from groma.geometry.algebra import apply, matrices, vectors
 from groma.geometry.so3 import hat
 
 #: A pose (..., 7), or the pair (R, t).
 Rigid: TypeAlias = FloatArray | tuple[FloatArray, FloatArray]
-#: The triple (s, R, t).
-Similarity: TypeAlias = tuple[FloatArray | float, FloatArray, FloatArray]
 
 
 def rotation_and_translation(b_from_a: Rigid) -> tuple[FloatArray, FloatArray]:
@@ -40,14 +38,6 @@ def rotation_and_translation(b_from_a: Rigid) -> tuple[FloatArray, FloatArray]:
         return matrices(b_from_a[0], 3, 3, "rotation"), vectors(b_from_a[1], 3, "translation")
     pose = vectors(b_from_a, 7, "b_from_a")
     return quaternion.to_matrix(quaternion.normalize(pose[..., :4])), pose[..., 4:]
-
-
-def _similarity(b_from_a: Similarity) -> tuple[FloatArray, FloatArray, FloatArray]:
-    scale, rotation, translation = b_from_a
-    scale = np.asarray(scale, dtype=np.float64)
-    if not (scale > 0.0).all():
-        raise InputError(f"The scale of a similarity must be positive; got a smallest value of {scale.min()}.")
-    return scale, matrices(rotation, 3, 3, "rotation"), vectors(translation, 3, "translation")
 
 
 # --------------------------------------------------------------------------------------------------------------- Rigid
@@ -70,13 +60,13 @@ def rigid_line_matrix(b_from_a: Rigid) -> FloatArray:
     Plücker notes, eq. (65), (83).
     """
     rotation, translation = rotation_and_translation(b_from_a)
-    return similarity_line_matrix((1.0, rotation, translation))
+    return _line_matrix(np.ones(()), rotation, translation)
 
 
 def rigid_lines(b_from_a: Rigid, lines_in_a: FloatArray) -> FloatArray:
     """Lines (..., 6) in the frame b: m' = R m + t x R d, d' = R d; Plücker notes, eq. (65)."""
     rotation, translation = rotation_and_translation(b_from_a)
-    return similarity_lines((1.0, rotation, translation), lines_in_a)
+    return apply(_line_matrix(np.ones(()), rotation, translation), vectors(lines_in_a, 6, "lines_in_a"))
 
 
 def rigid_plane_matrix(b_from_a: Rigid) -> FloatArray:
@@ -87,13 +77,13 @@ def rigid_plane_matrix(b_from_a: Rigid) -> FloatArray:
     Point-line-plane notes, section on planes, :math:`\pi_w = T^\top \pi_c`.
     """
     rotation, translation = rotation_and_translation(b_from_a)
-    return similarity_plane_matrix((1.0, rotation, translation))
+    return _plane_matrix(np.ones(()), rotation, translation)
 
 
 def rigid_planes(b_from_a: Rigid, planes_in_a: FloatArray) -> FloatArray:
     """Planes (..., 4) in the frame b: n' = R n, w' = w - t·R n. The length of n is kept."""
     rotation, translation = rotation_and_translation(b_from_a)
-    return similarity_planes((1.0, rotation, translation), planes_in_a)
+    return apply(_plane_matrix(np.ones(()), rotation, translation), vectors(planes_in_a, 4, "planes_in_a"))
 
 
 def rigid_points_wrt_twist(points_in_b: FloatArray) -> FloatArray:
@@ -145,18 +135,39 @@ def rigid_planes_wrt_twist(planes_in_b: FloatArray) -> FloatArray:
 
 
 # ---------------------------------------------------------------------------------------------------------- Similarity
-def similarity_points(b_from_a: Similarity, points_in_a: FloatArray) -> FloatArray:
+def similarity_points(b_from_a: FloatArray, points_in_a: FloatArray) -> FloatArray:
     """Points (..., 3) in b, s R X + t. The derivative with respect to the point is s R."""
-    scale, rotation, translation = _similarity(b_from_a)
+    scale, rotation, translation = sim3.to_parts(b_from_a)
     return scale[..., None] * apply(rotation, vectors(points_in_a, 3, "points_in_a")) + translation
 
 
-def similarity_line_matrix(b_from_a: Similarity) -> FloatArray:
+def similarity_line_matrix(b_from_a: FloatArray) -> FloatArray:
     r"""Matrix (..., 6, 6) on (m; d), :math:`\begin{bmatrix} sR & [t]_\times R \\ 0 & R \end{bmatrix}`.
 
     The common factor is chosen to keep the length of d.
     """
-    scale, rotation, translation = _similarity(b_from_a)
+    return _line_matrix(*sim3.to_parts(b_from_a))
+
+
+def similarity_lines(b_from_a: FloatArray, lines_in_a: FloatArray) -> FloatArray:
+    """Lines (..., 6) in b: m' = s R m + t x R d, d' = R d."""
+    return apply(similarity_line_matrix(b_from_a), vectors(lines_in_a, 6, "lines_in_a"))
+
+
+def similarity_plane_matrix(b_from_a: FloatArray) -> FloatArray:
+    r"""Matrix (..., 4, 4) on planes, :math:`\begin{bmatrix} R & 0 \\ -t^\top R & s \end{bmatrix}`.
+
+    The common factor is chosen to keep the length of n.
+    """
+    return _plane_matrix(*sim3.to_parts(b_from_a))
+
+
+def similarity_planes(b_from_a: FloatArray, planes_in_a: FloatArray) -> FloatArray:
+    """Planes (..., 4) in b: n' = R n, w' = s w - t·R n."""
+    return apply(similarity_plane_matrix(b_from_a), vectors(planes_in_a, 4, "planes_in_a"))
+
+
+def _line_matrix(scale: FloatArray, rotation: FloatArray, translation: FloatArray) -> FloatArray:
     shear = hat(translation) @ rotation
     leading = np.broadcast_shapes(scale.shape, shear.shape[:-2])
     out = np.zeros((*leading, 6, 6))
@@ -166,28 +177,13 @@ def similarity_line_matrix(b_from_a: Similarity) -> FloatArray:
     return out
 
 
-def similarity_lines(b_from_a: Similarity, lines_in_a: FloatArray) -> FloatArray:
-    """Lines (..., 6) in b: m' = s R m + t x R d, d' = R d."""
-    return apply(similarity_line_matrix(b_from_a), vectors(lines_in_a, 6, "lines_in_a"))
-
-
-def similarity_plane_matrix(b_from_a: Similarity) -> FloatArray:
-    r"""Matrix (..., 4, 4) on planes, :math:`\begin{bmatrix} R & 0 \\ -t^\top R & s \end{bmatrix}`.
-
-    The common factor is chosen to keep the length of n.
-    """
-    scale, rotation, translation = _similarity(b_from_a)
+def _plane_matrix(scale: FloatArray, rotation: FloatArray, translation: FloatArray) -> FloatArray:
     leading = np.broadcast_shapes(scale.shape, rotation.shape[:-2], translation.shape[:-1])
     out = np.zeros((*leading, 4, 4))
     out[..., :3, :3] = rotation
     out[..., 3, :3] = -np.einsum("...i,...ij->...j", translation, rotation)
     out[..., 3, 3] = scale
     return out
-
-
-def similarity_planes(b_from_a: Similarity, planes_in_a: FloatArray) -> FloatArray:
-    """Planes (..., 4) in b: n' = R n, w' = s w - t·R n."""
-    return apply(similarity_plane_matrix(b_from_a), vectors(planes_in_a, 4, "planes_in_a"))
 
 
 # ---------------------------------------------------------------------------------------------------------- Projective

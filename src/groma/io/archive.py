@@ -25,6 +25,7 @@ import numpy.typing as npt
 from groma.errors import FileFormatError
 from groma.io.atomic import atomic_output
 from groma.io.reading import existing, reading
+from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 
 FORMAT, VERSION = "groma scene", 1
@@ -150,5 +151,17 @@ def is_archive_name(path: str | os.PathLike[str]) -> bool:
     """Tell from its name whether a file is meant to be an archive."""
     return Path(path).suffix.lower() == ".npz"
 
+
+register_format(
+    SceneFormat(
+        "archive",
+        source="a groma archive (.npz)",
+        target=".npz for an archive",
+        endings=(".npz",),
+        recognise=lambda place, head: looks_like_archive(head) or (is_archive_name(place) and place.is_file()),
+        read=read_archive,
+        write=write_archive,
+    )
+)
 
 __all__ = ["is_archive_name", "looks_like_archive", "read_archive", "write_archive"]

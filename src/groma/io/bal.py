@@ -28,6 +28,7 @@ from groma.errors import FileFormatError, InputError, OutputError
 from groma.geometry import quaternion
 from groma.io.atomic import atomic_output
 from groma.io.reading import existing, reading
+from groma.io.registry import HEAD_BYTES, SceneFormat, register_format
 from groma.scene import Cameras, PointObservations, Points, Scene
 
 _FLIP = np.array([1.0, -1.0, -1.0])
@@ -158,6 +159,18 @@ def looks_like_bal(head: bytes) -> bool:
     return len(words) == 3 and all(word.isdigit() for word in words)
 
 
+def _recognise(path: Path, head: bytes) -> bool:
+    """Whether three counts begin the text of a file that may be compressed."""
+    try:
+        for magic, module in ((b"BZh", bz2), (b"\x1f\x8b", gzip)):
+            if head.startswith(magic):
+                with module.open(path) as stream:
+                    return looks_like_bal(stream.read(HEAD_BYTES))
+    except Exception as error:  # OSError, EOFError, ValueError, and zlib.error, which derives from none of them
+        raise FileFormatError(f"{path} cannot be decompressed: {error}. Fetch it again.") from error
+    return looks_like_bal(head)
+
+
 def _refuse_broken_zlib() -> None:
     """Raise where compressing would end the process: see :mod:`groma.io.archive` on pycolmap and zlib."""
     loaded = list(sys.modules)
@@ -229,5 +242,18 @@ def _scene(image_idx: IntArray, point_idx: IntArray, pixel: FloatArray, camera: 
         point_observations=PointObservations.numbered(image_idx, point_idx, pixel * [1, -1]),
     )
 
+
+register_format(
+    SceneFormat(
+        "bal",
+        source="a BAL file (three counts in its first line)",
+        target=".txt, .bz2 or .gz for BAL",
+        endings=(".txt", ".bz2", ".gz"),
+        recognise=_recognise,
+        read=read_bal,
+        write=write_bal,
+        check=check_bal,
+    )
+)
 
 __all__ = ["bal_params", "check_bal", "looks_like_bal", "read_bal", "write_bal"]

@@ -22,6 +22,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.io.atomic import atomic_output
+from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
 from groma.scene.patches import PALETTE, patch_groups, plane_patches, triangle_fans
 
@@ -165,5 +166,8 @@ def _line_colours(scene: Scene) -> npt.NDArray[np.uint8]:
     colours[line] = PALETTE[direction % len(PALETTE)]
     return colours
 
+
+register_format(SceneFormat("ply", target=".ply", endings=(".ply",), write=write_ply))
+register_format(SceneFormat("obj", target=".obj", endings=(".obj",), write=write_obj))
 
 __all__ = ["PARTS", "Part", "write_geometry", "write_obj", "write_ply"]

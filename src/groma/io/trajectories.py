@@ -18,7 +18,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,8 @@ from groma.io.atomic import atomic_output
 from groma.io.reading import existing, reading
 from groma.scene.table import Table, column
 
-TrajectoryFormat = Literal["auto", "tum", "kitti", "euroc"]
+#: Lines that hold something, with their numbers.
+Rows = list[tuple[int, str]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +50,41 @@ class Trajectory(Table):
         return se3.inverse(self.world_from_cam)
 
 
+@dataclass(frozen=True)
+class TrajectoryFormat:
+    """How trajectories are written as text, one pose a line."""
+
+    name: str
+    #: Given the first line that holds something: whether a file may be of this format.
+    fits: Callable[[str], bool]
+    #: Given the path, for messages, and the lines. Whatever it raises becomes a FileFormatError.
+    read: Callable[[Path, Rows], Trajectory]
+    #: Returns the text.
+    write: Callable[[Trajectory], str]
+    #: Whether the lines hold times; without, callers may give them.
+    has_times: bool = True
+
+
+_FORMATS: dict[str, TrajectoryFormat] = {}
+
+
+def register_trajectory_format(trajectory_format: TrajectoryFormat) -> TrajectoryFormat:
+    """Make a format known to :func:`read_trajectory` and :func:`write_trajectory`; return it.
+
+    Raises
+    ------
+    InputError
+        If the name belongs to another format.
+    """
+    name = trajectory_format.name
+    if _FORMATS.get(name, trajectory_format).read.__module__ != trajectory_format.read.__module__:
+        raise InputError(f"A trajectory format named {name!r} is registered already. Choose another name.")
+    _FORMATS[name] = trajectory_format
+    return trajectory_format
+
+
 def read_trajectory(
-    path: str | os.PathLike[str], format: TrajectoryFormat = "auto", timestamps: npt.ArrayLike | None = None
+    path: str | os.PathLike[str], format: str = "auto", timestamps: npt.ArrayLike | None = None
 ) -> Trajectory:
     """Read a trajectory; quaternions are scaled to length one and matrices replaced by the nearest rotation.
 
@@ -75,14 +109,14 @@ def read_trajectory(
     FileFormatError
         If a line does not hold the numbers of its format, or a quaternion or matrix is not a rotation.
     """
-    if format not in ("auto", *_READERS):
-        raise InputError(f"Unknown trajectory format {format!r}. Use auto, {', '.join(_READERS)}.")
+    if format not in ("auto", *_FORMATS):
+        raise InputError(f"Unknown trajectory format {format!r}. Use auto, {', '.join(_FORMATS)}.")
     place = existing(path)
     with reading(place, "trajectory"):
         rows = _rows(place)
-        chosen = _recognise(place, rows) if format == "auto" else format
-        read = _READERS[chosen](place, rows)
-        if timestamps is None or chosen != "kitti":
+        chosen = _recognise(place, rows) if format == "auto" else _FORMATS[format]
+        read = chosen.read(place, rows)
+        if timestamps is None or chosen.has_times:
             return read
         times = np.asarray(timestamps, float)
         if times.shape != (len(read),):
@@ -93,7 +127,7 @@ def read_trajectory(
 def write_trajectory(
     trajectory: Trajectory,
     path: str | os.PathLike[str],
-    format: Literal["tum", "kitti", "euroc"] = "tum",
+    format: str = "tum",
     force: bool = False,
 ) -> None:
     """Write a trajectory, whole or not at all.
@@ -107,9 +141,9 @@ def write_trajectory(
     OutputError
         If something is there already or the file system refuses.
     """
-    if format not in _WRITERS:
-        raise InputError(f"Unknown trajectory format {format!r}. Use {', '.join(_WRITERS)}.")
-    text = _WRITERS[format](trajectory)
+    if format not in _FORMATS:
+        raise InputError(f"Unknown trajectory format {format!r}. Use {', '.join(_FORMATS)}.")
+    text = _FORMATS[format].write(trajectory)
     with atomic_output(path, force) as draft:
         draft.write_text(text, encoding="utf-8")
 
@@ -132,11 +166,8 @@ def read_text(path: Path) -> str:
 
 # ---------------------------------------------------------------------------------------------------------- Formats
 
-#: Lines that hold something, with their numbers.
-_Rows = list[tuple[int, str]]
 
-
-def _rows(path: Path) -> _Rows:
+def _rows(path: Path) -> Rows:
     lines = (line.partition("#")[0].strip() for line in read_text(path).splitlines())
     return [(number, line) for number, line in enumerate(lines, start=1) if line]
 
@@ -145,22 +176,20 @@ def _words(line: str) -> list[str]:
     return line.split(",") if "," in line else line.split()
 
 
-def _recognise(path: Path, rows: _Rows) -> str:
+def _recognise(path: Path, rows: Rows) -> TrajectoryFormat:
     if not rows:
         raise FileFormatError(f"{path} holds no pose.")
     number, line = rows[0]
-    count = len(_words(line))
-    if "," in line and count >= 8:
-        return "euroc"
-    if "," not in line and count in (8, 12):
-        return "tum" if count == 8 else "kitti"
+    for known in _FORMATS.values():
+        if known.fits(line):
+            return known
     raise FileFormatError(
         f"{path}, line {number}: expected 8 numbers (TUM), 12 (KITTI) or 8 and more separated by commas (EuRoC); "
-        f"got {count} words. Pass the format if this is not the first pose."
+        f"got {len(_words(line))} words. Pass the format if this is not the first pose."
     )
 
 
-def _numbers(path: Path, rows: _Rows, count: int, more: bool = False) -> FloatArray:
+def _numbers(path: Path, rows: Rows, count: int, more: bool = False) -> FloatArray:
     """Return the first ``count`` numbers of each row, (N, count)."""
     table = np.empty((len(rows), count))
     for row, (number, line) in enumerate(rows):
@@ -171,7 +200,7 @@ def _numbers(path: Path, rows: _Rows, count: int, more: bool = False) -> FloatAr
     return table
 
 
-def _unit(path: Path, rows: _Rows, quaternions: FloatArray) -> FloatArray:
+def _unit(path: Path, rows: Rows, quaternions: FloatArray) -> FloatArray:
     length = np.linalg.norm(quaternions, axis=1)
     bad = np.flatnonzero(~((length > 0.5) & (length < 2)))
     if len(bad):
@@ -181,18 +210,18 @@ def _unit(path: Path, rows: _Rows, quaternions: FloatArray) -> FloatArray:
     return quaternions / length[:, None]
 
 
-def _read_tum(path: Path, rows: _Rows) -> Trajectory:
+def _read_tum(path: Path, rows: Rows) -> Trajectory:
     table = _numbers(path, rows, 8)
     return Trajectory(table[:, 0], np.hstack([_unit(path, rows, table[:, 4:]), table[:, 1:4]]))
 
 
-def _read_euroc(path: Path, rows: _Rows) -> Trajectory:
+def _read_euroc(path: Path, rows: Rows) -> Trajectory:
     table = _numbers(path, rows, 8, more=True)
     turned = _unit(path, rows, table[:, [5, 6, 7, 4]])
     return Trajectory(table[:, 0] * 1e-9, np.hstack([turned, table[:, 1:4]]))
 
 
-def _read_kitti(path: Path, rows: _Rows) -> Trajectory:
+def _read_kitti(path: Path, rows: Rows) -> Trajectory:
     matrices = _numbers(path, rows, 12).reshape(-1, 3, 4)
     # The nearest rotation: files hold six or seven digits.
     u, singular, vt = np.linalg.svd(matrices[:, :, :3])
@@ -225,11 +254,21 @@ def _write_euroc(trajectory: Trajectory) -> str:
     return "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z []\n" + "".join(body)
 
 
-_READERS: dict[str, Callable[[Path, _Rows], Trajectory]] = {
-    "tum": _read_tum,
-    "kitti": _read_kitti,
-    "euroc": _read_euroc,
-}
-_WRITERS: dict[str, Callable[[Trajectory], str]] = {"tum": _write_tum, "kitti": _write_kitti, "euroc": _write_euroc}
+for _format in (
+    TrajectoryFormat("tum", lambda line: "," not in line and len(_words(line)) == 8, _read_tum, _write_tum),
+    TrajectoryFormat(
+        "kitti", lambda line: "," not in line and len(_words(line)) == 12, _read_kitti, _write_kitti, False
+    ),
+    TrajectoryFormat("euroc", lambda line: "," in line and len(_words(line)) >= 8, _read_euroc, _write_euroc),
+):
+    register_trajectory_format(_format)
 
-__all__ = ["Trajectory", "TrajectoryFormat", "read_trajectory", "read_tum", "write_trajectory", "write_tum"]
+__all__ = [
+    "Trajectory",
+    "TrajectoryFormat",
+    "read_trajectory",
+    "read_tum",
+    "register_trajectory_format",
+    "write_trajectory",
+    "write_tum",
+]

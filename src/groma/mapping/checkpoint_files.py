@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from groma._typing import IntArray
-from groma.adjustment.adjust import AdjustReport, AdjustResult
+from groma.adjustment.report import AdjustReport, AdjustResult
 from groma.features.segments import Segments
 from groma.io import atomic_output, read_archive, write_archive
 from groma.io.reading import reading

@@ -40,7 +40,7 @@ def _feed(update: Callable[[bytes], None], value: Any) -> None:
         update(f"{value.dtype}{value.shape}".encode())
         update(np.ascontiguousarray(value).tobytes())
     elif is_dataclass(value) and not isinstance(value, type):
-        update(type(value).__name__.encode())
+        update(f"{type(value).__module__}.{type(value).__qualname__}".encode())
         _feed(update, {item.name: getattr(value, item.name) for item in fields(value)})
     elif isinstance(value, Mapping):
         _feed(update, sorted(value.items(), key=lambda item: repr(item[0])))

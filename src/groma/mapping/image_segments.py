@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -21,6 +20,7 @@ import numpy.typing as npt
 from groma import cameras as camera_models
 from groma._typing import FloatArray
 from groma.errors import InputError
+from groma.features.contract import SegmentDetector
 from groma.features.external import ExternalMatches
 from groma.features.images import GrayImage
 from groma.features.segments import Segments
@@ -47,14 +47,6 @@ class LensGates:
 GATES = LensGates()
 #: Places looked at along a segment, to find the part of it inside the image.
 _SAMPLES = 65
-
-
-class Detector(Protocol):
-    """What finds segments in an image: see :mod:`groma.features`."""
-
-    def detect(self, image: npt.NDArray[np.generic]) -> Segments:
-        """Segments of a grey image."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -97,7 +89,7 @@ class Straightener:
             source[row] = np.where(np.isfinite(pixels), pixels - 0.5, -1e6)
         return Straightener(model, params, (width, height), K, source)
 
-    def detect(self, detector: Detector, image: GrayImage) -> Segments:
+    def detect(self, detector: SegmentDetector, image: GrayImage) -> Segments:
         """Find segments in an image of this camera; their end points are pixels of the image as it is."""
         # The border is repeated: black outside would be an edge all around.
         straight = cv2.remap(image, self.source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
@@ -135,7 +127,7 @@ class Straightener:
 
 
 def detect_segments(
-    folder: Path, scene: Scene, detector: Detector, say: Callable[[str, int, int], None]
+    folder: Path, scene: Scene, detector: SegmentDetector, say: Callable[[str, int, int], None]
 ) -> list[Segments]:
     """Find the segments of every image of a scene; pixels of the images as they are."""
     straighteners: dict[int, Straightener | None] = {}

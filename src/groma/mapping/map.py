@@ -25,27 +25,30 @@ from functools import partial
 from pathlib import Path
 
 from groma._version import __version__
-from groma.adjustment.adjust import AdjustOptions, AdjustReport, AdjustResult, adjust
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.report import AdjustResult
+from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches
-from groma.features.lsd import LsdDetector
 from groma.features.matches import LineMatches
+from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
 from groma.gates import gate
 from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
 from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, SCENE, SEGMENTS
 from groma.mapping.checkpoints import Stages, digest, digest_files, stage
+from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
 from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider, explain, map_lines
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.photographs import check_images, check_number, image_files, images_left_out, read_gray
 from groma.mapping.refine_points import PointRefinementOptions, refine_points
+from groma.mapping.result import MapResult
 from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.unused import without_unused
 from groma.scene import Scene
 from groma.scene.local_frame import local_frame
-from groma.scene.similarity import Similarity
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,12 @@ class MapOptions:
 
     #: Shortest segment, pixels.
     min_segment_length: float = 12.0
+    #: What finds the segments: an object, or a name of :data:`groma.features.registry.DETECTORS`.
+    detector: str | SegmentDetector = "lsd"
+    #: What matches them, likewise; None: the geometry of the poses alone.
+    matcher: str | SegmentMatcher | None = None
+    #: What tells which images to compare where they share too few points, likewise; None: nothing does.
+    retrieval: str | ImageRetrieval | None = None
     #: Place the observations of points anew by the grey levels around them: three times less noise, which pays where
     #: the calibration is as good.
     refine_points: bool = False
@@ -102,34 +111,6 @@ class MapOptions:
     def point_model(self, threads: bool = True) -> PointModelOptions:
         """How points are reconstructed, with or without the number of threads, on which no result depends."""
         return PointModelOptions(self.camera_model, self.camera_params, self.seed, self.threads if threads else None)
-
-
-@dataclass(frozen=True)
-class MapResult:
-    """The map and how it came about."""
-
-    #: Points, lines, planes, poses.
-    scene: Scene
-    #: The scene that went in: the given model, or the reconstruction of the points.
-    start: Scene
-    #: The map before its last joint adjustment, with the same landmarks as ``scene``.
-    before: Scene
-    #: Report of the last joint adjustment, and what it was told: noise, losses, what is estimated.
-    report: AdjustReport
-    adjusted_with: AdjustOptions
-    #: Estimated standard deviations, pixels: of points, and of segment end points.
-    sigma_px: dict[str, float]
-    #: What became of the segments, in words.
-    explanation: str
-    #: Number of segments with each outcome, by name.
-    outcomes: dict[str, int]
-    #: Sentences for the user.
-    warnings: tuple[str, ...]
-
-    def transformed(self, move: Similarity) -> MapResult:
-        """Return the result in another world frame."""
-        scene, start, before = (part.transformed(move) for part in (self.scene, self.start, self.before))
-        return dataclasses.replace(self, scene=scene, start=start, before=before)
 
 
 def map_images(
@@ -169,7 +150,7 @@ def map_images(
     OutputError
         If another run works in ``work``, or it cannot be written.
     """
-    options = options or MapOptions()
+    options = with_parts(options or MapOptions())
     say = progress or (lambda doing, done, total: None)
     folder = Path(images)
     files = image_files(folder)
@@ -187,11 +168,15 @@ def map_images(
         if options.refine_points:
             points = stages.run(measure_points, folder, points)
         segments = stages.run(find_segments, folder, points, line_matches, given=line_matches)
-        result = map_segments(points, segments, _by_index(line_matches, start), stages)
+        matches = matches_for(options, folder, points, segments, line_matches)
+        result = map_segments(points, segments, matches, stages, neighbors_for(options, folder))
     say("done", 1, 1)
     left_out = images_left_out(names, start.images.names, model is not None)
     result = dataclasses.replace(result, start=start, warnings=(*left_out, *result.warnings))
-    return result if near is None else result.transformed(near.inverse())
+    if near is None:
+        return result
+    scene, start, before = (part.transformed(near.inverse()) for part in (result.scene, result.start, result.before))
+    return dataclasses.replace(result, scene=scene, start=start, before=before)
 
 
 def map_segments(
@@ -199,6 +184,7 @@ def map_segments(
     segments: list[Segments],
     matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
     stages: Stages[MapOptions],
+    neighbors: NeighborChooser | None = None,
 ) -> MapResult:
     """Map lines and planes from segments and an adjusted model of points: the stages from ``lines`` on.
 
@@ -206,7 +192,7 @@ def map_segments(
     """
     options = stages.options
     scene = with_point_noise(points)
-    line_map = stages.run(find_lines, scene, segments, matches)
+    line_map = stages.run(find_lines, scene, segments, matches, neighbors)
     scene = line_map.add_to(scene, segments)
     weighted = _weighted(scene, options)
     for turn in range(GATES.max_rounds if options.refine_poses and scene.num_lines else 0):
@@ -217,7 +203,7 @@ def map_segments(
         joint = with_point_noise(joint.replace(point_observations=given))
         # The lines as mapped are good starts, and only the adjusted ones tell the noise of the segments.
         weighted = _weighted(joint, options)
-        line_map = stages.run(find_lines_again, joint, segments, matches, tag=tag)
+        line_map = stages.run(find_lines_again, joint, segments, matches, neighbors, tag=tag)
         scene = line_map.add_to(joint, segments)
         if scene.num_lines == 0 or moved_px(before, joint, GATES.moved_share) <= options.lines.noise:
             break
@@ -274,17 +260,19 @@ def find_segments(
     """Line segments in every image."""
     if line_matches is not None:
         return given_segments(folder, scene, line_matches, say)
-    return detect_segments(folder, scene, LsdDetector(min_length=options.min_segment_length), say)
+    detector = DETECTORS.make(options.detector, min_length=options.min_segment_length, max_segments=0)
+    return detect_segments(folder, scene, detector, say)
 
 
 def _find_lines(
     scene: Scene,
     segments: list[Segments],
     matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
+    neighbors: NeighborChooser | None,
     options: MapOptions,
     say: StageProgress,
 ) -> LineMap:
-    return map_lines(scene, segments, matches, options.lines, say)
+    return map_lines(scene, segments, matches, options.lines, say, neighbors)
 
 
 #: 3D lines from the segments; and again, with better poses.
@@ -311,12 +299,6 @@ def adjust_everything(scene: Scene, weighted: AdjustOptions, options: MapOptions
 
 
 # -------------------------------------------------------------------------------------------------------------- helpers
-def _by_index(line_matches: ExternalMatches | None, scene: Scene) -> Callable[[int, int], LineMatches] | None:
-    if line_matches is None:
-        return None
-    return lambda i, j: line_matches.match(scene.images.names[i], scene.images.names[j])
-
-
 def _robust(options: MapOptions) -> AdjustOptions:
     return AdjustOptions(refine_intrinsics=options.refine_intrinsics, threads=options.threads)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma._numba import loop
+from groma._numba import exact_kernel, loop
 from groma._simd import set_product
 from groma.factors.losses import loss_derivatives, loss_value
 
@@ -31,8 +31,14 @@ def whiten(record, begin, information):
                 record[i, a, c] = total
 
 
+@exact_kernel
+def _sum_and_root(cost, rho, weight):
+    """Return cost + rho and the root of the weight, rounded alike for every loss that is inlined before."""
+    return cost + rho, np.sqrt(weight)
+
+
 @loop
-def weigh(record, begin, scale, step, code, first, second, norms):
+def weigh(record, begin, scale, step, loss_tag, parameters, norms):
     """Scale each record by 1/sigma and by the root of the loss' weight; return sum of rho, write the squared norms."""
     n, m, columns = record.shape
     cost = 0.0
@@ -43,12 +49,9 @@ def weigh(record, begin, scale, step, code, first, second, norms):
             norm += record[i, a, columns - 1] * record[i, a, columns - 1]
         norm *= s * s
         norms[i] = norm
-        if code == 0:
-            cost += norm
-        else:
-            rho, weight, _ = loss_derivatives(code, first, second, norm)
-            cost += rho
-            s *= np.sqrt(weight)
+        rho, weight, _ = loss_derivatives(loss_tag, parameters, norm)
+        cost, root = _sum_and_root(cost, rho, weight)
+        s *= root
         if s != 1.0:
             for a in range(m):
                 for c in range(columns):
@@ -57,7 +60,7 @@ def weigh(record, begin, scale, step, code, first, second, norms):
 
 
 @loop
-def cost_scaled(residual, begin, scale, step, code, first, second, rho):
+def cost_scaled(residual, begin, scale, step, loss_tag, parameters, rho):
     n, m = residual.shape
     cost = 0.0
     for i in range(n):
@@ -65,14 +68,14 @@ def cost_scaled(residual, begin, scale, step, code, first, second, rho):
         norm = 0.0
         for a in range(m):
             norm += residual[i, a] * residual[i, a]
-        value = loss_value(code, first, second, norm * s * s)
+        value = loss_value(loss_tag, parameters, norm * s * s)
         rho[i] = value
         cost += value
     return cost
 
 
 @loop
-def cost_whitened(residual, begin, information, code, first, second, rho):
+def cost_whitened(residual, begin, information, loss_tag, parameters, rho):
     n, m = residual.shape
     cost = 0.0
     for i in range(n):
@@ -82,7 +85,7 @@ def cost_whitened(residual, begin, information, code, first, second, rho):
             for b in range(m):
                 total += information[begin + i, a, b] * residual[i, b]
             norm += total * total
-        value = loss_value(code, first, second, norm)
+        value = loss_value(loss_tag, parameters, norm)
         rho[i] = value
         cost += value
     return cost

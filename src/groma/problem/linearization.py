@@ -43,8 +43,7 @@ class Noise:
             self.scale, self.step = np.ascontiguousarray(information), 1
         else:
             self.scale = information.reshape(1)
-        self.code = factor.loss.code
-        self.first, self.second = (float(p) for p in factor.loss.parameters)
+        self.loss = factor.loss.tag, factor.loss.parameters
 
 
 class NormalEquations:
@@ -171,9 +170,9 @@ class NormalEquations:
         rho = flat[n * m : n * m + n]
         degenerate = layout.factor.residuals(inputs, begin, end, out)
         if noise.matrices is not None:
-            value = cost_whitened(out, begin, noise.matrices, noise.code, noise.first, noise.second, rho)
+            value = cost_whitened(out, begin, noise.matrices, *noise.loss, rho)
         else:
-            value = cost_scaled(out, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, rho)
+            value = cost_scaled(out, begin, noise.scale, noise.step, *noise.loss, rho)
         return value, rho, degenerate
 
     def _record(self, share: int, f: int) -> FloatArray:
@@ -290,7 +289,7 @@ class NormalEquations:
         degenerate = layout.factor.linearize(inputs, begin, end, layout.columns, record)
         if noise.matrices is not None:
             whiten(record, begin, noise.matrices)
-        cost = weigh(record, begin, noise.scale, noise.step, noise.code, noise.first, noise.second, norms)
+        cost = weigh(record, begin, noise.scale, noise.step, *noise.loss, norms)
         references = self._references[f]
         for chain in layout.chains:
             ref = references[chain.reference]

@@ -286,11 +286,14 @@ class Scene:
             relations=Relations(),
         )
 
-    def transformed(self, new_from_old: Similarity) -> Self:
+    def transformed(self, new_from_old: Similarity | FloatArray) -> Self:
         """Return the scene seen from another world frame; what the cameras see stays the same.
 
-        Lengths in the camera and rig frames are scaled too, so that reprojections do not change.
+        Lengths in the camera and rig frames are scaled too, so that reprojections do not change. A similarity may be
+        given as an array (8,) of :mod:`groma.geometry.sim3`, too.
         """
+        if not isinstance(new_from_old, Similarity):
+            new_from_old = Similarity.from_array(new_from_old)
         mounted = self.sensors.cam_from_rig.copy()
         mounted[:, 4:] *= new_from_old.scale
         lines = self.lines.replace(

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
-from groma.geometry import quaternion
+from groma.geometry import quaternion, sim3
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,19 @@ class Similarity:
             raise InputError(f"Similarity needs a positive scale and finite numbers; got scale {self.scale}.")
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
             raise InputError("Similarity.rotation must be a rotation matrix. Orthonormalise it first.")
+
+    @classmethod
+    def from_array(cls, new_from_old: npt.ArrayLike) -> Self:
+        """Return that of an array (8,) [qx qy qz qw tx ty tz s], the form of :mod:`groma.geometry.sim3`."""
+        array = np.asarray(new_from_old, float)
+        if array.shape != (8,):
+            raise ShapeError(f"One similarity must have shape (8,), quaternion, translation, scale; got {array.shape}.")
+        scale, rotation, translation = sim3.to_parts(array)
+        return cls(float(scale), rotation, translation)
+
+    def to_array(self) -> FloatArray:
+        """Return (8,) [qx qy qz qw tx ty tz s], the form of :mod:`groma.geometry.sim3`."""
+        return sim3.from_parts(self.scale, self.rotation, self.translation)
 
     def inverse(self) -> Self:
         """Return ``old_from_new``."""

@@ -8,19 +8,21 @@ once it has converged: what it becomes does not depend on the others, and a few 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from groma._simd import width
-from groma._typing import FloatArray
+from groma._typing import BoolArray, FloatArray
 from groma.problem.layout import Chunk, Layout
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import Workers
+from groma.solver.damped_problem import Trial
 from groma.solver.linear.schur import MIN_DIAGONAL, invert_blocks
 from groma.solver.options import SolverOptions, first_damping
-from groma.solver.report import Iteration, SolveReport, Stopwatch, note_end, note_start
-from groma.solver.steps import States
+from groma.solver.report import SolveReport, Stopwatch, note_costs
+from groma.solver.steps import States, size_of
 from groma.solver.termination import Termination
 
 #: A variable whose damping exceeds this has reached its minimum to machine precision.
@@ -32,6 +34,15 @@ STRETCH_GAIN_RATIO, SHORTEN_GAIN_RATIO = 1.5, 0.5
 MAX_STRETCH = 8.0
 
 
+def stretch_factor(gain_ratio: Any) -> Any:
+    """Return what a step should be multiplied by, for a gain ratio or an array of them.
+
+    If the curvature along a step is c times the model's, the gain ratio is 2 - c, and the minimum lies at 1 / c times
+    the step. Robust losses bend the cost down (c < 1): reweighted least squares overestimates the curvature.
+    """
+    return 1.0 / np.clip(2.0 - gain_ratio, 1.0 / MAX_STRETCH, MAX_STRETCH)
+
+
 @dataclass(frozen=True)
 class BlockProgress:
     """How far the variables have come in one step."""
@@ -40,12 +51,10 @@ class BlockProgress:
     unfinished: int
     #: Euclidean length of all steps that were kept.
     length: float
-    #: Largest component of the gradient before the step.
-    gradient: float
 
 
 class IndependentBlocks:
-    """Levenberg-Marquardt on every variable of a layout without kept blocks."""
+    """Levenberg-Marquardt on every variable of a layout without kept blocks; Gauss-Newton if it begins undamped."""
 
     def __init__(self, layout: Layout, workers: Workers, initial_damping: float, tolerance: float = 1e-6) -> None:
         self.layout = layout
@@ -54,6 +63,7 @@ class IndependentBlocks:
         self._N = [np.zeros_like(V) for V in self.equations.V]
         self._h = [np.zeros_like(g) for g in self.equations.g_landmarks]
         self._initial_damping = initial_damping
+        self._max_damping = MAX_DAMPING if initial_damping > 0.0 else 0.0
         self._singular: dict[tuple[int, int], int] = {}
         self.reset()
 
@@ -83,21 +93,23 @@ class IndependentBlocks:
 
     def step(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
         """Try one step of every variable; return the new states, their costs, and how far the variables have come."""
-        equations = self.equations
-        equations.linearize(states, equations.prepare(states), self._invert, self._wanted if self._begun else None)
+        self.linearize(states)
+        return self.advance(states, costs)
+
+    def linearize(self, states: States) -> None:
+        """Form and solve the normal equations of all variables that have not converged."""
+        prepared = self.equations.prepare(states)
+        self.equations.linearize(states, prepared, self._invert, self._wanted if self._begun else None)
         self._begun = True
-        moved, deltas, promised, slope = dict(states), [], [], 0.0
-        for e, group in enumerate(self.layout.eliminated):
-            V, g, mine = equations.V[e].reshape(group.count, -1), equations.g_landmarks[e], self._open[e]
-            g = g.reshape(group.count, group.dof)
-            delta = np.where(mine[:, None], self._h[e].reshape(group.count, group.dof), 0.0)
-            diagonal = np.maximum(V[:, :: group.dof + 1], MIN_DIAGONAL)
-            pull = -np.einsum("ni,ni->n", g, delta)
-            promised.append(0.5 * (pull + self.damping[e] * np.einsum("ni,ni,ni->n", delta, diagonal, delta)))
-            deltas.append(delta)
-            slope = max(slope, float(np.abs(g).max(initial=0.0)))
-            manifold = self.layout.problem.variables[group.group].manifold
-            moved[group.group] = manifold.retract(states[group.group], delta)
+
+    def largest_gradient(self) -> float:
+        """Return the largest component of the gradient."""
+        return max((float(np.abs(g).max(initial=0.0)) for g in self.equations.g_landmarks), default=0.0)
+
+    def advance(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
+        """Take the step of every variable from where they were linearised, if it lowers the variable's cost."""
+        deltas, promised = self._steps()
+        moved = self._moved(states, deltas)
         new_costs = self.costs(moved, costs)
         self._rescale(states, costs, moved, new_costs, deltas, promised)
         unfinished, squared_length = 0, 0.0
@@ -105,15 +117,40 @@ class IndependentBlocks:
             better = new_costs[e] < costs[e]
             moved[group.group] = np.where(better[:, None], moved[group.group], states[group.group])
             decrease = np.where(better, costs[e] - new_costs[e], promised[e])
-            open_ended = better | (self.damping[e] < MAX_DAMPING)
+            open_ended = better | (self.damping[e] < self._max_damping)
             self._open[e] &= open_ended & (decrease > self._tolerance * costs[e])
             unfinished += int(self._open[e].sum())
             squared_length += float((np.where(better[:, None], deltas[e], 0.0) ** 2).sum())
             new_costs[e] = np.where(better, new_costs[e], costs[e])
-            raised = np.minimum(self.damping[e] * self._growth[e], MAX_DAMPING)
-            self.damping[e] = np.where(better, np.maximum(self.damping[e] / 5.0, MIN_DAMPING), raised)
-            self._growth[e] = np.where(better, 2.0, np.minimum(2.0 * self._growth[e], 1e6))
-        return moved, new_costs, BlockProgress(unfinished, float(np.sqrt(squared_length)), slope)
+            self._adapt(e, better)
+        return moved, new_costs, BlockProgress(unfinished, float(np.sqrt(squared_length)))
+
+    def _steps(self) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return the steps (count, dof) of each group, and what the quadratic model promises for each variable."""
+        deltas, promised = [], []
+        for e, group in enumerate(self.layout.eliminated):
+            V, g = self.equations.V[e].reshape(group.count, -1), self.equations.g_landmarks[e]
+            g = g.reshape(group.count, group.dof)
+            delta = np.where(self._open[e][:, None], self._h[e].reshape(group.count, group.dof), 0.0)
+            diagonal = np.maximum(V[:, :: group.dof + 1], MIN_DIAGONAL)
+            pull = -np.einsum("ni,ni->n", g, delta)
+            promised.append(0.5 * (pull + self.damping[e] * np.einsum("ni,ni,ni->n", delta, diagonal, delta)))
+            deltas.append(delta)
+        return deltas, promised
+
+    def _moved(self, states: States, deltas: list[FloatArray]) -> States:
+        moved = dict(states)
+        for group, delta in zip(self.layout.eliminated, deltas, strict=True):
+            manifold = self.layout.problem.variables[group.group].manifold
+            moved[group.group] = manifold.retract(states[group.group], delta)
+        return moved
+
+    def _adapt(self, e: int, better: BoolArray) -> None:
+        """Lower the damping of variables whose cost fell, and raise that of the others."""
+        raised = np.minimum(self.damping[e] * self._growth[e], self._max_damping)
+        lowered = np.maximum(self.damping[e] / 5.0, min(MIN_DAMPING, self._max_damping))
+        self.damping[e] = np.where(better, lowered, raised)
+        self._growth[e] = np.where(better, 2.0, np.minimum(2.0 * self._growth[e], 1e6))
 
     def _invert(self, share: int, chunk: Chunk) -> None:
         """Find the steps of the variables of one chunk."""
@@ -126,12 +163,11 @@ class IndependentBlocks:
             )
 
     def _rescale(self, states: States, costs, moved: States, new_costs, deltas, promised) -> None:
-        r"""Try other lengths for steps whose cost fell otherwise than promised; ``moved``, costs and steps are updated.
+        """Try other lengths for steps whose cost fell otherwise than promised; ``moved``, costs and steps are updated.
 
-        If the curvature along a step is c times the model's, the gain ratio is 2 - c, and the minimum lies at 1 / c
-        times the step. Robust losses bend the cost down (c < 1). A line seen along its length, or anything else that is
-        bent and has large residuals, may bend it up: from c = 2 on, full steps jump over the minimum to where the cost
-        is higher, for ever. Damping helps little there, because the diagonal says nothing of such a direction.
+        A line seen along its length, or anything else that is bent and has large residuals, may bend the cost up: from
+        twice the model's curvature on, full steps jump over the minimum to where the cost is higher, for ever. Damping
+        helps little there, because the diagonal says nothing of such a direction.
         """
         factors = []
         for e in range(len(deltas)):
@@ -139,7 +175,7 @@ class IndependentBlocks:
             ratio = decrease / np.maximum(promised[e], 1e-300)
             counts = self._open[e] & (np.maximum(np.abs(decrease), promised[e]) > self._tolerance * costs[e])
             wrong = counts & ((ratio > STRETCH_GAIN_RATIO) | (ratio < SHORTEN_GAIN_RATIO))
-            factors.append(np.where(wrong, 1.0 / np.clip(2.0 - ratio, 1.0 / MAX_STRETCH, MAX_STRETCH), 1.0))
+            factors.append(np.where(wrong, stretch_factor(ratio), 1.0))
 
         def concerned(chunk: Chunk) -> bool:
             e = chunk.eliminated
@@ -147,10 +183,7 @@ class IndependentBlocks:
 
         if all((factor == 1.0).all() for factor in factors):
             return
-        other = dict(moved)
-        for e, group in enumerate(self.layout.eliminated):
-            manifold = self.layout.problem.variables[group.group].manifold
-            other[group.group] = manifold.retract(states[group.group], factors[e][:, None] * deltas[e])
+        other = self._moved(states, [factor[:, None] * delta for factor, delta in zip(factors, deltas, strict=True)])
         other_costs = [np.zeros(e.count) for e in self.layout.eliminated]
         self.equations.cost(self.equations.prepare(other), other_costs, concerned)
         for e, group in enumerate(self.layout.eliminated):
@@ -160,52 +193,93 @@ class IndependentBlocks:
             new_costs[e] = np.where(better, other_costs[e], new_costs[e])
 
 
-def solve_independently(
-    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
-) -> States:
-    """Solve a layout without kept blocks; return the states in its order."""
-    with watch("setup"):
-        blocks = IndependentBlocks(layout, workers, first_damping(layout, options), options.function_tolerance)
-        states = to_solver_order(layout)
-    report.linear_solver = "blocks"
-    with watch("cost"):
-        costs = blocks.costs(states)
-    cost = float(sum(blocks.equations.costs))
-    outside = cost - float(sum(part.sum() for part in costs))
-    note_start(report, layout, blocks.equations, cost)
-    if not np.isfinite(cost):
-        report.termination = Termination.NOT_FINITE
-        return states
-    report.termination = Termination.MAX_ITERATIONS
-    while report.iterations < options.max_iterations:
-        report.iterations += 1
-        with watch("linearize"):
-            states, costs, moved = blocks.step(states, costs)
-        new_cost = float(sum(part.sum() for part in costs)) + outside
-        damping = max((float(d.max()) for d in blocks.damping if d.size), default=0.0)
-        record = Iteration(
-            iteration=report.iterations,
-            cost=new_cost,
-            accepted=new_cost < cost,
-            damping=damping,
-            gain_ratio=0.0,
-            step_norm=moved.length,
-            gradient_max=moved.gradient,
-            linear_iterations=0,
-            seconds=watch.elapsed(),
-        )
-        report.history.append(record)
-        cost = new_cost
-        if moved.gradient <= options.gradient_tolerance:
-            report.termination = Termination.GRADIENT_CONVERGED
-        elif moved.unfinished == 0:
-            report.termination = Termination.COST_CONVERGED
-        if progress is not None and progress(record) is False:
-            report.termination = Termination.STOPPED_BY_CALLER
-        if report.termination is not Termination.MAX_ITERATIONS:
-            break
-    with watch("cost"):
-        report.final_cost = blocks.equations.cost(blocks.equations.prepare(states))
-        blocks.equations.num_degenerate = blocks.equations.hidden
-    note_end(report, layout, blocks.equations, blocks.num_singular)
-    return states
+@dataclass(frozen=True, kw_only=True)
+class IndependentTrial(Trial):
+    """States of all variables, and the cost of each variable of each group."""
+
+    states: States
+    costs: list[FloatArray]
+
+
+class IndependentProblem:
+    """A layout without kept blocks; a :class:`groma.solver.damped_problem.DampedProblem`.
+
+    A step is accepted or refused variable by variable before the loop sees it.
+    """
+
+    linear_iterations = 0
+
+    def __init__(self, layout: Layout, workers: Workers, options: SolverOptions, watch: Stopwatch) -> None:
+        with watch("setup"):
+            first = first_damping(layout.problem.variables, options)
+            self._blocks = IndependentBlocks(layout, workers, first, options.function_tolerance)
+            self._here = IndependentTrial(cost=np.nan, states=to_solver_order(layout), costs=[])
+        self._layout, self._watch, self._outside = layout, watch, 0.0
+        self._at_start: list[float] = []
+
+    @property
+    def states(self) -> States:
+        """The present states, in the order of the layout."""
+        return self._here.states
+
+    @property
+    def num_factors(self) -> int:  # noqa: D102
+        return sum(len(layout.factor) for layout in self._layout.factors)
+
+    @property
+    def damping(self) -> float:  # noqa: D102
+        return max((float(d.max()) for d in self._blocks.damping if d.size), default=0.0)
+
+    def start(self) -> IndependentTrial:  # noqa: D102
+        with self._watch("cost"):
+            costs = self._blocks.costs(self.states)
+        self._at_start = self._blocks.equations.costs
+        cost = float(sum(self._at_start))
+        self._outside = cost - _total(costs)
+        self._here = replace(self._here, cost=cost, costs=costs)
+        return self._here
+
+    def linearize(self) -> None:  # noqa: D102
+        with self._watch("linearize"):
+            self._blocks.linearize(self.states)
+
+    def largest_gradient(self) -> float:  # noqa: D102
+        return self._blocks.largest_gradient()
+
+    def size(self) -> float:  # noqa: D102
+        return size_of(self.states)
+
+    def try_step(self) -> IndependentTrial:  # noqa: D102
+        with self._watch("linearize"):
+            states, costs, came = self._blocks.advance(self.states, self._here.costs)
+        found = {"cost": _total(costs) + self._outside, "length": came.length, "settled": came.unfinished == 0}
+        return IndependentTrial(**found, states=states, costs=costs)
+
+    def stretch(self, trial: IndependentTrial, factor: float) -> IndependentTrial:  # noqa: D102
+        return trial
+
+    def refine(self, trial: IndependentTrial) -> IndependentTrial:  # noqa: D102
+        return trial
+
+    def rescue(self, trial: IndependentTrial) -> IndependentTrial:  # noqa: D102
+        return trial
+
+    def accept(self, trial: IndependentTrial) -> None:  # noqa: D102
+        self._here = trial
+
+    def refuse(self, trial: IndependentTrial) -> Termination | None:
+        """Go on from the trial: what fell of single variables may be too little to be seen in the sum."""
+        self._here = trial
+        return None
+
+    def note_end(self, report: SolveReport) -> None:
+        """Write the costs of the present states into the report, and what could not be evaluated or determined."""
+        equations = self._blocks.equations
+        with self._watch("cost"):
+            report.final_cost = equations.cost(equations.prepare(self.states))
+            equations.num_degenerate = equations.hidden
+        note_costs(report, self._layout, equations, self._at_start, self._blocks.num_singular)
+
+
+def _total(costs: list[FloatArray]) -> float:
+    return float(sum(part.sum() for part in costs))

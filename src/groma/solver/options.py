@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import InitVar, dataclass
 
 from groma.errors import InputError
-from groma.problem.layout import Layout
+from groma.problem.variables import Variables
+from groma.solver.linear.choice import linear_solver_names
+
+METHODS = ("levenberg_marquardt", "gauss_newton")
 
 
 @dataclass(frozen=True)
@@ -21,12 +25,14 @@ class SolverOptions:
     gradient_tolerance: float = 1e-10
     #: Stop when a step is shorter than this fraction of the state.
     step_tolerance: float = 1e-10
-    #: ``levenberg_marquardt`` or ``dogleg``.
-    strategy: str = "levenberg_marquardt"
+    #: ``levenberg_marquardt``, or ``gauss_newton`` for steps without damping: for problems that are well determined and
+    #: start near their minimum. Where the system is singular, or a step does not lower the cost, it stops.
+    method: str = "levenberg_marquardt"
     #: First damping, relative to the diagonal of the normal equations; None: 1e-4 where lines move, 1e-8 between poses
     #: alone, else 1e-5.
     initial_damping: float | None = None
-    #: ``auto``, ``dense``, ``sparse`` or ``pcg``: how the reduced system is solved.
+    #: How the reduced system is solved: ``auto``, ``dense``, ``sparse``, ``pcg``, or a solver that was registered
+    #: (:mod:`groma.solver.linear.contract`).
     linear_solver: str = "auto"
     #: Steps of every landmark on its own after each accepted joint step; a step that does not help is undone.
     landmark_steps: int = 0
@@ -37,30 +43,44 @@ class SolverOptions:
     #: Threads; None takes one for small problems and all cores for large ones.
     threads: int | None = None
 
-    def __post_init__(self) -> None:
-        choices = {
-            "strategy": ("levenberg_marquardt", "dogleg"),
-            "linear_solver": ("auto", "dense", "sparse", "pcg"),
-        }
-        for name, allowed in choices.items():
+    #: Gone: see ``method``.
+    strategy: InitVar[str | None] = None
+
+    def __post_init__(self, strategy: str | None) -> None:
+        if strategy is not None:
+            raise InputError(
+                f"There is no strategy any more (got {strategy!r}): steps are damped as method='levenberg_marquardt' "
+                "says, or not at all, method='gauss_newton'."
+            )
+        for name, allowed in {"method": METHODS, "linear_solver": linear_solver_names()}.items():
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
+        if self.initial_damping is not None and not self.initial_damping > 0.0:
+            raise InputError(
+                f"initial_damping must be positive; got {self.initial_damping}. Steps without damping are "
+                "method='gauss_newton'."
+            )
         for name in ("max_iterations", "landmark_steps"):
             if getattr(self, name) < 0:
                 raise InputError(f"{name} must not be negative; got {getattr(self, name)}.")
-        for name in ("function_tolerance", "gradient_tolerance", "step_tolerance", "initial_damping"):
-            if getattr(self, name) is not None and not getattr(self, name) >= 0:
+        for name in ("function_tolerance", "gradient_tolerance", "step_tolerance"):
+            if not getattr(self, name) >= 0:
                 raise InputError(f"{name} must be a number that is not negative; got {getattr(self, name)}.")
         if self.threads is not None and self.threads < 1:
             raise InputError(f"threads must be at least 1, or None; got {self.threads}.")
 
 
-def first_damping(layout: Layout, options: SolverOptions) -> float:
-    """Lines are more bent than points, and long first steps throw some into minima of their own; motions are not."""
+def first_damping(variables: Mapping[str, Variables], options: SolverOptions) -> float:
+    """Return the damping of the first step; 0 for steps without damping.
+
+    Lines are more bent than points, and long first steps throw some into minima of their own; motions are not.
+    """
+    if options.method == "gauss_newton":
+        return 0.0
     if options.initial_damping is not None:
         return options.initial_damping
-    variables = layout.problem.variables.values()
-    if all(group.manifold.kind == "pose" for group in variables):
+    groups = variables.values()
+    if all(group.manifold.kind == "pose" for group in groups):
         return 1e-8
-    moving_lines = any(group.manifold.kind == "line" and not group.is_constant for group in variables)
+    moving_lines = any(group.manifold.kind == "line" and not group.is_constant for group in groups)
     return 1e-4 if moving_lines else 1e-5

@@ -15,7 +15,7 @@ from groma.problem.problem import Problem
 from groma.solver.independent import IndependentBlocks
 from groma.solver.options import SolverOptions
 from groma.solver.steps import States
-from groma.solver.trial import Trial
+from groma.solver.trial import JointTrial, counted_in
 
 
 class LandmarkRefiner:
@@ -35,7 +35,7 @@ class LandmarkRefiner:
         self._of_all: LandmarkRefiner | None = None
         self._blocks = IndependentBlocks(lay_out(Problem(held, factors), tuple(groups)), workers, 1e-6)
 
-    def refine(self, equations: NormalEquations, trial: Trial, instead: States | None = None) -> Trial:
+    def refine(self, equations: NormalEquations, trial: JointTrial, instead: States | None = None) -> JointTrial:
         """Return the trial with better landmarks.
 
         Landmarks start from the trial, or from the states ``instead`` where those cost less with the new cameras. Those
@@ -67,8 +67,7 @@ class LandmarkRefiner:
         cost = equations.cost_of(inputs, moved, trial.costs, trial.hidden)
         if cost >= trial.cost:
             return trial
-        better = {"states": refined, "inputs": inputs, "cost": cost, "costs": equations.costs}
-        return replace(trial, **better, hidden=equations.hidden)
+        return replace(trial, states=refined, inputs=inputs, cost=cost, **counted_in(equations))
 
 
 def landmark_refiner(layout: Layout, workers: Workers, options: SolverOptions) -> LandmarkRefiner | None:

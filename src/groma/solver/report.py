@@ -138,15 +138,11 @@ def _by_type(layout: Layout, values: list) -> dict:
     return totals
 
 
-def note_start(report: SolveReport, layout: Layout, equations: NormalEquations, cost: float) -> None:
-    """Write the costs at the start into the report."""
-    report.initial_cost = report.final_cost = cost
-    report.initial_costs = report.final_costs = _by_type(layout, equations.costs)
-
-
-def note_end(report: SolveReport, layout: Layout, equations: NormalEquations, singular: int) -> None:
-    """Write the costs at the end into the report, and what could not be evaluated or determined."""
-    report.final_costs = _by_type(layout, equations.costs)
+def note_costs(
+    report: SolveReport, layout: Layout, equations: NormalEquations, at_start: list[float], singular: int
+) -> None:
+    """Write the costs at the start and at the end by factor type, and what could not be evaluated or determined."""
+    report.initial_costs, report.final_costs = _by_type(layout, at_start), _by_type(layout, equations.costs)
     report.num_degenerate = {name: n for name, n in _by_type(layout, equations.num_degenerate).items() if n}
     report.num_underdetermined_landmarks = singular
 

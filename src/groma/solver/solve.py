@@ -1,22 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The solve itself.
+"""The solve itself: one loop of damped least squares for every kind of problem.
 
 ::
 
-    linearise and eliminate
+    start
     repeat
-        propose a step                                   (levenberg_marquardt.py or dogleg.py)
-        move the states, evaluate the cost               -> gain ratio
-        if the cost fell:  keep the states, test for convergence, linearise and eliminate again
-        else:              shorten the step
+        linearise                                        (and eliminate, where there are landmarks)
+        try a step                                       -> cost, gain ratio
+        improve it                                       (a longer one; landmarks on their own)
+        if the cost fell:  accept the step, lower the damping, test for convergence
+        else:              refuse it, raise the damping
 
-When no free variable is coupled to another, each is solved on its own: see :mod:`groma.solver.independent`.
+The problems are a joint one (``joint.py``), variables that are not coupled to each other (``independent.py``), and
+landmarks in shards (``reduce/shards.py``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,32 +28,17 @@ from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
 from groma.problem.parallel import Workers, available_cores
 from groma.problem.problem import Problem
-from groma.solver.dogleg import Dogleg
-from groma.solver.independent import STRETCH_GAIN_RATIO, solve_independently
-from groma.solver.levenberg_marquardt import LevenbergMarquardt
+from groma.solver.damped_problem import DampedProblem, T
+from groma.solver.independent import STRETCH_GAIN_RATIO, IndependentProblem, stretch_factor
+from groma.solver.joint import JointProblem
 from groma.solver.linear.blas import one_blas_thread
-from groma.solver.linear.reduced import ConjugateGradients, choose
-from groma.solver.linear.reduction import Reduction
-from groma.solver.linear.schur import ReducedSystem
-from groma.solver.options import SolverOptions, first_damping
-from groma.solver.refinement import landmark_refiner
-from groma.solver.report import (
-    Iteration,
-    SolveReport,
-    Stopwatch,
-    count_unknowns,
-    note_end,
-    note_start,
-    warn_of_oddities,
-)
-from groma.solver.steps import States, gradient, largest, size_of
-from groma.solver.termination import Termination, cost_converged
-from groma.solver.trial import stretched, try_step
+from groma.solver.options import SolverOptions
+from groma.solver.report import Iteration, SolveReport, Stopwatch, count_unknowns, note_costs, warn_of_oddities
+from groma.solver.steps import States
+from groma.solver.termination import Criteria, Termination
 
 #: From this many factors on, all cores are used unless the caller says otherwise.
 FACTORS_FOR_THREADS = 50_000
-#: Where the blocks between landmarks and kept blocks would take more bytes than this, single precision keeps them.
-COMPACT_FROM = 2**28
 
 #: Called after every step tried; returning False stops the solve.
 Progress = Callable[[Iteration], bool | None]
@@ -104,7 +91,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, progress: Prog
     report.threads = options.threads or (available_cores() if report.num_factors >= FACTORS_FOR_THREADS else 1)
     workers = Workers(report.threads)
     try:
-        run = _evaluate if options.max_iterations == 0 else _solve_jointly if layout.kept else solve_independently
+        run = _evaluate if options.max_iterations == 0 else _solve_jointly if layout.kept else _solve_independently
         with one_blas_thread():
             states = run(layout, workers, options, report, watch, progress)
     finally:
@@ -112,6 +99,63 @@ def solve(problem: Problem, options: SolverOptions | None = None, progress: Prog
     warn_of_oddities(report)
     report.seconds["total"] = watch.elapsed()
     return Solution(problem.with_states(to_original_order(layout, states)), report)
+
+
+def minimise(
+    problem: DampedProblem[T],
+    options: SolverOptions,
+    report: SolveReport,
+    watch: Stopwatch,
+    progress: Progress | None = None,
+) -> Termination:
+    """Step until a criterion is met, and return which; the states are the problem's own."""
+    best = problem.start()
+    report.initial_cost = report.final_cost = best.cost
+    if not np.isfinite(best.cost):
+        return Termination.NOT_FINITE
+    share, criteria = best.cost / max(1, problem.num_factors), Criteria(options)
+    while report.iterations < options.max_iterations:
+        problem.linearize()
+        slope, damping = problem.largest_gradient(), problem.damping
+        if slope <= options.gradient_tolerance:
+            return Termination.GRADIENT_CONVERGED
+        report.iterations += 1
+        trial, accepted = _improved(problem, problem.try_step(), best, share)
+        if accepted:
+            problem.accept(trial)
+            ended = criteria.after_accepted(trial, best, problem.size)
+            best = trial
+        else:
+            ended = criteria.after_refused(trial, best, problem.size) or problem.refuse(trial)
+        report.final_cost = best.cost
+        record = Iteration(
+            iteration=report.iterations,
+            cost=trial.cost,
+            accepted=accepted,
+            damping=damping,
+            gain_ratio=trial.gain_ratio,
+            step_norm=trial.length,
+            gradient_max=slope,
+            linear_iterations=problem.linear_iterations,
+            seconds=watch.elapsed(),
+        )
+        report.history.append(record)
+        if progress is not None and progress(record) is False:
+            return Termination.STOPPED_BY_CALLER
+        if ended is not None:
+            return ended
+    return Termination.MAX_ITERATIONS
+
+
+def _improved(problem: DampedProblem[T], trial: T, best: T, share: float) -> tuple[T, bool]:
+    """Return a trial, or a better one from where it led, and whether to accept it."""
+    if not trial.lowers(best, share):
+        rescued = problem.rescue(trial)
+        return (rescued, True) if rescued.lowers(best, share) else (trial, False)
+    if trial.gain_ratio > STRETCH_GAIN_RATIO:
+        longer = problem.stretch(trial, stretch_factor(trial.gain_ratio))
+        trial = longer if longer.cost < trial.cost else trial
+    return problem.refine(trial), True
 
 
 def _evaluate(
@@ -123,8 +167,8 @@ def _evaluate(
     with watch("cost"):
         cost = equations.cost(equations.prepare(states))
     equations.num_degenerate = equations.hidden
-    note_start(report, layout, equations, cost)
-    note_end(report, layout, equations, 0)
+    report.initial_cost = report.final_cost = cost
+    note_costs(report, layout, equations, equations.costs, 0)
     report.termination = Termination.MAX_ITERATIONS if np.isfinite(cost) else Termination.NOT_FINITE
     return states
 
@@ -132,91 +176,18 @@ def _evaluate(
 def _solve_jointly(
     layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
 ) -> States:
-    with watch("setup"):
-        equations = NormalEquations(layout, workers, compact=_bytes_of_blocks(layout) > COMPACT_FROM)
-        system = ReducedSystem(equations)
-        linear = choose(layout, options.linear_solver)
-        refiner = landmark_refiner(layout, workers, options)
-        states = to_solver_order(layout)
-    report.linear_solver = linear.name
-    strategy = {"levenberg_marquardt": LevenbergMarquardt, "dogleg": Dogleg}[options.strategy](
-        Reduction(equations, system, linear, watch), first_damping(layout, options)
-    )
-    inputs = equations.prepare(states)
-    cost = strategy.linearize(states, inputs)
-    costs, hidden = equations.costs, sum(equations.num_degenerate)
-    note_start(report, layout, equations, cost)
-    if not np.isfinite(cost):
-        report.termination = Termination.NOT_FINITE
-        return states
-    share = cost / max(1, sum(len(layout_.factor) for layout_ in layout.factors))
-    termination, fell = None, 0.0
-    while termination is None:
-        slope = largest(gradient(equations))
-        if slope <= options.gradient_tolerance:
-            termination = Termination.GRADIENT_CONVERGED
-            break
-        if report.iterations == options.max_iterations:
-            termination = Termination.MAX_ITERATIONS
-            break
-        report.iterations += 1
-        fell_before, fell = fell, 0.0
-        damping = strategy.damping
-        trial = try_step(equations, strategy, watch, states, cost)
-        # a factor that became degenerate counts nothing; without its share put back, steps would hide what they spoil
-        accepted = trial is not None and trial.cost + max(0, trial.num_hidden - hidden) * share < cost
-        if trial is not None and not accepted and refiner is not None:
-            with watch("backsubstitute"):
-                rescued = refiner.refine(equations, trial, instead=states)
-            accepted = rescued.cost + max(0, rescued.num_hidden - hidden) * share < cost
-            if accepted:
-                trial = replace(rescued, gain_ratio=min((cost - rescued.cost) / trial.promised, 1.0))
-        elif trial is not None and accepted:
-            if trial.gain_ratio > STRETCH_GAIN_RATIO:
-                with watch("cost"):
-                    trial = stretched(equations, states, trial)
-            if refiner is not None:
-                with watch("backsubstitute"):
-                    trial = refiner.refine(equations, trial)
-        if trial is not None and accepted:
-            fell, withheld = (cost - trial.cost) / cost, strategy.withheld / cost
-            states, cost, costs = trial.states, trial.cost, trial.costs
-            inputs, hidden = trial.inputs, trial.num_hidden
-            strategy.accept(trial.gain_ratio)
-            if cost_converged(fell, fell_before, trial.gain_ratio, withheld, options.function_tolerance):
-                termination = Termination.COST_CONVERGED
-            elif trial.length <= options.step_tolerance * size_of(states):
-                termination = Termination.STEP_CONVERGED
-        elif trial is not None and trial.promised <= options.function_tolerance * cost:
-            termination = Termination.COST_CONVERGED  # even as promised the step would have ended the solve
-        elif (trial is not None and trial.length <= 1e-14 * size_of(states)) or not strategy.refuse():
-            termination = Termination.DAMPING_EXHAUSTED
-        record = Iteration(
-            iteration=report.iterations,
-            cost=trial.cost if trial is not None else float("inf"),
-            accepted=accepted,
-            damping=damping,
-            gain_ratio=trial.gain_ratio if trial is not None else 0.0,
-            step_norm=trial.length if trial is not None else float("inf"),
-            gradient_max=slope,
-            linear_iterations=linear.num_iterations if isinstance(linear, ConjugateGradients) else 0,
-            seconds=watch.elapsed(),
-        )
-        report.history.append(record)
-        if progress is not None and progress(record) is False:
-            termination = Termination.STOPPED_BY_CALLER
-        if accepted and termination is None and report.iterations < options.max_iterations:
-            strategy.linearize(states, inputs)
-    report.termination = termination
-    report.final_cost, equations.costs = cost, costs
-    note_end(report, layout, equations, system.num_singular_landmarks)
-    return states
+    problem = JointProblem(layout, workers, options, watch)
+    report.linear_solver = problem.linear.name
+    report.termination = minimise(problem, options, report, watch, progress)
+    problem.note_end(report)
+    return problem.states
 
 
-def _bytes_of_blocks(layout: Layout) -> int:
-    """Memory of the blocks W in double precision."""
-    return sum(
-        8 * len(incidences.block) * e.dof * layout.kept[c].width
-        for e in layout.eliminated
-        for c, incidences in e.incidences.items()
-    )
+def _solve_independently(
+    layout: Layout, workers: Workers, options: SolverOptions, report: SolveReport, watch: Stopwatch, progress
+) -> States:
+    problem = IndependentProblem(layout, workers, options, watch)
+    report.linear_solver = "blocks"
+    report.termination = minimise(problem, options, report, watch, progress)
+    problem.note_end(report)
+    return problem.states

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A step of all free variables: moving the states by it, and the quadratic model of the cost along it."""
+"""A step of all free variables, and moving the states by it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
-from groma.solver.linear.reduced import multiply
-from groma.solver.linear.schur import MIN_DIAGONAL, ReducedSystem
 
 States = dict[str, FloatArray]
 #: About so many states of a group are looked at for the one of middle length.
@@ -37,12 +35,9 @@ class Step:
         """Return the Euclidean length."""
         return float(np.sqrt(self.dot(self)))
 
-    def blend(self, weight: float, other: Step, other_weight: float) -> Step:
-        """Return weight * self + other_weight * other."""
-        return Step(
-            [weight * a + other_weight * b for a, b in zip(self.kept, other.kept, strict=True)],
-            [weight * a + other_weight * b for a, b in zip(self.landmarks, other.landmarks, strict=True)],
-        )
+    def scaled(self, factor: float) -> Step:
+        """Return a multiple of the step."""
+        return Step([factor * part for part in self.kept], [factor * part for part in self.landmarks])
 
 
 def retract(layout: Layout, states: States, step: Step) -> States:
@@ -83,31 +78,3 @@ def gradient(equations: NormalEquations) -> Step:
 def largest(step: Step) -> float:
     """Return the largest component of a step."""
     return max((float(np.abs(part).max()) for part in step.parts() if part.size), default=0.0)
-
-
-def diagonal(equations: NormalEquations, system: ReducedSystem) -> Step:
-    """Return the diagonal of the normal equations, bounded from below as the damping takes it."""
-    kept = [np.maximum(system.diagonal(c).reshape(-1), MIN_DIAGONAL) for c in range(len(equations.layout.kept))]
-    landmarks = []
-    for e, eliminated in enumerate(equations.layout.eliminated):
-        dof = eliminated.dof
-        values = equations.V[e].reshape(-1, dof * dof)[:, :: dof + 1].reshape(-1)
-        landmarks.append(np.maximum(values, MIN_DIAGONAL))
-    return Step(kept, landmarks)
-
-
-def curvature(equations: NormalEquations, system: ReducedSystem, step: Step) -> float:
-    r"""Return :math:`\delta^\top J^\top J\,\delta` of the undamped normal equations."""
-    layout = equations.layout
-    direct = {
-        pair: equations.H[pair].reshape(-1, layout.kept[pair[0]].width, layout.kept[pair[1]].width)
-        for pair in layout.blocks
-    }
-    product = multiply(layout, direct, step.kept)
-    total = float(sum(a @ b for a, b in zip(step.kept, product, strict=True)))
-    for e, (t, delta) in enumerate(zip(system.incident_products(step.kept), step.landmarks, strict=True)):
-        dof = layout.eliminated[e].dof
-        V = equations.V[e].reshape(-1, dof, dof)
-        blocks = delta.reshape(-1, dof)
-        total += float(np.einsum("ni,nij,nj->", blocks, V, blocks)) + 2.0 * float(delta @ t)
-    return total

@@ -3,7 +3,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import Enum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from groma.solver.damped_problem import Trial
+    from groma.solver.options import SolverOptions
+
+#: A step below this fraction of the states changes nothing in double precision.
+NO_CHANGE = 1e-14
 
 
 class Termination(Enum):
@@ -35,6 +44,19 @@ class Termination(Enum):
         False,
         "Stopped: no step reduced the cost, even with the strongest damping. Causes: (a) the state is at a minimum to "
         "machine precision, (b) a Jacobian of an own factor is wrong (run check_factor), (c) outliers of extreme size.",
+    )
+    STEP_REFUSED = (
+        "step_refused",
+        False,
+        "Stopped: a Gauss-Newton step did not reduce the cost. The start is too far from the minimum, or the problem "
+        "too nonlinear, for undamped steps; use method='levenberg_marquardt'.",
+    )
+    SINGULAR = (
+        "singular",
+        False,
+        "Stopped: the normal equations are singular, and Gauss-Newton steps are not damped. Hold variables constant or "
+        "add priors (a scene seen by cameras alone is free to move, turn and scale), or use "
+        "method='levenberg_marquardt'.",
     )
     NOT_FINITE = (
         "not_finite",
@@ -89,3 +111,30 @@ def cost_converged(decrease: float, previous: float, gain_ratio: float, withheld
     if previous <= 0.0 or decrease > tolerance**0.5:
         return False
     return decrease * max(decrease / previous, abs(1.0 - gain_ratio)) + withheld <= tolerance
+
+
+class Criteria:
+    """The tests for convergence after every step."""
+
+    def __init__(self, options: SolverOptions) -> None:
+        self._options = options
+        self._fell = 0.0  # relative decrease in the last step, 0 where it was refused
+
+    def after_accepted(self, trial: Trial, best: Trial, size: Callable[[], float]) -> Termination | None:
+        """Return why to stop after a step from ``best`` to ``trial``, to states of a ``size``."""
+        if trial.settled is not None:
+            return Termination.COST_CONVERGED if trial.settled else None
+        before, self._fell = self._fell, (best.cost - trial.cost) / best.cost
+        withheld, tolerance = trial.withheld / best.cost, self._options.function_tolerance
+        if cost_converged(self._fell, before, trial.gain_ratio, withheld, tolerance):
+            return Termination.COST_CONVERGED
+        return Termination.STEP_CONVERGED if trial.length <= self._options.step_tolerance * size() else None
+
+    def after_refused(self, trial: Trial, best: Trial, size: Callable[[], float]) -> Termination | None:
+        """Return why to stop after a step that was refused."""
+        self._fell = 0.0
+        if trial.settled is not None:
+            return Termination.COST_CONVERGED if trial.settled else None
+        if trial.promised <= self._options.function_tolerance * best.cost:
+            return Termination.COST_CONVERGED  # even as promised the step would have ended the solve
+        return Termination.DAMPING_EXHAUSTED if trial.length <= NO_CHANGE * size() else None

@@ -1,72 +1,39 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A step that is tried: the states after it, their cost, and what a longer one would give."""
+"""States of all variables of a joint solve, before or after a step, with what was found there."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from groma.problem.linearization import NormalEquations
-from groma.solver.dogleg import Dogleg
-from groma.solver.independent import MAX_STRETCH
-from groma.solver.levenberg_marquardt import LevenbergMarquardt
-from groma.solver.report import Stopwatch
-from groma.solver.steps import States, Step, retract
+from groma.solver.damped_problem import Trial
+from groma.solver.steps import States, Step
 
 
-@dataclass(frozen=True)
-class Trial:
-    """States after a step, with what was found there."""
+@dataclass(frozen=True, kw_only=True)
+class JointTrial(Trial):
+    """A trial of a joint solve."""
 
-    step: Step
     states: States
+    #: What each factor group reads of the states.
     inputs: list[tuple]
-    cost: float
-    #: Actual over predicted decrease of the cost.
-    gain_ratio: float
-    length: float
-    #: The decrease of the quadratic model.
-    promised: float
-    #: Costs, and numbers of degenerate factors at the new states, by factor group.
+    #: Costs, and numbers of degenerate factors, by factor group.
     costs: list[float]
     hidden: list[int]
-
-    @property
-    def num_hidden(self) -> int:
-        """Degenerate factors at the new states."""
-        return sum(self.hidden)
+    #: How the states were reached; None at the start.
+    step: Step | None = None
 
 
-def try_step(
-    equations: NormalEquations,
-    strategy: LevenbergMarquardt | Dogleg,
-    watch: Stopwatch,
-    states: States,
-    cost: float,
-) -> Trial | None:
-    """Propose a step and evaluate the cost after it; None if the linear system could not be solved."""
-    proposal = strategy.propose()
-    if proposal is None:
-        return None
-    step, predicted = proposal
-    with watch("backsubstitute"):
-        moved = retract(equations.layout, states, step)
-    with watch("cost"):
-        inputs = equations.prepare(moved)
-        new_cost = equations.cost(inputs)
-    ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
-    found = (float(ratio), step.norm(), predicted, equations.costs, equations.hidden)
-    return Trial(step, moved, inputs, new_cost, *found)
-
-
-def stretched(equations: NormalEquations, states: States, trial: Trial) -> Trial:
-    r"""Try a multiple of an accepted step, and return the better trial.
-
-    Robust losses bend the cost down, so reweighted least squares overestimates the curvature. If the curvature along
-    the step is the fraction c of the model's, the gain ratio is 2 - c and the minimum lies at 1 / c times the step.
-    """
-    factor = min(1.0 / max(2.0 - trial.gain_ratio, 1.0 / MAX_STRETCH), MAX_STRETCH)
-    moved = retract(equations.layout, states, trial.step.blend(factor, trial.step, 0.0))
-    inputs = equations.prepare(moved)
+def evaluated(equations: NormalEquations, states: States) -> dict:
+    """Evaluate the cost at some states; return the fields of :class:`JointTrial` that tell of it."""
+    inputs = equations.prepare(states)
     cost = equations.cost(inputs)
-    better = {"states": moved, "inputs": inputs, "cost": cost, "costs": equations.costs, "hidden": equations.hidden}
-    return replace(trial, **better) if cost < trial.cost else trial
+    return {"states": states, "inputs": inputs, "cost": cost, **counted_in(equations)}
+
+
+def counted_in(equations: NormalEquations) -> dict:
+    """Return what the last evaluation of the cost left behind, as fields of :class:`JointTrial`."""
+    return {"costs": equations.costs, "hidden": equations.hidden, "num_hidden": equations.num_hidden}
+
+
+__all__ = ["JointTrial", "counted_in", "evaluated"]

@@ -6,6 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from groma.errors import InputError
+from groma.features.contract import SegmentDetector
+from groma.features.registry import DETECTORS
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,8 @@ class TrackOptions:
     num_lines: int = 100
     #: Shortest segment, pixels.
     min_segment_length: float = 30.0
+    #: What finds the segments: an object, or a name of :data:`groma.features.registry.DETECTORS`.
+    detector: str | SegmentDetector = "lsd"
     #: Depths beyond this are not used, scene units.
     max_depth: float = 6.0
     #: Standard deviation of a followed point, pixels.
@@ -43,6 +47,10 @@ class TrackOptions:
     relations: bool = True
     #: Adjust the window in a thread of its own; its result is taken up two frames later, so runs repeat exactly.
     threaded: bool = True
+
+    def make_detector(self) -> SegmentDetector:
+        """Return the detector; :class:`~groma.errors.InputError` if there is none of that name."""
+        return DETECTORS.make(self.detector, min_length=self.min_segment_length, max_segments=2 * self.num_lines)
 
     def __post_init__(self) -> None:
         if not (self.points or self.lines or self.planes):

@@ -2,15 +2,23 @@
 """``groma adjust``: bundle adjustment of a COLMAP model, a BAL file or a groma archive; of a pose graph, too."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from groma.cli.shared import options as _options
-from groma.cli.shared.adjusting import CovarianceGauge, Wanted, adjust_and_write
 from groma.errors import InputError
 
-LinearSolver = Literal["auto", "dense", "sparse", "pcg"]
+CovarianceGauge = Literal["auto", "inner", "held"]
+
+
+def _linear_solver(name: str) -> str:
+    """Return the name of a linear solver that is registered."""
+    from groma.solver.linear.choice import linear_solver_names
+
+    if name not in linear_solver_names():
+        raise typer.BadParameter(f"{name!r} is not one of {', '.join(linear_solver_names())}.")
+    return name
 
 
 def adjust(
@@ -29,7 +37,8 @@ def adjust(
         str,
         typer.Option(
             metavar="NAME",
-            help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron or truncated. auto: robust "
+            help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron, truncated, or one of an installed "
+            "package. auto: robust "
             "(Cauchy, then Geman-McClure) for what comes from matching, none for BAL files.",
         ),
     ] = "auto",
@@ -56,7 +65,14 @@ def adjust(
     max_iterations: Annotated[
         int | None, typer.Option(min=0, metavar="N", help="Stop after N steps. Default: 50, for pose graphs 100.")
     ] = None,
-    linear_solver: Annotated[LinearSolver, typer.Option(help="How each step is solved.")] = "auto",
+    linear_solver: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            callback=_linear_solver,
+            help="How each step is solved: auto, dense, sparse, pcg, or a solver that was registered.",
+        ),
+    ] = "auto",
     line_chart: Annotated[
         str | None,
         typer.Option(
@@ -124,9 +140,10 @@ def adjust(
     Chance plays no part here: --seed is accepted so that scripts can pass it everywhere.
     """
     from groma.cli.shared import output as _output
+    from groma.cli.shared.adjusting import Wanted, adjust_and_write
     from groma.cli.shared.console import Console
     from groma.cli.shared.input import check_inputs
-    from groma.cli.shared.pose_graph import adjust_pose_graph_file, is_pose_graph
+    from groma.cli.shared.pose_graph import adjust_graph_and_write, is_pose_graph
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, page, covariance, json_target=json_target)
@@ -142,45 +159,28 @@ def adjust(
             "--report": page, "--covariance": covariance, "--contributions": contributions, "--gauge": gauge,
             "--line-chart": line_chart, "--refine-intrinsics": refine_intrinsics, "--refine-rigs": refine_rigs,
         }  # fmt: skip
-        given = {
-            "loss": "none" if loss == "auto" else loss, "loss_scale": loss_scale, "linear_solver": linear_solver,
-            "max_iterations": max_iterations, "threads": threads,
-        }  # fmt: skip
-        options_of_graph = {name: value for name, value in given.items() if value is not None}
-        numbers_of_graph = adjust_pose_graph_file(source, output, console, force, options_of_graph, refused)
-        _output.write_json(json_target, numbers_of_graph, force)
+        graph_options = _chosen(
+            loss="none" if loss == "auto" else loss, loss_scale=loss_scale, linear_solver=linear_solver,
+            max_iterations=max_iterations, threads=threads,
+        )  # fmt: skip
+        numbers = adjust_graph_and_write(source, output, console, force, graph_options, refused)
+        _output.write_json(json_target, numbers, force)
         return
 
     from groma.adjustment.adjust import AdjustOptions
 
-    chosen = {
-        "loss_scale": loss_scale,
-        "refine_intrinsics": refine_intrinsics,
-        "max_iterations": max_iterations,
-        "line_chart": line_chart,
-        "gauge": gauge,
-        "threads": threads,
-    }
-    options = AdjustOptions(
-        loss=loss,
-        refine_principal_point=refine_principal_point,
-        refine_rigs=refine_rigs,
-        points=points,
-        lines=lines,
-        planes=planes,
-        linear_solver=linear_solver,
-        **{name: value for name, value in chosen.items() if value is not None},  # type: ignore[arg-type]
-    )
+    options = AdjustOptions(**_chosen(
+        loss=loss, loss_scale=loss_scale, refine_intrinsics=refine_intrinsics,
+        refine_principal_point=refine_principal_point, refine_rigs=refine_rigs, points=points, lines=lines,
+        planes=planes, max_iterations=max_iterations, linear_solver=linear_solver, line_chart=line_chart, gauge=gauge,
+        threads=threads,
+    ))  # fmt: skip
     wanted = Wanted(
-        output=output,
-        page=page,
-        covariance=covariance,
-        gauge=covariance_gauge,
-        sigma0=sigma0,
-        diagnosis=diagnosis,
-        contributions=contributions,
-        truth=truth,
-        json_target=json_target,
-        force=force,
+        output, page, covariance, covariance_gauge, sigma0, diagnosis, contributions, truth, json_target, force
     )
     adjust_and_write(console, source, options, wanted)
+
+
+def _chosen(**options: Any) -> dict[str, Any]:
+    """Options that were given; for the others the library has its defaults."""
+    return {name: value for name, value in options.items() if value is not None}

@@ -33,10 +33,9 @@ def convert(
     _output.check_outputs(force, target, json_target=json_target)
     check_inputs(source)
 
-    from groma.cli.shared.counts import counts_of, sentence_of
-    from groma.io import read_scene, structures_of, write_scene
+    from groma.io.convert import convert as convert_scene
+    from groma.scene.counts import counts_of, sentence_of
 
-    scene = read_scene(source)
-    write_scene(scene, target, force=force, like=structures_of(source))
+    scene = convert_scene(source, target, force)
     console.say(f"Wrote {target}: {sentence_of(scene, geometry=target.suffix.lower() in ('.ply', '.obj'))}")
     _output.write_json(json_target, {"input": str(source), "output": str(target), **counts_of(scene)}, force)

@@ -30,26 +30,22 @@ def demo(
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
 
-    from groma.cli.shared import cabinet as _cabinet
-    from groma.cli.shared.mapping import map_and_write
+    from groma.cli.shared.diagnosis import try_diagnosis
+    from groma.cli.shared.mapping import run_map, say_map, write_map
+    from groma.evaluation import cabinet
     from groma.io import read_scene
     from groma.mapping.map import MapOptions
 
-    cabinet = _cabinet.folder()
     console.say("58 photographs of a filing cabinet, nearly without texture (TUM RGB-D benchmark), about a minute.")
-    reference = read_scene(cabinet / "motion_capture")
-    numbers = map_and_write(
-        console,
-        cabinet / "images",
-        output,
-        read_scene(cabinet / "model"),
-        MapOptions(threads=threads),
-        force,
-        "A filing cabinet in 58 photographs",
-        judge=lambda result: _cabinet.judge(result, reference),
-        explain=False,
-    )
-    for sentence in _cabinet.sentences(numbers):
+    folder, work = cabinet.folder(), output.with_name(output.name + ".work")
+    images, reference = folder / "images", read_scene(folder / "motion_capture")
+    result = run_map(console, images, work, read_scene(folder / "model"), MapOptions(threads=threads))
+    found = try_diagnosis(result.diagnose, result.scene.num_images, console)
+    numbers = result.summary(found) | cabinet.evaluate_cabinet(result.start, result.scene, reference)
+    title = "A filing cabinet in 58 photographs"
+    write_map(result, output, work, force, images=images, title=title, summary=numbers)
+    say_map(console, result, numbers, explain=False)
+    for sentence in cabinet.sentences(numbers):
         console.say(sentence)
     console.say(f"Open {(output / 'report.html').absolute()} in a browser to walk around it, before and after.")
     console.say("With photographs of your own: groma map IMAGES -o OUT")

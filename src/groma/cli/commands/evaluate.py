@@ -86,14 +86,12 @@ def lines(
     _output.check_json(json_target, force)
     check_inputs(estimate, reference)
 
-    from groma.evaluation.lines import evaluate_lines, score_lines
+    from groma.evaluation.lines import evaluate_lines
     from groma.io import read_scene
     from groma.io.reference import read_reference
 
-    if align:
-        scores = evaluate_lines(read_scene(estimate), read_scene(reference), threshold, align=True)
-    else:
-        scores = score_lines(read_reference(estimate).segments, read_reference(reference), threshold)
+    read = read_scene if align else read_reference
+    scores = evaluate_lines(read(estimate), read(reference), threshold, align)
     lines_there = counted(scores.num_lines, "lines")
     console.say(f"{lines_there}, {scores.length:.6g} long; reference {scores.reference_length:.6g} long")
     if scores.num_lines == 0:

@@ -38,6 +38,15 @@ def map_(
             metavar="NPZ", help="Segments and their matches from elsewhere; the documentation has the layout."
         ),
     ] = None,
+    line_detector: _options.LineDetector = "lsd",
+    line_matcher: Annotated[
+        str | None,
+        typer.Option(
+            "--line-matcher",
+            metavar="NAME",
+            help="Match segments by wide_baseline, flow, or a matcher of an installed package. Default: poses alone.",
+        ),
+    ] = None,
     min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
     refine_poses: Annotated[
@@ -81,16 +90,22 @@ def map_(
     if model is not None and (camera_params is not None or camera_model != "SIMPLE_RADIAL"):
         raise InputError("--camera-model and --camera-params are for images without a model. Leave them out.")
 
+    if line_matches is not None and line_matcher is not None:
+        raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
+
     if truth is not None and not contributions:
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
 
-    from groma.cli.shared.mapping import map_and_write
+    from groma.cli.shared.diagnosis import try_diagnosis
+    from groma.cli.shared.mapping import run_map, say_map, write_map
     from groma.features.external import read_matches
     from groma.io import read_scene
     from groma.mapping.map import MapOptions
 
     options = MapOptions(
         min_segment_length=min_length,
+        detector=line_detector,
+        matcher=line_matcher,
         find_planes=planes,
         refine_points=refine_points,
         refine_poses=refine_poses,
@@ -100,19 +115,15 @@ def map_(
         threads=threads,
         seed=seed,
     )
-    numbers = map_and_write(
-        console,
-        images,
-        output,
-        read_scene(model) if model is not None else None,
-        options,
-        force,
-        f"Map of {images.absolute().name}",
-        line_matches=read_matches(line_matches) if line_matches is not None else None,
-        diagnose=diagnosis,
-        contributions=contributions,
-        truth=read_scene(truth) if truth is not None else None,
-    )
+    start = read_scene(model) if model is not None else None
+    matches = read_matches(line_matches) if line_matches is not None else None
+    true = read_scene(truth) if truth is not None else None
+    work = output.with_name(output.name + ".work")
+    result = run_map(console, images, work, start, options, matches)
+    found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
+    numbers = result.summary(found, result.contributions(true) if contributions else ())
+    write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
+    say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
 

@@ -39,9 +39,9 @@ def report(
     _output.check_outputs(force, output, json_target=json_target, file=True)
     check_inputs(source, images, before)
 
-    from groma.cli.shared.counts import counts_of
     from groma.errors import InputError
     from groma.io import read_scene
+    from groma.scene.counts import counts_of
     from groma.viz.pictures import image_file
     from groma.viz.report.page import write_report
     from groma.viz.report.saved import saved_report

@@ -54,7 +54,7 @@ def selfcheck(
 
 
 def _check_derivatives(console: "Console", golden: Path | None, seed: int) -> tuple[bool, dict[str, Any]]:
-    from groma.factors.checks import selfcheck as run_selfcheck
+    from groma.factors import selfcheck as run_selfcheck
 
     outcome = run_selfcheck(golden, seed)
     console.say(f"{'factor':<28}{'block':<34}{'against':<12}{'cases':>6}{'worst / allowed':>18}")

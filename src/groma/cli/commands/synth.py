@@ -42,9 +42,9 @@ def synth(
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
 
-    from groma.cli.shared.counts import counts_of, sentence_of
     from groma.io import write_scene
     from groma.scene import synthetic
+    from groma.scene.counts import counts_of, sentence_of
 
     make = synthetic.holistic if kind == "holistic" else synthetic.corridor
     made = make(cameras, seed=seed) if noise is None else make(cameras, seed=seed, noise_px=noise)

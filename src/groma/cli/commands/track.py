@@ -11,9 +11,6 @@ from groma.cli.shared import options as _options
 
 if TYPE_CHECKING:
     from groma.cli.shared.console import Console
-    from groma.evaluation.trajectory import TrajectoryScores
-    from groma.io.sequences.frame import Sequence
-    from groma.tracking import TrackedFrame, Tracker, TrackResult
 
 
 def track(
@@ -37,6 +34,7 @@ def track(
     ] = None,
     points: Annotated[bool, typer.Option("--points/--no-points", help="Follow points.")] = True,
     lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Follow line segments.")] = True,
+    line_detector: _options.LineDetector = "lsd",
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Find planes in depth images.")] = True,
     loops: Annotated[bool, typer.Option("--loops/--no-loops", help="Close loops.")] = True,
     max_frames: Annotated[
@@ -79,8 +77,9 @@ def track(
     import shutil
 
     from groma.io.sequences import open_sequence
-    from groma.tracking import TrackedFrame, Tracker, TrackOptions
-    from groma.viz.report.trajectory import write_track_report
+    from groma.tracking.options import TrackOptions
+    from groma.tracking.sequence import TrackProgress
+    from groma.tracking.sequence import track as track_sequence
 
     frames = open_sequence(
         sequence,
@@ -90,105 +89,41 @@ def track(
         max_frames=max_frames,
         kind=cast("Literal['rgbd', 'stereo', 'mono'] | None", kind),
     )
-    options = TrackOptions(points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth)
-    tracker = Tracker(frames.camera, options)
+    options = TrackOptions(
+        points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth, detector=line_detector
+    )
+    options.make_detector()  # refuses a wrong name now
     console.announce_compilation()
     work = output.with_name(output.name + ".work")
-    rows: list[TrackedFrame] = []
-    interrupted = _run(tracker, frames, work, console, rows)
-    result = tracker.finish()
-    if not len(result.trajectory):
-        raise InputError(
-            f"No frame of {sequence} could be tracked: {' '.join([*frames.warnings, *result.warnings])} "
-            "Check the camera and the depth scale."
-        )
-    numbers = {"kind": frames.kind, "interrupted": interrupted, **result.statistics, "sequence": str(sequence)}
-    numbers["warnings"] = [*frames.warnings, *result.warnings]
-    if result.parts:
-        folders = ", ".join(f"part_{number}" for number in range(2, len(result.parts) + 2))
-        numbers["warnings"].append(f"Only the longest part is in trajectory.txt and the report; see also {folders}.")
-    compared, scores = _scores(result, frames)
-    if scores:
-        numbers["reference"] = scores
-    with _output.atomic_output(output, force) as draft:
-        _write(result, draft)
-        write_track_report(
-            draft / "report.html",
-            result,
-            rows,
-            compared,
-            title=f"Track of {sequence.absolute().name}",
-            warnings=numbers["warnings"],
-        )
-        _output.write_json(str(draft / "summary.json"), numbers)
+    with console.stages() as stages:
+
+        def show(event: TrackProgress) -> None:
+            stages(event.stage, event.done, event.total)
+            frame = event.frame
+            if frame is not None and (frame.weak or frame.status in ("lost", "skipped")):
+                why = frame.reason or ("held by the prior: " + ", ".join(frame.weak) if frame.weak else "")
+                console.detail(f"frame {event.name or event.done}: {frame.status} {why}".rstrip())
+
+        result = track_sequence(frames, options, show, work=work, name=str(sequence))
+    if result.interrupted:
+        console.warn("interrupted; what was tracked so far is written.")
+    _output.check_output(output, force)
+    result.write(output, f"Track of {sequence.absolute().name}", force)
     shutil.rmtree(work, ignore_errors=True)
-    _tell(console, result, scores, numbers["warnings"])
+    numbers = result.summary()
+    _say(console, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
 
 
-def _run(tracker: "Tracker", frames: "Sequence", work: Path, console: "Console", rows: "list[TrackedFrame]") -> bool:
-    """Track all frames, noting in ``rows`` what became of each; return whether Ctrl-C ended it early."""
-    from groma.tracking.journal import Journal
-
-    journal = Journal(work)
-    total, done = frames.num_frames or 0, 0
-    try:
-        with console.stages() as progress:
-            for frame in frames:
-                tracked = tracker.process(frame)
-                rows.append(tracked)
-                journal.frame(tracked)
-                done += 1
-                progress("tracking frame", done, total)
-                if tracked.status in ("lost", "skipped") or tracked.weak:
-                    why = tracked.reason or ("held by the prior: " + ", ".join(tracked.weak) if tracked.weak else "")
-                    console.detail(f"frame {frame.name or done}: {tracked.status} {why}".rstrip())
-                if tracked.keyframe:
-                    journal.keyframe(tracker, tracked)
-    except KeyboardInterrupt:
-        console.warn("interrupted; what was tracked so far is written.")
-        return True
-    return False
-
-
-def _write(result: "TrackResult", draft: Path) -> None:
-    from groma.io import write_scene
-    from groma.io.trajectories import write_tum
-
-    write_scene(result.scene, draft, format="colmap")
-    write_scene(result.scene, draft / "scene.npz")
-    write_tum(result.trajectory, draft / "trajectory.txt")
-    for number, part in enumerate(result.parts, start=2):
-        folder = draft / f"part_{number}"
-        folder.mkdir()
-        write_scene(part.scene, folder / "scene.npz")
-        write_tum(part.trajectory, folder / "trajectory.txt")
-
-
-def _scores(result: "TrackResult", frames: "Sequence") -> "tuple[TrajectoryScores | None, dict[str, Any]]":
-    """Comparison with the reference of the sequence, if it has one, and its numbers or why there are none."""
-    from groma.errors import GromaError
-    from groma.evaluation.trajectory import score_trajectory
-
-    if frames.reference is None or len(result.trajectory) < 3:
-        return None, {}
-    align = "sim3" if frames.kind == "mono" else "se3"
-    try:
-        scores = score_trajectory(result.trajectory, frames.reference, align=align, max_time_difference=0.02)
-    except GromaError as error:
-        return None, {"error": str(error)}
-    return scores, scores.to_dict()
-
-
-def _tell(console: "Console", result: "TrackResult", scores: dict[str, Any], warnings: list[str]) -> None:
-    statistics = result.statistics
-    statuses = ", ".join(f"{count:,} {status}" for status, count in sorted(statistics["frames"].items()))
+def _say(console: "Console", numbers: dict[str, Any]) -> None:
+    statuses = ", ".join(f"{count:,} {status}" for status, count in sorted(numbers["frames"].items()))
     kinds = ("keyframes", "points", "lines", "planes", "loops")
-    console.say(f"Frames: {statuses}; {', '.join(counted(statistics[kind], kind) for kind in kinds)}")
-    total = statistics["milliseconds"].get("total")
+    console.say(f"Frames: {statuses}; {', '.join(counted(numbers[kind], kind) for kind in kinds)}")
+    total = numbers["milliseconds"].get("total")
     if total:
         console.say(f"Time per frame: median {total['median']:.1f} ms, 95 % below {total['p95']:.1f} ms")
+    scores = numbers.get("reference", {})
     if "ate_rmse" in scores:
         drift = scores["drift_percent"]
         console.say(
@@ -196,5 +131,5 @@ def _tell(console: "Console", result: "TrackResult", scores: dict[str, Any], war
             f"square, units of the reference) over {scores['path_length']:.2f}"
             + (f"; drift {drift:.2f} %, {scores['drift_deg_per_metre']:.4f} deg per unit" if drift is not None else "")
         )
-    for sentence in warnings:
+    for sentence in numbers["warnings"]:
         console.warn(sentence)

@@ -48,8 +48,8 @@ def view(
         return
     check_inputs(source, images)
 
-    from groma.cli.shared.counts import counts_of, sentence_of
     from groma.io import read_scene
+    from groma.scene.counts import counts_of, sentence_of
     from groma.viz.viewer.scene import serving, wait_for_interrupt
 
     scene = read_scene(source)

@@ -29,31 +29,16 @@ def warmup(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.errors import InputError, OutputError
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
 
-    import time
+    from groma.compilation.warmup import PARTS, warm_up
 
-    begin = time.perf_counter()
-    from groma.cli.shared import warmup as _warmup
-
-    wanted = tuple(name for name in _warmup.PARTS if name in (parts or _warmup.PARTS))
-    if unknown := {*(parts or ())} - {*_warmup.PARTS}:
-        raise InputError(f"There is nothing to compile for {', '.join(sorted(unknown))}; there are "
-                         f"{', '.join(_warmup.PARTS)}.")  # fmt: skip
-    if not _warmup.place():
-        raise OutputError(
-            "No folder for compiled functions can be written, so nothing would be kept. Set NUMBA_CACHE_DIR to one."
-        )
-    missing = wanted if again else tuple(name for name in wanted if not _warmup.is_ready(name))
-    numbers: dict[str, Any] = {"parts": list(wanted), "compiled": 0, "loaded": 0, "unsaved": 0}
-    if missing:
-        with console.stages() as progress:
-            numbers |= _warmup.run(missing, progress)
-    numbers |= {"seconds": time.perf_counter() - begin, "folder": _warmup.place()}
-    for sentence in _sentences(numbers, bool(missing)):
+    with console.stages() as progress:
+        numbers = warm_up(parts or PARTS, progress, again)
+    ran = bool(numbers.pop("run"))
+    for sentence in _sentences(numbers, ran):
         console.say(sentence)
     if numbers["unsaved"]:
         console.warn(f"{counted(numbers['unsaved'], 'functions')} could not be written; is the disk full?")

@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Adjusting a scene as a command does it: run the adjustment, write what is wanted, say what came out."""
+"""Adjusting a scene with everything that a terminal adds: progress, files that are wanted, words at the end."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from groma.cli.shared import output as _output
 from groma.errors import ProblemError
 
 if TYPE_CHECKING:
-    from groma.adjustment.adjust import AdjustOptions, AdjustResult
+    from groma.adjustment.adjust import AdjustOptions
     from groma.cli.shared.console import Console
-    from groma.scene import Scene
-
-CovarianceGauge = Literal["auto", "inner", "held"]
 
 
 @dataclass(frozen=True)
@@ -27,7 +24,7 @@ class Wanted:
     page: Path | None = None
     covariance: Path | None = None
     #: What the covariances refer to, and the noise in units of that stated.
-    gauge: CovarianceGauge = "auto"
+    gauge: str = "auto"
     sigma0: float = 1.0
     #: Say what the data determine; None: unless there are many images.
     diagnosis: bool | None = None
@@ -48,10 +45,13 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
         If covariances are wanted that do not exist, after everything else was written and said.
     """
     from groma.adjustment.adjust import adjust
-    from groma.adjustment.diagnosis import diagnose_scene
-    from groma.cli.shared.compilation import compilation_time
-    from groma.cli.shared.diagnosis import diagnosis_of, why_steps_ran_out
+    from groma.adjustment.contributions import contributions
+    from groma.adjustment.covariance_files import write_covariances
+    from groma.cli.shared.diagnosis import try_diagnosis
+    from groma.compilation.time import compilation_time
     from groma.io import check_target, read_scene, structures_of, write_scene
+    from groma.viz.report.page import write_report
+    from groma.viz.report.tables import contributions_card
 
     before = read_scene(source)
     if wanted.output is not None:
@@ -60,25 +60,32 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     console.announce_compilation()
     with compilation_time() as compilation, console.progress() as progress:
         result = adjust(before, options, progress)
-    numbers: dict[str, Any] = result.report.to_dict()
+    entries = contributions(before, options, true) if wanted.contributions else ()
+    diagnosis = try_diagnosis(result.diagnose, before.num_images, console, wanted.diagnosis)
+    numbers = result.summary(diagnosis, entries)
     numbers["seconds"]["compilation"] = compilation.seconds
-    if wanted.contributions:
-        from groma.adjustment.contributions import contributions
-
-        numbers["contributions"] = [entry.to_dict() for entry in contributions(before, options, true)]
-    numbers["diagnosis"] = diagnosis_of(
-        result.scene, lambda: diagnose_scene(result.scene, problem=result.problem), console, wanted.diagnosis
-    )
-    numbers["warnings"] = [*result.report.warnings, *why_steps_ran_out(numbers)]
 
     if wanted.output is not None:
         write_scene(result.scene, wanted.output, force=wanted.force, like=structures_of(source))
     if wanted.page is not None:
-        _write_page(wanted.page, before, result, numbers, f"Adjustment of {source.absolute().name}", wanted.force)
+        with _output.atomic_output(wanted.page, wanted.force) as draft:
+            write_report(
+                draft,
+                before,
+                result.scene,
+                result.report,
+                title=f"Adjustment of {source.absolute().name}",
+                warnings=numbers["warnings"],
+                diagnosis=numbers["diagnosis"],
+                cards=contributions_card(numbers.get("contributions")),
+            )
     failure = None
     if wanted.covariance is not None:
         try:
-            numbers["uncertainty"] = _write_covariances(wanted.covariance, result, wanted)
+            found = result.uncertainty(wanted.gauge, wanted.sigma0)
+            _output.check_output(wanted.covariance, wanted.force)
+            write_covariances(wanted.covariance, result.scene, found, wanted.force)
+            numbers["uncertainty"] = found.to_dict()
         except ProblemError as error:  # raised at the end, when all else is written and said
             failure = error
     _say(console, numbers, compilation.compiled)
@@ -94,9 +101,8 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
 
 def _say(console: Console, numbers: dict[str, Any], compiled: bool) -> None:
     """Say the main numbers, what the data do not determine, and the warnings."""
-    from groma.cli.shared.contributions import describe_contributions
     from groma.cli.shared.diagnosis import say_diagnosis
-    from groma.cli.shared.numbers import describe, describe_uncertainty
+    from groma.cli.shared.sentences import describe, describe_contributions, describe_uncertainty
 
     lines = describe(numbers, numbers["termination_sentence"], verbose=console.verbose, compiled=compiled)
     lines += describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else []
@@ -106,33 +112,3 @@ def _say(console: Console, numbers: dict[str, Any], compiled: bool) -> None:
     say_diagnosis(numbers["diagnosis"], console)
     for sentence in numbers["warnings"]:
         console.warn(sentence)
-
-
-def _write_page(
-    page: Path, before: Scene, result: AdjustResult, numbers: dict[str, Any], title: str, force: bool
-) -> None:
-    """Write the HTML page of an adjustment."""
-    from groma.viz.report.page import write_report
-    from groma.viz.report.tables import contributions_card
-
-    with _output.atomic_output(page, force) as draft:
-        write_report(
-            draft,
-            before,
-            result.scene,
-            result.report,
-            title=title,
-            warnings=numbers["warnings"],
-            diagnosis=numbers["diagnosis"],
-            cards=contributions_card(numbers.get("contributions")),
-        )
-
-
-def _write_covariances(path: Path, result: AdjustResult, wanted: Wanted) -> dict[str, Any]:
-    """Write the covariances of an adjusted scene and return their summary."""
-    from groma.adjustment.uncertainty import uncertainty
-    from groma.cli.shared.covariance import write_covariances
-
-    found = uncertainty(result.scene, gauge=wanted.gauge, sigma0=wanted.sigma0, problem=result.problem)
-    write_covariances(path, result.scene, found, wanted.force)
-    return found.to_dict()

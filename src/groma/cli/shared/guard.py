@@ -11,6 +11,7 @@ import typer
 
 from groma.cli.shared.interrupt import INTERRUPTED
 from groma.errors import GromaError
+from groma.plugins import load_plugins
 
 P = ParamSpec("P")
 
@@ -27,6 +28,7 @@ def guard(command: Callable[P, None]) -> Callable[P, None]:
                     warnings.simplefilter("always", UserWarning)
                 else:
                     warnings.simplefilter("ignore")
+                load_plugins()
                 command(*args, **kwargs)
             if sys.stdout is not None:  # a process may be started without one
                 sys.stdout.flush()

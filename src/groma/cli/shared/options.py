@@ -33,6 +33,12 @@ Truth = Annotated[
         "--truth", metavar="SCENE", help="With --contributions: a scene to compare the camera poses with, by name."
     ),
 ]
+LineDetector = Annotated[
+    str,
+    typer.Option(
+        "--line-detector", metavar="NAME", help="What finds line segments: lsd, or a detector of an installed package."
+    ),
+]
 Input = Annotated[
     Path,
     typer.Argument(metavar="INPUT", help="COLMAP model folder, BAL file (.txt, .bz2, .gz) or groma archive (.npz)."),

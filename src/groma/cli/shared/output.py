@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Writing results: complete or not at all, and never over something that was there unless asked to."""
 
-import json
 import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from groma._json import json_text
 from groma.errors import OutputError
 
 #: What the commands write into folders. A folder that holds anything else is not replaced by ``--force``.
@@ -105,30 +105,12 @@ def check_json(target: str | None, force: bool) -> None:
 
 
 def write_json(target: str | None, content: dict[str, object], force: bool = False) -> None:
-    """Write ``content`` to the file ``target``, to standard output when it is '-', nowhere when it is None.
-
-    Numbers that are not finite become null, which every JSON reader accepts.
-    """
+    """Write ``content`` to the file ``target``, to standard output when it is '-', nowhere when it is None."""
     if target is None:
         return
-    text = json.dumps(plain(content), indent=2, allow_nan=False) + "\n"
+    text = json_text(content)
     if target == "-":
         print(text, end="", flush=True)
         return
     with atomic_output(Path(target), force) as draft:
         draft.write_text(text, encoding="utf-8")
-
-
-def plain(value: object) -> object:
-    """Turn NumPy numbers and arrays, enumerations and paths into what JSON knows; not-finite numbers into None."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, (str, bool, int)) or value is None:
-        return value
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())  # type: ignore[attr-defined]
-    if isinstance(value, float):
-        return value if value - value == 0 else None
-    return str(value)

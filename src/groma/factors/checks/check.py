@@ -21,6 +21,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import ProblemError
 from groma.factors._examples import charts
+from groma.factors.checks.world import check_invariance
 from groma.factors.contract import Example, Factor
 from groma.geometry.manifold import Manifold
 
@@ -202,6 +203,14 @@ def _check_ranges(name: str, example: Example) -> None:
         _require(same, name, f"columns {columns}: the unwanted block is written, or another one changes.")
 
 
+def _check_world(name: str, example: Example, rng: np.random.Generator) -> None:
+    factor = example.factor
+    if factor.invariance is not None:
+        slots = [slot for slot, _ in factor.references()]
+        ambients = _ambients(example)
+        check_invariance(name, factor.invariance, slots, ambients, lambda moved: _residuals(factor, moved), rng)
+
+
 def _check_degenerate(name: str, example: Example) -> None:
     """Variables that are no object at all (all zeros) must give zeros, never NaN."""
     factor, sizes = example.factor, _block_sizes(example)
@@ -232,8 +241,8 @@ def check_factor(
     """Check that a factor keeps its contract.
 
     Checked are: each Jacobian block against differences through the charts (see the top of this module), in every chart
-    of its kind; ranges, empty batches and :meth:`Factor.take`; that unwanted columns are left alone; that variables of
-    zeros give zeros and no NaN.
+    of its kind; which motions of the world it notices (:attr:`Factor.invariance`); ranges, empty batches and
+    :meth:`Factor.take`; that unwanted columns are left alone; that variables of zeros give zeros and no NaN.
 
     Parameters
     ----------
@@ -268,6 +277,7 @@ def check_factor(
                     f"analytic\n{check.analytic}\nnumeric\n{check.numeric}"
                 )
     _check_ranges(name, example)
+    _check_world(name, example, rng)
     _check_degenerate(name, example)
     for group, (_, state) in example.variables.items():
         _require(np.array_equal(state, before[group]), name, f"the states of group {group!r} were changed.")

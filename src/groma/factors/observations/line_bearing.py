@@ -40,7 +40,7 @@ from groma.factors._rig import (
     put_line_pose,
     transform_line,
 )
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors.contract import ANY_SIMILARITY, Example, Invariance, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -97,6 +97,7 @@ class LineBearing(CameraFactor):
     end_bearings: FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), EXTRINSICS)
+    invariance: ClassVar[Invariance] = ANY_SIMILARITY
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("start_bearings", 3), ("end_bearings", 3))
 
     def __post_init__(self) -> None:

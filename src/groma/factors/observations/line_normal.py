@@ -35,7 +35,7 @@ from groma._typing import FloatArray
 from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._record import put_block, put_residual
 from groma.factors._rig import EXTRINSICS, POSE, CameraFactor, normalize_rows
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors.contract import Example, Invariance, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -122,6 +122,7 @@ class LineNormal(CameraFactor):
     normals: FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), EXTRINSICS)
+    invariance: ClassVar[Invariance] = Invariance(translation=False, scale=True)  # anchors are closest to the origin
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("normals", 3),)
 
     def __post_init__(self) -> None:

@@ -39,7 +39,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.factors._record import put_block, put_residual
-from groma.factors.contract import register
+from groma.factors.contract import WORLD_FIXED, Invariance, register
 from groma.factors.observations.plane_observation import PlaneInCamera
 
 
@@ -146,6 +146,7 @@ class PlaneQuaternion(PlaneInCamera):
     """
 
     num_normalized: ClassVar[int] = 4
+    invariance: ClassVar[Invariance] = WORLD_FIXED  # the angle between 4-vectors depends on the world origin
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

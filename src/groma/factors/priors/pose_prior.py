@@ -30,7 +30,7 @@ from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.factors._examples import indices, make_example, random_poses
 from groma.factors._record import poses_from_states, put_block, put_residual, set_rows
-from groma.factors.contract import Example, Factor, Ref, Slot, register
+from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
 from groma.geometry.quaternion import log_kernel
 from groma.geometry.so3 import left_jacobian_inverse_kernel
 
@@ -167,6 +167,7 @@ class PosePrior(Factor):
     cam_from_world: FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("pose", "pose"),)
+    invariance: ClassVar[Invariance] = WORLD_FIXED
 
     def __post_init__(self) -> None:
         set_rows(self, "cam_from_world", 7)

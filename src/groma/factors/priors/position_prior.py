@@ -18,7 +18,7 @@ from groma._numba import loop
 from groma._typing import FloatArray
 from groma.factors._examples import indices, make_example
 from groma.factors._record import set_rows
-from groma.factors.contract import Example, Factor, Ref, Slot, register
+from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -48,6 +48,7 @@ class PositionPrior(Factor):
     cam_center_in_world: FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("pose", "pose"),)
+    invariance: ClassVar[Invariance] = WORLD_FIXED
 
     def __post_init__(self) -> None:
         set_rows(self, "cam_center_in_world", 3)

@@ -17,7 +17,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import ShapeError
 from groma.factors._examples import indices, make_example
-from groma.factors.contract import Example, Factor, Ref, Slot, register
+from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
 from groma.geometry.manifold import Euclidean
 
 
@@ -32,6 +32,7 @@ class VectorPrior(Factor):
     measured: FloatArray
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("variable", "vector"),)
+    invariance: ClassVar[Invariance] = WORLD_FIXED
 
     def __post_init__(self) -> None:
         measured = np.ascontiguousarray(self.measured, dtype=np.float64)

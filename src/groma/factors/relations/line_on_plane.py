@@ -40,7 +40,7 @@ from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.factors._examples import indices, make_example
 from groma.factors._record import put_block, put_residual, set_rows
-from groma.factors.contract import Example, Factor, Ref, Slot, register
+from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -121,6 +121,7 @@ class _LineAndPlane(Factor):
     plane: Ref
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("line", "line"), Slot("plane", "plane"))
+    invariance: ClassVar[Invariance] = WORLD_FIXED  # anchors and ends are world points
 
     @property
     def residual_size(self) -> int:

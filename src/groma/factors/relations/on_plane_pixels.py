@@ -43,7 +43,7 @@ from groma.factors._examples import indices
 from groma.factors._pixels import PixelFactor, load_row, pixel_example
 from groma.factors._record import set_rows
 from groma.factors._rig import EXTRINSICS, POSE, clear_block, clear_record
-from groma.factors.contract import Example, Ref, Slot, register
+from groma.factors.contract import WORLD_FIXED, Example, Invariance, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -274,6 +274,7 @@ class SegmentOnPlanePixels(_OnPlanePixels):
     slots: ClassVar[tuple[Slot, ...]] = (
         POSE, Slot("line", "line"), Slot("plane", "plane"), Slot("intrinsics", "intrinsics"), EXTRINSICS,
     )  # fmt: skip
+    invariance: ClassVar[Invariance] = WORLD_FIXED  # ends are world points
 
     def __post_init__(self) -> None:
         super().__post_init__()

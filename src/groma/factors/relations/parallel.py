@@ -27,7 +27,7 @@ from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.factors._examples import indices, make_example
 from groma.factors._record import put_residual
-from groma.factors.contract import Example, Factor, Ref, Slot, register
+from groma.factors.contract import ANY_SIMILARITY, Example, Factor, Invariance, Ref, Slot, register
 from groma.geometry.manifold import FACTOR_COLUMNS
 
 #: Where the direction starts in the numbers of each kind.
@@ -97,6 +97,8 @@ class DirectionPair(Factor):
 
     Subclasses declare two slots of kind line, plane or direction.
     """
+
+    invariance: ClassVar[Invariance] = ANY_SIMILARITY
 
     @property
     def _sizes(self) -> tuple[int, int]:

@@ -3,5 +3,11 @@
 
 In come states and increments; a chart retracts one by the other, and gives the derivative of the coordinates that
 factors read by the increment. Solver, tests and factors' checks use the same ``retract``. Every chart fulfils
-:class:`groma.geometry.manifold.Manifold`; a new one is one file.
+:class:`groma.geometry.manifold.Manifold`; a new one is one file, made known
+by :func:`register_chart`.
 """
+
+from groma.geometry.charts import line_charts, plane_charts, point3, pose_charts, unit3
+from groma.geometry.charts.registry import charts_of, register_chart
+
+__all__ = ["charts_of", "line_charts", "plane_charts", "point3", "pose_charts", "register_chart", "unit3"]

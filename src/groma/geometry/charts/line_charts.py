@@ -17,13 +17,12 @@ from __future__ import annotations
 from groma.geometry.charts.line_cartesian import CartesianLine
 from groma.geometry.charts.line_free import FreeLineLeft, FreeLineRight
 from groma.geometry.charts.line_orthonormal import OrthonormalLineLeft, OrthonormalLineRight
-from groma.geometry.manifold import Manifold
+from groma.geometry.charts.registry import charts_of, register_chart
 
-#: Charts of lines by name.
-LINE_CHARTS: dict[str, Manifold] = {
-    chart.name: chart
-    for chart in (CartesianLine(), OrthonormalLineRight(), OrthonormalLineLeft(), FreeLineRight(), FreeLineLeft())
-}
+for _chart in (CartesianLine, OrthonormalLineRight, OrthonormalLineLeft, FreeLineRight, FreeLineLeft):
+    register_chart(_chart)
+#: Charts of lines by name, registered ones too.
+LINE_CHARTS = charts_of("line")
 
 __all__ = [
     "LINE_CHARTS",

@@ -16,12 +16,11 @@ from __future__ import annotations
 from groma.geometry.charts.plane_closest_point import ClosestPointPlane
 from groma.geometry.charts.plane_normal_offset import NormalOffsetPlane
 from groma.geometry.charts.plane_quaternion import QuaternionPlaneLeft, QuaternionPlaneRight
-from groma.geometry.manifold import Manifold
+from groma.geometry.charts.registry import charts_of, register_chart
 
-#: Charts of planes by name.
-PLANE_CHARTS: dict[str, Manifold] = {
-    chart.name: chart
-    for chart in (NormalOffsetPlane(), QuaternionPlaneLeft(), QuaternionPlaneRight(), ClosestPointPlane())
-}
+for _chart in (NormalOffsetPlane, QuaternionPlaneLeft, QuaternionPlaneRight, ClosestPointPlane):
+    register_chart(_chart)
+#: Charts of planes by name, registered ones too.
+PLANE_CHARTS = charts_of("plane")
 
 __all__ = ["PLANE_CHARTS", "ClosestPointPlane", "NormalOffsetPlane", "QuaternionPlaneLeft", "QuaternionPlaneRight"]

@@ -13,13 +13,13 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import ShapeError
 from groma.geometry.charts.point_inverse_depth import InverseDepthPoint
-from groma.geometry.manifold import Euclidean, Manifold
+from groma.geometry.charts.registry import charts_of, register_chart
+from groma.geometry.manifold import Euclidean
 
-#: Charts of points by name: moved by addition, or linear in the inverse of the distance from an anchor.
-POINT_CHARTS: dict[str, Manifold] = {
-    Euclidean.name: Euclidean(3, "point"),
-    InverseDepthPoint.name: InverseDepthPoint(),
-}
+register_chart(Euclidean(3, "point"))
+register_chart(InverseDepthPoint)
+#: Charts of points by name: moved by addition, linear in the inverse of the distance from an anchor, registered ones.
+POINT_CHARTS = charts_of("point")
 
 
 def to_homogeneous(point: FloatArray) -> FloatArray:

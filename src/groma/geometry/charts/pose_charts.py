@@ -33,6 +33,7 @@ from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.geometry import quaternion, se3
 from groma.geometry.charts.chart import as_rows, as_steps, reject
+from groma.geometry.charts.registry import charts_of, register_chart
 from groma.geometry.manifold import Manifold
 from groma.geometry.quaternion import exp_kernel, multiply_kernel, to_matrix_kernel
 from groma.geometry.so3 import left_jacobian_kernel
@@ -140,6 +141,7 @@ class _PoseChart(Manifold):
         return np.hstack([quaternion.normalize(rng.normal(size=(count, 4))), rng.normal(size=(count, 3))])
 
 
+@register_chart
 class PoseLeft(_PoseChart):
     """Increments in the camera frame, ``"left"``: T <- Exp(xi) T. The default."""
 
@@ -161,6 +163,7 @@ class PoseLeft(_PoseChart):
         return None
 
 
+@register_chart
 class PoseRight(_PoseChart):
     """Increments in the world frame, ``"right"``: T <- T Exp(xi)."""
 
@@ -182,6 +185,7 @@ class PoseRight(_PoseChart):
         return se3.adjoint(state)
 
 
+@register_chart
 class PoseBody(_PoseChart):
     """Increments in the world frame with a first-order translation, ``"body"``, as in the free line notes."""
 
@@ -204,7 +208,7 @@ class PoseBody(_PoseChart):
         return se3.adjoint(state)
 
 
-#: Charts of poses by name, the default first.
-POSE_CHARTS: dict[str, Manifold] = {chart.name: chart for chart in (PoseLeft(), PoseRight(), PoseBody())}
+#: Charts of poses by name, the default first, registered ones too.
+POSE_CHARTS = charts_of("pose")
 
 __all__ = ["POSE_CHARTS", "PoseBody", "PoseLeft", "PoseRight"]

@@ -21,6 +21,7 @@ from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
 from groma.geometry.charts.chart import as_rows, as_steps, perpendicular, perpendicular_kernel, unit
+from groma.geometry.charts.registry import charts_of, register_chart
 from groma.geometry.manifold import Manifold
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -90,6 +91,7 @@ def log(direction: FloatArray, other: FloatArray) -> FloatArray:
     return angle * along / length
 
 
+@register_chart
 class Unit3(Manifold):
     """The chart of directions: two numbers in the tangent basis. The sign of a direction is kept."""
 
@@ -138,7 +140,7 @@ class Unit3(Manifold):
         return unit(rng.normal(size=(count, 3)))
 
 
-#: Charts of directions by name.
-DIRECTION_CHARTS: dict[str, Manifold] = {Unit3.name: Unit3()}
+#: Charts of directions by name, registered ones too.
+DIRECTION_CHARTS = charts_of("direction")
 
 __all__ = ["DIRECTION_CHARTS", "Unit3", "exp", "log", "tangent_basis"]

@@ -52,6 +52,13 @@ def find_model(path: str | os.PathLike[str]) -> tuple[Path, Literal["binary", "t
     )
 
 
+def is_model(place: Path) -> bool:
+    """Whether a folder holds a model, or a file is named like one of a model's."""
+    if place.is_dir():
+        return any(_form(part) is not None for part in (place, place / "sparse", *(place / "sparse").glob("[0-9]*")))
+    return place.suffix in (".bin", ".txt") and place.stem in (*_FILES, "rigs", "frames")
+
+
 def _form(place: Path) -> Literal["binary", "text"] | None:
     """Return the form of the model in a folder; None where there is none."""
     forms: tuple[tuple[str, Literal["binary", "text"]], ...] = ((".bin", "binary"), (".txt", "text"))

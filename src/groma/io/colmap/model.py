@@ -23,11 +23,12 @@ from groma import cameras as camera_models
 from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError
 from groma.io.atomic import atomic_output
-from groma.io.colmap.files import check_binary_model, damage_in_text, find_model
+from groma.io.colmap.files import check_binary_model, damage_in_text, find_model, is_model
 from groma.io.colmap.quiet import quiet
 from groma.io.colmap.to_pycolmap import colmap_camera, to_pycolmap
 from groma.io.limap.structures import Structures, read_beside, write_beside
 from groma.io.reading import reading
+from groma.io.registry import SceneFormat, register_format
 from groma.scene import Cameras, Frames, Images, Keypoints, PointObservations, Points, Rigs, Scene, Sensors
 from groma.scene.camera import CAMERA, OTHER
 
@@ -313,5 +314,27 @@ def check_colmap(scene: Scene, form: Literal["binary", "text"] = "binary") -> No
     for row in range(scene.num_cameras):
         colmap_camera(scene.cameras, row)
 
+
+register_format(
+    SceneFormat(
+        "colmap",
+        source="the folder of a COLMAP model",
+        target="a folder name for COLMAP",
+        endings=("",),
+        recognise=lambda place, head: is_model(place),
+        read=lambda place: read_colmap(place if place.is_dir() else place.parent),
+        write=lambda scene, path, force, like: write_colmap(scene, path, "binary", force, like),
+        check=check_colmap,
+        keeps_structures=True,
+    )
+)
+register_format(
+    SceneFormat(
+        "colmap_text",
+        write=lambda scene, path, force, like: write_colmap(scene, path, "text", force, like),
+        check=lambda scene: check_colmap(scene, "text"),
+        keeps_structures=True,
+    )
+)
 
 __all__ = ["check_colmap", "find_model", "from_pycolmap", "read_colmap", "to_pycolmap", "write_colmap"]

@@ -4,16 +4,19 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from pathlib import Path
 
 from groma.errors import InputError
 from groma.io.endings import VIDEOS
 from groma.io.reading import existing
-from groma.io.sequences._calibration import CameraLike, calibration_of
+from groma.io.sequences._calibration import Calibration, CameraLike, calibration_of
 from groma.io.sequences._reader import Selection
 from groma.io.sequences.euroc import euroc_root, open_euroc
 from groma.io.sequences.frame import Frame, Kind, Sequence, SequenceCamera
 from groma.io.sequences.images import image_files, open_images, open_video
 from groma.io.sequences.kitti import is_kitti, open_kitti
+from groma.io.sequences.layouts import SequenceLayout, Wishes, layouts, register_layout
 from groma.io.sequences.seven_scenes import open_seven_scenes, seven_scenes_root
 from groma.io.sequences.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 
@@ -64,24 +67,54 @@ def open_sequence(
     if depth_scale is not None and not 0 < depth_scale < float("inf"):
         raise InputError(f"depth_scale must be positive (depth in files per metre); got {depth_scale}.")
     calibration = None if camera is None else calibration_of(camera)
-    if place.is_file() and place.suffix.lower() in VIDEOS:
-        return open_video(place, calibration, selection)
+    wishes = Wishes(calibration, depth_scale, selection)
+    for layout in layouts():
+        if (root := layout.find(place)) is not None:
+            return layout.open(root, wishes)
     if not place.is_dir():
         raise InputError(f"{place} is neither a folder nor a video ({', '.join(VIDEOS)}). Pass the sequence's folder.")
-    if is_tum_rgbd(place):
-        return open_tum_rgbd(place, calibration, depth_scale, selection)
-    if (root := euroc_root(place)) is not None:
-        return open_euroc(root, calibration, selection)
-    if is_kitti(place):
-        return open_kitti(place, calibration, selection)
-    if (root := seven_scenes_root(place)) is not None:
-        return open_seven_scenes(root, calibration, depth_scale, selection)
-    if image_files(place):
-        return open_images(place, calibration, selection)
-    raise InputError(
-        f"{place} is no sequence that groma knows: expected rgb.txt or associations.txt (TUM), mav0/cam0 (EuRoC), "
-        "image_0 (KITTI), frame-000000.color.png (7-Scenes), or images. Check the path."
-    )
+    signs = ", ".join(layout.sign for layout in layouts() if layout.sign)
+    raise InputError(f"{place} is no sequence that groma knows: expected {signs}, or images. Check the path.")
 
 
-__all__ = ["CameraLike", "Frame", "Kind", "Sequence", "SequenceCamera", "open_sequence"]
+def _here(has_layout: Callable[[Path], object]) -> Callable[[Path], Path | None]:
+    return lambda place: place if has_layout(place) else None
+
+
+def _is_video(place: Path) -> bool:
+    return place.is_file() and place.suffix.lower() in VIDEOS
+
+
+for _layout in (
+    SequenceLayout("video", "", _here(_is_video), lambda path, w: open_video(path, w.calibration, w.selection)),
+    SequenceLayout(
+        "tum_rgbd", "rgb.txt or associations.txt (TUM)", _here(is_tum_rgbd),
+        lambda path, w: open_tum_rgbd(path, w.calibration, w.depth_scale, w.selection),
+    ),
+    SequenceLayout(
+        "euroc", "mav0/cam0 (EuRoC)", euroc_root, lambda path, w: open_euroc(path, w.calibration, w.selection)
+    ),
+    SequenceLayout(
+        "kitti", "image_0 (KITTI)", _here(is_kitti), lambda path, w: open_kitti(path, w.calibration, w.selection)
+    ),
+    SequenceLayout(
+        "seven_scenes", "frame-000000.color.png (7-Scenes)", seven_scenes_root,
+        lambda path, w: open_seven_scenes(path, w.calibration, w.depth_scale, w.selection),
+    ),
+    SequenceLayout("images", "", _here(image_files), lambda path, w: open_images(path, w.calibration, w.selection)),
+):  # fmt: skip
+    register_layout(_layout)
+
+__all__ = [
+    "Calibration",
+    "CameraLike",
+    "Frame",
+    "Kind",
+    "Selection",
+    "Sequence",
+    "SequenceCamera",
+    "SequenceLayout",
+    "Wishes",
+    "open_sequence",
+    "register_layout",
+]

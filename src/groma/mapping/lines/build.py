@@ -30,7 +30,7 @@ from groma.mapping.lines.directions import depth_ratios
 from groma.mapping.lines.filters import Evidence, filtered
 from groma.mapping.lines.growth import grow
 from groma.mapping.lines.line_map import LineMap, explain
-from groma.mapping.lines.matches import MatchProvider, external_matches, flow_matches, wide_baseline_matches
+from groma.mapping.lines.matches import MatchProvider, external_matches, segment_matches
 from groma.mapping.lines.merge import merge_agreeing
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.options import MapLinesOptions
@@ -51,6 +51,7 @@ def map_lines(
     matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None = None,
     options: MapLinesOptions | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    neighbors: Callable[[Scene], list[IntArray]] | None = None,
 ) -> LineMap:
     """Build 3D lines from the segments of posed images.
 
@@ -68,6 +69,9 @@ def map_lines(
         Lengths, gates and counts.
     progress : callable, optional
         Called with stage, number done, number in all.
+    neighbors : callable, optional
+        Chooses for every image of a scene which others it is compared with, the best first, in place of
+        :func:`~groma.mapping.lines.neighbors.covisible_neighbors`.
 
     Returns
     -------
@@ -92,19 +96,22 @@ def map_lines(
 
     report = progress or (lambda stage, done, total: None)
 
-    neighbors = covisible_neighbors(scene, options.num_neighbors, options.min_shared)
+    if neighbors is None:
+        compared = covisible_neighbors(scene, options.num_neighbors, options.min_shared)
+    else:
+        compared = neighbors(scene)
     views = build_views(scene, segments, options.min_length, options.noise, options.depth_margin)
     ratios = depth_ratios(scene, segments, views) if options.use_directions else np.zeros((len(views.image_idx), 2))
-    places = find_places(scene, views, ratios, neighbors, matches, options, partial(report, "proposals"))
-    unmerged = grow(Tracks.none(views, places.rejection), places, neighbors, options, partial(report, "tracks"))
+    places = find_places(scene, views, ratios, compared, matches, options, partial(report, "proposals"))
+    unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, partial(report, "tracks"))
     evidence = Evidence(
         options=options,
-        neighbors=neighbors,
+        neighbors=compared,
         strength=np.concatenate([np.zeros(0), *(one.strength for one in segments)]),
         size=np.column_stack([scene.cameras.width, scene.cameras.height])[scene.images.camera_idx],
         unmerged=unmerged,
     )
-    return _line_map(filtered(merge_agreeing(unmerged), evidence), neighbors)
+    return _line_map(filtered(merge_agreeing(unmerged), evidence), compared)
 
 
 def _line_map(tracks: Tracks, neighbors: list[IntArray]) -> LineMap:
@@ -149,7 +156,6 @@ __all__ = [
     "Outcome",
     "explain",
     "external_matches",
-    "flow_matches",
     "map_lines",
-    "wide_baseline_matches",
+    "segment_matches",
 ]

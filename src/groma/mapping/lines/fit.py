@@ -1,12 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Lines from their observations: maximum likelihood, and segments that lie on them. Kernels only.
+"""Lines from their observations: maximum likelihood, and segments that lie on them.
 
-A line is two points that move across it, :math:`X_k = A_k + x_k u + y_k v` with u, v perpendicular to the line: four
-numbers, regular for every finite line. Residuals are the distances of the measured end points to the projected line,
-
-.. math:: r = \frac{l^\top x}{\sigma \sqrt{l_1^2 + l_2^2}}, \qquad l = (P X_1) \times (P X_2),
-
-under a Cauchy loss, and the loop is Levenberg-Marquardt on 4x4 systems.
+The residuals and the parameters of a line are those of :mod:`groma.estimators.two_point_line`, under a Cauchy loss.
 
 Observations of all lines are flat arrays, stored by line: those of line n are ``pointers[n] : pointers[n + 1]``, and
 ``rows`` names their segments.
@@ -15,193 +10,90 @@ Observations of all lines are flat arrays, stored by line: those of line n are `
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from groma._numba import kernel, loop
+from groma._simd import width
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators.batch_least_squares import solve_batch, solve_damped
+from groma.estimators.two_point_line import TWO_POINT_LINE, line_residuals
+from groma.mapping.lines.views import LineViews
 
 #: Scale of the Cauchy loss, in sigma.
 _CAUCHY = 2.0
+_FOUR = width(4)
 
 
 # ------------------------------------------------------------------------------------------------------------- Refine
 @kernel
-def line_residuals(P, ends, sigma, X, U, r, J):
-    """Distances over sigma of the two measured end points to the projected line, and their derivatives (2, 4)."""
-    x0 = P[0, 0] * X[0, 0] + P[0, 1] * X[0, 1] + P[0, 2] * X[0, 2] + P[0, 3]
-    y0 = P[1, 0] * X[0, 0] + P[1, 1] * X[0, 1] + P[1, 2] * X[0, 2] + P[1, 3]
-    z0 = P[2, 0] * X[0, 0] + P[2, 1] * X[0, 1] + P[2, 2] * X[0, 2] + P[2, 3]
-    x1 = P[0, 0] * X[1, 0] + P[0, 1] * X[1, 1] + P[0, 2] * X[1, 2] + P[0, 3]
-    y1 = P[1, 0] * X[1, 0] + P[1, 1] * X[1, 1] + P[1, 2] * X[1, 2] + P[1, 3]
-    z1 = P[2, 0] * X[1, 0] + P[2, 1] * X[1, 1] + P[2, 2] * X[1, 2] + P[2, 3]
-    a, b, c = y0 * z1 - z0 * y1, z0 * x1 - x0 * z1, x0 * y1 - y0 * x1
-    h2 = a * a + b * b
-    if not h2 > 1e-24 * (z0 * z0 + z1 * z1):
-        r[0], r[1] = 1e3, 1e3
-        J[:, :] = 0.0
-        return False
-    h = math.sqrt(h2)
-    r[0] = (a * ends[0] + b * ends[1] + c) / h
-    r[1] = (a * ends[2] + b * ends[3] + c) / h
-    for k in range(4):
-        w = k % 2
-        dx = P[0, 0] * U[w, 0] + P[0, 1] * U[w, 1] + P[0, 2] * U[w, 2]
-        dy = P[1, 0] * U[w, 0] + P[1, 1] * U[w, 1] + P[1, 2] * U[w, 2]
-        dz = P[2, 0] * U[w, 0] + P[2, 1] * U[w, 1] + P[2, 2] * U[w, 2]
-        if k < 2:
-            da, db, dc = dy * z1 - dz * y1, dz * x1 - dx * z1, dx * y1 - dy * x1
-        else:
-            da, db, dc = y0 * dz - z0 * dy, z0 * dx - x0 * dz, x0 * dy - y0 * dx
-        dh = (a * da + b * db) / h2
-        J[0, k] = ((da * ends[0] + db * ends[1] + dc) / h - r[0] * dh) / sigma
-        J[1, k] = ((da * ends[2] + db * ends[3] + dc) / h - r[1] * dh) / sigma
-    r[0] /= sigma
-    r[1] /= sigma
-    return True
-
-
-@kernel
-def _solve4(H, g, damping, x):
-    """Solve (H + damping diag H) x = g by Cholesky; False if not positive definite."""
-    L = np.zeros((4, 4))
-    for m in range(4):
-        for n in range(m + 1):
-            s = H[m, n]
-            if m == n:
-                s += damping * H[m, m] + 1e-300
-            for k in range(n):
-                s -= L[m, k] * L[n, k]
-            if m == n:
-                if not s > 1e-12 * H[m, m]:
-                    return False
-                L[m, m] = math.sqrt(s)
-            else:
-                L[m, n] = s / L[n, n]
-    for m in range(4):
-        s = g[m]
-        for k in range(m):
-            s -= L[m, k] * x[k]
-        x[m] = s / L[m, m]
-    for m in range(3, -1, -1):
-        s = x[m]
-        for k in range(m + 1, 4):
-            s -= L[k, m] * x[k]
-        x[m] = s / L[m, m]
-    return True
-
-
-@kernel
-def across_basis(X, U):
-    """Write two unit vectors across the line through the points X (2, 3)."""
-    d0, d1, d2 = X[1, 0] - X[0, 0], X[1, 1] - X[0, 1], X[1, 2] - X[0, 2]
-    n = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-    d0, d1, d2 = d0 / n, d1 / n, d2 / n
-    if abs(d0) <= abs(d1) and abs(d0) <= abs(d2):
-        u0, u1, u2 = 0.0, d2, -d1
-    elif abs(d1) <= abs(d2):
-        u0, u1, u2 = -d2, 0.0, d0
-    else:
-        u0, u1, u2 = d1, -d0, 0.0
-    n = math.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
-    u0, u1, u2 = u0 / n, u1 / n, u2 / n
-    U[0, 0], U[0, 1], U[0, 2] = u0, u1, u2
-    U[1, 0], U[1, 1], U[1, 2] = d1 * u2 - d2 * u1, d2 * u0 - d0 * u2, d0 * u1 - d1 * u0
-
-
-@kernel
-def _largest_deviation(H, g, x):
+def _largest_deviation(H, g, L, x):
     """Root of the largest diagonal entry of the inverse of H; infinite where it has none."""
     worst = 0.0
     for a in range(4):
         g[:] = 0.0
         g[a] = 1.0
-        if not _solve4(H, g, 0.0, x):
+        if not solve_damped(H, g, 0.0, L, x, _FOUR):
             return np.inf
         worst = max(worst, x[a])
     return math.sqrt(worst)
 
 
 @loop
-def refine(camera, image, ends, sigma, pointers, rows, active, X, squared, uncertainty, unchecked):
-    """Refine the lines through X (L, 2, 3) in place.
-
-    Also the squared distances over sigma of each observation (M,), the largest standard deviation of the end points
-    across the line (L,), and the same when the image that tells most is left out.
-    """
-    r, J, U = np.zeros(2), np.zeros((2, 4)), np.zeros((2, 3))
-    H, g, step, inverse = np.zeros((4, 4)), np.zeros(4), np.zeros(4), np.zeros(4)
-    trial, without = np.zeros((2, 3)), np.zeros((4, 4))
+def _examine(camera, image, ends, sigma, rows, pointers, active, X, U, information, squared, uncertainty, unchecked):
+    """Write what :class:`Fit` tells of lines that were refined."""
+    r, J, g, x = np.zeros(2), np.zeros((2, 4)), np.zeros(4), np.zeros(4)
+    L, without = np.zeros((4, 4)), np.zeros((4, 4))
     for n in range(len(pointers) - 1):
-        damping = 1e-4
-        cost = np.inf
-        for _ in range(20):
-            across_basis(X[n], U)
-            cost = 0.0
-            H[:, :] = 0.0
-            g[:] = 0.0
-            for m in range(pointers[n], pointers[n + 1]):
-                if not active[m]:
-                    continue
-                s = rows[m]
-                line_residuals(camera[image[s]], ends[s], sigma[s], X[n], U, r, J)
-                square = (r[0] * r[0] + r[1] * r[1]) / (_CAUCHY * _CAUCHY)
-                cost += math.log1p(square)
-                weight = 1.0 / (1.0 + square)
-                for a in range(4):
-                    g[a] -= weight * (J[0, a] * r[0] + J[1, a] * r[1])
-                    for b in range(a + 1):
-                        H[a, b] += weight * (J[0, a] * J[0, b] + J[1, a] * J[1, b])
-            done = better = False
-            for _ in range(8):
-                better = False
-                if _solve4(H, g, damping, step):
-                    for c in range(3):
-                        trial[0, c] = X[n, 0, c] + step[0] * U[0, c] + step[1] * U[1, c]
-                        trial[1, c] = X[n, 1, c] + step[2] * U[0, c] + step[3] * U[1, c]
-                    fresh = 0.0
-                    for m in range(pointers[n], pointers[n + 1]):
-                        if active[m]:
-                            s = rows[m]
-                            line_residuals(camera[image[s]], ends[s], sigma[s], trial, U, r, J)
-                            fresh += math.log1p((r[0] * r[0] + r[1] * r[1]) / (_CAUCHY * _CAUCHY))
-                    better = fresh <= cost
-                    done = fresh >= cost * (1.0 - 1e-9) - 1e-12
-                if better:
-                    for c in range(3):
-                        X[n, 0, c], X[n, 1, c] = trial[0, c], trial[1, c]
-                    damping = max(damping * 0.1, 1e-12)
-                    break
-                damping *= 10.0
-            if done or not better:
-                break
-        across_basis(X[n], U)
-        H[:, :] = 0.0
         for m in range(pointers[n], pointers[n + 1]):
             s = rows[m]
-            line_residuals(camera[image[s]], ends[s], sigma[s], X[n], U, r, J)
+            line_residuals(camera[image[s]], ends[s], sigma[s], X[n], U[n], r, J)
             squared[m] = r[0] * r[0] + r[1] * r[1]
-            if active[m]:
-                for a in range(4):
-                    for b in range(a + 1):
-                        H[a, b] += J[0, a] * J[0, b] + J[1, a] * J[1, b]
-        uncertainty[n] = _largest_deviation(H, g, inverse)
-        unchecked[n] = 0.0
+        uncertainty[n] = _largest_deviation(information[n], g, L, x)
         for m in range(pointers[n], pointers[n + 1]):
             if not active[m] or (m > pointers[n] and active[m - 1] and image[rows[m]] == image[rows[m - 1]]):
                 continue
             for a in range(4):
                 for b in range(a + 1):
-                    without[a, b] = H[a, b]
+                    without[a, b] = information[n, a, b]
             for k in range(m, pointers[n + 1]):
                 s = rows[k]
                 if image[s] != image[rows[m]]:
                     break
                 if active[k]:
-                    line_residuals(camera[image[s]], ends[s], sigma[s], X[n], U, r, J)
+                    line_residuals(camera[image[s]], ends[s], sigma[s], X[n], U[n], r, J)
                     for a in range(4):
                         for b in range(a + 1):
                             without[a, b] -= J[0, a] * J[0, b] + J[1, a] * J[1, b]
-            unchecked[n] = max(unchecked[n], _largest_deviation(without, g, inverse))
+            unchecked[n] = max(unchecked[n], _largest_deviation(without, g, L, x))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Lines of maximum likelihood."""
+
+    #: (L, 2, 3) points on the lines.
+    X: FloatArray
+    #: (M,) squared distances over sigma of each observation.
+    squared: FloatArray
+    #: (L,) largest standard deviation of the end points across the line, and the same when the image that tells most is
+    #: left out.
+    uncertainty: FloatArray
+    unchecked: FloatArray
+
+
+def fit_lines(
+    views: LineViews, sigma: FloatArray, pointers: IntArray, rows: IntArray, active: BoolArray, start: FloatArray
+) -> Fit:
+    """Fit lines to the segments ``rows`` (M,) that are ``active``, from lines through ``start`` (L, 2, 3)."""
+    data = (views.camera, views.image_idx, views.ends, sigma, rows)
+    found = solve_batch(TWO_POINT_LINE, data, pointers, active, start, cauchy_scale=_CAUCHY)
+    fit = Fit(found.states, np.zeros(len(rows)), np.zeros(len(start)), np.zeros(len(start)))
+    _examine(
+        *data, pointers, active, fit.X, found.frames, found.information, fit.squared, fit.uncertainty, fit.unchecked
+    )
+    return fit
 
 
 # ------------------------------------------------------------------------------------------------------------ Recover

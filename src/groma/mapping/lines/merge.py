@@ -23,8 +23,8 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators.two_point_line import across_basis, line_residuals
 from groma.gates import gate
-from groma.mapping.lines.fit import across_basis, line_residuals
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.tracks import Tracks

@@ -14,7 +14,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_ends import trim
 from groma.gates import gate
 from groma.mapping.groups import grouped, num_distinct
-from groma.mapping.lines.fit import refine
+from groma.mapping.lines.fit import fit_lines
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import LineViews
@@ -134,13 +134,11 @@ class Tracks:
         """Return the lines at maximum likelihood, without observations that do not fit and lines of too few images."""
         views = self.views
         rows, pointers = self.table()
-        lines, uncertainty, unchecked = self.lines.copy(), np.zeros(self.num_lines), np.zeros(self.num_lines)
+        lines, uncertainty, unchecked = self.lines, self.uncertainty, self.unchecked
         active, squared, front = np.ones(len(rows), bool), np.zeros(len(rows)), np.zeros(len(rows), bool)
         for k in range(self.gates.fitting_rounds):
-            refine(
-                views.camera, views.image_idx, views.ends, self.sigma, pointers, rows, active, lines, squared,
-                uncertainty, unchecked,
-            )  # fmt: skip
+            fit = fit_lines(views, self.sigma, pointers, rows, active, lines)
+            lines, squared, uncertainty, unchecked = fit.X, fit.squared, fit.uncertainty, fit.unchecked
             trim(views.center, views.image_idx, views.ray, views.length, pointers, rows, active, lines, front)
             fits = (squared < AGREEMENT.max_squared(2)) & front
             if k == self.gates.fitting_rounds - 1:

@@ -28,7 +28,7 @@ from groma.problem.gauge import world_motions
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 from groma.problem.problem import Problem
-from groma.solver.linear.reduced import Blocks, multiply
+from groma.solver.linear.blocks import Blocks, multiply
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.steps import Step
 

@@ -17,8 +17,8 @@ from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
+from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.elimination import LANDMARK_TOLERANCE, eliminate, scaled_blocks
-from groma.solver.linear.reduced import Blocks
 from groma.solver.linear.schur import ReducedSystem
 
 # ---------------------------------------------------------------------------------------------------------- Kernels

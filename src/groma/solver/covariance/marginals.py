@@ -39,9 +39,9 @@ from groma.solver.covariance.landmarks import Landmarks
 from groma.solver.covariance.rank_deficient import LOOSE, deficiency, hold_open_blocks, loses_the_cameras, zero_modes
 from groma.solver.covariance.s_transform import Transformation, datum_weights, transformation
 from groma.solver.linear.blas import one_blas_thread
+from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.fronts import Fronts
 from groma.solver.linear.modes import divided, scaled, smallest
-from groma.solver.linear.reduced import Blocks
 from groma.solver.linear.schur import ReducedSystem
 
 #: A scaled variance above this means a direction that the data do not determine.

@@ -16,10 +16,10 @@ from groma._typing import BoolArray, FloatArray
 from groma.errors import ProblemError
 from groma.problem.layout import KeptClass, Layout
 from groma.problem.linearization import NormalEquations
+from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.elimination import LANDMARK_TOLERANCE, scaled_blocks
 from groma.solver.linear.fronts import Fronts
 from groma.solver.linear.modes import MODES, Modes, smallest
-from groma.solver.linear.reduced import Blocks
 
 #: A variable that moves by more than this in a scaled mode of zero cost is loose; this share of the poses may be.
 LOOSE, MAX_LOOSE = 1e-6, 0.2

@@ -22,6 +22,7 @@ from groma._simd import add_matvec, add_product, set_product, width
 from groma._typing import FloatArray, IntArray
 from groma.problem.layout import Layout
 from groma.problem.sorting import argsort_by
+from groma.solver.linear.contract import PIVOT_TOLERANCE
 from groma.solver.linear.ordering import fill_reducing_order
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -114,7 +115,7 @@ def _factorize(pointer, column, slot, flipped, diagonal, parent, S, first, rows,
                     total -= L[r, k] * L[c, k]
                 if r > c:
                     L[r, c] = total * inverse[c, c]
-                elif total > 0.0:
+                elif total > PIVOT_TOLERANCE * S[np.int64(diagonal[i]) * size + r * b + r]:
                     L[r, r] = np.sqrt(total)
                     inverse[r, r] = 1.0 / L[r, r]
                 else:

@@ -30,8 +30,8 @@ from scipy.linalg import get_lapack_funcs, solve_triangular
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.problem.layout import Layout
+from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.ordering import fill_reducing_order
-from groma.solver.linear.reduced import Blocks
 from groma.solver.linear.visible_motion import distinct
 
 #: A reduced system with more than this share of its blocks filled is one front.

@@ -14,8 +14,8 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.problem.layout import Layout
+from groma.solver.linear.blocks import Blocks, multiply
 from groma.solver.linear.fronts import Fronts
-from groma.solver.linear.reduced import Blocks, multiply
 
 #: Eigenvalues of the scaled system below this count as zero: rounding reaches about 1e-13.
 NULL_TOLERANCE = 1e-11

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The reduced system at one place, for one damping after the other: what all strategies ask for a step."""
+"""The reduced system at one place, for one damping after the other."""
 
 from __future__ import annotations
 
 from groma._typing import FloatArray
 from groma.problem.layout import Chunk
 from groma.problem.linearization import NormalEquations
-from groma.solver.linear.reduced import LinearSolver
+from groma.solver.linear.contract import LinearSolver
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.report import Stopwatch
 from groma.solver.steps import States
@@ -19,19 +19,17 @@ class Reduction:
         self, equations: NormalEquations, system: ReducedSystem, linear: LinearSolver, watch: Stopwatch
     ) -> None:
         self.equations, self.system, self.linear, self.watch = equations, system, linear, watch
-        self._at: tuple[States, list[tuple]] = ({}, [])
+        self._states: States = {}
+        self._damping = 0.0
 
     def linearize(self, states: States, inputs: list[tuple], damping: float) -> float:
         """Form the normal equations; eliminate each chunk's landmarks right after, while they are in cache.
 
         Returns the cost at the states.
         """
-        self._at = (states, inputs)
+        self._states, self._damping = states, damping
         with self.watch("solve"):
             self.linear.follow(states)
-        return self._form(damping)
-
-    def _form(self, damping: float) -> float:
         spent = [0.0]
 
         def eliminate(share: int, chunk: Chunk) -> None:
@@ -42,21 +40,25 @@ class Reduction:
 
         with self.watch("linearize"):
             self.system.clear()
-            cost = self.equations.linearize(*self._at, eliminate)
+            cost = self.equations.linearize(states, inputs, eliminate)
         self.watch.move("linearize", "schur", spent[0])
         return cost
 
-    def damp(self, damping: float) -> None:
-        """Eliminate the landmarks for another damping; compact equations are formed anew for that."""
-        if self.equations.compact:
-            self._form(damping)
-            return
-        with self.watch("schur"):
-            self.system.eliminate(damping)
+    def form(self, states: States, inputs: list[tuple], damping: float) -> None:
+        """Do what is missing of :meth:`linearize`: for another damping alone, landmarks are eliminated again.
 
-    def solve(self, damping: float) -> list[FloatArray] | None:
+        Compact equations are linearised for that, too.
+        """
+        if states is not self._states or (damping != self._damping and self.equations.compact):
+            self.linearize(states, inputs, damping)
+        elif damping != self._damping:
+            self._damping = damping
+            with self.watch("schur"):
+                self.system.eliminate(damping)
+
+    def solve(self) -> list[FloatArray] | None:
         """Return the steps of the kept blocks by class, flat; None if the system is not positive definite."""
         with self.watch("schur"):
-            self.system.assemble(damping)
+            self.system.assemble(self._damping)
         with self.watch("solve"):
             return self.linear.solve(self.system.S, self.system.rhs)

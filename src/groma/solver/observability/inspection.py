@@ -21,7 +21,7 @@ from groma.problem.linearization import NormalEquations
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
 from groma.solver.covariance.datum import FREE_TOLERANCE, free_motions, held_coordinates, middle_and_extent, unmoved
-from groma.solver.linear.reduced import multiply
+from groma.solver.linear.blocks import multiply
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.linear.visible_motion import camera_centers, motion
 from groma.solver.observability.messages import Names

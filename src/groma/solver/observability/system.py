@@ -8,8 +8,8 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from groma._typing import BoolArray, FloatArray
+from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.modes import Modes, divided, scaled
-from groma.solver.linear.reduced import Blocks
 from groma.solver.observability.findings import Finding, few, first_upper
 from groma.solver.observability.inspection import UNDETERMINED, Inspection
 from groma.solver.observability.messages import listing

@@ -14,9 +14,9 @@ import scipy.sparse.linalg
 
 from groma._typing import BoolArray, FloatArray
 from groma.problem.layout import Layout
+from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.fronts import Fronts
 from groma.solver.linear.modes import MAX_SHIFT, MODES, ROUNDS, SHIFT, Modes, smallest
-from groma.solver.linear.reduced import Blocks
 
 #: Systems of up to so many unknowns are decomposed completely.
 DENSE = 300

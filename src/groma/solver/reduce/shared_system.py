@@ -12,6 +12,7 @@ from groma.problem.layout import KeptClass, Layout, Member
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.linear.schur import MIN_DIAGONAL, ReducedSystem
+from groma.solver.reduce.alone import Reducer
 from groma.solver.steps import States
 
 
@@ -69,15 +70,32 @@ class SharedSystem:
 
     def _add_blocks(self, a: int, b: int, number: IntArray, blocks: FloatArray) -> None:
         known = self._number.get((a, b), np.zeros(0, np.int64))
-        values = self._blocks.get((a, b), np.zeros((0, self._sizes[a][1], self._sizes[b][1])))
         place = np.searchsorted(known, number)
         if len(known) == 0 or (known[np.minimum(place, len(known) - 1)] != number).any():
-            union = np.union1d(known, number)
-            grown = np.zeros((len(union), *values.shape[1:]))
-            grown[np.searchsorted(union, known)] = values
-            known, values, place = union, grown, np.searchsorted(union, number)
-            self._number[a, b], self._blocks[a, b] = known, values
-        np.add.at(values, place, blocks)
+            known = np.union1d(known, number)
+            self._grow(a, b, known)
+            place = np.searchsorted(known, number)
+        np.add.at(self._blocks[a, b], place, blocks)
+
+    def _grow(self, a: int, b: int, number: IntArray) -> None:
+        """Make room for the blocks of these numbers, which contain those that are there."""
+        grown = np.zeros((len(number), self._sizes[a][1], self._sizes[b][1]))
+        if (a, b) in self._number:
+            grown[np.searchsorted(number, self._number[a, b])] = self._blocks[a, b]
+        self._number[a, b], self._blocks[a, b] = number, grown
+
+    def reduce(self, reducer: Reducer) -> None:
+        """Add the sums of all machines; to be called once, when the shards have been visited."""
+        for sums in (self._on_diagonal, self._curvature, self._gradient, self._rhs):
+            sums[:] = [reducer.sum(part) for part in sums]
+        for a in range(len(self._sizes)):
+            for b in range(a, len(self._sizes)):
+                own = self._number.get((a, b), np.zeros(0, np.int64))
+                number = reducer.union(own)
+                if len(number) > len(own):
+                    self._grow(a, b, number)
+                if len(number):
+                    self._blocks[a, b] = reducer.sum(self._blocks[a, b])
 
     def _cut(self, layout: Layout, system: ReducedSystem) -> Iterator[tuple[int, int, IntArray, IntArray, FloatArray]]:
         """Yield the blocks of a shard by pairs of groups a <= b: rows, columns and blocks of single variables."""
@@ -135,15 +153,12 @@ class SharedSystem:
         row, column = np.divmod(number, self._sizes[b][0])
         return row.astype(np.int32), column.astype(np.int32)
 
-    def decrease(self, step: list[FloatArray], damping: float, residual: list[FloatArray] | None) -> float:
-        """Return the kept variables' part of the decrease that the quadratic model predicts."""
-        total = 0.0
-        for delta, curvature, gradient in zip(step, self._curvature, self._gradient, strict=True):
-            total += damping * float((np.maximum(curvature, MIN_DIAGONAL).reshape(-1) * delta) @ delta)
-            total -= float(gradient.reshape(-1) @ delta)
-        if residual is not None:
-            total += sum(float(r @ delta) for r, delta in zip(residual, step, strict=True))
-        return 0.5 * total
+    def model(self, step: list[FloatArray]) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+        """Return diagonal, gradient and step of every class, flat; they are kept when the sums are cleared."""
+        return [
+            (curvature.reshape(-1), gradient.reshape(-1), delta)
+            for curvature, gradient, delta in zip(self._curvature, self._gradient, step, strict=True)
+        ]
 
     def retract(self, states: States, step: list[FloatArray]) -> States:
         """Return the kept variables moved by a step."""

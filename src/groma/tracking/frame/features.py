@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
-from groma.features.lsd import LsdDetector
 from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
 from groma.tracking.frame.camera import TrackCamera
@@ -81,9 +80,8 @@ class FrameFeatures:
 
     @cached_property
     def detected(self) -> DetectedSegments:
-        """Segments by LSD, fitted to the grey levels."""
-        detector = LsdDetector(min_length=self.options.min_segment_length, max_segments=2 * self.options.num_lines)
-        segments = detector.detect(self.gray)
+        """Segments by the chosen detector."""
+        segments = self.options.make_detector().detect(self.gray)
         inverse, sigma = self.inverse_depths(segments.ends)
         return DetectedSegments(segments, inverse, sigma)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from groma._counted import counted
 
 if TYPE_CHECKING:
-    from groma.scene import Scene
+    from groma.scene.scene import Scene
 
 
 def counts_of(scene: "Scene") -> dict[str, int]:
@@ -27,3 +27,6 @@ def sentence_of(scene: "Scene", geometry: bool = False) -> str:
         counts = {kind: counts[kind] for kind in ("points", "lines", "planes")}
     said = [counted(count, kind) for kind, count in counts.items() if count or kind == "images"]
     return ", ".join(said) or "nothing"
+
+
+__all__ = ["counts_of", "sentence_of"]

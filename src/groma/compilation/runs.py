@@ -90,7 +90,7 @@ def _cameras(name: str, count: int) -> Cameras:
 
 
 def _map_steps() -> Steps:
-    from groma.cli.shared import cabinet as _cabinet
+    from groma.evaluation import cabinet as _cabinet
     from groma.io import read_scene
     from groma.mapping.map import MapOptions, map_images
 

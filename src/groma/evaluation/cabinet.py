@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The scene of ``groma demo``, and how near a map of it comes to what was measured.
+"""The packaged scene of ``groma demo``, and how near a map of it comes to what was measured.
 
 58 photographs of a filing cabinet; a start from points alone (SIFT, matches of neighbours, incremental mapping); poses
 by motion capture, which the map never sees. See ``data/ATTRIBUTION.md``.
@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from groma.evaluation import evaluate_poses
-from groma.mapping.map import MapResult
+from groma.evaluation.poses import evaluate_poses
 from groma.scene import Scene, Similarity
 
 #: The cabinet in the frame of the motion capture: centre, heading about the vertical z, half sizes. Metres, radians.
@@ -50,13 +49,20 @@ def folder() -> Path:
     return Path(str(files("groma"))) / "data" / "cabinet"
 
 
-def judge(result: MapResult, reference: Scene) -> dict[str, Any]:
+def evaluate_cabinet(start: Scene, scene: Scene, reference: Scene) -> dict[str, Any]:
     """Return how near the map of the cabinet comes to the poses and the size that were measured.
 
     Photographs have no scale: the map is aligned with the motion capture by a similarity of the camera centres.
+
+    Parameters
+    ----------
+    start, scene : Scene
+        The model that the map began with, and the map.
+    reference : Scene
+        Poses by motion capture, in ``folder() / "motion_capture"``.
     """
-    before, after = evaluate_poses(result.start, reference), evaluate_poses(result.scene, reference)
-    cabinet = score_cabinet(result.scene, after.alignment)
+    before, after = evaluate_poses(start, reference), evaluate_poses(scene, reference)
+    cabinet = score_cabinet(scene, after.alignment)
     return {
         "poses": {"before": before.to_dict(), "after": after.to_dict()},
         "cabinet": {
@@ -66,12 +72,12 @@ def judge(result: MapResult, reference: Scene) -> dict[str, Any]:
             "size": cabinet.size,
             "size_measured": 2 * HALF_SIZE,
         },
-        "right_angles_deg": right_angles(result.scene),
+        "right_angles_deg": right_angles(scene),
     }
 
 
 def sentences(numbers: dict[str, Any]) -> list[str]:
-    """Say what :func:`judge` found."""
+    """Say what :func:`evaluate_cabinet` found."""
     poses, cabinet, angles = numbers["poses"], numbers["cabinet"], numbers["right_angles_deg"]
     size = " x ".join("?" if np.isnan(value) else f"{value:.2f}" for value in cabinet["size"])
     measured = " x ".join(f"{value:.2f}" for value in cabinet["size_measured"])

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The numbers of an adjustment as lines of text."""
+"""Numbers as lines of text: of an adjustment, its uncertainties, its contributions, and what a scene determines."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from groma._counted import counted
-from groma.cli.shared.compilation import spent
 
 _SIGMAS = (
     ("centres", "center", ""),
@@ -74,3 +73,36 @@ def describe_uncertainty(numbers: Mapping[str, Any]) -> list[str]:
     if left:
         lines.append(f"    {left:,} points, segment ends and planes are not determined and have none")
     return lines
+
+
+def describe_contributions(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return one line for each adjustment, points alone first; the entries are those of ``--json``."""
+    lines = ["With and without:"] if entries else []
+    for number, entry in enumerate(entries):
+        parts = [f"{name} {value:.3f} px" for name, value in entry["rmse_px"].items()]
+        if number:
+            parts.append(f"cameras moved {entry['moved']:.3g}")
+        if entry["center_sigma"] is not None:
+            parts.append(f"centres known to {entry['center_sigma']:.3g}")
+        elif number == 0 or not entries[number - 1]["center_sigma_missing"]:
+            parts.append(f"centres not predicted: {entry['center_sigma_missing'].rstrip('.')}")
+        if entry["center_error"] is not None:
+            parts.append(f"error {entry['center_error']:.4g}, {entry['rotation_error_deg']:.4f}°")
+        if entry["num_relations"]:
+            parts.append(f"{entry['num_dropped']:,} of {entry['num_relations']:,} relations given up")
+        lines.append(f"  {('and ' if number else '') + entry['added']:<26}{', '.join(parts)}")
+    return lines
+
+
+def spent(total: float, compilation: float, compiled: bool) -> str:
+    """Return for example ``0.13 s, and 0.98 s to load compiled code``.
+
+    Parameters
+    ----------
+    total, compilation : float
+        Seconds of the work as a whole, and those of them that went into compiled code.
+    compiled : bool
+        Whether it was compiled, and not only loaded.
+    """
+    apart = f", and {compilation:.2f} s to {'compile' if compiled else 'load compiled code'}"
+    return f"{max(total - compilation, 0.0):.2f} s{apart if compilation >= 0.005 else ''}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How much of the time of a command goes into compiled code: compiling it, or loading it from disk."""
+"""How much time goes into compiled code: compiling it, or loading it from disk."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,18 +30,4 @@ def compilation_time() -> Iterator[Compilation]:
     found.compiled = counts.compiled + counts.unsaved > before
 
 
-def spent(total: float, compilation: float, compiled: bool) -> str:
-    """Return for example ``0.13 s, and 0.98 s to load compiled code``.
-
-    Parameters
-    ----------
-    total, compilation : float
-        Seconds of the work as a whole, and those of them that went into compiled code.
-    compiled : bool
-        Whether it was compiled, and not only loaded.
-    """
-    apart = f", and {compilation:.2f} s to {'compile' if compiled else 'load compiled code'}"
-    return f"{max(total - compilation, 0.0):.2f} s{apart if compilation >= 0.005 else ''}"
-
-
-__all__ = ["Compilation", "compilation_time", "spent"]
+__all__ = ["Compilation", "compilation_time"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The file of ``groma adjust --covariance``: covariances as arrays (.npz), or standard deviations as text (.json).
+"""Files of covariances: arrays (.npz), or standard deviations as text (.json). ``groma adjust --covariance``.
 
 ===============  =============  ======================================================================================
 Array            Shape          Content
@@ -15,41 +15,66 @@ Array            Shape          Content
 ``gauge``        ()             ``inner`` or ``held``, and in ``sigma0`` the factor that was applied
 ===============  =============  ======================================================================================
 
-Scene units and radians; NaN where the data leave something open.
+Scene units and radians; NaN for what is not observable.
 """
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from groma._json import json_text
 from groma._typing import FloatArray
-from groma.cli.shared import output as _output
-
-if TYPE_CHECKING:
-    from groma.adjustment.uncertainty import SceneUncertainty
-    from groma.scene import Scene
+from groma.adjustment.uncertainty import SceneUncertainty
+from groma.errors import InputError
+from groma.io import atomic_output
+from groma.scene import Scene
 
 #: Fields of :class:`SceneUncertainty` that go into the file as they are.
 _FIELDS = ("poses", "centers", "points", "lines", "segment_ends", "planes", "directions")
 
 
-def write_covariances(path: Path, scene: Scene, found: SceneUncertainty, force: bool) -> None:
-    """Write what is known of the uncertainty of a scene; the ending of ``path`` chooses the form."""
-    if path.suffix == ".json":
-        _output.write_json(str(path), standard_deviations(scene, found), force)
+def write_covariances(
+    path: str | os.PathLike[str], scene: Scene, uncertainty: SceneUncertainty, force: bool = False
+) -> None:
+    """Write what is known of the uncertainty of a scene, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        Ends in ``.npz`` for arrays (the module lists them), or ``.json`` for standard deviations by name.
+    scene : Scene
+        The scene that ``uncertainty`` is about.
+    uncertainty : SceneUncertainty
+        As :func:`groma.uncertainty` returns it.
+    force : bool
+        Replace what is there.
+
+    Raises
+    ------
+    InputError
+        If the name ends otherwise.
+    OutputError
+        If something is there already or the file system refuses.
+    """
+    if Path(path).suffix not in (".npz", ".json"):
+        raise InputError(f"A file of covariances must end in .npz or .json; got {path}.")
+    if Path(path).suffix == ".json":
+        with atomic_output(path, force) as draft:
+            draft.write_text(json_text(standard_deviations(scene, uncertainty)), encoding="utf-8")
         return
-    arrays: dict[str, Any] = {name: getattr(found, name) for name in _FIELDS}
+    arrays: dict[str, Any] = {name: getattr(uncertainty, name) for name in _FIELDS}
     arrays |= {
-        "gauge": np.array(found.gauge),
-        "sigma0": np.array(found.sigma0),
+        "gauge": np.array(uncertainty.gauge),
+        "sigma0": np.array(uncertainty.sigma0),
         "image_names": np.array(scene.images.names, dtype=np.str_),
         "image_frames": np.asarray(scene.images.frame_idx),
         **{f"{kind}_ids": np.asarray(ids) for kind, ids in _ids(scene).items()},
     }
-    with _output.atomic_output(path, force) as draft, draft.open("wb") as file:
+    with atomic_output(path, force) as draft, draft.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
@@ -94,3 +119,6 @@ def _sigma(covariance: FloatArray) -> FloatArray:
 def _total(covariance: FloatArray) -> FloatArray:
     """Roots of the summed variances (N,) of covariances (N, m, m)."""
     return np.sqrt(np.maximum(np.einsum("nii->n", covariance), 0.0))
+
+
+__all__ = ["standard_deviations", "write_covariances"]

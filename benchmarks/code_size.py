@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The size and form of the sources as one table of counts, read from the syntax and not run.
+
+    python benchmarks/code_size.py [--root DIR] [--list ROW]
+
+Compares two states of the house: run it on both checkouts. ``--list`` prints what a row counts.
+
+==========================  ==========================================================================================
+Row                         Rule
+==========================  ==========================================================================================
+lines, source lines         all lines of ``src/groma/**/*.py``; those that are neither blank, comment nor docstring
+long functions              more than 60 lines from ``def`` to the end, without the docstring
+many arguments              ten or more arguments, ``self`` and ``cls`` not counted; in rows of their own kernels
+                            (``@kernel``, ``@loop``) and the command line, whose arguments are its options
+private imports             imports of an underscored name or module by another package than the one that holds it
+optimiser loops             functions with a loop in which a name that contains ``damp`` or ``lambda`` is assigned to:
+                            every damped least-squares loop raises and lowers its damping
+named numbers               module-level names in capitals whose value is a number or a tuple of numbers
+option defaults             fields of classes ``...Options`` whose default is a number
+gates with origin           fields of classes ``...Gates`` that call ``gate`` or ``chi_square_gate``
+inline numbers              floats inside functions other than 0, 1, -1, 2, 0.5 and powers of ten, defaults of
+                            arguments included; kernels too
+... in decisions            those of them inside a comparison
+public names                ``groma.__all__``; and functions and classes without underscore in modules without one
+==========================  ==========================================================================================
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+Found: TypeAlias = list[str]
+Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
+LONG, MANY = 60, 10
+
+
+@dataclass(frozen=True)
+class Module:
+    """A source file."""
+
+    name: str
+    is_package: bool
+    text: str
+    tree: ast.Module
+
+
+def modules_of(root: Path) -> list[Module]:
+    """Read the sources of a checkout."""
+    found = []
+    for path in sorted((root / "src" / "groma").rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        parts = path.relative_to(root / "src").with_suffix("").parts
+        is_package = parts[-1] == "__init__"
+        found.append(Module(".".join(parts[: len(parts) - is_package]), is_package, text, ast.parse(text)))
+    return found
+
+
+def docstring_lines(node: ast.AST) -> set[int]:
+    """Return the lines of the docstring of a module, class or function."""
+    body = getattr(node, "body", [])
+    if body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
+        if isinstance(body[0].value.value, str):
+            return set(range(body[0].lineno, (body[0].end_lineno or 0) + 1))
+    return set()
+
+
+def source_lines(module: Module) -> int:
+    """Count the lines that are neither blank, comment nor docstring."""
+    documented: set[int] = set()
+    for node in ast.walk(module.tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            documented |= docstring_lines(node)
+    return sum(
+        bool(line.strip()) and not line.strip().startswith("#") and number not in documented
+        for number, line in enumerate(module.text.splitlines(), 1)
+    )
+
+
+def functions(module: Module) -> Iterator[tuple[str, Function]]:
+    """Yield all functions with their names, inner ones too."""
+
+    def inside(node: ast.AST, prefix: str) -> Iterator[tuple[str, Function]]:
+        for child in ast.iter_child_nodes(node):
+            named = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef))
+            name = f"{prefix}.{child.name}" if named else prefix
+            if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                yield name, child
+            yield from inside(child, name)
+
+    return inside(module.tree, module.name)
+
+
+def classes(module: Module, ending: str) -> Iterator[tuple[str, ast.AnnAssign]]:
+    """Yield the fields with a default of the classes whose name has an ending."""
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.ClassDef) and node.name.endswith(ending):
+            for field in node.body:
+                if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and field.value is not None:
+                    yield f"{module.name}.{node.name}.{field.target.id}", field
+
+
+def long_functions(modules: list[Module]) -> Found:
+    """Functions of more than sixty lines."""
+    return [
+        f"{name} ({lines})"
+        for module in modules
+        for name, node in functions(module)
+        if (lines := (node.end_lineno or 0) - node.lineno + 1 - len(docstring_lines(node))) > LONG
+    ]
+
+
+def many_arguments(modules: list[Module], kind: str = "") -> Found:
+    """Functions of ten arguments and more: ``kernels``, those of the command line (``cli``), or all others."""
+    found = []
+    for module in modules:
+        for name, node in functions(module):
+            every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            count = sum(argument.arg not in ("self", "cls") for argument in every)
+            words = {
+                part.id
+                for decorator in node.decorator_list
+                for part in ast.walk(decorator)
+                if isinstance(part, ast.Name)
+            }
+            here = "cli" if module.name.startswith("groma.cli.") else "kernels" if words & {"kernel", "loop"} else ""
+            if count >= MANY and here == kind:
+                found.append(f"{name} ({count})")
+    return found
+
+
+def private_imports(modules: list[Module]) -> Found:
+    """Imports of underscored names and modules by another package."""
+    packages = {module.name for module in modules if module.is_package}
+    found = []
+    for module in modules:
+        for node in ast.walk(module.tree):
+            names: list[str] = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            for name in (name for name in names if name.split(".")[0] == "groma"):
+                parts = name.split(".")
+                hidden = [k for k, part in enumerate(parts) if part.startswith("_") and not part.startswith("__")]
+                if not hidden:
+                    continue
+                owner = ".".join(parts[: hidden[0]])
+                owner = owner if owner in packages else owner.rpartition(".")[0]
+                if module.name != owner and not module.name.startswith(f"{owner}."):
+                    found.append(f"{module.name}: {name}")
+    return found
+
+
+def optimiser_loops(modules: list[Module]) -> Found:
+    """Functions with a loop that changes a damping."""
+
+    def changes_damping(loop: ast.AST) -> bool:
+        for node in ast.walk(loop):
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+            if isinstance(node, (ast.Assign, ast.AugAssign, ast.AnnAssign)):
+                for name in (part for target in targets if target is not None for part in ast.walk(target)):
+                    word = getattr(name, "id", getattr(name, "attr", ""))
+                    if "damp" in word.lower() or "lambda" in word.lower():
+                        return True
+        return False
+
+    return [
+        name
+        for module in modules
+        for name, node in functions(module)
+        if any(isinstance(loop, (ast.For, ast.While)) and changes_damping(loop) for loop in ast.walk(node))
+    ]
+
+
+def is_number(node: ast.AST | None) -> bool:
+    """Whether an expression is a number, or a tuple or arithmetic of numbers."""
+    if isinstance(node, ast.Constant):
+        return isinstance(node.value, (int, float)) and not isinstance(node.value, bool)
+    if isinstance(node, ast.UnaryOp):
+        return is_number(node.operand)
+    if isinstance(node, ast.BinOp):
+        return is_number(node.left) and is_number(node.right)
+    return isinstance(node, (ast.Tuple, ast.List)) and bool(node.elts) and all(is_number(item) for item in node.elts)
+
+
+def named_numbers(modules: list[Module]) -> Found:
+    """Module-level names in capitals that are numbers."""
+    found = []
+    for module in modules:
+        for node in module.tree.body:
+            if not isinstance(node, (ast.Assign, ast.AnnAssign)) or not is_number(node.value):
+                continue
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                names = target.elts if isinstance(target, ast.Tuple) else [target]
+                found += [f"{module.name}.{n.id}" for n in names if isinstance(n, ast.Name) and n.id.isupper()]
+    return found
+
+
+def option_defaults(modules: list[Module]) -> Found:
+    """Fields of options that are numbers by default."""
+    return [name for module in modules for name, field in classes(module, "Options") if is_number(field.value)]
+
+
+def gates(modules: list[Module]) -> Found:
+    """Fields of gates that say where their number is from."""
+    return [
+        name
+        for module in modules
+        for name, field in classes(module, "Gates")
+        if isinstance(field.value, ast.Call) and getattr(field.value.func, "id", "") in ("gate", "chi_square_gate")
+    ]
+
+
+def is_usual(value: float) -> bool:
+    """Whether a number needs no origin: 0, 1, 2, 0.5 and powers of ten."""
+    return value in (0.0, 1.0, 2.0, 0.5) or (value > 0 and math.log10(value) == round(math.log10(value)))
+
+
+def inline_numbers(modules: list[Module], decisions: bool = False) -> Found:
+    """Floats inside functions that need an origin; only those inside comparisons if ``decisions``."""
+    found = set()
+
+    def collect(node: ast.AST, module: str, inside: bool) -> None:
+        if isinstance(node, ast.Constant) and isinstance(node.value, float) and inside and not is_usual(node.value):
+            found.add((f"{module}:{node.lineno}:{node.col_offset}", node.value))
+        opens = (ast.Compare,) if decisions else (ast.FunctionDef, ast.AsyncFunctionDef)
+        for child in ast.iter_child_nodes(node):
+            collect(child, module, inside or isinstance(child, opens))
+
+    for module in modules:
+        collect(module.tree, module.name, False)
+    return [f"{place}: {value}" for place, value in sorted(found)]
+
+
+def top_level_names(modules: list[Module]) -> Found:
+    """Names in ``groma.__all__``."""
+    root = next(module for module in modules if module.name == "groma")
+    for node in root.tree.body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+            return list(ast.literal_eval(node.value))
+    return []
+
+
+def public_names(modules: list[Module]) -> Found:
+    """Functions and classes without underscore in modules without one."""
+    return [
+        f"{module.name}.{node.name}"
+        for module in modules
+        if "._" not in module.name
+        for node in module.tree.body
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)) and not node.name.startswith("_")
+    ]
+
+
+#: Rows of the table and what they list; the lines are counted apart.
+ROWS: dict[str, Callable[[list[Module]], Found]] = {
+    "files": lambda modules: [module.name for module in modules],
+    "functions": lambda modules: [name for module in modules for name, _ in functions(module)],
+    "long functions": long_functions,
+    "many arguments": many_arguments,
+    "many arguments, kernels": lambda modules: many_arguments(modules, "kernels"),
+    "many arguments, command line": lambda modules: many_arguments(modules, "cli"),
+    "private imports": private_imports,
+    "optimiser loops": optimiser_loops,
+    "named numbers": named_numbers,
+    "option defaults": option_defaults,
+    "gates with origin": gates,
+    "inline numbers": inline_numbers,
+    "inline numbers in decisions": lambda modules: inline_numbers(modules, decisions=True),
+    "public names, groma.__all__": top_level_names,
+    "public names, all modules": public_names,
+}
+
+
+def counts(root: Path) -> dict[str, int]:
+    """Return the table of a checkout."""
+    modules = modules_of(root)
+    table = {"lines": sum(len(module.text.splitlines()) for module in modules)}
+    table["source lines"] = sum(map(source_lines, modules))
+    in_cli = [module for module in modules if module.name.startswith("groma.cli")]
+    table["source lines, cli"] = sum(map(source_lines, in_cli))
+    return table | {row: len(listed(modules)) for row, listed in ROWS.items()}
+
+
+def main() -> None:
+    """Print the table, or what one row counts."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[1], help="checkout to measure")
+    parser.add_argument("--list", metavar="ROW", choices=ROWS, help="print what a row counts")
+    arguments = parser.parse_args()
+    if arguments.list:
+        print(*ROWS[arguments.list](modules_of(arguments.root)), sep="\n")
+        return
+    for row, count in counts(arguments.root).items():
+        print(f"{row:<30}{count:>8,}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What comes out of an adjustment: the scene, and a report in its terms, as text and as plain numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from groma._counted import counted
+from groma.problem.problem import Problem
+from groma.scene import Scene
+from groma.solver.report import SolveReport
+from groma.solver.termination import Termination
+
+if TYPE_CHECKING:
+    from groma.adjustment.contributions import Contribution
+    from groma.adjustment.uncertainty import SceneUncertainty
+    from groma.solver.observability.diagnosis import Diagnosis
+
+#: An adjustment creeps if, after so many accepted steps, one lowers the cost by less than this share.
+CREEPING_STEPS, CREEPING = 10, 0.2
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress callback gets after every step."""
+
+    #: Steps tried so far, and the most there may be.
+    iteration: int
+    max_iterations: int
+    #: The cost after this step.
+    cost: float
+
+
+@dataclass(frozen=True)
+class AdjustReport:
+    """Outcome of :func:`adjust` in the terms of the scene; as a string, its main figures."""
+
+    #: What took part.
+    num_images: int
+    num_points: int
+    num_lines: int
+    num_planes: int
+    num_observations: int
+    #: Root mean square residual by kind of landmark, pixels: {kind: {before, after}}, without the loss.
+    rmse_px: dict[str, dict[str, float]]
+    #: How the solver got there.
+    solve: SolveReport
+    #: Sentences for the user.
+    warnings: tuple[str, ...]
+    #: One entry per loss that was solved with, in order: loss, initial_cost, first_step. Costs of different stages
+    #: cannot be compared.
+    stages: tuple[dict[str, Any], ...] = ()
+    #: Relations between landmarks by kind: how many held, and how many the loss gave up, which the scene then drops.
+    relations: dict[str, dict[str, int]] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        counts = {"images": self.num_images, "points": self.num_points, "lines": self.num_lines}
+        counts |= {"planes": self.num_planes, "observations": self.num_observations}
+        rows = [", ".join(counted(number, kind) for kind, number in counts.items() if number)]
+        rows += [
+            f"{kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms)"
+            for kind, rmse in self.rmse_px.items()
+            if None not in rmse.values()
+        ]
+        return "\n".join([*rows, str(self.solve), *(f"warning: {sentence}" for sentence in self.warnings)])
+
+    @property
+    def termination(self) -> Termination:
+        """Why the solve stopped."""
+        return self.solve.termination
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        """One entry per step tried: iteration, stage, cost, accepted, damping, step_norm, seconds and more."""
+        firsts = [stage["first_step"] for stage in self.stages]
+        return [
+            {**asdict(record), "stage": sum(first <= record.iteration for first in firsts)}
+            for record in self.solve.history
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as plain numbers and words, for JSON."""
+        solve = self.solve
+        return {
+            "num_images": self.num_images,
+            "num_points": self.num_points,
+            "num_lines": self.num_lines,
+            "num_planes": self.num_planes,
+            "num_observations": self.num_observations,
+            "num_residuals": solve.num_residuals,
+            "num_unknowns": solve.num_unknowns,
+            "initial_cost": solve.initial_cost,
+            "final_cost": solve.final_cost,
+            "initial_costs": solve.initial_costs,
+            "final_costs": solve.final_costs,
+            "reduced_chi_square": solve.reduced_chi_square,
+            "iterations": solve.iterations,
+            "termination": solve.termination.key,
+            "termination_sentence": solve.termination.sentence,
+            "converged": solve.converged,
+            "linear_solver": solve.linear_solver,
+            "threads": solve.threads,
+            "seconds": dict(solve.seconds),
+            "rmse_px": self.rmse_px,
+            "relations": self.relations,
+            "stages": list(self.stages),
+            "num_degenerate": solve.num_degenerate,
+            "num_underdetermined_landmarks": solve.num_underdetermined_landmarks,
+            "history": self.history,
+        }
+
+
+@dataclass(frozen=True)
+class AdjustResult:
+    """The adjusted scene and the report."""
+
+    scene: Scene
+    report: AdjustReport
+    #: The problem at its solution, for covariances and diagnosis; None in a result read from a file.
+    problem: Problem | None = None
+
+    def diagnose(self) -> Diagnosis:
+        """Say in words what the observations determine, at the noise and with the loss of the adjustment."""
+        from groma.adjustment.diagnosis import diagnose_scene
+
+        return diagnose_scene(self.scene, problem=self.problem)
+
+    def uncertainty(self, gauge: str = "auto", sigma0: float = 1.0) -> SceneUncertainty:
+        """Return the covariances of the scene: :func:`groma.uncertainty` of the problem that was solved."""
+        from groma.adjustment.uncertainty import uncertainty
+
+        return uncertainty(self.scene, gauge=gauge, sigma0=sigma0, problem=self.problem)
+
+    def summary(self, diagnosis: Diagnosis | None = None, contributions: Sequence[Contribution] = ()) -> dict[str, Any]:
+        """Return all numbers as plain values, as ``groma adjust --json`` writes them.
+
+        Parameters
+        ----------
+        diagnosis : Diagnosis, optional
+            What the data determine: :meth:`diagnose`.
+        contributions : sequence of Contribution
+            The same adjustment with fewer kinds of landmarks: :func:`groma.contributions`.
+        """
+        numbers = self.report.to_dict()
+        if contributions:
+            numbers["contributions"] = [entry.to_dict() for entry in contributions]
+        numbers["diagnosis"] = None if diagnosis is None else diagnosis.to_dict()
+        numbers["warnings"] = [*self.report.warnings, *why_steps_ran_out(numbers)]
+        return numbers
+
+
+def why_steps_ran_out(numbers: Mapping[str, Any]) -> list[str]:
+    """Return a sentence for an adjustment that crept along unobservable directions of the cameras to its last step.
+
+    Along an unobservable direction the cost is nearly flat and bent, so steps follow it for long; neither more of them
+    nor a robust loss would make a result that can be relied on.
+    """
+    diagnosis = numbers.get("diagnosis")
+    if numbers["termination"] != "max_iterations" or diagnosis is None or not diagnosis["num_open_directions"]:
+        return []
+    costs = [step["cost"] for step in numbers["history"] if step["accepted"]]
+    if len(costs) < CREEPING_STEPS or costs[-1] < (1.0 - CREEPING) * costs[-2]:
+        return []
+    return [
+        "The steps ran out where the data leave cameras or calibrations open: along these the cost falls slowly, and "
+        "wherever more steps end is one result of many. Hold them, or add data."
+    ]
+
+
+__all__ = ["AdjustReport", "AdjustResult", "Progress", "why_steps_ran_out"]

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What comes out of a map: the scene, its numbers, what its data determine, and the folder of results."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from groma._json import json_text
+from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
+from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.contributions import Contribution, contributions
+from groma.adjustment.diagnosis import diagnose_scene
+from groma.adjustment.report import AdjustReport
+from groma.adjustment.stages import with_loss
+from groma.factors.losses import GemanMcClure, Loss, loss
+from groma.io import atomic_output, write_geometry, write_scene
+from groma.problem.problem import Problem
+from groma.scene import Scene
+from groma.solver.observability.diagnosis import Diagnosis
+from groma.viz.pictures import ImageFiles
+from groma.viz.report.page import write_report
+from groma.viz.report.tables import contributions_card
+
+
+@dataclass(frozen=True)
+class MapResult:
+    """The map and how it came about."""
+
+    #: Points, lines, planes, poses.
+    scene: Scene
+    #: The scene that went in: the given model, or the reconstruction of the points.
+    start: Scene
+    #: The map before its last joint adjustment, with the same landmarks as ``scene``.
+    before: Scene
+    #: Report of the last joint adjustment, and what it was told: noise, losses, what is estimated.
+    report: AdjustReport
+    adjusted_with: AdjustOptions
+    #: Estimated standard deviations, pixels: of points, and of segment end points.
+    sigma_px: dict[str, float]
+    #: What became of the segments, in words.
+    explanation: str
+    #: Number of segments with each outcome, by name.
+    outcomes: dict[str, int]
+    #: Sentences for the user.
+    warnings: tuple[str, ...]
+
+    def diagnose(self) -> Diagnosis:
+        """Say in words what the observations determine, at the noise and with the loss of the last adjustment."""
+        told = self.adjusted_with
+        assembly = AssemblyOptions(
+            point_sigma_px=told.point_sigma_px,
+            line_sigma_px=told.line_sigma_px,
+            line_end_correlation=told.line_end_correlation,
+            structure_sigma_px=told.structure_sigma_px,
+            refine_poses=told.refine_poses,
+            refine_intrinsics=bool(told.refine_intrinsics),
+        )
+        problem, ended_with = assemble(self.scene, assembly).problem, last_loss(told)
+        factors = [with_loss(factor, ended_with) for factor in problem.factors]
+        return diagnose_scene(self.scene, problem=Problem(problem.variables, factors))
+
+    def contributions(self, reference: Scene | None = None) -> tuple[Contribution, ...]:
+        """Repeat the last adjustment by points alone, with lines, with planes: :func:`groma.contributions`."""
+        return contributions(self.before, self.adjusted_with, reference)
+
+    def summary(self, diagnosis: Diagnosis | None = None, contributions: Sequence[Contribution] = ()) -> dict[str, Any]:
+        """Return all numbers as plain values: the content of ``summary.json``."""
+        numbers = {
+            **self.report.to_dict(),
+            "num_images": self.scene.num_images,
+            "num_points": self.scene.num_points,
+            "num_lines": self.scene.num_lines,
+            "num_planes": self.scene.num_planes,
+            "num_directions": self.scene.num_directions,
+            "sigma_px": self.sigma_px,
+            "segments": self.outcomes,
+            "explanation": self.explanation,
+            "warnings": list(self.warnings),
+            "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
+        }
+        if contributions:
+            numbers["contributions"] = [entry.to_dict() for entry in contributions]
+        return numbers
+
+    def write(
+        self,
+        folder: str | os.PathLike[str],
+        images: ImageFiles | None = None,
+        title: str = "Map",
+        *,
+        summary: Mapping[str, Any] | None = None,
+        force: bool = False,
+        work: str | os.PathLike[str] | None = None,
+    ) -> None:
+        """Write everything that ``groma map`` writes to a folder, whole or not at all.
+
+        A COLMAP model with the lines and planes beside it (``structures``), ``scene.npz``, lines and planes as PLY and
+        OBJ, ``summary.json`` and ``report.html``.
+
+        Parameters
+        ----------
+        folder : path
+            Made here.
+        images : path or mapping, optional
+            The photographs, for the page.
+        title : str
+            Heading of the page.
+        summary : mapping, optional
+            Content of ``summary.json``; by default :meth:`summary`. The page shows its diagnosis and contributions.
+        force : bool
+            Replace what is there.
+        work : path, optional
+            Folder on the same disk in which the results are built; by default beside ``folder``.
+        """
+        numbers = dict(self.summary() if summary is None else summary)
+        with atomic_output(folder, force, work) as draft:
+            write_scene(self.scene, draft, format="colmap")
+            write_scene(self.scene, draft / "scene.npz")
+            write_geometry(self.scene, draft)
+            write_report(
+                draft / "report.html",
+                self.before,
+                self.scene,
+                self.report,
+                images,
+                title,
+                outcomes=self.outcomes,
+                explanation=self.explanation,
+                warnings=self.warnings,
+                diagnosis=numbers.get("diagnosis"),
+                cards=contributions_card(numbers.get("contributions")),
+            )
+            (draft / "summary.json").write_text(json_text(numbers), encoding="utf-8")
+
+
+def last_loss(told: AdjustOptions) -> Loss:
+    """Return the loss that an adjustment of photographs ends with."""
+    if told.loss == "auto":
+        return GemanMcClure(LAST_SCALE_SIGMAS)
+    return loss(told.loss, 1.0 if told.loss_scale is None else told.loss_scale)
+
+
+__all__ = ["MapResult", "last_loss"]

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the solver's loop asks of a problem: linearise, try a step, make it better, accept it or refuse it.
+
+:func:`groma.solver.solve.minimise` drives whatever has these methods: the joint solve (``joint.py``), variables that do
+not depend on each other (``independent.py``), landmarks that come in shards (``reduce/shards.py``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol, Self, TypeVar
+
+import numpy as np
+
+from groma.solver.termination import Termination
+
+
+@dataclass(frozen=True)
+class Trial:
+    """States, as far as the loop needs to know them, and the step that led there."""
+
+    cost: float
+    #: Factors that cannot be evaluated at these states and count nothing.
+    num_hidden: int = 0
+    #: Actual over predicted decrease of the cost.
+    gain_ratio: float = 0.0
+    #: Decrease of the cost that the quadratic model predicts.
+    promised: float = np.inf
+    #: Euclidean length of the step in increments.
+    length: float = np.inf
+    #: What the damping holds back of the decrease, to first order.
+    withheld: float = 0.0
+    #: Whether all variables have converged, where each is judged on its own; None where the cost decides.
+    settled: bool | None = None
+
+    def without_step(self) -> Self:
+        """Return what stands for a step that could not be found, because the linear system was singular."""
+        return replace(self, cost=np.inf, gain_ratio=0.0, promised=np.inf, length=np.inf, withheld=0.0)
+
+    @property
+    def has_step(self) -> bool:
+        """Whether the linear system gave a step."""
+        return self.length < np.inf
+
+    def lowers(self, best: Trial, share: float) -> bool:
+        """Whether the cost is below that of ``best``.
+
+        A factor that became degenerate counts nothing. Its ``share`` of the cost is put back, because steps would
+        otherwise hide what they spoil.
+        """
+        return self.cost + max(0, self.num_hidden - best.num_hidden) * share < best.cost
+
+
+T = TypeVar("T", bound=Trial)
+
+
+class DampedProblem(Protocol[T]):
+    """A least-squares problem at its present states, with a damping."""
+
+    @property
+    def num_factors(self) -> int:
+        """How many factors share the cost."""
+        ...
+
+    @property
+    def damping(self) -> float:
+        """The damping of the next step; the largest, where there are many."""
+        ...
+
+    @property
+    def linear_iterations(self) -> int:
+        """Iterations of the linear solver in the last step; 0 for direct solvers."""
+        ...
+
+    def start(self) -> T:
+        """Evaluate the problem where it begins."""
+        ...
+
+    def linearize(self) -> None:
+        """Form the normal equations of the present states and damping, unless they are formed."""
+        ...
+
+    def largest_gradient(self) -> float:
+        """Return the largest component of the gradient of the linearised cost."""
+        ...
+
+    def size(self) -> float:
+        """Return the Euclidean length of the present states."""
+        ...
+
+    def try_step(self) -> T:
+        """Solve for a step and evaluate the states after it; :meth:`Trial.without_step` where there is none."""
+        ...
+
+    def stretch(self, trial: T, factor: float) -> T:
+        """Evaluate a multiple of the step of a trial; return the trial itself where that is not worth it."""
+        ...
+
+    def refine(self, trial: T) -> T:
+        """Improve a trial that will be accepted; the trial itself where there is nothing to improve it with."""
+        ...
+
+    def rescue(self, trial: T) -> T:
+        """Improve a trial that would be refused; the trial itself where there is nothing to improve it with."""
+        ...
+
+    def accept(self, trial: T) -> None:
+        """Take the states of a trial, and lower the damping."""
+        ...
+
+    def refuse(self, trial: T) -> Termination | None:
+        """Keep the states and raise the damping; return why to stop where that is of no use."""
+        ...
+
+
+__all__ = ["DampedProblem", "Trial"]

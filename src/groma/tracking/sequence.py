@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A whole sequence in one call: frames from disk in, trajectory, map, scores and what became of each frame out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from groma._json import json_text
+from groma.errors import GromaError, InputError
+from groma.evaluation.trajectory import TrajectoryScores, score_trajectory
+from groma.io import atomic_output, write_scene
+from groma.io.sequences import Sequence, open_sequence
+from groma.io.trajectories import write_tum
+from groma.tracking.journal import Journal
+from groma.tracking.options import TrackOptions
+from groma.tracking.outcome import TrackedFrame, TrackResult
+from groma.tracking.tracker import Tracker
+from groma.viz.report.trajectory import write_track_report
+
+#: Largest difference between the times of a frame and of a pose of the reference, seconds.
+MAX_TIME_DIFFERENCE = 0.02
+
+
+@dataclass(frozen=True)
+class TrackProgress:
+    """What a progress callback gets after every frame."""
+
+    #: ``tracking frame``, and at the end ``adjusting all keyframes``.
+    stage: str
+    #: Frames done, and how many there are; 0 if that is not known.
+    done: int
+    total: int
+    #: What became of the frame, and its name in the sequence; None at the end.
+    frame: TrackedFrame | None = None
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class SequenceResult(TrackResult):
+    """Outcome of :func:`track`: that of the tracker, and what the sequence says about it."""
+
+    #: What became of each frame, in order.
+    frames: tuple[TrackedFrame, ...] = ()
+    #: Name of the sequence, and what its frames hold: ``rgbd``, ``stereo`` or ``mono``.
+    name: str = ""
+    kind: str = ""
+    #: Whether it was ended early.
+    interrupted: bool = False
+    #: Comparison with the reference of the sequence, if it has one; else why there is none.
+    scores: TrajectoryScores | None = None
+    not_compared: str = ""
+
+    def summary(self) -> dict[str, Any]:
+        """Return all numbers as plain values: the content of ``summary.json``."""
+        numbers = {"kind": self.kind, "interrupted": self.interrupted, **self.statistics, "sequence": self.name}
+        numbers["warnings"] = list(self.warnings)
+        if self.scores is not None:
+            numbers["reference"] = self.scores.to_dict()
+        elif self.not_compared:
+            numbers["reference"] = {"error": self.not_compared}
+        return numbers
+
+    def write(self, folder: str | os.PathLike[str], title: str = "Track", force: bool = False) -> None:
+        """Write everything that ``groma track`` writes to a folder, whole or not at all.
+
+        ``trajectory.txt`` (TUM), the keyframes as a COLMAP model with lines and planes beside it (``structures``),
+        ``scene.npz``, ``summary.json`` and ``report.html``; further maps in ``part_2``, ``part_3``, ...
+
+        Parameters
+        ----------
+        folder : path
+            Made here.
+        title : str
+            Heading of the page.
+        force : bool
+            Replace what is there.
+        """
+        with atomic_output(folder, force) as draft:
+            write_scene(self.scene, draft, format="colmap")
+            write_scene(self.scene, draft / "scene.npz")
+            write_tum(self.trajectory, draft / "trajectory.txt")
+            for number, part in enumerate(self.parts, start=2):
+                place = draft / f"part_{number}"
+                place.mkdir()
+                write_scene(part.scene, place / "scene.npz")
+                write_tum(part.trajectory, place / "trajectory.txt")
+            write_track_report(draft / "report.html", self, self.frames, self.scores, title=title)
+            (draft / "summary.json").write_text(json_text(self.summary()), encoding="utf-8")
+
+
+def track(
+    sequence: Sequence | str | os.PathLike[str],
+    options: TrackOptions | None = None,
+    progress: Callable[[TrackProgress], bool | None] | None = None,
+    *,
+    work: str | os.PathLike[str] | None = None,
+    name: str = "",
+) -> SequenceResult:
+    """Track a camera through a sequence, and map points, lines and planes on the way.
+
+    Parameters
+    ----------
+    sequence : Sequence or path
+        What :func:`groma.io.sequences.open_sequence` opened, or what it opens.
+    options : TrackOptions, optional
+        What is tracked, and when.
+    progress : callable, optional
+        Called after every frame; return False to end the track there. Ctrl-C does the same.
+    work : path, optional
+        Folder for the keyframes that are finished, while it runs (``groma view --live``); made anew.
+    name : str
+        What the sequence is called in the summary; by default the path.
+
+    Returns
+    -------
+    SequenceResult
+        Trajectory and map, adjusted together at the end, and the comparison with the reference of the sequence.
+
+    Raises
+    ------
+    InputError
+        If there is no sequence, or no frame of it could be tracked.
+    """
+    if isinstance(sequence, (str, os.PathLike)):
+        name = name or os.fspath(sequence)
+        sequence = open_sequence(sequence)
+    tracker = Tracker(sequence.camera, options)
+    frames: list[TrackedFrame] = []
+    completed = _follow(tracker, sequence, frames, progress, None if work is None else Journal(Path(work)))
+    if progress is not None:
+        progress(TrackProgress("adjusting all keyframes", 0, 1))
+    result = tracker.finish()
+    warnings = [*sequence.warnings, *result.warnings]
+    if not len(result.trajectory):
+        raise InputError(
+            f"No frame of {name or 'the sequence'} could be tracked: {' '.join(warnings)} Check the camera and the "
+            "depth scale."
+        )
+    if result.parts:
+        folders = ", ".join(f"part_{number}" for number in range(2, len(result.parts) + 2))
+        warnings.append(f"Only the longest part is in trajectory.txt and the report; see also {folders}.")
+    scores, not_compared = _compared(result, sequence)
+    return SequenceResult(
+        result.trajectory, result.scene, result.keyframes, result.statistics, tuple(warnings), result.parts,
+        tuple(frames), name, sequence.kind, not completed, scores, not_compared,
+    )  # fmt: skip
+
+
+def _follow(
+    tracker: Tracker,
+    sequence: Sequence,
+    frames: list[TrackedFrame],
+    progress: Callable[[TrackProgress], bool | None] | None,
+    journal: Journal | None,
+) -> bool:
+    """Track all frames, noting in ``frames`` what became of each; return whether none was left out."""
+    total = sequence.num_frames or 0
+    try:
+        for frame in sequence:
+            tracked = tracker.process(frame)
+            frames.append(tracked)
+            if journal is not None:
+                journal.frame(tracked)
+            event = TrackProgress("tracking frame", len(frames), total, tracked, frame.name)
+            go_on = progress is None or progress(event) is not False
+            if journal is not None and tracked.keyframe:
+                journal.keyframe(tracker, tracked)
+            if not go_on:
+                return False
+    except KeyboardInterrupt:
+        return False
+    return True
+
+
+def _compared(result: TrackResult, sequence: Sequence) -> tuple[TrajectoryScores | None, str]:
+    """Return the comparison with the reference of the sequence, if it has one, and why it failed."""
+    if sequence.reference is None or len(result.trajectory) < 3:
+        return None, ""
+    align = "sim3" if sequence.kind == "mono" else "se3"
+    try:
+        return score_trajectory(result.trajectory, sequence.reference, align, MAX_TIME_DIFFERENCE), ""
+    except GromaError as error:
+        return None, str(error)
+
+
+__all__ = ["SequenceResult", "TrackProgress", "track"]

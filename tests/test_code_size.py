@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``benchmarks/code_size.py`` counts what it says, on a house of two small files."""
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+GROMA = '''"""A house."""
+
+__all__ = ["a", "b"]
+'''
+ROOM = '''"""A room."""
+from groma.other._hidden import name
+from groma._own import name
+
+NEAR, FAR = 0.25, (3, -4.5)
+NAMES = ("a",)
+
+
+@dataclass
+class ThingOptions:
+    """Options."""
+
+    #: A comment.
+    size: float = 7.5
+    name: str = "x"
+
+
+class ThingGates:
+    far: float = gate(3.0, "px", "far", "chosen on nothing")
+
+
+def public(a, b, c, d, e, f, g, h, i, j):
+    """Of two
+
+    lines.
+    """
+    while a > 0.3:
+        damping = 10.0 * damping
+    return 0.7 * b
+
+
+@loop
+def _kernel(a, b, c, d, e, f, g, h, i, j):
+    return -1.0
+'''
+
+
+@pytest.fixture
+def code_size(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    return importlib.import_module("code_size")
+
+
+def test_a_small_house(code_size, tmp_path):
+    for name, text in (
+        ("__init__", GROMA),
+        ("room/__init__", '"""Room."""\n'),
+        ("room/thing", ROOM),
+        ("other/__init__", ""),
+    ):
+        path = tmp_path / "src" / "groma" / f"{name}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    table = code_size.counts(tmp_path)
+    assert table["files"] == 4 and table["functions"] == 2
+    assert table["lines"] == len((GROMA + ROOM).splitlines()) + 1
+    assert table["source lines"] == 1 + 4 + 4 + 2 + 4 + 3
+    assert table["private imports"] == 1 and table["optimiser loops"] == 1
+    assert (table["many arguments"], table["many arguments, kernels"]) == (1, 1)
+    assert (table["named numbers"], table["option defaults"], table["gates with origin"]) == (2, 1, 1)
+    assert (table["inline numbers"], table["inline numbers in decisions"]) == (2, 1)
+    assert (table["public names, groma.__all__"], table["public names, all modules"]) == (2, 3)
+
+
+def test_this_house_borrows_no_underscores(code_size):
+    assert code_size.private_imports(code_size.modules_of(FOLDER.parent)) == []
