@@ -16,6 +16,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.gates import gate
+from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.views import LineViews
 
 #: Points of one segment that are looked at.
@@ -24,23 +25,21 @@ _MAX_POINTS = 16
 
 @dataclass(frozen=True)
 class KnownPointGates:
-    """Which points lie on a segment, and what they are worth."""
+    """Which points lie on a segment, and agree."""
 
-    max_distance: float = gate(2.0, "px", "of a point from the image line of a segment", "chosen on wireframes")
-    max_beyond: float = gate(4.0, "px", "of a point beyond the ends of a segment", "chosen on wireframes")
+    max_distance: float = gate(
+        2.0, "px", "of a point from a segment, across it and beyond its ends", "chosen on wireframes"
+    )
     tolerance: float = gate(0.01, "1", "relative difference of inverse depths that agree", "chosen on wireframes")
-    min_apart: float = gate(0.3, "share", "of the segment, between two points that fix a line", "chosen on wireframes")
-    min_agreeing: int = gate(3, "points", "that agree on a line", "derived from two fixing it")
-    score: float = gate(0.5, "1", "what such a proposal counts beside that of a neighbour", "chosen on wireframes")
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
-def _points_on(ends, line, pixel, inverse, max_distance, max_beyond, t, q):
+def _points_on(ends, line, pixel, inverse, max_distance, t, q):
     """Positions along a segment and inverse depths of the points on it; return how many."""
     ux, uy = ends[2] - ends[0], ends[3] - ends[1]
     length2 = ux * ux + uy * uy
-    reach = max_beyond / math.sqrt(length2)
+    reach = max_distance / math.sqrt(length2)
     number = 0
     for p in range(len(pixel)):
         if abs(line[0] * pixel[p, 0] + line[1] * pixel[p, 1] + line[2]) > max_distance:
@@ -72,9 +71,9 @@ def _through_one(t, q, number, ratio, tolerance, out):
 
 
 @kernel
-def _through_several(t, q, number, tolerance, min_apart, min_agreeing, out):
-    """Fit the line that most points agree on; fill out = q1 q2 c11 c12 c22; False where too few do."""
-    best, first, second = min_agreeing - 1, -1, -1
+def _through_several(t, q, number, tolerance, min_apart, out):
+    """Fit the line that most points agree on, three at least; fill out = q1 q2 c11 c12 c22; False where too few do."""
+    best, first, second = 2, -1, -1
     for m in range(number):
         for n in range(m):
             if abs(t[m] - t[n]) < min_apart:
@@ -107,8 +106,7 @@ def _through_several(t, q, number, tolerance, min_apart, min_agreeing, out):
 
 @loop
 def _propose(
-    ends, line, usable, search, ratio, pixel, inverse, max_distance, max_beyond, tolerance, min_apart, min_agreeing,
-    score, neighbor, out_index, out,
+    ends, line, usable, search, ratio, pixel, inverse, max_distance, tolerance, min_apart, neighbor, out_index, out,
 ):  # fmt: skip
     """Lines through one point have the slot ``neighbor + 1``, those through several ``neighbor``; return how many."""
     count = 0
@@ -116,10 +114,10 @@ def _propose(
     for i in range(len(ends)):
         if not usable[i]:
             continue
-        number = _points_on(ends[i], line[i], pixel, inverse, max_distance, max_beyond, t, q)
+        number = _points_on(ends[i], line[i], pixel, inverse, max_distance, t, q)
         for several in range(2):
             if several:
-                if not _through_several(t, q, number, tolerance, min_apart, min_agreeing, work):
+                if not _through_several(t, q, number, tolerance, min_apart, work):
                     continue
             elif ratio[i, 0] > 0.0 and number > 0:
                 _through_one(t, q, number, ratio[i], tolerance, work)
@@ -128,7 +126,7 @@ def _propose(
             if min(work[0], work[1]) < search[i, 0] or max(work[0], work[1]) > search[i, 1]:
                 continue
             out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor + 1 - several, -1
-            out[count, 5] = score
+            out[count, 5] = 1.0
             for c in range(5):
                 out[count, c] = work[c]
             count += 1
@@ -168,7 +166,7 @@ def lines_through_points(
     index, values = np.empty((2 * len(ratios), 3), np.int64), np.empty((2 * len(ratios), 6))
     count = _propose(
         views.ends[rows], views.line[rows], views.usable[rows], views.range[rows], ratios, *points, gates.max_distance,
-        gates.max_beyond, gates.tolerance, gates.min_apart, gates.min_agreeing, gates.score, slot, index, values,
+        gates.tolerance, AGREEMENT.min_overlap, slot, index, values,
     )  # fmt: skip
     return index[:count], values[:count]
 
