@@ -164,7 +164,7 @@ class Tracker:
         """Predict the pose and follow the frame before, if that is not long ago."""
         present = self._present
         predicted, prior_sigma = self._motion.predict(present.pose, data.frame.timestamp)
-        if self._lost_for > self._gates.near_frames:
+        if self._lost_for > self._gates.lost_frames:
             return _Attempt(predicted, prior_sigma)
         assert present.data is not None
         with watch("turn"):
@@ -236,13 +236,13 @@ class Tracker:
 
     def _find(self, data, predicted, prior_sigma, doubtful: PoseEstimate | None) -> Found | None:
         """Find a pose by described features: near the last keyframes first, then anywhere."""
-        if self._lost_for <= self._gates.near_frames:
+        if self._lost_for <= self._gates.lost_frames:
             guesses = [predicted, self._present.pose] + ([doubtful.pose] if doubtful is not None else [])
             found = self._verification.find_near(self.map, data, guesses, predicted, prior_sigma)
             if found is not None:
                 return found
         found = self._verification.find_anywhere(self.map, data)
-        if found is None or self._lost_for > self._gates.near_frames:
+        if found is None or self._lost_for > self._gates.lost_frames:
             return found
         return found if self._verification.is_near(found.estimate.pose, predicted, prior_sigma) else None
 
@@ -319,7 +319,7 @@ class Tracker:
             self._lost_since = now
         self._lost_for += 1
         self._guess = data.gray, guess
-        if self._lost_for > self._gates.restart_frames and now - self._lost_since > self._gates.restart_seconds:
+        if self._lost_for > self._gates.lost_frames and now - self._lost_since > self._gates.restart_seconds:
             self._mapper.begin_anew(self._present)
             self._present, self._motion = Present(), MotionModel(self.options.gates.motion)
             return self._start(data, began, watch)
