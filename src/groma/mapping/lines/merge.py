@@ -44,14 +44,13 @@ ROUNDS = 6
 
 # -------------------------------------------------------------------------------------------------------------- Loops
 @loop
-def _information(camera, image, ends, sigma, pointers, rows, X, H, U):
+def _information(camera, image, own, pointers, X, H, U):
     """Information (L, 4, 4) of the offsets of both points of each line, in the basis (L, 2, 3) across it."""
     r, J = np.zeros(2), np.zeros((2, 4))
     for n in range(len(pointers) - 1):
         across_basis(X[n], U[n])
         for m in range(pointers[n], pointers[n + 1]):
-            s = rows[m]
-            line_residuals(camera[image[s]], ends[s], sigma[s], X[n], U[n], r, J)
+            line_residuals(camera, image[m], own, m, X[n], U[n], r, J)
             for a in range(4):
                 for b in range(4):
                     H[n, a, b] += J[0, a] * J[0, b] + J[1, a] * J[1, b]
@@ -177,7 +176,8 @@ def _compare(tracks: Tracks) -> tuple[IntArray, FloatArray, FloatArray, FloatArr
     views, count = tracks.views, len(tracks.X)
     rows, pointers = tracks.table()
     H, U = np.zeros((count, 4, 4)), np.zeros((count, 2, 3))
-    _information(views.camera, views.image_idx, views.ends, views.sigma, pointers, rows, tracks.X, H, U)
+    own = np.column_stack([views.ends[rows], views.sigma[rows]])
+    _information(views.camera, views.image_idx[rows], own, pointers, tracks.X, H, U)
     unit = _pixel_size(tracks)
     X = tracks.X
     pairs, span = _candidates(X, MAX_PX * unit)

@@ -20,7 +20,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.terms.relations import SURFACE_SIGMA_PX, lengths_per_pixel
+from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
+from groma.adjustment.terms.relations import lengths_per_pixel
 from groma.errors import InputError
 from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines, orthogonal_pairs
 from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
