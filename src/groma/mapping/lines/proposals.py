@@ -52,7 +52,7 @@ class ProposalGates:
         2.0,
         "1",
         "factor by which the ends of a segment may leave the range of depths of its middle",
-        "chosen on wireframes",
+        "chosen on benchmarks/lines.py",
     )
 
     def limits(self) -> tuple[float, float, float]:
