@@ -100,6 +100,7 @@ ROOMS: Rooms = (
         "Evaluation",
         {
             "groma.evaluation": None,
+            "groma.evaluation.cabinet": ("evaluate_cabinet", "folder"),
             "groma.evaluation.trajectory": ("Spread", "TrajectoryScores", "associate", "score_trajectory"),
         },
     ),

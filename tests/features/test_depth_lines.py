@@ -8,7 +8,7 @@ import pytest
 from _depth_scenes import FLOOR, PINHOLE, SHAPE, WALL, noisy, plane, render
 
 from groma.errors import InputError, ShapeError
-from groma.features.depth.lines import CREASE, LEFT, NONE, RIGHT, SURFACE, fit_depth_lines
+from groma.features.depth.lines import CREASE, LEFT, NONE, RIGHT, SURFACE, DepthLineGates, fit_depth_lines
 from groma.features.depth.noise import DepthNoise
 
 pytestmark = pytest.mark.kernels
@@ -149,4 +149,4 @@ def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(ShapeError, match=r"\(N, 4\)"):
         fit_depth_lines(np.zeros(4), np.ones(SHAPE), PINHOLE)
     with pytest.raises(InputError, match="near"):
-        fit_depth_lines(ends, np.ones(SHAPE), PINHOLE, near=5, far=2)
+        fit_depth_lines(ends, np.ones(SHAPE), PINHOLE, gates=DepthLineGates(near=5, far=2))

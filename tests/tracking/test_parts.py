@@ -12,7 +12,7 @@ from groma.geometry import se3
 from groma.scene.landmarks import Lines
 from groma.tracking.frame.camera import TrackCamera, back, into, planes_back, planes_into
 from groma.tracking.frame.depth import depth_at, segment_inverse_depths
-from groma.tracking.frame.features import SEGMENT_NOISE
+from groma.tracking.frame.features import segment_noise
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.frame.planes import frame_planes
 from groma.tracking.frame.sparse_depth import fill_sparse
@@ -165,7 +165,7 @@ def test_depth_of_pixels_and_segments():
     assert np.isnan(found[2:]).all()
     # An edge between two surfaces belongs to the nearer one; where nothing is known, nothing is told.
     ends = np.array([[40.0, 20, 40.0, 50.0], [10.0, 5.0, 30.0, 5.0]])
-    inverse, sigma = segment_inverse_depths(depth, ends, CAMERA.params, SEGMENT_NOISE)
+    inverse, sigma = segment_inverse_depths(depth, ends, CAMERA.params, segment_noise())
     assert np.abs(inverse[0] - 1.0).max() < 1e-6
     assert (sigma[0] < 0.01).all()
     assert np.isnan(inverse[1]).all()

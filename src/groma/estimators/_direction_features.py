@@ -80,12 +80,12 @@ class Parallel:
         return self.whitened
 
 
-def crossings(pool: Perpendicular, count: int, rng: np.random.Generator) -> FloatArray:
+def crossings(pool: Perpendicular, count: int, min_sine: float, rng: np.random.Generator) -> FloatArray:
     """Candidates: cross products of so many pairs of normals, drawn by their certainty."""
     certainty = 1.0 / np.sqrt((pool.factors**2).sum(axis=(1, 2)) + pool.sigma**2)
     pairs = rng.choice(len(pool), (count, 2), p=certainty / certainty.sum())
     crossed = np.cross(pool.normals[pairs[:, 0]], pool.normals[pairs[:, 1]])
-    return unit(crossed[norm(crossed) > 0.02])
+    return unit(crossed[norm(crossed) > min_sine])
 
 
 __all__ = ["Parallel", "Perpendicular", "crossings"]

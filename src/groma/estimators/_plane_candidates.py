@@ -16,20 +16,9 @@ from scipy.spatial import KDTree
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.estimators._plane_loops import BALL, height_kernel, least_axis_kernel, variance_kernel
+from groma.estimators._plane_options import PLANE_SEARCH
 from groma.geometry.algebra import dot, norm
 
-#: Neighbours that make a candidate, and that improve it; the one whose distance is the spacing.
-_NEIGHBOURS, RANK = 32, 8
-#: Features for each that is a seed, in large scenes; small ones have as many seeds at least.
-_FEATURES_PER_SEED, _MIN_SEEDS = 4, 1536
-#: Most seeds at one feature.
-_REPEATED = 4
-#: Rounds in which a candidate is improved on its neighbourhood.
-_ROUNDS = 3
-#: Nearest segments that a segment is paired with, and pairs of it that become candidates.
-_NEAR_SEGMENTS, _PAIRS = 24, 2
-#: Features that score a candidate, at most.
-_MAX_FOLLOWED = 8192
 #: Pairs looked at together.
 _CHUNK = 16384
 
@@ -62,10 +51,10 @@ class Features:
 
 def features_of(places: FloatArray, noise: FloatArray, partner: IntArray, carrier: IntArray) -> Features:
     """Return places (N, 3) of points and segment ends with their covariances (N, 3, 3), and what is near what."""
-    near = min(_NEIGHBOURS, len(places))
+    near = min(PLANE_SEARCH.neighbours, len(places))
     tree = KDTree(places)
     distance, neighbours = tree.query(places, k=near)
-    spacing = np.maximum(distance[:, min(RANK, near - 1)], 1e-12)
+    spacing = np.maximum(distance[:, min(PLANE_SEARCH.rank, near - 1)], 1e-12)
     order = np.asarray(tree.indices, dtype=np.int64)
     first = np.arange(0, len(order), BALL)
     number = np.diff(np.append(first, len(order)))
@@ -86,7 +75,7 @@ def squares(normal: FloatArray) -> FloatArray:
 
 
 @loop
-def _through_neighbours(places, packed, neighbours, seed, choice, gate, rounds, planes):
+def _through_neighbours(places, packed, neighbours, seed, choice, limit, rounds, planes):
     """Planes (H, 4) through seeds and two of their neighbours each, improved on all of them; all zero where none is."""
     A, V, n = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     weight = np.empty(neighbours.shape[1])
@@ -110,7 +99,7 @@ def _through_neighbours(places, packed, neighbours, seed, choice, gate, rounds, 
                 height = (places[i, 0] - c0) * n[0] + (places[i, 1] - c1) * n[1] + (places[i, 2] - c2) * n[2]
                 variance = max(variance_kernel(packed[i], n[0], n[1], n[2]), 1e-300)
                 weight[k] = 0.0
-                if height * height < 4.0 * gate * variance:
+                if height * height < limit * variance:
                     weight[k] = 1.0 / (variance + height * height)
                     enough += 1
                     total += weight[k]
@@ -140,12 +129,13 @@ def _through_neighbours(places, packed, neighbours, seed, choice, gate, rounds, 
 def from_neighbours(features: Features, gate: float, rng: np.random.Generator) -> tuple[FloatArray, IntArray]:
     """Candidates (H, 4) from a feature and two of its neighbours, improved on the neighbourhood; their homes (H,)."""
     number, near = features.neighbours.shape
-    count = max(number // _FEATURES_PER_SEED, min(_MIN_SEEDS, _REPEATED * number))
+    count = max(number // PLANE_SEARCH.features_per_seed, min(PLANE_SEARCH.min_seeds, PLANE_SEARCH.repeated * number))
     seed = rng.permutation(np.repeat(np.arange(number), -(-count // number)))[:count]
     choice = rng.integers(1, near, (count, 2))
     planes = np.empty((count, 4))
     _through_neighbours(
-        features.places, features.packed, features.neighbours, seed, choice, gate, _ROUNDS, planes
+        features.places, features.packed, features.neighbours, seed, choice, PLANE_SEARCH.wider * gate,
+        PLANE_SEARCH.rounds, planes
     )  # fmt: skip
     valid = planes[:, :3].any(axis=1)
     return planes[valid], seed[valid]
@@ -160,7 +150,7 @@ def from_segments(features: Features, num_points: int, gate: float) -> tuple[Flo
     if len(ends) < 2:
         return np.zeros((0, 4)), np.zeros(0, np.int64), 0
     middle = ends.mean(axis=1)
-    count = min(_NEAR_SEGMENTS + 1, len(ends))
+    count = min(PLANE_SEARCH.near_segments + 1, len(ends))
     near = np.asarray(KDTree(middle).query(middle, k=count)[1], dtype=np.int64)
     first, second = np.repeat(np.arange(len(ends)), count - 1), near[:, 1:].ravel()
     once = np.unique(np.column_stack([np.minimum(first, second), np.maximum(first, second)]), axis=0)
@@ -169,7 +159,7 @@ def from_segments(features: Features, num_points: int, gate: float) -> tuple[Flo
     pairs, planes, worth = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((-worth, pairs[:, 0]))
     owner = pairs[order, 0]
-    chosen = np.sort(order[np.arange(len(order)) - np.searchsorted(owner, owner) < _PAIRS])
+    chosen = np.sort(order[np.arange(len(order)) - np.searchsorted(owner, owner) < PLANE_SEARCH.pairs])
     return planes[chosen], num_points + 2 * pairs[chosen, 0], len(once)
 
 
@@ -186,7 +176,7 @@ def _coplanar(
     variance = np.einsum("hkc,hc->hk", features.packed[corner], squares(normal)).mean(axis=1)
     flat = values[:, 0] < 2.0 * gate * variance
     # Two segments on one line leave the plane open.
-    flat &= values[:, 1] > 25.0 * np.maximum(values[:, 0], variance)
+    flat &= values[:, 1] > PLANE_SEARCH.not_collinear * np.maximum(values[:, 0], variance)
     planes = np.column_stack([normal, -dot(normal, center)])
     return pairs[flat], planes[flat], values[flat, 1] / variance[flat]
 
@@ -276,7 +266,7 @@ class Scores:
         self._features, self._planes, self._homes = features, planes, homes
         self._gate, self._reach = gate, reach
         self._stamp, self._number = np.zeros(len(features.places), np.int64), 0
-        self._queue = np.empty(_MAX_FOLLOWED, np.int64)
+        self._queue = np.empty(PLANE_SEARCH.max_followed, np.int64)
 
     def of(self, which: IntArray, labels: IntArray) -> tuple[IntArray, FloatArray]:
         """Support (M,) and score (M,) of some candidates among the features without a label."""

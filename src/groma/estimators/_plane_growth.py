@@ -10,7 +10,7 @@ from scipy import stats
 from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators._plane_candidates import RANK, Features
+from groma.estimators._plane_candidates import Features
 from groma.estimators._plane_loops import (
     ball_loop,
     connected_part_loop,
@@ -21,23 +21,11 @@ from groma.estimators._plane_loops import (
     near_loop,
     nearest_rows_loop,
 )
+from groma.estimators._plane_options import PLANE_SEARCH as GATES
 from groma.estimators._plane_options import PlaneOptions
 from groma.estimators.association import inlier_probability
 from groma.estimators.plane_fit import PlaneFit, fit_plane, tilt_sigma
 from groma.geometry.algebra import norm, perpendicular
-
-#: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
-BAND = 8.0
-#: Links between inliers, as a multiple of the distance to the eighth neighbour.
-LINK = 3.0
-#: Rounds of refinement of a candidate on its growing support.
-_GROW_STEPS = 10
-#: Rounds with the probability of membership as the weight.
-_POLISH_STEPS = 3
-#: A plane is given up when its share is below this part of the least; the later rounds do not bring so much.
-_HOPELESS = 0.5
-#: Rounds of a fit in which the variances are taken from the last normal.
-_FIT_ROUNDS = 10
 
 
 @dataclass(frozen=True)
@@ -83,11 +71,11 @@ class Grower:
         features, gate, options = self._features, self._gate, self._options
         free = None
         rows, weight = features.neighbours[home], np.zeros(0)
-        for step in range(_GROW_STEPS):
+        for step in range(GATES.grow_steps):
             if step == 1:  # what is far away stays away
-                free = self._near_free(labels, plane, 50.0 * gate)
+                free = self._near_free(labels, plane, GATES.far * gate)
             # The first rounds reach farther: the candidate is not yet exact.
-            limit = (4.0 if step < 2 else 1.0) * gate
+            limit = (GATES.wider if step < 2 else 1.0) * gate
             near = self._near_free(labels, plane, limit) if free is None else self._near(free, plane, limit)
             rows, independent = self._part(near, rows)
             if independent < options.min_support:
@@ -100,16 +88,16 @@ class Grower:
             turned = float(np.sign(before[:3] @ plane[:3]))
             moved, spread = self._heights(rows, plane)
             moved -= turned * height
-            if step > 1 and np.abs(moved).max() < 0.1 * _median(spread):
+            if step > 1 and np.abs(moved).max() < GATES.converged * _median(spread):
                 break
         if (
             tilt_sigma(fit_plane(features.places[rows], features.covariances[rows], weight).covariance)
             > options.max_tilt
         ):
             return None, plane, rows
-        band = BAND * _median(self._heights(rows, plane)[1])
+        band = GATES.band * _median(self._heights(rows, plane)[1])
         support, layer, share = features.places[rows], rows, np.zeros(1)
-        for _ in range(_POLISH_STEPS):
+        for _ in range(GATES.polish_steps):
             # Judged against all that is near, taken or not: what lies on a plane beside this one speaks against it.
             layer = self._layer[
                 : layer_loop(features.places, features.order, features.balls, plane, band, self._layer)
@@ -121,8 +109,8 @@ class Grower:
             height, spread = self._heights(layer, plane)
             height = np.abs(height)
             probability, share = inlier_probability(height, spread, np.zeros(len(layer), np.int64), np.array([band]))
-            weight = np.where(height < 3.0 * spread, probability, 0.0)
-            if share[0] < _HOPELESS * options.min_share or np.count_nonzero(weight) < 3:
+            weight = np.where(height < GATES.inlier * spread, probability, 0.0)
+            if share[0] < GATES.hopeless * options.min_share or np.count_nonzero(weight) < 3:
                 return None, plane, rows
             # Membership as the weight: all of the plane where it is clean, its densest part where it is not.
             plane = self._fitted(layer, weight)
@@ -159,13 +147,13 @@ class Grower:
         """Plane through some features."""
         plane, center, precision = np.empty(4), np.empty(3), np.empty(len(rows))
         fit_loop(
-            self._features.places, self._features.packed, rows, weight, _FIT_ROUNDS, plane, center, precision
+            self._features.places, self._features.packed, rows, weight, GATES.fit_rounds, plane, center, precision
         )  # fmt: skip
         return plane
 
     def _part(self, rows: IntArray, held: IntArray) -> tuple[IntArray, int]:
         """Part of some features that is connected in space, with most of those held; how many no segment carries."""
-        features, count = self._features, min(RANK + 1, len(rows))
+        features, count = self._features, min(GATES.rank + 1, len(rows))
         if count < 3:
             return rows, 0
         nearest, distance = np.empty((len(rows), count), np.int64), np.empty((len(rows), count))
@@ -180,7 +168,7 @@ class Grower:
         out, count_of = np.empty(len(rows), np.int64), np.empty(2, np.int64)
         self._held[held] = 1
         connected_part_loop(
-            rows, nearest, distance, LINK, features.spacing, features.partner, features.carrier, self._held,
+            rows, nearest, distance, GATES.link, features.spacing, features.partner, features.carrier, self._held,
             self._mark, out, count_of,
         )  # fmt: skip
         self._held[held] = 0
@@ -190,7 +178,7 @@ class Grower:
         """Number of planes tried on which as much would lie by chance, of their neighbourhood, base-10 logarithm."""
         features = self._features
         center = features.places[rows].mean(axis=0)
-        radius = float(np.quantile(norm(features.places[rows] - center), 0.9))
+        radius = float(np.quantile(norm(features.places[rows] - center), GATES.extent))
         found = np.zeros(2)
         ball_loop(
             features.places, features.packed, features.carrier, features.order, features.balls, rows, center, radius,
@@ -223,8 +211,8 @@ def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, pl
         return np.zeros(0, dtype=bool)
     basis = np.stack(perpendicular(plane[:3]), axis=1)
     tree = KDTree(places @ basis, balanced_tree=False, compact_nodes=False)
-    distance, _ = tree.query(tested @ basis, distance_upper_bound=np.nextafter(LINK * spacing.max(), np.inf))
-    return np.asarray(distance <= LINK * spacing)
+    distance, _ = tree.query(tested @ basis, distance_upper_bound=np.nextafter(GATES.link * spacing.max(), np.inf))
+    return np.asarray(distance <= GATES.link * spacing)
 
 
 def _median(values: FloatArray) -> float:

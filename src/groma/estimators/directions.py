@@ -31,12 +31,44 @@ from scipy import stats
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.estimators._direction_features import Parallel, Perpendicular, crossings
+from groma.gates import gate
 from groma.geometry.algebra import dot, norm, perpendicular, unit, vectors
 
-#: Steps of the robust refinement.
-_REFINE_STEPS = 12
-#: Candidates and features that take part in one round of the search.
-_MAX_CANDIDATES, _MAX_SCORED = 512, 4096
+
+@dataclass(frozen=True)
+class DirectionGates:
+    """How common directions are searched, beside the options."""
+
+    refine_steps: int = gate(12, "steps", "steps of the robust refinement", "cost: converges in fewer")
+    max_candidates: int = gate(512, "directions", "candidates of one round", "cost: time of a search")
+    max_scored: int = gate(4096, "features", "features that score them", "cost: time of a search")
+    max_refined: int = gate(3, "directions", "best candidates that are refined", "cost: time of a search")
+    min_sine: float = gate(
+        0.02, "rad", "angle of two normals that make a candidate", "derived from noise of 0.05 degrees"
+    )
+    taken: float = gate(
+        0.9999, "probability", "features out to this quantile are taken out with a direction",
+        "derived from noise: what is left must not repeat it",
+    )  # fmt: skip
+    wider: float = gate(
+        4.0, "1", "factor of the squared gate in the refinement: twice as far", "chosen on synthetic rooms"
+    )
+    max_move: float = gate(0.05, "rad", "longest step of the refinement", "derived from linearity")
+    same: float = gate(
+        3.0, "parallel sigmas", "directions nearer to each other are one", "derived from normal noise: 1 in 370"
+    )
+    orthogonal_sigma: float = gate(
+        2.6e-3, "rad", "how orthogonal things are that are meant to be",
+        "derived from three times how parallel they are: 0.15 degrees",
+    )  # fmt: skip
+    orthogonal_level: float = gate(0.95, "probability", "level of the test of a right angle", "convention: 95 %")
+    max_orthogonal_sigma: float = gate(
+        0.01, "rad", "right angles less certain say nothing", "chosen on synthetic rooms"
+    )
+
+
+#: The numbers in use.
+DIRECTIONS = DirectionGates()
 
 
 @dataclass(frozen=True)
@@ -170,7 +202,7 @@ def directions_from_lines(
         )
     _check_finite(directions, covariance)
     features = Parallel.of(unit(directions), covariance, options.parallel_sigma)
-    best = np.argsort(features.area, kind="stable")[:_MAX_CANDIDATES]
+    best = np.argsort(features.area, kind="stable")[: DIRECTIONS.max_candidates]
     tried = unit(directions)[best]
     if candidates is not None:
         tried = np.concatenate([tried, unit(vectors(candidates, 3, "candidates"))])
@@ -178,7 +210,11 @@ def directions_from_lines(
 
 
 def orthogonal_pairs(
-    directions: FloatArray, covariance: FloatArray, sigma: float = 2.6e-3, level: float = 0.95, max_sigma: float = 0.01
+    directions: FloatArray,
+    covariance: FloatArray,
+    sigma: float = DIRECTIONS.orthogonal_sigma,
+    level: float = DIRECTIONS.orthogonal_level,
+    max_sigma: float = DIRECTIONS.max_orthogonal_sigma,
 ) -> IntArray:
     r"""Pairs of directions that are orthogonal within their uncertainty.
 
@@ -228,7 +264,7 @@ def _search(
     rng = np.random.default_rng(options.seed)
     gate = float(stats.chi2.ppf(options.level, features.freedom))
     # Features out to where one in 10^4 ends are taken out together: what is left must not repeat the direction.
-    wide = float(stats.chi2.ppf(0.9999, features.freedom))
+    wide = float(stats.chi2.ppf(DIRECTIONS.taken, features.freedom))
     tried = max(len(features), 2) ** (3 - features.freedom)
     remaining = np.arange(len(features))
     found: list[FloatArray] = []
@@ -240,15 +276,19 @@ def _search(
         if candidates is not None:
             guesses = candidates
         else:
-            guesses = crossings(pool, _MAX_CANDIDATES, rng) if isinstance(pool, Perpendicular) else np.zeros((0, 3))
+            guesses = (
+                crossings(pool, DIRECTIONS.max_candidates, DIRECTIONS.min_sine, rng)
+                if isinstance(pool, Perpendicular)
+                else np.zeros((0, 3))
+            )
         if len(guesses) == 0:
             break
         scored = pool
-        if len(remaining) > _MAX_SCORED:
-            scored = pool.take(rng.choice(len(remaining), _MAX_SCORED, replace=False))
+        if len(remaining) > DIRECTIONS.max_scored:
+            scored = pool.take(rng.choice(len(remaining), DIRECTIONS.max_scored, replace=False))
         accepted = None
         order = np.argsort(-_score(scored, guesses, gate), kind="stable")
-        for start in guesses[order[:3]]:
+        for start in guesses[order[: DIRECTIONS.max_refined]]:
             direction, covariance = _refine(pool, start, gate)
             inside = pool.squared(direction[None])[0] < gate
             count = int(inside.sum())
@@ -257,7 +297,9 @@ def _search(
             spread = count if groups is None else len(np.unique(groups[remaining[inside]]))
             certain = float(np.linalg.eigvalsh(covariance)[-1]) < options.max_sigma**2
             strong = tail < np.log10(options.max_false_alarms) and count >= least
-            new = all(abs(float(direction @ other)) < np.cos(3 * options.parallel_sigma) for other in found)
+            new = all(
+                abs(float(direction @ other)) < np.cos(DIRECTIONS.same * options.parallel_sigma) for other in found
+            )
             if strong and certain and new and spread >= options.min_groups:
                 accepted = direction, covariance, tail
                 break
@@ -289,7 +331,7 @@ def _collect(
     agrees = squared.min(axis=0) < gate
     label[agrees] = nearest[agrees]
     support = np.bincount(label[agrees], minlength=len(found))
-    pairs = orthogonal_pairs(directions, covariance, 3 * options.parallel_sigma)
+    pairs = orthogonal_pairs(directions, covariance, DIRECTIONS.same * options.parallel_sigma)
     return DirectionSet(directions, covariance, support, np.array(alarms), label, pairs)
 
 
@@ -305,10 +347,10 @@ def _refine(pool: Perpendicular | Parallel, start: FloatArray, gate: float) -> t
     information = np.eye(2)
     basis = np.stack(perpendicular(direction))
     scale = 1.0
-    for step in range(_REFINE_STEPS):
+    for step in range(DIRECTIONS.refine_steps):
         squared = pool.squared(direction[None])[0]
-        near = squared < 4.0 * gate
-        last = step == _REFINE_STEPS - 1
+        near = squared < DIRECTIONS.wider * gate
+        last = step == DIRECTIONS.refine_steps - 1
         if last:
             near = squared < gate
         rows = pool.take(near).rows(direction)
@@ -322,7 +364,7 @@ def _refine(pool: Perpendicular | Parallel, start: FloatArray, gate: float) -> t
             scale = max(1.0, float((residual**2).sum()) / max(residual.size - 2, 1))
             break
         move = -np.linalg.solve(information, np.einsum("n,nka,nk->a", weight, slope, residual))
-        move *= min(1.0, 0.05 / max(float(norm(move)), 1e-300))
+        move *= min(1.0, DIRECTIONS.max_move / max(float(norm(move)), 1e-300))
         direction = unit(direction + move @ basis)
     return direction, scale * basis.T @ np.linalg.inv(information) @ basis
 

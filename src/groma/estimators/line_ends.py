@@ -13,14 +13,30 @@ Of the images that end there, the outer third counts, by their resolution.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from groma._numba import kernel, loop
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.gates import gate, numbers
 
-#: Segments whose ends are that near to each other show the same end of a line, pixels.
-_SAME_END = 5.0
-#: So many times more images must end at a place than go on, if these are to be wrong.
-_MAJORITY = 3
+
+@dataclass(frozen=True)
+class LineEndGates:
+    """Where a line ends, by where its segments end."""
+
+    same_end: float = gate(5.0, "px", "ends so near to each other are the same end", "chosen on Strecha's scenes")
+    majority: float = gate(
+        3.0, "ratio", "images that end at a place, to those that go on", "chosen on Strecha's scenes"
+    )
+    quantile: float = gate(
+        1 / 3, "share", "of the weight of its segments that lies beyond an end", "chosen on Strecha's scenes"
+    )
+
+
+#: The defaults.
+LINE_ENDS = LineEndGates()
 
 
 @kernel
@@ -61,11 +77,12 @@ def _seen_twice(first, last):
 
 
 @kernel
-def _end_of(last, size, limit, stop):
+def _end_of(last, size, limit, stop, gates):
     """The upper end of a line from the upper ends of its segments and the size of a pixel of each, along the line.
 
     ``limit`` is as far as two images see; the end is not below ``stop``.
     """
+    same_end, majority, quantile = gates
     count = len(last)
     place = limit
     order = np.argsort(-last)
@@ -76,16 +93,16 @@ def _end_of(last, size, limit, stop):
             break
         ends, beyond = 0, 0
         for m in range(count):
-            if last[m] > last[k] + _SAME_END * size[m]:
+            if last[m] > last[k] + same_end * size[m]:
                 beyond += 1
-            elif last[m] >= last[k] - _SAME_END * min(size[m], size[k]):
+            elif last[m] >= last[k] - same_end * min(size[m], size[k]):
                 ends += 1
-        if ends >= _MAJORITY * beyond and beyond > 0:
+        if ends >= majority * beyond and beyond > 0:
             place = last[k]
             break
-        if _MAJORITY * beyond > count:
+        if majority * beyond > count:
             break
-    reach = _SAME_END * np.median(size)
+    reach = same_end * np.median(size)
     total = 0.0
     for k in order:
         if abs(last[k] - place) <= reach:
@@ -94,14 +111,14 @@ def _end_of(last, size, limit, stop):
     for k in order:
         if abs(last[k] - place) <= reach:
             so_far += 1.0 / (size[k] * size[k])
-            if so_far >= total / 3.0:
+            if so_far >= quantile * total:
                 return last[k]
     return place
 
 
 @loop
-def trim(center, image, ray, length, pointers, rows, active, X, front):
-    """Move the end points of lines to where they end; front (M,): observation lies before its camera."""
+def _trim_all(center, image, ray, length, pointers, rows, active, gates, X, front):
+    """Loop of :func:`trim`."""
     for n in range(len(pointers) - 1):
         begin, end = pointers[n], pointers[n + 1]
         low_ends, high_ends, sizes = np.empty(end - begin), np.empty(end - begin), np.empty(end - begin)
@@ -119,9 +136,25 @@ def trim(center, image, ray, length, pointers, rows, active, X, front):
         low, high = _seen_twice(first, last)
         if low < high:
             middle = 0.5 * (low + high)
-            high_end = _end_of(last, size, high, middle)
-            low_end = -_end_of(-first, size, -low, -middle)
+            high_end = _end_of(last, size, high, middle, gates)
+            low_end = -_end_of(-first, size, -low, -middle, gates)
             a0, a1, a2 = X[n, 0, 0], X[n, 0, 1], X[n, 0, 2]
             d0, d1, d2 = X[n, 1, 0] - a0, X[n, 1, 1] - a1, X[n, 1, 2] - a2
             X[n, 0, 0], X[n, 0, 1], X[n, 0, 2] = a0 + low_end * d0, a1 + low_end * d1, a2 + low_end * d2
             X[n, 1, 0], X[n, 1, 1], X[n, 1, 2] = a0 + high_end * d0, a1 + high_end * d1, a2 + high_end * d2
+
+
+def trim(
+    center: FloatArray,
+    image: IntArray,
+    ray: FloatArray,
+    length: FloatArray,
+    pointers: IntArray,
+    rows: IntArray,
+    active: BoolArray,
+    X: FloatArray,
+    front: BoolArray,
+    gates: LineEndGates = LINE_ENDS,
+) -> None:
+    """Move the end points X (L, 2, 3) of lines to where they end; front (M,): observation lies before its camera."""
+    _trim_all(center, image, ray, length, pointers, rows, active, numbers(gates), X, front)

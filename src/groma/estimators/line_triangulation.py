@@ -42,12 +42,14 @@ from groma.estimators._line_observations import (
     to_world,
 )
 from groma.estimators.line_refinement import refine_lines
+from groma.gates import gate
 from groma.geometry import line3, projection, segment2
 from groma.geometry.algebra import dot, norm, ratio, stack, vectors
 from groma.geometry.so3 import hat
 
 __all__ = [
     "LineTriangulation",
+    "TriangulationGates",
     "TriangulationStatus",
     "triangulate_lines",
     "triangulate_planes",
@@ -56,8 +58,26 @@ __all__ = [
 ]
 
 
+@dataclass(frozen=True)
+class TriangulationGates:
+    """Lines from planes."""
+
+    min_sine: float = gate(
+        0.05,
+        "1",
+        "sine of the angle of two planes that tells a line: 3 degrees",
+        "derived from noise: its error grows 20 times",
+    )
+
+
+#: The defaults.
+TRIANGULATION = TriangulationGates()
+
+
 # ------------------------------------------------------------------------------------------------------------ Two views
-def triangulate_two_planes(first: FloatArray, second: FloatArray, min_sine: float = 0.05) -> LineTriangulation:
+def triangulate_two_planes(
+    first: FloatArray, second: FloatArray, min_sine: float = TRIANGULATION.min_sine
+) -> LineTriangulation:
     """Lines in which two planes meet, with the quality of the intersection.
 
     Parameters
@@ -187,7 +207,7 @@ def triangulate_planes(
     centers: FloatArray,
     weights: FloatArray | None = None,
     pair: str = "planes",
-    min_sine: float = 0.05,
+    min_sine: float = TRIANGULATION.min_sine,
 ) -> LineTriangulation:
     r"""Lines from n planes each, by the singular vectors of the stacked planes.
 
@@ -228,7 +248,7 @@ def triangulate_plucker(
     line_pointers: IntArray,
     centers: FloatArray,
     weights: FloatArray | None = None,
-    min_sine: float = 0.05,
+    min_sine: float = TRIANGULATION.min_sine,
 ) -> LineTriangulation:
     r"""Lines from n planes each, linear in the Plücker vector, then moved to the closest valid line.
 
@@ -251,7 +271,7 @@ def triangulate_lines(
     segments: FloatArray,
     line_pointers: IntArray,
     weights: FloatArray | None = None,
-    min_sine: float = 0.05,
+    min_sine: float = TRIANGULATION.min_sine,
     with_covariance: bool = False,
 ) -> LineTriangulation:
     """Lines from image segments: linear estimate, maximum likelihood, check that they lie in front of the cameras.

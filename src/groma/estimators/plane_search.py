@@ -29,15 +29,12 @@ from scipy import stats
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.estimators._plane_candidates import Scores, features_of, from_neighbours, from_segments
-from groma.estimators._plane_growth import BAND, LINK, Grower, Grown, connected_to
-from groma.estimators._plane_options import PlaneOptions
+from groma.estimators._plane_growth import Grower, Grown, connected_to
+from groma.estimators._plane_options import PLANE_SEARCH, PlaneOptions
 from groma.geometry.algebra import vectors
 
-#: Failures one after the other, of ever weaker candidates, after which the search ends: so many at least, and one for
-#: so many candidates.
-_PATIENCE, _CANDIDATES_PER_FAILURE = 100, 64
-#: A candidate is the same as a plane tried before if it passes its support within so many standard deviations.
-_SAME = 2.0
+#: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
+BAND = PLANE_SEARCH.band
 
 
 @dataclass(frozen=True)
@@ -163,9 +160,9 @@ def _extract(
     first, first_homes = from_neighbours(features, gate, rng)
     second, second_homes, num_pairs = from_segments(features, num_points, gate)
     candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])
-    scores = Scores(features, candidates, homes, gate, LINK)
+    scores = Scores(features, candidates, homes, gate, PLANE_SEARCH.link)
     support, score = scores.of(np.arange(len(candidates)), labels)
-    log_tried = np.log10(10.0 * (len(first) + num_pairs) + 1.0)  # a refined candidate stands for about ten
+    log_tried = np.log10(PLANE_SEARCH.refined * (len(first) + num_pairs) + 1.0)
     found: list[Grown] = []
     # With less information than the test of false alarms asks for, a candidate has little hope.
     least_score = np.log(10.0) * (log_tried - np.log10(options.max_false_alarms))
@@ -174,7 +171,7 @@ def _extract(
     heapify(queue)
     grower = Grower(features, gate, float(log_tried), options)
     failures = 0
-    patience = max(_PATIENCE, len(candidates) // _CANDIDATES_PER_FAILURE)
+    patience = max(PLANE_SEARCH.patience, len(candidates) // PLANE_SEARCH.candidates_per_failure)
     at = np.argsort(homes, kind="stable")
     first_at = np.searchsorted(homes[at], np.arange(len(places) + 1))
     while queue and failures < patience:
@@ -204,7 +201,7 @@ def _extract(
             some = features.places[rows[:: max(1, len(rows) // 64)]]
             alive[left] = _median_above(
                 np.abs(some @ candidates[left, :3].T + candidates[left, 3]),
-                _SAME * float(np.median(features.spread(plane[:3], rows))),
+                PLANE_SEARCH.same * float(np.median(features.spread(plane[:3], rows))),
             )
     return found
 

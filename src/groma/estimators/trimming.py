@@ -23,8 +23,25 @@ from enum import IntEnum
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.gates import gate
 from groma.geometry import incidence, line3, projection
 from groma.geometry.algebra import cofactor, dot, matrices, norm, not_negative, ratio, stack, unit, vectors
+
+
+@dataclass(frozen=True)
+class TrimGates:
+    """Ends of lines."""
+
+    min_sine: float = gate(
+        0.02,
+        "1",
+        "sine of the angle between line and ray that tells an end",
+        "derived from noise: its error grows 50 times",
+    )
+
+
+#: The defaults.
+TRIMS = TrimGates()
 
 
 class TrimStatus(IntEnum):
@@ -55,7 +72,7 @@ class TrimmedPoints:
 
 
 def trim_to_ray(
-    line: FloatArray, ray_origin: FloatArray, ray_direction: FloatArray, min_sine: float = 0.02
+    line: FloatArray, ray_origin: FloatArray, ray_direction: FloatArray, min_sine: float = TRIMS.min_sine
 ) -> TrimmedPoints:
     r"""Point of lines closest to viewing rays.
 
@@ -101,7 +118,11 @@ def trim_to_ray(
 
 
 def trim_in_image(
-    camera: FloatArray, line: FloatArray, pixel: FloatArray, min_sine: float = 0.02, min_distance: float = 1e-9
+    camera: FloatArray,
+    line: FloatArray,
+    pixel: FloatArray,
+    min_sine: float = TRIMS.min_sine,
+    min_distance: float = 1e-9,
 ) -> TrimmedPoints:
     r"""Point of lines whose image is the foot of a pixel on the projected line.
 
@@ -161,7 +182,9 @@ def trim_in_image(
     return TrimmedPoints(point=point, depth=depth, sine=np.broadcast_to(sine, status.shape), status=status)
 
 
-def trim_segments(camera: FloatArray, line: FloatArray, segment: FloatArray, min_sine: float = 0.02) -> TrimmedPoints:
+def trim_segments(
+    camera: FloatArray, line: FloatArray, segment: FloatArray, min_sine: float = TRIMS.min_sine
+) -> TrimmedPoints:
     """Both end points of image segments (..., 4) on lines (..., 6), in the image.
 
     Returns

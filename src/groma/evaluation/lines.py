@@ -40,18 +40,13 @@ from scipy.spatial import KDTree
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
+from groma.evaluation.gates import SCORES
 from groma.evaluation.poses import evaluate_poses
 from groma.geometry.algebra import finite_rows
 from groma.io.geometry import Geometry
 from groma.scene import Scene
 
-#: Places on one segment: at least, at most.
-_PLACES = (4, 1000)
-#: Anchors of all segments or triangles of a set together, about.
-_MAX_ANCHORS = 200_000
 _CHUNK = 100_000
-_STRICT_SHARE = 0.9
-_FOUND_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -119,11 +114,11 @@ def score_lines(
     if len(truth) == len(target):  # segments only
         back, true_length = _near(truth, step, taus, Distances(Geometry(segments=estimate), min(taus), *needed))
         reference_length = float(true_length.sum())
-        covered, halves = (back * true_length[:, None]).sum(0), (back >= _FOUND_SHARE).mean(0)
+        covered, halves = (back * true_length[:, None]).sum(0), (back >= SCORES.found_share).mean(0)
     else:
         reference_length, covered, halves = np.nan, np.full(len(taus), np.nan), np.full(len(taus), np.nan)
     inlier = (forth * length[:, None]).sum(0)
-    shares = [forth > 0, forth >= _STRICT_SHARE]
+    shares = [forth > 0, forth >= SCORES.strict_share]
     any_part, nearly_all = (s.mean(0) if len(estimate) else np.full(len(taus), np.nan) for s in shares)
     recall, precision = _ratio(covered, reference_length), _ratio(inlier, total)
     columns = (recall, any_part, nearly_all, precision, inlier, covered, halves)
@@ -178,7 +173,7 @@ def threshold_list(thresholds: Sequence[float] | None, extent: float) -> list[fl
         if not extent > 0:
             raise InputError("The reference has no extent; pass thresholds in scene units.")
         # Rounded, so that they can be read and typed again.
-        return [float(f"{share * extent:.4g}") for share in (0.001, 0.005, 0.01)]
+        return [float(f"{share * extent:.4g}") for share in SCORES.line_shares]
     taus = sorted({float(tau) for tau in thresholds})
     if not taus or not (taus[0] > 0 and taus[-1] < np.inf):
         raise InputError(f"thresholds must be positive distances in scene units; got {list(thresholds)}.")
@@ -189,7 +184,7 @@ def _near(segments: FloatArray, step: float, taus: list[float], target: Distance
     """Return the share of each segment within each threshold, (L, len(taus)), and the lengths."""
     length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     share = np.zeros((len(segments), len(taus)))
-    count = np.clip(np.ceil(length / step), *_PLACES).astype(np.int64)
+    count = np.clip(np.ceil(length / step), 4, SCORES.max_places).astype(np.int64)
     ends = np.cumsum(count)
     first = 0
     while first < len(segments):
@@ -284,7 +279,7 @@ class Distances:
 
 def _anchors_on_segments(segments: FloatArray, spacing: float) -> tuple[FloatArray, float, IntArray]:
     length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
-    step = max(spacing, float(length.sum()) / _MAX_ANCHORS)
+    step = max(spacing, float(length.sum()) / SCORES.max_anchors)
     count = np.maximum(np.ceil(length / step), 1).astype(np.int64)
     anchors, owner = places_on(segments, count)
     return anchors, float((length / count).max() / 2) if len(segments) else 0.0, owner
@@ -296,7 +291,7 @@ def _anchors_on_triangles(triangles: FloatArray, spacing: float) -> tuple[FloatA
         return np.zeros((0, 3)), 0.0, np.zeros(0, np.int64)
     edges = triangles - np.roll(triangles, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(1)
-    step = max(spacing, float(np.sqrt((longest**2).sum() / _MAX_ANCHORS)))
+    step = max(spacing, float(np.sqrt((longest**2).sum() / SCORES.max_anchors)))
     count = np.maximum(np.ceil(longest / step), 1).astype(np.int64)
     anchors, owners = [], []
     for n in np.unique(count).tolist():

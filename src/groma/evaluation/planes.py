@@ -23,6 +23,7 @@ from scipy.optimize import linear_sum_assignment
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
+from groma.evaluation.gates import SCORES
 from groma.evaluation.lines import threshold_list
 from groma.geometry.algebra import finite_rows
 from groma.scene import Scene
@@ -87,7 +88,7 @@ def match_planes(
     estimate: npt.ArrayLike,
     reference: npt.ArrayLike,
     places: npt.ArrayLike,
-    max_angle_deg: float = 10.0,
+    max_angle_deg: float = SCORES.plane_angle_deg,
     max_offset: float = np.inf,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return matched pairs (m, 2), the angle (degrees) and the offset (scene units) of each; see the module.
@@ -126,7 +127,7 @@ def score_planes(
     estimate: npt.ArrayLike,
     reference: npt.ArrayLike,
     places: npt.ArrayLike,
-    max_angle_deg: float = 10.0,
+    max_angle_deg: float = SCORES.plane_angle_deg,
     max_offset: float = np.inf,
 ) -> PlaneScores:
     """Compare planes with reference planes in the same frame; see :func:`match_planes` for the parameters.
@@ -151,7 +152,7 @@ def score_planes(
 
 
 def evaluate_planes(
-    estimate: Scene, reference: Scene, max_angle_deg: float = 10.0, max_offset: float | None = None
+    estimate: Scene, reference: Scene, max_angle_deg: float = SCORES.plane_angle_deg, max_offset: float | None = None
 ) -> PlaneScores:
     """Compare the planes of two scenes in the same frame.
 
@@ -176,7 +177,7 @@ def evaluate_planes(
     if max_offset is None:
         every = np.concatenate([reference.points.xyz, reference.lines.segments.reshape(-1, 3)])
         sides = np.diff(np.percentile(every, (2, 98), axis=0), axis=0) if len(every) else np.zeros(3)
-        max_offset = 0.01 * float(np.linalg.norm(sides))
+        max_offset = SCORES.plane_share * float(np.linalg.norm(sides))
         if not max_offset > 0:
             raise InputError("The reference has no extent; pass max_offset in scene units.")
     return score_planes(

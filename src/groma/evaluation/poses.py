@@ -11,11 +11,12 @@ import numpy.typing as npt
 from groma._typing import FloatArray
 from groma.errors import InputError
 from groma.evaluation.alignment import align_poses, camera_centers
+from groma.evaluation.gates import SCORES
 from groma.geometry import quaternion
 from groma.scene import Scene, Similarity
 
 #: Thresholds of the area under the curve of pairwise errors, degrees.
-THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0)
+THRESHOLDS_DEG = SCORES.pose_angles_deg
 
 
 @dataclass(frozen=True)

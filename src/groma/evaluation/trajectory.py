@@ -24,6 +24,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.evaluation.alignment import align_poses
+from groma.evaluation.gates import SCORES
 from groma.evaluation.poses import rotation_angle
 from groma.geometry import quaternion, se3
 from groma.io.trajectories import Trajectory
@@ -33,8 +34,7 @@ Alignment = Literal["se3", "sim3", "none"]
 StepUnit = Literal["frames", "metres", "seconds"]
 
 #: Lengths of the segments of the KITTI odometry benchmark, metres, and the step between their first poses.
-SEGMENT_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-SEGMENT_STEP = 10
+SEGMENT_LENGTHS, SEGMENT_STEP = SCORES.segment_lengths, SCORES.segment_step
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def score_trajectory(
     estimate: Trajectory,
     reference: Trajectory,
     align: Alignment = "se3",
-    max_time_difference: float = 0.01,
+    max_time_difference: float = SCORES.time_difference,
     rpe_delta: float = 1.0,
     rpe_unit: StepUnit = "frames",
 ) -> TrajectoryScores:
@@ -188,7 +188,7 @@ def score_trajectory(
 
 
 def associate(
-    first: npt.ArrayLike, second: npt.ArrayLike, max_time_difference: float = 0.01
+    first: npt.ArrayLike, second: npt.ArrayLike, max_time_difference: float = SCORES.time_difference
 ) -> tuple[IntArray, IntArray]:
     """Associate two increasing series of times: each time of the shorter takes the nearest of the longer.
 

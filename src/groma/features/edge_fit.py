@@ -22,6 +22,7 @@ line; with a sigma of that size it takes little part in what is exact.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -29,16 +30,38 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.features.images import GrayImage
+from groma.gates import gate, numbers
 
-REACH = 3  # samples across the segment reach this far on either side, pixels
+#: Samples across the segment reach this far on either side, pixels: the size of an array.
+REACH = 3
 SAMPLES = 2 * REACH + 1
-WINDOW = 1.5  # standard deviation of the window, pixels
-MAX_SHIFT = 1.5  # an end point that would move further keeps its place, pixels
-SIGMA_FLOOR = 0.03  # pixels
-SIGMA_UNFITTED = 0.5  # of segments that could not be fitted, pixels
-PRIOR_SIGMA = 0.15  # of one sample, pixels
-PRIOR_COUNT = 10.0  # samples that the prior weighs
-BOW_TEST = 9.0  # a bow counts from three standard deviations
+
+
+@dataclass(frozen=True)
+class EdgeGates:
+    """How segments are fitted to the grey levels, and how well that makes them known."""
+
+    window: float = gate(1.5, "px", "standard deviation of the window around a peak", "chosen on rendered edges")
+    max_shift: float = gate(
+        1.5, "px", "an end point that would move further keeps its place", "chosen on rendered edges"
+    )
+    min_sigma: float = gate(
+        0.03, "px", "what no image can tell: lens model, shading", "chosen on Strecha's scenes, against their surveys"
+    )
+    unfitted_sigma: float = gate(0.5, "px", "segments that could not be fitted", "derived from the detector's pixels")
+    prior_sigma: float = gate(0.15, "px", "noise of one sample, before any is seen", "chosen on Strecha's scenes")
+    prior_count: float = gate(10.0, "samples", "samples that this weighs", "chosen on Strecha's scenes")
+    bow_test: float = gate(9.0, "sigma squared", "a bow counts from here", "derived from normal noise: 1 in 370")
+    outlier: float = gate(
+        4.0, "sigma", "samples farther from the line weigh nothing", "derived from Tukey's 95 % efficiency"
+    )
+    min_share: float = gate(
+        0.5, "share", "share of the samples that show an edge", "derived from the median it starts from"
+    )
+
+
+#: The defaults.
+EDGES = EdgeGates()
 
 
 # -------------------------------------------------------------------------------------------------------- Kernels
@@ -57,7 +80,7 @@ def _bilinear(image, x, y):
 
 
 @kernel
-def _peak(profile):
+def _peak(profile, window):
     """Offset of the steepest ascent in a profile of grey levels, pixels; NaN where there is none inside."""
     best, at = 0.0, -1
     for k in range(SAMPLES - 1):
@@ -72,7 +95,7 @@ def _peak(profile):
         moment = 0.0
         for k in range(SAMPLES - 1):
             away = k - REACH + 0.5 - center
-            weight = max(profile[k + 1] - profile[k], 0.0) * math.exp(-0.5 * away * away / WINDOW**2)
+            weight = max(profile[k + 1] - profile[k], 0.0) * math.exp(-0.5 * away * away / window**2)
             total += weight
             moment += weight * away
         # The window pulls the centroid back by this factor when the edge is blurred by about one pixel.
@@ -105,8 +128,9 @@ def _line_fit(s, e, w, n, out):
 
 
 @loop
-def _measure_all(image, ends, fit, new_ends, sigma, strength):
-    """Direct, fit and rate all segments; `image` is float32, smoothed."""
+def _measure_all(image, ends, fit, gates, new_ends, sigma, strength):
+    """Direct, fit and rate all segments; `image` is float32, smoothed, `gates` the numbers of :class:`EdgeGates`."""
+    window, max_shift, min_sigma, unfitted_sigma, prior_sigma, prior_count, bow_test, outlier, min_share = gates
     profile = np.zeros(SAMPLES)
     line = np.zeros(2)
     for row in range(ends.shape[0]):
@@ -125,7 +149,7 @@ def _measure_all(image, ends, fit, new_ends, sigma, strength):
             dx, dy = -dx, -dy
         strength[row] = 0.5 * abs(total) / count
         new_ends[row, 0], new_ends[row, 1], new_ends[row, 2], new_ends[row, 3] = u1, v1, u2, v2
-        sigma[row] = SIGMA_UNFITTED
+        sigma[row] = unfitted_sigma
         if not fit:
             continue
         s, e, w, spread = np.zeros(count), np.zeros(count), np.ones(count), np.zeros(count)
@@ -135,11 +159,11 @@ def _measure_all(image, ends, fit, new_ends, sigma, strength):
             x, y = u1 + t * (u2 - u1) - 0.5, v1 + t * (v2 - v1) - 0.5
             for j in range(SAMPLES):
                 profile[j] = _bilinear(image, x - (j - REACH) * dy, y + (j - REACH) * dx)
-            peak = _peak(profile)
+            peak = _peak(profile, window)
             if peak == peak:
                 s[n], e[n] = t - 0.5, peak
                 n += 1
-        if n < 5 or n < 0.5 * count:
+        if n < 5 or n < min_share * count:
             continue
         # Start from the median offset: half of the samples may belong to a neighbouring edge.
         line[0], line[1] = np.median(e[:n]), 0.0
@@ -147,7 +171,7 @@ def _measure_all(image, ends, fit, new_ends, sigma, strength):
         for _ in range(4):
             for k in range(n):
                 spread[k] = abs(e[k] - line[0] - line[1] * s[k])
-            cut = 4.0 * max(1.4826 * np.median(spread[:n]), 0.05)
+            cut = outlier * max(1.4826 * np.median(spread[:n]), 0.05)
             for k in range(n):
                 ratio = spread[k] / cut
                 w[k] = (1.0 - ratio * ratio) ** 2 if ratio < 1.0 else 0.0
@@ -155,7 +179,7 @@ def _measure_all(image, ends, fit, new_ends, sigma, strength):
                 good = False
                 break
         first, second = line[0] - 0.5 * line[1], line[0] + 0.5 * line[1]
-        if not good or abs(first) > MAX_SHIFT or abs(second) > MAX_SHIFT:
+        if not good or abs(first) > max_shift or abs(second) > max_shift:
             continue
         new_ends[row, 0], new_ends[row, 1] = u1 - dy * first, v1 + dx * first
         new_ends[row, 2], new_ends[row, 3] = u2 - dy * second, v2 + dx * second
@@ -171,17 +195,19 @@ def _measure_all(image, ends, fit, new_ends, sigma, strength):
             if k > 0:
                 lagged += math.sqrt(w[k] * w[k - 1]) * residual * before
             before = residual
-        variance = (squares + PRIOR_COUNT * PRIOR_SIGMA**2) / (weight + PRIOR_COUNT)
+        variance = (squares + prior_count * prior_sigma**2) / (weight + prior_count)
         rho = min(max(lagged / max(squares, 1e-12), 0.0), 0.9)
         effective = max(weight * (1.0 - rho) / (1.0 + rho), 2.0)
         bow /= max(bows, 1e-12)
-        if bow * bow * bows < BOW_TEST * variance * (weight / effective):
+        if bow * bow * bows < bow_test * variance * (weight / effective):
             bow = 0.0
-        sigma[row] = math.sqrt(SIGMA_FLOOR**2 + 4.0 * variance / effective + (bow / 6.0) ** 2)
+        sigma[row] = math.sqrt(min_sigma**2 + 4.0 * variance / effective + (bow / 6.0) ** 2)
 
 
 # --------------------------------------------------------------------------------------------------------- Public
-def measure_edges(image: GrayImage, ends: FloatArray, fit: bool = True) -> tuple[FloatArray, FloatArray, FloatArray]:
+def measure_edges(
+    image: GrayImage, ends: FloatArray, fit: bool = True, gates: EdgeGates = EDGES
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Direct segments by the gradient (darker side left), fit them to the grey levels, and rate them.
 
     Parameters
@@ -192,6 +218,8 @@ def measure_edges(image: GrayImage, ends: FloatArray, fit: bool = True) -> tuple
         Segments within about a pixel of the edges, pixels.
     fit : bool
         Whether the end points may move across the segment; otherwise only their order changes.
+    gates : EdgeGates
+        Numbers of the fit.
 
     Returns
     -------
@@ -206,8 +234,8 @@ def measure_edges(image: GrayImage, ends: FloatArray, fit: bool = True) -> tuple
     new_ends, sigma, strength = np.zeros_like(ends), np.zeros(len(ends)), np.zeros(len(ends))
     if len(ends):
         smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
-        _measure_all(smooth, ends, fit, new_ends, sigma, strength)
+        _measure_all(smooth, ends, fit, numbers(gates), new_ends, sigma, strength)
     return new_ends, sigma, strength
 
 
-__all__ = ["measure_edges"]
+__all__ = ["EDGES", "EdgeGates", "measure_edges"]

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from groma.errors import InputError
 from groma.features.edge_fit import measure_edges
 from groma.features.images import to_gray
-from groma.features.merging import merge_collinear
+from groma.features.merging import MERGES, merge_collinear
 from groma.features.segments import Segments
 
 MIN_IMAGE = 8  # pixels; LSD needs a few gradients, and no segment fits in less
@@ -70,7 +70,7 @@ class LsdDetector:
         if detected is None or np.size(detected) == 0:
             return Segments.empty()
         ends = np.asarray(detected, dtype=np.float64).reshape(-1, 4) + 0.5 / self.scale
-        ends = _keep_long(ends, min(self.min_length, 8.0) if self.merge else self.min_length)
+        ends = _keep_long(ends, min(self.min_length, MERGES.min_piece) if self.merge else self.min_length)
         ends, sigma, strength = measure_edges(gray, ends, fit=self.fit)
         if self.merge:
             merged = merge_collinear(ends)

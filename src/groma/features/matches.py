@@ -10,6 +10,19 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.features.segments import Segments
+from groma.gates import gate
+
+
+@dataclass(frozen=True)
+class RivalGates:
+    """Candidates that continue the line of the best one are no rivals of it."""
+
+    distance: float = gate(2.0, "px", "distance from the line of the best one", "derived from edges one pixel wide")
+    angle: float = gate(0.02, "rad", "and angle", "derived from a pixel at the ends of a segment")
+
+
+#: The numbers in use.
+RIVALS = RivalGates()
 
 
 @dataclass(frozen=True)
@@ -109,10 +122,10 @@ def _best_and_rival(
         np.abs((line[:, :2] * ends[:, :2]).sum(axis=1) + line[:, 2]),
         np.abs((line[:, :2] * ends[:, 2:]).sum(axis=1) + line[:, 2]),
     )
-    is_rival = (other != chosen) & (distance > 2.0 + 0.02 * segments.length[other])
+    is_rival = (other != chosen) & (distance > RIVALS.distance + RIVALS.angle * segments.length[other])
     rival = np.full(len(best), -np.inf)
     np.maximum.at(rival, owner[is_rival], evidence[is_rival])
     return best, rival
 
 
-__all__ = ["LineMatches", "mutual_best"]
+__all__ = ["LineMatches", "RivalGates", "mutual_best"]

@@ -8,27 +8,41 @@ one line. Chains are joined whole; a chain that bends is left in pieces.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from groma._typing import FloatArray
+from groma.gates import gate
 
 
-def merge_collinear(ends: FloatArray, gap: float = 8.0, angle: float = 0.04, distance: float = 1.0) -> FloatArray:
+@dataclass(frozen=True)
+class MergeGates:
+    """Pieces of one edge."""
+
+    min_piece: float = gate(8.0, "px", "shortest piece of a segment", "derived from what LSD finds in noise")
+    gap: float = gate(8.0, "px", "from the end of one piece to the beginning of the next", "chosen on Strecha's scenes")
+    angle: float = gate(0.04, "rad", "between two pieces", "chosen on Strecha's scenes")
+    distance: float = gate(1.0, "px", "of an end point from the joined line", "derived from edges one pixel wide")
+    overlap: float = gate(2.0, "px", "by which the next piece may begin before the end", "chosen on Strecha's scenes")
+
+
+#: The defaults.
+MERGES = MergeGates()
+
+
+def merge_collinear(ends: FloatArray, gates: MergeGates = MERGES) -> FloatArray:
     """Segments with collinear neighbours joined.
 
     Parameters
     ----------
     ends : (N, 4) float64
         Directed segments, pixels.
-    gap : float
-        Largest distance from the end of one piece to the beginning of the next, pixels.
-    angle : float
-        Largest angle between two pieces, radians.
-    distance : float
-        Largest distance of an end point from the joined line, pixels.
+    gates : MergeGates
+        What counts as one edge.
 
     Returns
     -------
@@ -41,15 +55,15 @@ def merge_collinear(ends: FloatArray, gap: float = 8.0, angle: float = 0.04, dis
     start, end = ends[:, :2], ends[:, 2:]
     length = np.maximum(np.linalg.norm(end - start, axis=1), 1e-9)
     along = (end - start) / length[:, None]
-    near = KDTree(end).sparse_distance_matrix(KDTree(start), gap, output_type="coo_matrix")
+    near = KDTree(end).sparse_distance_matrix(KDTree(start), gates.gap, output_type="coo_matrix")
     first, second = near.row.astype(np.intp), near.col.astype(np.intp)
     # The next piece must lie ahead, parallel, and on the line of the longer of the two.
     longer = np.where((length[first] >= length[second]), first, second)
     offset = start[second] - end[first]
     across = np.abs(offset[:, 0] * along[longer, 1] - offset[:, 1] * along[longer, 0])
     ahead = (offset * along[longer]).sum(axis=1)
-    parallel = (along[first] * along[second]).sum(axis=1) > np.cos(angle)
-    joined = (first != second) & parallel & (across < distance) & (ahead > -2.0)
+    parallel = (along[first] * along[second]).sum(axis=1) > np.cos(gates.angle)
+    joined = (first != second) & parallel & (across < gates.distance) & (ahead > -gates.overlap)
     first, second = first[joined], second[joined]
     graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(len(ends), len(ends)))
     count, group = connected_components(graph, directed=False)
@@ -75,9 +89,9 @@ def merge_collinear(ends: FloatArray, gap: float = 8.0, angle: float = 0.04, dis
     np.maximum.at(high, owner, at)
     np.maximum.at(worst, owner, off)
 
-    straight = (size > 1) & (worst <= distance)
+    straight = (size > 1) & (worst <= gates.distance)
     whole = np.hstack([mean + low[:, None] * axis, mean + high[:, None] * axis])[straight]
     return np.vstack([ends[~straight[group]], whole])
 
 
-__all__ = ["merge_collinear"]
+__all__ = ["MERGES", "MergeGates", "merge_collinear"]

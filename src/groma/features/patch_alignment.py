@@ -36,15 +36,37 @@ from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import ShapeError
 from groma.features.images import GrayImage
+from groma.gates import gate, numbers
 
 RADIUS = 7  # of the template, pixels
 SIZE = 2 * RADIUS + 3  # side of a template: the patch and one pixel more for its gradient
-SPREAD = 4.0  # standard deviation of the window, pixels
-SMOOTHING = 0.8  # of both images, pixels: cubic interpolation is exact to a hundredth of a pixel then
-MAX_ITERATIONS = 20
-STEP = 2e-3  # pixels: a smaller step ends the iteration
-SHAPE_SIGMA = 0.1  # how far a step may turn, shear and stretch the patch, against grey levels of no texture
 _COUNT = (2 * RADIUS + 1) ** 2
+
+
+@dataclass(frozen=True)
+class PatchGates:
+    """How a template is aligned."""
+
+    spread: float = gate(4.0, "px", "standard deviation of the window", "chosen on Strecha's scenes")
+    max_iterations: int = gate(20, "steps", "steps of an alignment", "cost: converges in fewer")
+    step: float = gate(2e-3, "px", "a smaller step ends the alignment", "cost: a tenth of what it is good for")
+    shape_sigma: float = gate(
+        0.1, "1", "how far a step may turn, shear and stretch the patch, against grey levels of no texture",
+        "chosen on Strecha's scenes",
+    )  # fmt: skip
+    unexplained: float = gate(
+        0.01, "share", "of the contrast squared, that no template explains", "chosen on Strecha's scenes"
+    )
+    min_texture: float = gate(
+        1.0, "grey levels squared", "templates with less are left alone", "derived from camera noise"
+    )
+    smoothing: float = gate(
+        0.8, "px", "blur of both images", "derived from cubic interpolation: exact to a hundredth of a pixel then"
+    )
+
+
+#: The defaults.
+PATCHES = PatchGates()
 
 
 # -------------------------------------------------------------------------------------------------------- Kernels
@@ -94,12 +116,15 @@ def _cut_all(image, pixels, templates, fractions):
 
 
 @loop
-def _align_all(image, templates, fractions, template_index, pixels, shapes, out_pixels, covariance, correlation):
+def _align_all(
+    image, templates, fractions, template_index, pixels, shapes, gates, out_pixels, covariance, correlation
+):  # fmt: skip
     """Align one template per row to the image; correlation NaN where it left the image or has no texture."""
+    spread, max_iterations, smallest_step, shape_sigma, unexplained, min_texture, _ = gates
     height, width = image.shape
     window = np.empty(2 * RADIUS + 1)
     for k in range(2 * RADIUS + 1):
-        window[k] = math.exp(-0.5 * ((k - RADIUS) / SPREAD) ** 2)
+        window[k] = math.exp(-0.5 * ((k - RADIUS) / spread) ** 2)
     S, T, W, warped = np.empty((_COUNT, 8)), np.empty(_COUNT), np.empty(_COUNT), np.empty(_COUNT)
     H, rhs, delta, wu, wv = np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(4), np.empty(4)
     for row in range(pixels.shape[0]):
@@ -136,20 +161,20 @@ def _align_all(image, templates, fractions, template_index, pixels, shapes, out_
                 for a in range(8):
                     for b in range(a + 1):
                         H[a, b] += W[k] * S[k, a] * S[k, b]
-        if not squares > total:  # less than a grey level of texture
+        if not squares > min_texture * total:
             continue
-        noise = 0.01 * squares / total  # what is not explained: a tenth of the contrast
+        noise = unexplained * squares / total
         for a in range(8):
             for b in range(a):
                 H[b, a] = H[a, b]
         for a in range(4):
-            H[a, a] += noise / SHAPE_SIGMA**2
+            H[a, a] += noise / shape_sigma**2
         if not _solve_in_place(H, 8):
             continue
         A0, A1, A2, A3 = shapes[row, 0, 0], shapes[row, 0, 1], shapes[row, 1, 0], shapes[row, 1, 1]
         cu, cv = pixels[row, 0] - 0.5, pixels[row, 1] - 0.5
         inside, residual, likeness = True, 0.0, -1.0
-        for iteration in range(MAX_ITERATIONS + 1):
+        for iteration in range(int(max_iterations) + 1):
             mean = 0.0
             for v in range(2 * RADIUS + 1):
                 y = v - RADIUS - fv
@@ -198,7 +223,7 @@ def _align_all(image, templates, fractions, template_index, pixels, shapes, out_
                 delta[a] = 0.0
                 for b in range(8):
                     delta[a] += H[a, b] * rhs[b]
-            if iteration == MAX_ITERATIONS:
+            if iteration == max_iterations:
                 break
             # The increment of the template, undone in the image.
             D0, D1, D2, D3 = 1.0 + delta[0], delta[1], delta[2], 1.0 + delta[3]
@@ -212,7 +237,7 @@ def _align_all(image, templates, fractions, template_index, pixels, shapes, out_
             su, sv = A0 * delta[4] + A1 * delta[5], A2 * delta[4] + A3 * delta[5]
             cu -= su
             cv -= sv
-            if su * su + sv * sv < STEP**2:
+            if su * su + sv * sv < smallest_step**2:
                 break
         if not inside:
             continue
@@ -259,7 +284,7 @@ class Alignment:
 def smoothed(image: GrayImage) -> npt.NDArray[np.float32]:
     """Return the grey levels as templates are cut from and aligned to: float32, slightly smoothed."""
     levels = image.astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(levels, (0, 0), SMOOTHING, borderType=cv2.BORDER_REPLICATE), np.float32)
+    return np.asarray(cv2.GaussianBlur(levels, (0, 0), PATCHES.smoothing, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def cut_templates(smooth_image: npt.NDArray[np.float32], pixels: FloatArray) -> Templates:
@@ -280,6 +305,7 @@ def align_templates(
     template_index: IntArray,
     pixels: FloatArray,
     shapes: FloatArray,
+    gates: PatchGates = PATCHES,
 ) -> Alignment:
     """Align templates to an image.
 
@@ -295,6 +321,8 @@ def align_templates(
         Where it is looked for, within a pixel or two, pixels.
     shapes : (N, 2, 2) float64
         Derivative of pixels in this image by pixels of the template, to about a fifth.
+    gates : PatchGates
+        Numbers of the alignment.
 
     Returns
     -------
@@ -315,8 +343,9 @@ def align_templates(
     found = np.zeros((len(pixels), 2))
     covariance, correlation = np.zeros((len(pixels), 2, 2)), np.zeros(len(pixels))
     _align_all(
-        smooth_image, templates.levels, templates.fractions, index, pixels, shapes, found, covariance, correlation
-    )
+        smooth_image, templates.levels, templates.fractions, index, pixels, shapes, numbers(gates), found, covariance,
+        correlation,
+    )  # fmt: skip
     return Alignment(found, covariance, correlation)
 
 
@@ -327,4 +356,4 @@ def _rows(array: FloatArray, row: tuple[int, ...], name: str) -> FloatArray:
     return rows
 
 
-__all__ = ["Alignment", "Templates", "align_templates", "cut_templates", "smoothed"]
+__all__ = ["Alignment", "PatchGates", "Templates", "align_templates", "cut_templates", "smoothed"]

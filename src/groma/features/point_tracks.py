@@ -9,19 +9,42 @@ Pixels count from the corner of the image (first pixel's centre at 0.5, 0.5).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.images import GrayImage
+from groma.gates import gate
 
 _HALF = np.float32(0.5)
-#: Least correlation of a patch with the one it was followed from: more signal than noise.
-MIN_ALIKE = 0.5
-#: Width of the blocks in which corners are rated, pixels; the mean eigenvalue in them that noise of one grey level
-#: makes (OpenCV's units: 12 times 25 samples, by 4, 5 and 255), and how often that a corner must have. Noise alone
-#: reaches three times in an image of 640 x 480.
-BLOCK, NOISE_EIGENVALUE, ABOVE_NOISE = 5, 12.0 * 25.0 / (4.0 * 5.0 * 255.0) ** 2, 4.0
+
+
+@dataclass(frozen=True)
+class PointTrackGates:
+    """Points worth following, and points that were followed."""
+
+    min_alike: float = gate(
+        0.5, "correlation", "of a patch with the one it was followed from", "derived from signal over noise"
+    )
+    iterations: int = gate(15, "steps", "steps of Lucas-Kanade on each level", "cost: converges in fewer")
+    converged: float = gate(0.03, "px", "a smaller step ends them", "cost: a tenth of what they are good for")
+    min_texture: float = gate(1e-4, "1", "least eigenvalue of a patch, OpenCV's units", "convention: OpenCV's default")
+    block: int = gate(5, "px", "width of the blocks in which corners are rated", "chosen on rendered rooms")
+    above_noise: float = gate(
+        4.0, "ratio", "eigenvalue of a corner to that of noise", "derived from noise: three corners in 640 x 480 at 4"
+    )
+    quality: float = gate(0.005, "share", "eigenvalue of a corner, of the strongest", "chosen on rendered rooms")
+
+    @property
+    def noise_eigenvalue(self) -> float:
+        """Mean eigenvalue that noise of one grey level makes: 12 times the samples, by 4, the width and 255."""
+        return 12.0 * self.block**2 / (4.0 * self.block * 255.0) ** 2
+
+
+#: The numbers in use.
+POINT_TRACKS = PointTrackGates()
 
 
 def follow(
@@ -60,8 +83,8 @@ def follow(
     settings: dict = {
         "winSize": (window, window),
         "maxLevel": levels,
-        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03),
-        "minEigThreshold": 1e-4,
+        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, POINT_TRACKS.iterations, POINT_TRACKS.converged),
+        "minEigThreshold": POINT_TRACKS.min_texture,
     }
     start = np.ascontiguousarray(pixels, dtype=np.float32) - _HALF
     guess = start.copy() if guesses is None else np.ascontiguousarray(guesses, dtype=np.float32) - _HALF
@@ -74,7 +97,7 @@ def follow(
         good &= ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
     if good.any():
         rows = np.flatnonzero(good)
-        good[rows] = _alike(image_1, image_2, start[rows], there[rows], window) > MIN_ALIKE
+        good[rows] = _alike(image_1, image_2, start[rows], there[rows], window) > POINT_TRACKS.min_alike
     if round_trip is not None and good.any():
         settings["maxLevel"] = min(1, levels)
         rows = np.flatnonzero(good)
@@ -103,7 +126,7 @@ def _alike(image_1: GrayImage, image_2: GrayImage, first, second, window: int) -
 
 
 def spread(
-    pixels: FloatArray, strength: FloatArray, taken: FloatArray, shape: tuple[int, int], count: int, cell: int = 24
+    pixels: FloatArray, strength: FloatArray, taken: FloatArray, shape: tuple[int, int], count: int, cell: int
 ) -> IntArray:
     """Choose points evenly over the image: the strongest of each grid cell that holds no point yet.
 
@@ -142,13 +165,15 @@ def spread(
 
 def corners(image: GrayImage, count: int, distance: float, mask: GrayImage | None = None) -> FloatArray:
     """Corners (Shi and Tomasi) that noise does not explain, (N, 2) pixels, strongest first."""
-    found = cv2.goodFeaturesToTrack(image, count, 0.005, distance, mask=mask, blockSize=BLOCK)
+    gates = POINT_TRACKS
+    found = cv2.goodFeaturesToTrack(image, count, gates.quality, distance, mask=mask, blockSize=gates.block)
     if found is None:
         return np.zeros((0, 2))
     at = found.reshape(-1, 2)
     column, row = at.astype(np.int64).T
-    strength = cv2.cornerMinEigenVal(image, BLOCK)[row, column]
-    return at[strength > ABOVE_NOISE * NOISE_EIGENVALUE * image_noise(image) ** 2].astype(np.float64) + 0.5
+    strength = cv2.cornerMinEigenVal(image, gates.block)[row, column]
+    noise = gates.noise_eigenvalue * image_noise(image) ** 2
+    return at[strength > gates.above_noise * noise].astype(np.float64) + 0.5
 
 
 def image_noise(image: GrayImage) -> float:
@@ -157,4 +182,4 @@ def image_noise(image: GrayImage) -> float:
     return 1.4826 / 6.0 * float(np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, kernel)[::2, ::2])))
 
 
-__all__ = ["corners", "follow", "image_noise", "spread"]
+__all__ = ["PointTrackGates", "corners", "follow", "image_noise", "spread"]

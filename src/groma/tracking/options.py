@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from groma.errors import InputError
 from groma.features.contract import SegmentDetector
 from groma.features.registry import DETECTORS
+from groma.tracking.gates import TrackingGates
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,8 @@ class TrackOptions:
     relations: bool = True
     #: Adjust the window in a thread of its own; its result is taken up two frames later, so runs repeat exactly.
     threaded: bool = True
+    #: Tuned numbers: thresholds, with unit, meaning and origin.
+    gates: TrackingGates = field(default_factory=TrackingGates)
 
     def make_detector(self) -> SegmentDetector:
         """Return the detector; :class:`~groma.errors.InputError` if there is none of that name."""

@@ -27,7 +27,7 @@ from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.submaps import Part, about_parts
 from groma.tracking.frame.camera import TrackCamera, back
 from groma.tracking.frame.checks import FrameChecks
-from groma.tracking.frame.coarse_alignment import TURN_SIGMA, turned, turned_prediction
+from groma.tracking.frame.coarse_alignment import turned, turned_prediction
 from groma.tracking.frame.features import FrameFeatures, grid_pixels
 from groma.tracking.map.keyframes import Followed, keyframe_nearby, wants_keyframe
 from groma.tracking.map.points import find_again
@@ -50,14 +50,9 @@ from groma.tracking.pose.following import follow_frame
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import Found, promote
-from groma.tracking.pose.verification import PoseVerification, is_near, score_of
+from groma.tracking.pose.verification import PoseVerification
 from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
-
-#: After this many lost frames and seconds a new map is begun.
-RESTART_FRAMES, RESTART_SECONDS = 5, 0.5
-#: After this many lost frames, the frame is no longer looked for near where the camera was.
-NEAR_FRAMES = 5
 
 
 class Tracker:
@@ -75,8 +70,9 @@ class Tracker:
         self.options = options or TrackOptions()
         self.camera = TrackCamera.of(camera)
         self.status = STARTING
-        self._checks = FrameChecks(self.camera)
-        self._motion = MotionModel()
+        self._gates = self.options.gates.verification
+        self._checks = FrameChecks(self.camera, self.options.gates.checks)
+        self._motion = MotionModel(self.options.gates.motion)
         self._initialiser: Initialiser | None = None
         self._mapper = Mapper(self.camera, self.options)
         self._present = Present()
@@ -126,7 +122,7 @@ class Tracker:
         estimate, doubtful, found, trusted = None, None, None, False
         followed = Followed.nothing()
         assert present.data is not None
-        if self._lost_for <= NEAR_FRAMES:
+        if self._lost_for <= self._gates.near_frames:
             with watch("turn"):
                 predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
             estimate, followed = follow_frame(
@@ -147,7 +143,9 @@ class Tracker:
                 mapper.make_keyframe(present, watch)
             with watch("find"):
                 found = self._find(data, predicted, prior_sigma, doubtful)
-            if found is not None and not (trusted and doubtful is not None and score_of(doubtful) >= found.score):
+            if found is not None and not (
+                trusted and doubtful is not None and self._verification.score(doubtful) >= found.score
+            ):
                 estimate, followed = found.estimate, Followed(promote(self.map, found, data), found.lines)
             elif doubtful is not None and (trusted or self._verification.confirms(self.map, data, doubtful)):
                 # The new keyframe may have moved the map.
@@ -185,48 +183,48 @@ class Tracker:
 
         While the frame before has no pose, turns from frame to frame tell roughly where the camera looks.
         """
-        present, points = self._present, self.map.points
+        present, points, gates = self._present, self.map.points, self.options.gates.turns
         assert present.data is not None
         if self._lost_for:
             gray, pose = self._guess
-            pose = turned(self.camera, gray, data.gray, pose)
-            return pose, np.maximum(prior_sigma, TURN_SIGMA * (1.0 + self._lost_for))
+            pose = turned(self.camera, gray, data.gray, pose, gates)
+            return pose, np.maximum(prior_sigma, gates.sigma * (1.0 + self._lost_for))
         tracks = present.followed.points
         tracks = tracks.take(points.alive[tracks.index])
         better = turned_prediction(
             self.camera, present.data.gray, data.gray, (tracks.pixel, points.xyz[tracks.index]),
-            self._spread(present.data, present.pose), present.pose, predicted,
+            self._spread(present.data, present.pose), present.pose, predicted, gates,
         )  # fmt: skip
         if better is None:
             return predicted, prior_sigma
-        return better, np.maximum(prior_sigma, [0.0] * 3 + [TURN_SIGMA] * 3)
+        return better, np.maximum(prior_sigma, [0.0] * 3 + [gates.sigma] * 3)
 
     def _spread(self, data: FrameFeatures, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels spread over a frame and their places, where it has a depth image."""
         if data.depth is None:
             return np.zeros((0, 2)), np.zeros((0, 3))
         known = np.isfinite(data.depth_grid)
-        pixel = grid_pixels(self.camera)[known]
+        pixel = grid_pixels(self.camera, self.options.gates.depth)[known]
         return pixel, back(pose, self.camera.bearings(pixel) * data.depth_grid[known, None])
 
     def _find(self, data, predicted, prior_sigma, doubtful: PoseEstimate | None) -> Found | None:
         """Find a pose by described features: near the last keyframes first, then anywhere."""
-        if self._lost_for <= NEAR_FRAMES:
+        if self._lost_for <= self._gates.near_frames:
             guesses = [predicted, self._present.pose] + ([doubtful.pose] if doubtful is not None else [])
             found = self._verification.find_near(self.map, data, guesses, predicted, prior_sigma)
             if found is not None:
                 return found
         found = self._verification.find_anywhere(self.map, data)
-        if found is None or self._lost_for > NEAR_FRAMES:
+        if found is None or self._lost_for > self._gates.near_frames:
             return found
-        return found if is_near(found.estimate.pose, predicted, prior_sigma) else None
+        return found if self._verification.is_near(found.estimate.pose, predicted, prior_sigma) else None
 
     def _find_again(self, data: FrameFeatures, pose: FloatArray, followed: Followed) -> Followed:
         """Look for points of the map that are in view but not followed."""
-        room = self.options.num_points - len(followed.points)
-        if not self.options.points or room < 0.2 * self.options.num_points:
+        room, gates = self.options.num_points - len(followed.points), self.options.gates.points
+        if not self.options.points or room < gates.again_room * self.options.num_points:
             return followed
-        found = find_again(self.map, self.camera, data.gray, pose, followed.points, room)
+        found = find_again(self.map, self.camera, data.gray, pose, followed.points, room, gates)
         return Followed(followed.points.joined(found), followed.lines)
 
     def _visit_nearby(self, data: FrameFeatures) -> bool:
@@ -235,8 +233,10 @@ class Tracker:
         if keyframe is None or self._mapper.busy:
             return False
         self.map.visit(keyframe)
-        points = self._present.followed.points
-        found = find_again(self.map, self.camera, data.gray, self._present.pose, points, self.options.num_points)
+        points, most = self._present.followed.points, self.options.num_points
+        found = find_again(
+            self.map, self.camera, data.gray, self._present.pose, points, most, self.options.gates.points
+        )
         points = points.joined(found)
         seen = np.isin(keyframe.measured.points.index, points.index).sum()
         if seen < self.options.keyframe_share * len(keyframe.measured.points):
@@ -292,9 +292,9 @@ class Tracker:
             self._lost_since = now
         self._lost_for += 1
         self._guess = data.gray, guess
-        if self._lost_for > RESTART_FRAMES and now - self._lost_since > RESTART_SECONDS:
+        if self._lost_for > self._gates.restart_frames and now - self._lost_since > self._gates.restart_seconds:
             self._mapper.begin_anew(self._present)
-            self._present, self._motion = Present(), MotionModel()
+            self._present, self._motion = Present(), MotionModel(self.options.gates.motion)
             return self._start(data, began, watch)
         return self._report(data.frame, LOST, None, False, began, watch)
 
@@ -319,7 +319,7 @@ class Tracker:
 
     def scene(self) -> Scene:
         """Return the keyframes with points, lines and planes of the map that is followed now; changes nothing."""
-        return map_to_scene(self.map, self.camera)
+        return map_to_scene(self.map, self.camera, self.options.relations)
 
     def finish(self) -> TrackResult:
         """End the track: join its maps where that is possible, adjust all keyframes together and return the result."""
@@ -346,7 +346,11 @@ class Tracker:
     def _part(self, root: int) -> Part:
         track_map = self._mapper.maps[root]
         stamps = np.array([keyframe.timestamp for keyframe in track_map.living()])
-        return Part(self._history.trajectory(track_map, root), map_to_scene(track_map, self.camera), stamps)
+        return Part(
+            self._history.trajectory(track_map, root),
+            map_to_scene(track_map, self.camera, self.options.relations),
+            stamps,
+        )
 
     def statistics(self, report: SolveReport | None = None, right_offset_px: float = 0.0) -> dict:
         """Return counts and times so far as plain numbers."""

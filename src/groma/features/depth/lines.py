@@ -28,19 +28,46 @@ from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError, ShapeError
 from groma.features.depth.noise import DepthNoise, as_depth, as_pinhole
+from groma.gates import gate
 
 #: Values of ``DepthLines.support``.
 NONE, SURFACE, CREASE, LEFT, RIGHT = range(5)
 
 # --------------------------------------------------------------------------------------------------------- Kernels
 
+#: Samples along a segment at most, and across on either side: the size of arrays.
 _ALONG, _ACROSS = 24, 3
-#: Limits of inliers shrink from round to round: shares of the inverse depth, on top of three standard deviations.
-_SHARES = (0.04, 0.015, 0.006, 0.0)
-#: The 99.9 % quantile of chi-square with two degrees of freedom.
-_AGREE = 13.8
-#: What two sides may differ by on top of noise: share of the inverse depth, and of it per pixel across.
-_AGREE_SHARE, _SLOPE_SHARE = 0.006, 0.0015
+
+
+@dataclass(frozen=True)
+class DepthLineGates:
+    """Where depth is sampled beside a segment, and what the samples must agree on."""
+
+    near: float = gate(
+        1.5, "px", "depth is sampled from this distance on", "chosen on Kinect images: edges are smeared"
+    )
+    far: float = gate(6.5, "px", "and up to this distance", "chosen on Kinect images")
+    min_share: float = gate(0.35, "share", "share of the samples of a side on its fit", "chosen on Kinect images")
+    max_relative_sigma: float = gate(
+        0.05, "share", "noise of the depth at an end, of the depth", "chosen on Kinect images"
+    )
+    inlier: float = gate(3.0, "sigma", "samples within are on the fit", "derived from normal noise: 1 in 370")
+    shares: tuple[float, ...] = gate(
+        (0.04, 0.015, 0.006, 0.0),
+        "share",
+        "added to it from round to round, of the inverse depth",
+        "chosen on Kinect images",
+    )
+    agree: float = gate(13.8, "sigma squared", "two sides agree in a line", "derived from chi-square, 2: 1 in 1000")
+    agree_slope: float = gate(9.0, "sigma squared", "they agree in the slope", "derived from normal noise: 1 in 370")
+    agree_share: float = gate(0.006, "share", "on top of noise, of the inverse depth", "chosen on Kinect images")
+    slope_share: float = gate(0.0015, "share / px", "the same for the slope", "chosen on Kinect images")
+    min_length: float = gate(4.0, "px", "shorter segments have no line", "derived from two samples a half")
+    min_inliers: int = gate(8, "samples", "samples on the fit of a side", "derived from 3 unknowns")
+
+
+#: The defaults.
+DEPTH_LINES = DepthLineGates()
 
 
 @kernel
@@ -78,7 +105,7 @@ def _median(values, first, last, scratch):
 
 
 @kernel
-def _fit_side(t, d, rho, weight, count, scratch, A, b, x, inverse):
+def _fit_side(t, d, rho, weight, count, inlier, shares, min_inliers, scratch, A, b, x, inverse):
     """Fit one side robustly; return the number of inliers and their mean squared whitened distance."""
     half = 0
     while half < count and t[half] < 0.5:
@@ -88,7 +115,7 @@ def _fit_side(t, d, rho, weight, count, scratch, A, b, x, inverse):
     early, late = _median(rho, 0, half, scratch), _median(rho, half, count, scratch)
     x[0], x[1], x[2] = 1.5 * early - 0.5 * late, 1.5 * late - 0.5 * early, 0.0
     inliers, chi = 0, 0.0
-    for share in _SHARES:
+    for share in shares:
         A[:, :] = 0.0
         b[:] = 0.0
         inliers, chi = 0, 0.0
@@ -97,7 +124,7 @@ def _fit_side(t, d, rho, weight, count, scratch, A, b, x, inverse):
             predicted = a0 * x[0] + a1 * x[1] + a2 * x[2]
             away = rho[i] - predicted
             w = weight[i]
-            if not abs(away) < 3.0 / math.sqrt(w) + share * rho[i]:
+            if not abs(away) < inlier / math.sqrt(w) + share * rho[i]:
                 continue
             inliers += 1
             chi += w * away * away
@@ -111,14 +138,18 @@ def _fit_side(t, d, rho, weight, count, scratch, A, b, x, inverse):
             b[1] += w * a1 * rho[i]
             b[2] += w * a2 * rho[i]
         A[1, 0], A[2, 0], A[2, 1] = A[0, 1], A[0, 2], A[1, 2]
-        if inliers < 8 or not _solve(A, b, x, inverse):
+        if inliers < min_inliers or not _solve(A, b, x, inverse):
             return 0, 0.0
     return inliers, chi / inliers
 
 
 @loop
-def _fit_all(ends, depth, noise, correlation, near, far, min_share, inverse_depth, covariance, support, share):
-    """Fit segments (N, 4); write inverse depths (N, 2), covariances (N, 2, 2), kinds (N,), shares of inliers (N,)."""
+def _fit_all(ends, depth, noise, correlation, gates, shares, inverse_depth, covariance, support, share):
+    """Fit segments (N, 4); ``gates`` and ``shares`` are of :class:`DepthLineGates`.
+
+    Writes inverse depths (N, 2), covariances (N, 2, 2), kinds (N,) and shares of inliers (N,).
+    """
+    near, far, min_share, min_length, inlier, min_inliers, agree, agree_slope, agree_share, slope_share = gates
     size = _ALONG * _ACROSS
     t, d, rho, weight = np.empty((2, size)), np.empty((2, size)), np.empty((2, size)), np.empty((2, size))
     scratch = np.empty(size)
@@ -134,7 +165,7 @@ def _fit_all(ends, depth, noise, correlation, near, far, min_share, inverse_dept
         covariance[n, :, :] = 0.0
         dx, dy = ends[n, 2] - ends[n, 0], ends[n, 3] - ends[n, 1]
         length = math.sqrt(dx * dx + dy * dy)
-        if not length > 4.0:
+        if not length > min_length:
             continue
         along = min(max(int(length / 2.0), 6), _ALONG)
         left_u, left_v = dy / length, -dx / length
@@ -161,8 +192,9 @@ def _fit_all(ends, depth, noise, correlation, near, far, min_share, inverse_dept
                     weight[side, count] = root * root
                     count += 1
             inliers, chi[side] = _fit_side(
-                t[side], d[side], rho[side], weight[side], count, scratch, A[side], b[side], x[side], inverse[side]
-            )
+                t[side], d[side], rho[side], weight[side], count, inlier, shares, min_inliers, scratch,
+                A[side], b[side], x[side], inverse[side],
+            )  # fmt: skip
             used[side] = inliers
             good[side] = inliers >= min_share * along * _ACROSS and inliers > 0.5 * count
             good[side] = good[side] and x[side, 0] > 0.0 and x[side, 1] > 0.0
@@ -171,17 +203,17 @@ def _fit_all(ends, depth, noise, correlation, near, far, min_share, inverse_dept
         if good[0] and good[1]:
             # Do the sides agree in the line?
             spread = correlation * max(chi[0], chi[1], 1.0)
-            floor = _AGREE_SHARE * max(x[0, 0], x[0, 1], x[1, 0], x[1, 1])
+            floor = agree_share * max(x[0, 0], x[0, 1], x[1, 0], x[1, 1])
             c00 = spread * (inverse[0, 0, 0] + inverse[1, 0, 0]) + floor * floor
             c01 = spread * (inverse[0, 0, 1] + inverse[1, 0, 1])
             c11 = spread * (inverse[0, 1, 1] + inverse[1, 1, 1]) + floor * floor
             e0, e1 = x[0, 0] - x[1, 0], x[0, 1] - x[1, 1]
             distance = (e0 * e0 * c11 - 2.0 * e0 * e1 * c01 + e1 * e1 * c00) / (c00 * c11 - c01 * c01)
-            if distance < _AGREE:
-                floor = _SLOPE_SHARE * (x[0, 0] + x[0, 1]) * 0.5
+            if distance < agree:
+                floor = slope_share * (x[0, 0] + x[0, 1]) * 0.5
                 gap = x[0, 2] - x[1, 2]
                 slope = spread * (inverse[0, 2, 2] + inverse[1, 2, 2]) + floor * floor
-                if gap * gap < 9.0 * slope:
+                if gap * gap < agree_slope * slope:
                     support[n] = 1
                     joint[:] = A[0] + A[1]
                     joint_b[:] = b[0] + b[1]
@@ -254,10 +286,7 @@ def fit_depth_lines(
     pinhole: npt.ArrayLike,
     noise: DepthNoise | None = None,
     sigma: npt.ArrayLike = 0.3,
-    near: float = 1.5,
-    far: float = 6.5,
-    min_share: float = 0.35,
-    max_relative_sigma: float = 0.05,
+    gates: DepthLineGates = DEPTH_LINES,
 ) -> DepthLines:
     r"""Fit lines in space to image segments by the depth on both of their sides.
 
@@ -278,12 +307,8 @@ def fit_depth_lines(
         Errors of depth.
     sigma : float or (N,) float
         Standard deviation of the ends across the segments, pixels.
-    near, far : float
-        Distances from the segment between which depth is sampled, pixels.
-    min_share : float
-        Share of the samples of a side that must lie on its fit.
-    max_relative_sigma : float
-        Lines whose depth at an end is less certain are refused.
+    gates : DepthLineGates
+        Where depth is sampled, and what the samples must agree on.
 
     Returns
     -------
@@ -302,20 +327,24 @@ def fit_depth_lines(
     segments = np.ascontiguousarray(ends, np.float64)
     if segments.ndim != 2 or segments.shape[1] != 4:
         raise ShapeError(f"ends must have shape (N, 4): u1 v1 u2 v2; got {segments.shape}.")
-    if not np.isfinite(segments).all() or not 0 <= near < far:
-        raise InputError(f"ends must be finite and 0 <= near < far; got near {near}, far {far}.")
+    if not np.isfinite(segments).all() or not 0 <= gates.near < gates.far:
+        raise InputError(f"ends must be finite and 0 <= near < far; got near {gates.near}, far {gates.far}.")
     image, camera, noise = as_depth(depth), as_pinhole(pinhole), noise or DepthNoise()
     across = np.broadcast_to(np.asarray(sigma, np.float64), (len(segments),))
     count = len(segments)
     inverse_depth, covariance = np.empty((count, 2)), np.empty((count, 2, 2))
     support, share = np.empty(count, np.int8), np.empty(count)
+    own = (
+        gates.near, gates.far, gates.min_share, gates.min_length, gates.inlier, float(gates.min_inliers), gates.agree,
+        gates.agree_slope, gates.agree_share, gates.slope_share,
+    )  # fmt: skip
     _fit_all(
-        segments, image, noise.numbers, noise.correlation, near, far, min_share, inverse_depth, covariance,
+        segments, image, noise.numbers, noise.correlation, own, np.array(gates.shares), inverse_depth, covariance,
         support, share,
     )  # fmt: skip
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     good = (support > 0) & (inverse_depth > 1.0 / noise.max_depth).all(axis=1)
-    good &= (variance < (max_relative_sigma * inverse_depth) ** 2).all(axis=1)
+    good &= (variance < (gates.max_relative_sigma * inverse_depth) ** 2).all(axis=1)
     support[~good] = NONE
     for values in (inverse_depth, covariance, share):
         values[~good] = 0.0
@@ -350,4 +379,4 @@ def fit_depth_lines(
     )
 
 
-__all__ = ["CREASE", "LEFT", "NONE", "RIGHT", "SURFACE", "DepthLines", "fit_depth_lines"]
+__all__ = ["CREASE", "LEFT", "NONE", "RIGHT", "SURFACE", "DepthLineGates", "DepthLines", "fit_depth_lines"]

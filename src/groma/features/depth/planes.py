@@ -29,7 +29,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.features.depth.noise import DepthNoise, as_depth, as_pinhole
-from groma.features.depth.regions import MAX_REGIONS, MIN_COUNT, assign, block_sums, grow, join
+from groma.features.depth.regions import MAX_REGIONS, REGIONS, RegionGates, assign, block_sums, grow, join
 from groma.geometry.charts.plane_normal_offset import NormalOffsetPlane
 
 
@@ -90,6 +90,7 @@ def find_depth_planes(
     pinhole: npt.ArrayLike,
     noise: DepthNoise | None = None,
     options: PlaneSearchOptions | None = None,
+    gates: RegionGates = REGIONS,
 ) -> DepthPlanes:
     r"""Find the planes of a depth image.
 
@@ -109,6 +110,8 @@ def find_depth_planes(
         Errors of depth.
     options : PlaneSearchOptions, optional
         What counts as a plane.
+    gates : RegionGates
+        Numbers of the search.
 
     Returns
     -------
@@ -126,7 +129,7 @@ def find_depth_planes(
     curved surfaces are cut into planes.
     """
     image, camera = as_depth(depth), as_pinhole(pinhole)
-    noise, options = noise or DepthNoise(), _for_density(options or PlaneSearchOptions(), image)
+    noise, options = noise or DepthNoise(), _for_density(options or PlaneSearchOptions(), image, gates.min_count)
     step, size = options.step, max(options.block // options.step, 2)
     rows, columns = -(-image.shape[0] // step), -(-image.shape[1] // step)
     blocks = (-(-rows // size), -(-columns // size))
@@ -139,21 +142,24 @@ def find_depth_planes(
     block_labels = np.empty(blocks, np.int64)
     regions, region_counts = np.zeros((MAX_REGIONS, 10)), np.zeros(MAX_REGIONS, np.int64)
     cos_floor = math.cos(math.radians(options.angle_deg))
-    limits = (options.gate, options.bend, cos_floor)
-    found = grow(sums, counts, numbers, *limits, MIN_COUNT, min_blocks, block_labels, regions, region_counts)
+    limits = (float(options.gate), float(options.bend), cos_floor)
+    found = grow(
+        sums, counts, numbers, limits, (float(gates.min_count), gates.flat, gates.turn), min_blocks, block_labels,
+        regions, region_counts,
+    )  # fmt: skip
     target = np.zeros(found, np.int64)
-    join(regions, region_counts, found, numbers, *limits, target)
-    return _refined(image, camera, noise, options, block_labels, regions, region_counts, target)
+    join(regions, region_counts, found, numbers, limits, (gates.looser, gates.turn), target)
+    return _refined(image, camera, noise, options, gates.inlier, block_labels, regions, region_counts, target)
 
 
-def _for_density(options: PlaneSearchOptions, image: npt.NDArray[np.float32]) -> PlaneSearchOptions:
+def _for_density(options: PlaneSearchOptions, image: npt.NDArray[np.float32], min_count: int) -> PlaneSearchOptions:
     """Return options under which a block of average density has twice the samples that it needs."""
     density = max(np.count_nonzero(image > 0) / image.size, 0.01)
     step = options.step
-    while step > 1 and density * (options.block // step) ** 2 < 2 * MIN_COUNT:
+    while step > 1 and density * (options.block // step) ** 2 < 2 * min_count:
         step -= 1
-    block = max(options.block, math.ceil(math.sqrt(2 * MIN_COUNT / density)) * step)
-    if density * (options.block // step) ** 2 >= 2 * MIN_COUNT:
+    block = max(options.block, math.ceil(math.sqrt(2 * min_count / density)) * step)
+    if density * (options.block // step) ** 2 >= 2 * min_count:
         block = options.block
     return replace(options, step=step, block=block)
 
@@ -163,6 +169,7 @@ def _refined(
     camera: FloatArray,
     noise: DepthNoise,
     options: PlaneSearchOptions,
+    inlier: float,
     blocks: IntArray,
     regions: FloatArray,
     region_counts: IntArray,
@@ -179,7 +186,9 @@ def _refined(
     labels = np.full((-(-image.shape[0] // step), -(-image.shape[1] // step)), -1, np.int8)
     sums, counts = np.zeros((len(roots), 10)), np.zeros(len(roots), np.int64)
     centers = np.zeros((len(roots), 3))
-    assign(image, camera, noise.numbers, options.bend, size, step, joined, thetas, labels, sums, counts, centers)
+    assign(
+        image, camera, noise.numbers, options.bend, inlier, size, step, joined, thetas, labels, sums, counts, centers
+    )
 
     theta, inverse, usable = _solve(sums)
     order = np.argsort(-counts, kind="stable")

@@ -8,18 +8,34 @@ A set of pixels is known by ten sums, in this order: w, wx, wy, wxx, wxy, wyy, w
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from groma._numba import kernel, loop
+from groma.gates import gate
 
-#: Planes seen at a flatter angle than this (cosine) are not used.
-_FLAT = 0.12
-#: A pixel belongs to a plane within so many standard deviations.
-_INLIER = 3.0
-#: Regions that are remembered, and samples that a block needs.
+#: Regions that are remembered: the size of an array.
 MAX_REGIONS = 120
-MIN_COUNT = 6
+#: The normals of two regions are compared up to this angle, radians: beyond, noise tells nothing of them.
+_ANY_ANGLE = 1.5
+
+
+@dataclass(frozen=True)
+class RegionGates:
+    """Which blocks and pixels of a depth image belong to a plane, beside the options."""
+
+    min_count: int = gate(6, "samples", "samples that a block needs", "derived from 3 unknowns")
+    flat: float = gate(0.12, "cosine", "planes seen at a flatter angle are not used", "chosen on Kinect images")
+    inlier: float = gate(3.0, "sigma", "a pixel within belongs to a plane", "derived from normal noise: 1 in 370")
+    turn: float = gate(
+        9.0, "sigma squared", "normals that differ by less may be joined", "derived from normal noise: 1 in 370"
+    )
+    looser: float = gate(1.3, "ratio", "joined regions fit worse by at most this factor", "chosen on Kinect images")
+
+
+#: The defaults.
+REGIONS = RegionGates()
 
 
 @kernel
@@ -120,8 +136,10 @@ def block_sums(depth, pinhole, noise, size, step, sums, counts):
 
 
 @loop
-def grow(sums, counts, noise, gate, bend, cos_floor, min_count, min_blocks, labels, regions, region_counts):
+def grow(sums, counts, noise, limits, gates, min_blocks, labels, regions, region_counts):
     """Label blocks (R, C) by region, -1 for none; write the sums of regions. Return their number."""
+    gate, bend, cos_floor = limits
+    min_count, flat, turn = gates
     rows, columns = counts.shape
     thetas = np.zeros((rows, columns, 3))
     quality = np.full(rows * columns, np.inf)
@@ -135,7 +153,7 @@ def grow(sums, counts, noise, gate, bend, cos_floor, min_count, min_blocks, labe
             rho = t[0] * x + t[1] * y + t[2]
             length = math.sqrt((t[0] * t[0] + t[1] * t[1] + t[2] * t[2]) * (x * x + y * y + 1.0))
             chi = _chi_square(s, t) / max(counts[i, j] - 3, 1)
-            if rho > _FLAT * length and chi < gate:
+            if rho > flat * length and chi < gate:
                 labels[i, j] = -1
                 # Blocks with few pixels fit well by chance and say little: they are tried last.
                 quality[i * columns + j] = (chi + 1.0) / counts[i, j]
@@ -168,8 +186,8 @@ def grow(sums, counts, noise, gate, bend, cos_floor, min_count, min_blocks, labe
                 allowed = gate + _bend_allowance(s, thetas[a, b], noise, bend)
                 if _chi_square(s, theta) > allowed * counts[a, b]:
                     continue
-                limit = math.sqrt(floor * floor + 9.0 * _tilt_variance(s, thetas[a, b]))
-                if limit < 1.5 and _cosine(theta, thetas[a, b]) < math.cos(limit):
+                limit = math.sqrt(floor * floor + turn * _tilt_variance(s, thetas[a, b]))
+                if limit < _ANY_ANGLE and _cosine(theta, thetas[a, b]) < math.cos(limit):
                     continue
                 labels[a, b] = found
                 region += s
@@ -191,8 +209,10 @@ def grow(sums, counts, noise, gate, bend, cos_floor, min_count, min_blocks, labe
 
 
 @loop
-def join(regions, region_counts, count, noise, gate, bend, cos_floor, target):
+def join(regions, region_counts, count, noise, limits, gates, target):
     """Join regions on one plane; ``target`` (count,) receives the region that each became part of."""
+    gate, bend, cos_floor = limits
+    looser, turn = gates
     thetas, theta, both = np.zeros((count, 3)), np.empty(3), np.empty(10)
     for a in range(count):
         target[a] = a
@@ -208,7 +228,7 @@ def join(regions, region_counts, count, noise, gate, bend, cos_floor, target):
                 if target[b] != b:
                     continue
                 variance = _tilt_variance(regions[a], thetas[a]) + _tilt_variance(regions[b], thetas[b])
-                limit = min(math.sqrt(floor * floor + 9.0 * variance), 1.5)
+                limit = min(math.sqrt(floor * floor + turn * variance), _ANY_ANGLE)
                 if _cosine(thetas[a], thetas[b]) < math.cos(limit):
                     continue
                 both[:] = regions[a] + regions[b]
@@ -217,7 +237,7 @@ def join(regions, region_counts, count, noise, gate, bend, cos_floor, target):
                 fits = True
                 for c in (a, b):
                     own = _chi_square(regions[c], thetas[c]) / region_counts[c]
-                    allowed = max(gate, 1.3 * own) + _bend_allowance(regions[c], thetas[c], noise, bend)
+                    allowed = max(gate, looser * own) + _bend_allowance(regions[c], thetas[c], noise, bend)
                     fits = fits and _chi_square(regions[c], theta) < allowed * region_counts[c]
                 if fits:
                     regions[a] = both
@@ -230,7 +250,7 @@ def join(regions, region_counts, count, noise, gate, bend, cos_floor, target):
 
 
 @loop
-def assign(depth, pinhole, noise, bend, size, step, blocks, thetas, labels, sums, counts, centers):
+def assign(depth, pinhole, noise, bend, inlier, size, step, blocks, thetas, labels, sums, counts, centers):
     """Give pixels to planes; write labels (h, w), and of each plane sums (K, 10), numbers and sums of points."""
     rows, columns = labels.shape
     c0, c2, z0, far = noise[0], noise[1], noise[2], noise[3]
@@ -262,7 +282,7 @@ def assign(depth, pinhole, noise, bend, size, step, blocks, thetas, labels, sums
                     x, rho = (u + 0.5 - pinhole[2]) / pinhole[0], 1.0 / z
                     sigma = c0 + c2 * (z - z0) * (z - z0)
                     root = z * z / sigma
-                    best, limit = -1, math.sqrt(_INLIER * _INLIER * sigma * sigma + bend * bend * z * z) * rho * rho
+                    best, limit = -1, math.sqrt(inlier * inlier * sigma * sigma + bend * bend * z * z) * rho * rho
                     for c in range(candidates):
                         t = thetas[near[c]]
                         away = abs(rho - t[0] * x - t[1] * y - t[2])
@@ -289,4 +309,4 @@ def assign(depth, pinhole, noise, bend, size, step, blocks, thetas, labels, sums
                     centers[best, 2] += z
 
 
-__all__ = ["MAX_REGIONS", "MIN_COUNT", "assign", "block_sums", "grow", "join"]
+__all__ = ["MAX_REGIONS", "REGIONS", "RegionGates", "assign", "block_sums", "grow", "join"]

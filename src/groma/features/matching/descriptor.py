@@ -21,6 +21,7 @@ triangular weights over rows, averages in place of sums, samples at a bounded nu
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -30,12 +31,29 @@ from groma._numba import kernel, loop
 from groma.errors import InputError
 from groma.features.images import to_gray
 from groma.features.segments import Segments
+from groma.gates import gate
 
 Descriptors = npt.NDArray[np.float32]
+#: Bands beside a segment: with it the size of a descriptor.
 BANDS = 9
 DESCRIPTOR_SIZE = 8 * BANDS
-MAX_ENTRY = 0.4
-MAX_SAMPLES = 48  # along a segment
+
+
+@dataclass(frozen=True)
+class DescriptorGates:
+    """How the surroundings of a segment are described."""
+
+    max_entry: float = gate(0.4, "1", "entries of the unit vector are cut here", "convention: LBD, Zhang and Koch 2013")
+    max_samples: int = gate(48, "samples", "samples along a segment", "cost: time per segment")
+    fade: float = gate(
+        0.6, "share", "standard deviation of the weight of rows, of the half width", "chosen on Strecha's scenes"
+    )
+    overlap: float = gate(1.25, "bands", "half width of the weight of rows in a band", "chosen on Strecha's scenes")
+    min_blur: float = gate(0.7, "px", "least standard deviation of the blur", "derived from sampling by pixels")
+
+
+#: The defaults.
+DESCRIPTORS = DescriptorGates()
 
 
 # -------------------------------------------------------------------------------------------------------- Kernels
@@ -65,7 +83,7 @@ def _row(gradient_u, gradient_v, u, v, du, dv, count, nu, nv, out):
 
 
 @loop
-def _describe_all(gradient_u, gradient_v, ends, band_rows, step, out):
+def _describe_all(gradient_u, gradient_v, ends, band_rows, step, max_samples, fade, overlap, out):
     """Raw band statistics: out (N, 72), means of the bands first, then deviations."""
     num_rows = BANDS * band_rows
     rows = np.zeros((num_rows, 4))
@@ -74,13 +92,13 @@ def _describe_all(gradient_u, gradient_v, ends, band_rows, step, out):
         du, dv = ends[n, 2] - u1, ends[n, 3] - v1
         length = max(math.hypot(du, dv), 1e-9)
         nu, nv = -dv / length, du / length
-        count = min(max(int(length), 4), MAX_SAMPLES)
+        count = min(max(int(length), 4), max_samples)
         for r in range(num_rows):
             offset = (r - 0.5 * (num_rows - 1)) * step
             _row(gradient_u, gradient_v, u1 + offset * nu, v1 + offset * nv, du, dv, count, nu, nv, rows[r])
             # Rows far from the segment say less: another surface may begin there.
             far = 2.0 * offset / (num_rows * step)
-            weight = math.exp(-0.5 * (far / 0.6) ** 2)
+            weight = math.exp(-0.5 * (far / fade) ** 2)
             for c in range(4):
                 rows[r, c] *= weight
         for band in range(BANDS):
@@ -90,7 +108,7 @@ def _describe_all(gradient_u, gradient_v, ends, band_rows, step, out):
                 first = 0.0
                 second = 0.0
                 for r in range(max((band - 1) * band_rows, 0), min((band + 2) * band_rows, num_rows)):
-                    w = 1.0 - abs(r - center) / (1.25 * band_rows)
+                    w = 1.0 - abs(r - center) / (overlap * band_rows)
                     if w <= 0.0:
                         continue
                     total += w
@@ -102,7 +120,13 @@ def _describe_all(gradient_u, gradient_v, ends, band_rows, step, out):
 
 
 # --------------------------------------------------------------------------------------------------------- Public
-def describe(image: npt.NDArray[np.generic], segments: Segments, band_rows: int = 5, scale: float = 1.0) -> Descriptors:
+def describe(
+    image: npt.NDArray[np.generic],
+    segments: Segments,
+    band_rows: int = 5,
+    scale: float = 1.0,
+    gates: DescriptorGates = DESCRIPTORS,
+) -> Descriptors:
     """Gradient-band descriptors of segments.
 
     Parameters
@@ -116,6 +140,8 @@ def describe(image: npt.NDArray[np.generic], segments: Segments, band_rows: int 
     scale : float
         Distance of the rows in pixels. To compare an image with one that shows things s times larger, describe the
         larger at scale s.
+    gates : DescriptorGates
+        Numbers of the description.
 
     Returns
     -------
@@ -132,13 +158,23 @@ def describe(image: npt.NDArray[np.generic], segments: Segments, band_rows: int 
     gray = to_gray(image).astype(np.float32)
     raw = np.zeros((len(segments), DESCRIPTOR_SIZE), dtype=np.float64)
     if len(segments):
-        smooth = cv2.GaussianBlur(gray, (0, 0), 1.0 * max(scale, 0.7), borderType=cv2.BORDER_REPLICATE)
+        smooth = cv2.GaussianBlur(gray, (0, 0), max(scale, gates.min_blur), borderType=cv2.BORDER_REPLICATE)
         gradient_u = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, borderType=cv2.BORDER_REPLICATE)
         gradient_v = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, borderType=cv2.BORDER_REPLICATE)
-        _describe_all(gradient_u, gradient_v, segments.ends, band_rows, float(scale), raw)
+        _describe_all(
+            gradient_u,
+            gradient_v,
+            segments.ends,
+            band_rows,
+            float(scale),
+            gates.max_samples,
+            gates.fade,
+            gates.overlap,
+            raw,
+        )
     half = DESCRIPTOR_SIZE // 2
     parts = np.concatenate([_unit(raw[:, :half]), _unit(raw[:, half:])], axis=1)
-    return _unit(np.minimum(_unit(parts), MAX_ENTRY)).astype(np.float32)
+    return _unit(np.minimum(_unit(parts), gates.max_entry)).astype(np.float32)
 
 
 def _unit(vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -146,4 +182,4 @@ def _unit(vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return vectors / np.where(norm > 1e-9, norm, np.inf)
 
 
-__all__ = ["DESCRIPTOR_SIZE", "Descriptors", "describe"]
+__all__ = ["DESCRIPTOR_SIZE", "DescriptorGates", "Descriptors", "describe"]

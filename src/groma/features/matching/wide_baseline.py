@@ -40,9 +40,11 @@ from groma.features.matches import LineMatches, mutual_best
 from groma.features.matching.descriptor import Descriptors
 from groma.features.matching.nearby import NearbyPoints, nearby_points
 from groma.features.segments import Segments
+from groma.gates import gate
 
-ROWS_AT_ONCE = 512  # of the table of descriptor products held in memory
-BIAS = 1.5  # logarithm of odds of identical surroundings without points or overlap
+#: Rows of the table of descriptor products held in memory.
+ROWS_AT_ONCE = 512
+_SURVEYED = "chosen on Strecha's surveyed scenes"
 FEATURES = 6  # descriptor distance; points for, against, near one only; overlap on first, on second (-1: unknown)
 
 
@@ -64,6 +66,33 @@ class WideBaselineOptions:
     """By how much a match must beat any rival, logarithm of odds: 0.7 is twice as likely."""
 
 
+@dataclass(frozen=True)
+class EvidenceGates:
+    """Weights of the logarithm of the odds that a candidate is right.
+
+    They best rank, for each segment, the candidate whose triangulated line is seen in two further images above all
+    others.
+    """
+
+    bias: float = gate(1.5, "log odds", "identical surroundings without points or overlap", _SURVEYED)
+    descriptor: float = gate(6.2, "log odds", "for a distance of one of the descriptors", _SURVEYED)
+    points_for: float = gate(2.9, "log odds", "for the logarithm of one and the points on the same side", _SURVEYED)
+    points_against: float = gate(0.25, "log odds", "for that of the points on opposite sides", _SURVEYED)
+    points_missing: float = gate(0.3, "log odds", "for that of the points near one of them only", _SURVEYED)
+    overlap: float = gate(2.4, "log odds", "for the whole epipolar overlap", _SURVEYED)
+    unknown_overlap: float = gate(-0.25, "share", "stands for an overlap that is not known", _SURVEYED)
+    on_line: float = gate(
+        2.0, "px", "points so near to a line are on no side of it", "derived from edges one pixel wide"
+    )
+    min_extent: float = gate(
+        4.0, "beam tolerances", "extents across the epipolar lines that give an overlap", _SURVEYED
+    )
+
+
+#: The weights in use.
+EVIDENCE = EvidenceGates()
+
+
 # -------------------------------------------------------------------------------------------------------- Kernels
 @kernel
 def _share(a, b):
@@ -80,7 +109,7 @@ def _crossing(a, b):
 
 
 @kernel
-def _points(ids_1, distance_1, low_1, high_1, ids_2, distance_2, low_2, high_2, out):
+def _points(ids_1, distance_1, low_1, high_1, ids_2, distance_2, low_2, high_2, on_line, out):
     """Shared points on the same side, by how alike their distances are; on opposite sides; and points not shared."""
     i, j = low_1, low_2
     for_it = 0.0
@@ -93,9 +122,9 @@ def _points(ids_1, distance_1, low_1, high_1, ids_2, distance_2, low_2, high_2, 
             j += 1
         else:
             one, two = distance_1[i], distance_2[j]
-            if abs(one) < 2.0 or abs(two) < 2.0:
+            if abs(one) < on_line or abs(two) < on_line:
                 # On the line: the side says nothing, but a point close to both supports them.
-                if abs(one) < 4.0 and abs(two) < 4.0:
+                if abs(one) < 2.0 * on_line and abs(two) < 2.0 * on_line:
                     for_it += 1.0
                 else:
                     against += 0.5
@@ -114,7 +143,7 @@ def _points(ids_1, distance_1, low_1, high_1, ids_2, distance_2, low_2, high_2, 
 @loop
 def _candidates(
     first_row, ends_1, ends_2, products, begin_1, ids_1, distance_1, begin_2, ids_2, distance_2,
-    F, has_F, min_overlap, tolerance, min_product,
+    F, has_F, min_overlap, tolerance, min_extent, on_line, min_product,
 ):  # fmt: skip
     """Pairs of a stretch of rows that pass the gates: indices (C, 2) and features (C, 6)."""
     n1, n2 = products.shape
@@ -162,7 +191,7 @@ def _candidates(
                     continue
                 # Extents in pixels: of the second across the epipolar lines, of the beam at the second.
                 turn, beam = 0.5 * ((qa - pa) + (qb - pb)), 0.5 * ((pa - pb) + (qa - qb))
-                if abs(turn) > 4.0 * tolerance and abs(beam) > 4.0 * tolerance:
+                if abs(turn) > min_extent and abs(beam) > min_extent:
                     if turn * beam < 0.0:
                         continue
                     if pa != qa and pb != qb:
@@ -172,7 +201,16 @@ def _candidates(
                     if min(on_1, on_2) < min_overlap:
                         continue
             _points(
-                ids_1, distance_1, begin_1[i], begin_1[i + 1], ids_2, distance_2, begin_2[j], begin_2[j + 1], points
+                ids_1,
+                distance_1,
+                begin_1[i],
+                begin_1[i + 1],
+                ids_2,
+                distance_2,
+                begin_2[j],
+                begin_2[j + 1],
+                on_line,
+                points,
             )
             if count == room:
                 more_pairs, more_features = np.zeros((2 * room, 2), dtype=np.int64), np.zeros((2 * room, FEATURES))
@@ -276,7 +314,8 @@ def candidates(
         found = _candidates(
             row, segments_1.ends, segments_2.ends, one[row : row + ROWS_AT_ONCE] @ two.T,
             near_1.begin, near_1.point_id, near_1.distance, near_2.begin, near_2.point_id, near_2.distance,
-            F, fundamental is not None, options.min_overlap, options.beam_tolerance, least,
+            F, fundamental is not None, options.min_overlap, options.beam_tolerance,
+            EVIDENCE.min_extent * options.beam_tolerance, EVIDENCE.on_line, least,
         )  # fmt: skip
         pairs.append(found[0])
         features.append(found[1])
@@ -318,20 +357,19 @@ def _descriptors(descriptors: Descriptors, segments: Segments, which: int) -> np
 
 
 def _evidence(features: FloatArray) -> FloatArray:
-    """Logarithm of the odds that a candidate is right.
-
-    The weights were found on surveyed scenes: they best rank, for each segment, the candidate whose triangulated line
-    is seen in two further images above all others.
-    """
+    """Logarithm of the odds that a candidate is right."""
+    w = EVIDENCE
     distance, for_it, against, missing, on_1, on_2 = features.T
     known = on_1 >= 0.0
-    overlap = np.where(known, np.sqrt(np.maximum(on_1, 0.0) * np.maximum(on_2, 0.0)), -0.25)
-    points = 2.9 * np.log1p(for_it) - 0.25 * np.log1p(against) - 0.3 * np.log1p(missing)
-    return BIAS - 6.2 * distance + points + 2.4 * overlap
+    overlap = np.where(known, np.sqrt(np.maximum(on_1, 0.0) * np.maximum(on_2, 0.0)), w.unknown_overlap)
+    points = w.points_for * np.log1p(for_it) - w.points_against * np.log1p(against)
+    points -= w.points_missing * np.log1p(missing)
+    return w.bias - w.descriptor * distance + points + w.overlap * overlap
 
 
 __all__ = [
     "FEATURES",
+    "EvidenceGates",
     "LineMatches",
     "WideBaselineOptions",
     "candidates",

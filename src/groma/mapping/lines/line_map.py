@@ -63,7 +63,7 @@ class LineMap:
         measured = np.concatenate([np.zeros((0, 4)), *(one.ends for one in segments)])[first]
         sigma = np.concatenate([np.zeros(0), *(one.sigma for one in segments)])[first]
         usual = float(np.median(sigma)) if len(sigma) else 1.0
-        return scene.replace(
+        return scene.keep(lines=[]).replace(
             lines=Lines.through(self.segments),
             line_observations=LineObservations(self.image_idx, self.line_idx, measured, sigma / usual),
             relations=Relations(point_on_plane=scene.relations.point_on_plane),

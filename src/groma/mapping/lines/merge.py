@@ -50,14 +50,13 @@ _MEDIAN_SQUARE = 0.6
 
 # -------------------------------------------------------------------------------------------------------------- Loops
 @loop
-def _information(camera, image, ends, sigma, pointers, rows, X, H, U):
+def _information(camera, image, own, pointers, X, H, U):
     """Information (L, 4, 4) of the offsets of both points of each line, in the basis (L, 2, 3) across it."""
     r, J = np.zeros(2), np.zeros((2, 4))
     for n in range(len(pointers) - 1):
         across_basis(X[n], U[n])
         for m in range(pointers[n], pointers[n + 1]):
-            s = rows[m]
-            line_residuals(camera[image[s]], ends[s], sigma[s], X[n], U[n], r, J)
+            line_residuals(camera, image[m], own, m, X[n], U[n], r, J)
             for a in range(4):
                 for b in range(4):
                     H[n, a, b] += J[0, a] * J[0, b] + J[1, a] * J[1, b]
@@ -203,7 +202,8 @@ def _compare(tracks: Tracks, gates: MergeGates) -> _Pairs:
     views, count, X = tracks.views, tracks.num_lines, tracks.lines
     rows, pointers = tracks.table()
     H, U = np.zeros((count, 4, 4)), np.zeros((count, 2, 3))
-    _information(views.camera, views.image_idx, views.ends, tracks.sigma, pointers, rows, X, H, U)
+    own = np.column_stack([views.ends[rows], tracks.sigma[rows]])
+    _information(views.camera, views.image_idx[rows], own, pointers, X, H, U)
     unit = _pixel_size(tracks)
     pairs, span = _candidates(X, gates.max_distance * unit, gates)
     a, b = pairs.T

@@ -21,7 +21,8 @@ from functools import partial
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.terms.relations import SURFACE_SIGMA_PX, lengths_per_pixel
+from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
+from groma.adjustment.terms.relations import lengths_per_pixel
 from groma.errors import InputError
 from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines, orthogonal_pairs
 from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
@@ -163,7 +164,12 @@ def detect_structure(
         scene=scene.replace(
             planes=Planes(np.arange(len(planes)) + 1, planes.planes),
             directions=Directions(np.arange(len(directions)) + 1, directions.vectors),
-            relations=Relations(**{name: relation.pairs for name, relation in found.items()}),
+            relations=Relations(
+                point_on_plane=found["point_on_plane"].pairs,
+                line_on_plane=found["line_on_plane"].pairs,
+                line_along_direction=found["line_along_direction"].pairs,
+                point_on_line=found["point_on_line"].pairs,
+            ),
         ),
         planes=planes,
         directions=directions,

@@ -9,13 +9,8 @@ from groma._counted import counted
 from groma._typing import BoolArray, FloatArray
 from groma.solver.linear.visible_motion import weakest
 from groma.solver.observability.findings import Finding, few
+from groma.solver.observability.gates import DIAGNOSIS
 from groma.solver.observability.inspection import Inspection
-
-#: A camera is suspicious if its residuals are this many times the usual, its observations this share of the usual, or
-#: its uncertainty this many times the usual.
-LARGE, FEW, FAINT = 3.0, 0.1, 10.0
-#: Cameras with fewer measured numbers than this have few in any case.
-MIN_NUMBERS = 12
 
 
 def camera_findings(inspection: Inspection, reported: set[tuple[str, int]]) -> list[Finding]:
@@ -28,10 +23,11 @@ def camera_findings(inspection: Inspection, reported: set[tuple[str, int]]) -> l
         rms = np.sqrt(sums / np.maximum(rows, 1))
         usual, typical = float(np.median(rms[seen])), float(np.median(rows[seen]))
         known = np.array([(name, i) in reported for i in range(len(rows))])
-        little = seen & (rows < np.maximum(FEW * typical, MIN_NUMBERS))
+        little = seen & (rows < np.maximum(DIAGNOSIS.few_observations * typical, DIAGNOSIS.min_numbers))
+        large = max(DIAGNOSIS.large_residual * usual, DIAGNOSIS.min_residual)
         found = [
             _suspicious(
-                inspection, "camera_residuals", name, seen & (rms > LARGE * usual) & (rms > 1.5),
+                inspection, "camera_residuals", name, seen & (rms > large),
                 rms / max(usual, 1e-300), "residuals {:,.0f} times the usual",
                 "Wrong matches, or a wrong pose or calibration.",
             ),
@@ -55,7 +51,7 @@ def _faint(inspection: Inspection, name: str, known: BoolArray) -> Finding | Non
     sigma = weakest(information, inspection.motion_of(name))[0][:, 0]
     usual = float(np.median(sigma[free]))
     return _suspicious(
-        inspection, "camera_faint", name, ~known & free & (sigma > FAINT * usual), sigma / usual,
+        inspection, "camera_faint", name, ~known & free & (sigma > DIAGNOSIS.faint * usual), sigma / usual,
         "{:,.0f} times less certain than the rest", "What it sees is little, far away or all on one side.",
     )  # fmt: skip
 

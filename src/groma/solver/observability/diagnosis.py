@@ -36,7 +36,8 @@ from groma.solver.linear.schur import ReducedSystem
 from groma.solver.linear.visible_motion import motion, observers, weakest
 from groma.solver.observability.cameras import camera_findings
 from groma.solver.observability.findings import Finding
-from groma.solver.observability.inspection import UNDETERMINED, WEAK, Inspection
+from groma.solver.observability.gates import DIAGNOSIS
+from groma.solver.observability.inspection import Inspection
 from groma.solver.observability.landmarks import landmark_findings
 from groma.solver.observability.messages import Names, listing, scene_freedom
 from groma.solver.observability.system import open_modes, separate_parts, unseen_variables
@@ -74,9 +75,9 @@ class Diagnosis:
             "findings": [finding.to_dict() for finding in self.findings],
             "observability": {
                 name: {
-                    "determined": int((values < WEAK).sum()),
-                    "weak": int(((values >= WEAK) & (values < UNDETERMINED)).sum()),
-                    "undetermined": int((values >= UNDETERMINED).sum()),
+                    "determined": int((values < DIAGNOSIS.weak).sum()),
+                    "weak": int(((values >= DIAGNOSIS.weak) & (values < DIAGNOSIS.undetermined)).sum()),
+                    "undetermined": int((values >= DIAGNOSIS.undetermined).sum()),
                 }
                 for name, values in self.weakness.items()
             },
@@ -187,8 +188,8 @@ def _eliminated(
         return
     J = inspection.motion_of(name)
     sigma, directions = weakest(_with_held(information, held), J)
-    for i in np.flatnonzero(sigma[:, 0] > UNDETERMINED):
-        moves[name, int(i)] = directions[i] * np.minimum(sigma[i], 100.0)
+    for i in np.flatnonzero(sigma[:, 0] > DIAGNOSIS.undetermined):
+        moves[name, int(i)] = directions[i] * np.minimum(sigma[i], DIAGNOSIS.largest_motion)
     if group.manifold.kind not in ("pose", "plane"):
         weakness[name] = sigma[:, 0]
 
@@ -215,12 +216,12 @@ def _landmarks(
             variance = np.einsum("nij,nij->n", J @ inverse, J)
         sigma = np.sqrt(np.maximum(variance, 0.0))
         rank = np.einsum("nij,nji->n", information, inverse)  # less where the elimination dropped a direction
-        unsure = ~(sigma < WEAK) | (rank < dof - 0.5) | held.any(axis=1)
+        unsure = ~(sigma < DIAGNOSIS.weak) | (rank < dof - 0.5) | held.any(axis=1)
     num_open = np.zeros(len(group), np.int64)
     if unsure.any():
         J = motion(group.manifold, group.state[unsure], seen.middle[unsure], seen.distance[unsure])
         all_sigma, _ = weakest(_with_held(information[unsure], held[unsure]), J)
-        sigma[unsure], num_open[unsure] = all_sigma[:, 0], (all_sigma > UNDETERMINED).sum(axis=1)
+        sigma[unsure], num_open[unsure] = all_sigma[:, 0], (all_sigma > DIAGNOSIS.undetermined).sum(axis=1)
     weakness[name] = sigma
     return landmark_findings(inspection, name, seen, sigma, num_open)
 

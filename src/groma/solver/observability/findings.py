@@ -8,10 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from groma.solver.observability.gates import DIAGNOSIS
 from groma.solver.observability.messages import listing
-
-#: Indices listed in ``to_dict``.
-LISTED = 20
 
 
 @dataclass(frozen=True)
@@ -36,12 +34,12 @@ class Finding:
             "sentence": self.sentence,
             "group": self.group,
             "count": len(self.indices),
-            "indices": list(self.indices[:LISTED]),
+            "indices": list(self.indices[: DIAGNOSIS.listed]),
             "values": {name: float(value) if np.isfinite(value) else None for name, value in self.values.items()},
         }
 
 
-def few(parts: list[str], most: int = 5) -> str:
+def few(parts: list[str], most: int = DIAGNOSIS.examples) -> str:
     """Return the first of a list in words, and how many more there are."""
     if len(parts) <= most:
         return listing(parts)

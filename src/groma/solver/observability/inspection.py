@@ -24,14 +24,8 @@ from groma.solver.covariance.datum import FREE_TOLERANCE, free_motions, held_coo
 from groma.solver.linear.blocks import multiply
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.linear.visible_motion import camera_centers, motion
+from groma.solver.observability.gates import DIAGNOSIS
 from groma.solver.observability.messages import Names
-
-#: Standard deviation, in viewing distances or radians, from which a direction is not determined, or is weak.
-UNDETERMINED, WEAK = 1.0, 0.2
-#: A motion that costs more than this share of what its size suggests in the reduced system is held for certain.
-CERTAIN = 1e-5
-#: Points looked at for the middle and the extent of the scene.
-SAMPLE = 4096
 
 
 @dataclass(frozen=True)
@@ -63,7 +57,7 @@ class Inspection:
     @cached_property
     def place_and_size(self) -> tuple[FloatArray, float]:
         """Middle and extent of points and cameras."""
-        return middle_and_extent(self.problem, SAMPLE)
+        return middle_and_extent(self.problem, DIAGNOSIS.sample)
 
     @cached_property
     def free_motions(self) -> tuple[FloatArray, FloatArray]:
@@ -82,7 +76,7 @@ class Inspection:
             scale = 1.0 / np.sqrt(np.maximum(np.diag(size), 1e-300))
             values, vectors = np.linalg.eigh(0.5 * (cost + cost.T) * scale[:, None] * scale)
             expected = np.einsum("ik,ij,jk->k", vectors, size * scale[:, None] * scale, vectors)
-            unsure = (values > FREE_TOLERANCE * expected) & (values < CERTAIN * expected)
+            unsure = (values > FREE_TOLERANCE * expected) & (values < DIAGNOSIS.certain * expected)
             if unsure.any() or self.system.num_singular_landmarks:
                 exact = free_motions(self.layout, self.equations, self.system)
                 return exact.combinations, np.concatenate(exact.kept)
@@ -170,4 +164,4 @@ class Inspection:
         return result
 
 
-__all__ = ["UNDETERMINED", "WEAK", "Inspection"]
+__all__ = ["Inspection"]

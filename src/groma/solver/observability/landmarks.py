@@ -8,23 +8,8 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.solver.linear.visible_motion import Observers, nearest_place
 from groma.solver.observability.findings import Finding, few, first_upper
-from groma.solver.observability.inspection import UNDETERMINED, WEAK, Inspection
-
-#: Camera centres nearer together than this share of the viewing distance count as one place.
-ONE_PLACE = 1e-3
-#: Below this share they hardly move, if most landmarks suffer from it.
-NEAR_ONE_PLACE = 0.03
-#: Rays that part by more than this determine a point, if its observations count in full; rays that part by more than
-#: the second angle may do so, and if a residual is this many times the noise, it is not for want of parallax.
-PARALLEL, NEARLY, DISCOUNTED = np.radians(3.0), np.radians(0.3), 5.0
-#: A line within this angle of the direction of the motion runs along it, and planes through a line nearer together than
-#: this are one plane; a ray nearer to a line than the second angle sees it end-on.
-ALONG = np.radians(5.0)
-END_ON = np.radians(0.5)
-#: Points whose least extent is below this share of the next, or below twice their uncertainty, are on one plane.
-FLAT, FLAT_SIGMAS = 1e-3, 2.0
-#: From this share of all landmarks on, what is wrong is said of the whole and none is named.
-MOST = 0.9
+from groma.solver.observability.gates import DIAGNOSIS
+from groma.solver.observability.inspection import Inspection
 
 
 def landmark_findings(
@@ -46,7 +31,7 @@ def landmark_findings(
         Directions that are not determined.
     """
     kind = inspection.problem.variables[name].manifold.kind
-    is_open = ~(weakness <= UNDETERMINED)
+    is_open = ~(weakness <= DIAGNOSIS.undetermined)
     findings: list[Finding] = []
     poses = np.zeros(len(is_open), np.int64)
     variable, pose = seen.of(is_open)
@@ -60,7 +45,7 @@ def landmark_findings(
         names = [inspection.names(name, int(i)) for i in bad[:1]]
         if len(bad) == 1:
             text, remedy = f"{first_upper(names[0])} {one}", _of_one(remedy)
-        elif len(bad) > max(MOST * len(which), 1):
+        elif len(bad) > max(DIAGNOSIS.most * len(which), 1):
             text = (
                 f"{'All' if len(bad) == len(which) else 'Nearly all'} {kind}s ({len(bad):,} of {len(which):,}) {many}"
             )
@@ -70,7 +55,7 @@ def landmark_findings(
         values = {"share": len(bad) / len(which), "weakest": float(weakness[bad].max())}
         findings.append(Finding(code, severity, f"{text}. {remedy}", name, tuple(int(i) for i in bad), values))
 
-    shaky = ~is_open & (weakness > WEAK)
+    shaky = ~is_open & (weakness > DIAGNOSIS.weak)
     turning = _only_turning(kind, seen, rest, shaky)
     if turning is not None:
         bad = tuple(int(i) for i in np.flatnonzero(rest | shaky))
@@ -78,9 +63,11 @@ def landmark_findings(
         rest, shaky = np.zeros_like(rest), np.zeros_like(shaky)
     if kind == "point":
         angle = _parting(inspection, name, variable, pose, seen)
-        apart = angle > PARALLEL
+        apart = angle > DIAGNOSIS.parallax
         if rest.any():
-            apart |= (angle > NEARLY) & (inspection.worst_residuals(name, rest) > DISCOUNTED)
+            apart |= (angle > DIAGNOSIS.small_parallax) & (
+                inspection.worst_residuals(name, rest) > DIAGNOSIS.discounted
+            )
         add(
             "point_seen_once", "problem", alone,
             "is seen by one camera only: its depth is open", "are seen by one camera only: their depth is open",
@@ -135,8 +122,8 @@ def landmark_findings(
     )  # fmt: skip
     add(
         f"{kind}_weak", "warning", shaky,
-        f"is weak: uncertain by more than {WEAK:.0%} of the distance",
-        f"are weak: uncertain by more than {WEAK:.0%} of the distance",
+        f"is weak: uncertain by more than {DIAGNOSIS.weak:.0%} of the distance",
+        f"are weak: uncertain by more than {DIAGNOSIS.weak:.0%} of the distance",
         "Views from farther apart would help.",
     )  # fmt: skip
     return findings
@@ -165,12 +152,12 @@ def _only_turning(kind: str, seen: Observers, rest: BoolArray, shaky: BoolArray)
     if len(used) < 2 or not affected:
         return None
     spread = _spread(seen.centers[used]) / float(np.median(seen.distance))
-    if spread < ONE_PLACE and rest.any():
+    if spread < DIAGNOSIS.one_place and rest.any():
         text = f"The cameras only turn: their centres are in one place, so the depth of {kind}s is not determined."
-    elif spread < NEAR_ONE_PLACE and affected > 0.5 * len(rest):
+    elif spread < DIAGNOSIS.near_one_place and affected > 0.5 * len(rest):
         text = (
             f"The cameras hardly move: their centres are within {spread:.1%} of the viewing distance, and the depth of "
-            f"{_so_many(kind, affected, len(rest))} is open or uncertain by more than {WEAK:.0%}."
+            f"{_so_many(kind, affected, len(rest))} is open or uncertain by more than {DIAGNOSIS.weak:.0%}."
         )
     else:
         return None
@@ -195,14 +182,14 @@ def _spread(places: FloatArray) -> float:
 
 def _flat(inspection: Inspection, name: str, weakness: FloatArray, seen: Observers) -> list[Finding]:
     """Notice that all points lie on one plane."""
-    good = weakness <= UNDETERMINED
+    good = weakness <= DIAGNOSIS.undetermined
     xyz = inspection.problem.variables[name].ambient()[good]
     if len(xyz) < 4:
         return []
     xyz = xyz - xyz.mean(axis=0)
     extent = np.sqrt(np.maximum(np.linalg.eigvalsh(xyz.T @ xyz / len(xyz)), 0.0))
-    uncertain = FLAT_SIGMAS * float(np.median(weakness[good] * seen.distance[good]))
-    if not extent[0] < max(FLAT * extent[1], min(uncertain, 0.1 * extent[1])):
+    uncertain = DIAGNOSIS.flat_sigmas * float(np.median(weakness[good] * seen.distance[good]))
+    if not extent[0] < max(DIAGNOSIS.flat * extent[1], min(uncertain, DIAGNOSIS.max_flat * extent[1])):
         return []
     return [
         Finding(
@@ -224,15 +211,15 @@ def _line_geometry(inspection: Inspection, name: str, seen: Observers) -> tuple[
     normal = np.cross(ray, d[seen.variable])
     size, away = np.linalg.norm(normal, axis=1), np.maximum(np.linalg.norm(ray, axis=1), 1e-300)
     # a ray along the line has almost no plane; what little there is says nothing
-    sees_side = size > np.sin(END_ON) * away
+    sees_side = size > np.sin(DIAGNOSIS.end_on) * away
     end_on = np.bincount(seen.variable, weights=sees_side, minlength=len(group)) == 0
     planes = _scatter(normal / np.maximum(size, 1e-300)[:, None] * sees_side[:, None], seen.variable, len(group))
     values = np.linalg.eigvalsh(planes)
-    same_plane = values[:, 1] <= np.sin(ALONG) ** 2 * np.maximum(values[:, 2], 1e-300)
+    same_plane = values[:, 1] <= np.sin(DIAGNOSIS.along) ** 2 * np.maximum(values[:, 2], 1e-300)
     path = _scatter(centers[seen.pose] - seen.middle[seen.variable], seen.variable, len(group))
     values, vectors = np.linalg.eigh(path)
-    straight = values[:, 1] < np.sin(ALONG) ** 2 * values[:, 2]
-    along = straight & (np.abs(np.einsum("ni,ni->n", vectors[:, :, 2], d)) > np.cos(ALONG))
+    straight = values[:, 1] < np.sin(DIAGNOSIS.along) ** 2 * values[:, 2]
+    along = straight & (np.abs(np.einsum("ni,ni->n", vectors[:, :, 2], d)) > np.cos(DIAGNOSIS.along))
     return end_on, same_plane, along
 
 

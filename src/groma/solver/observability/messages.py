@@ -8,18 +8,17 @@ from collections.abc import Callable
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.solver.observability.gates import DIAGNOSIS
 
 #: Name of a variable in sentences, from its group and its index.
 Names = Callable[[str, int], str]
-#: A part of a unit motion smaller than this is not mentioned.
-VISIBLE = 0.02
 
 
 def axis(vector: FloatArray) -> str:
     """Return a direction as a person would write it: an axis of the world if it is near one, else three numbers."""
     unit = vector / np.linalg.norm(vector)
     k = int(np.argmax(np.abs(unit)))
-    if abs(unit[k]) > 0.9995:
+    if abs(unit[k]) > DIAGNOSIS.axis:
         return "xyz"[k]
     unit = unit * (1.0 if unit[k] > 0 else -1.0)
     return "({:.2f}, {:.2f}, {:.2f})".format(*(unit + 0.0))
@@ -35,7 +34,7 @@ def split(motions: FloatArray) -> tuple[FloatArray, FloatArray]:
     motions = np.linalg.qr(motions)[0] if motions.shape[1] else motions
     U, values, Vt = np.linalg.svd(motions[3:], full_matrices=True)
     values = np.concatenate([values, np.zeros(motions.shape[1] - len(values))])
-    turning = values > VISIBLE
+    turning = values > DIAGNOSIS.visible
     shifts, few = motions[:3] @ Vt.T[:, ~turning], min(3, len(turning))
     turns = U[:, :few][:, turning[:few]]
     return np.linalg.svd(shifts, full_matrices=False)[0] if shifts.shape[1] else shifts, turns
@@ -75,7 +74,7 @@ def plane_freedom(motions: FloatArray, normal: FloatArray) -> str:
     if motions.shape[1] >= 3:
         return "move and turn in every way"
     U, values, _ = np.linalg.svd(motions[1:], full_matrices=False)
-    turning = U[:, values > VISIBLE * max(float(np.linalg.norm(motions)), 1e-300)]
+    turning = U[:, values > DIAGNOSIS.visible * max(float(np.linalg.norm(motions)), 1e-300)]
     if turning.shape[1] == 2:
         return "turn about every axis in it"
     if turning.shape[1] == 1:
@@ -89,7 +88,7 @@ def scene_freedom(combinations: FloatArray) -> list[str]:
     if combinations.shape[1] == 0:
         return []
     Q = np.linalg.qr(combinations)[0]
-    scaling = np.linalg.norm(Q[6]) > VISIBLE
+    scaling = np.linalg.norm(Q[6]) > DIAGNOSIS.visible
     if scaling:  # the part without scale
         direction = Q[6] / np.linalg.norm(Q[6])
         rest = Q @ _complement(direction)

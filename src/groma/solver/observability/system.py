@@ -11,21 +11,16 @@ from groma._typing import BoolArray, FloatArray
 from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.modes import Modes, divided, scaled
 from groma.solver.observability.findings import Finding, few, first_upper
-from groma.solver.observability.inspection import UNDETERMINED, Inspection
+from groma.solver.observability.gates import DIAGNOSIS
+from groma.solver.observability.inspection import Inspection
 from groma.solver.observability.messages import listing
 from groma.solver.observability.variables import parameter_names
 from groma.solver.observability.weak_modes import weak_modes
 
-#: A variable takes part in a mode if it moves by this share of the one that moves most.
-SHARE = 0.05
-#: A mode of more cameras than this share of all is one of the whole.
-MANY = 0.3
 #: What is left of a diagonal after elimination counts as rounding below this share.
 ROUNDING = 1e-10
 #: Eigenvalues below this count as much: their vectors are not exact.
 LEAST = 1e-13
-#: Motions at one standard deviation are cut here, so that what is not determined at all does not hide the rest.
-LARGEST = 100.0
 
 
 def separate_parts(inspection: Inspection) -> list[Finding]:
@@ -105,19 +100,21 @@ def open_modes(inspection: Inspection, apart: bool) -> tuple[list[Finding], dict
         return [], {}, 0
     kinds = {name: problem.variables[name].manifold.kind for name in excursions}
     largest = np.max([np.abs(part).max(axis=(0, 1), initial=0.0) for part in excursions.values()], axis=0)
-    is_open = largest > UNDETERMINED
+    is_open = largest > DIAGNOSIS.undetermined
     if not is_open.any():
         return [], {}, 0
     whole = np.zeros(len(is_open), bool)
     for name, part in excursions.items():
         if kinds[name] == "pose" and len(part) > 3:
-            moving = (np.linalg.norm(part, axis=1) > SHARE * largest).sum(axis=0)
-            whole |= is_open & (moving > MANY * len(part))
+            moving = (np.linalg.norm(part, axis=1) > DIAGNOSIS.takes_part * largest).sum(axis=0)
+            whole |= is_open & (moving > DIAGNOSIS.whole * len(part))
     findings = [_whole_modes(inspection, excursions, whole)] if whole.any() and not apart else []
     local, moves = is_open & ~whole, {}
     for name, part in excursions.items():
         amount = np.linalg.norm(part[:, :, local], axis=1)
-        for i in np.flatnonzero((amount > np.maximum(SHARE * largest[local], UNDETERMINED)).any(axis=1)):
+        for i in np.flatnonzero(
+            (amount > np.maximum(DIAGNOSIS.takes_part * largest[local], DIAGNOSIS.undetermined)).any(axis=1)
+        ):
             moves[name, int(i)] = part[i][:, local]
     return findings, moves, int(is_open.sum())
 
@@ -162,19 +159,22 @@ def _excursions(inspection: Inspection, modes: Modes, size: FloatArray) -> dict[
     if not result:
         return {}
     largest = np.max([np.abs(part).max(axis=(0, 1), initial=0.0) for part in result.values()], axis=0)
-    return {name: part * np.minimum(1.0, LARGEST / np.maximum(largest, 1e-300)) for name, part in result.items()}
+    return {
+        name: part * np.minimum(1.0, DIAGNOSIS.largest_motion / np.maximum(largest, 1e-300))
+        for name, part in result.items()
+    }
 
 
 def _whole_modes(inspection: Inspection, excursions: dict[str, FloatArray], whole: BoolArray) -> Finding:
     """Describe modes that move many cameras together."""
     count = int(whole.sum())
     moved = {name: np.abs(part[:, :, whole]).max(axis=(0, 2)) for name, part in excursions.items() if len(part)}
-    moved = {name: size for name, size in moved.items() if size.max() > SHARE}
+    moved = {name: size for name, size in moved.items() if size.max() > DIAGNOSIS.takes_part}
     parameters: list[str] = []
     for name, size in moved.items():
         if inspection.problem.variables[name].manifold.kind == "intrinsics":
             words = parameter_names(inspection, name) or tuple(f"parameter {k}" for k in range(len(size)))
-            parameters += [words[k] for k in np.flatnonzero(size > SHARE) if words[k] not in parameters]
+            parameters += [words[k] for k in np.flatnonzero(size > DIAGNOSIS.takes_part) if words[k] not in parameters]
     ways = f"in {count:,} ways" if count > 1 else "in one way"
     if parameters:
         text = (

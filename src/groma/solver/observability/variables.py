@@ -12,15 +12,9 @@ from groma._typing import FloatArray
 from groma.cameras import model
 from groma.solver.linear.visible_motion import observers
 from groma.solver.observability.findings import Finding, few, first_upper
-from groma.solver.observability.inspection import UNDETERMINED, Inspection
+from groma.solver.observability.gates import DIAGNOSIS
+from groma.solver.observability.inspection import Inspection
 from groma.solver.observability.messages import camera_freedom, listing, plane_freedom
-
-#: So many cameras or planes are described one by one; of more, the names are listed.
-ONE_BY_ONE = 4
-#: A plane is seen edge-on by a camera that is off it by less than this share of its distance.
-EDGE_ON = 0.03
-#: A parameter that moves by this share of the one that moves most is named.
-NAMED = 0.1
 
 
 def variable_findings(inspection: Inspection, moves: dict[tuple[str, int], FloatArray]) -> list[Finding]:
@@ -29,7 +23,7 @@ def variable_findings(inspection: Inspection, moves: dict[tuple[str, int], Float
     for (name, i), motions in sorted(moves.items(), key=lambda item: item[0]):
         U, values, _ = np.linalg.svd(motions, full_matrices=False)
         # directions that move with another one, but less than an undetermined one must, are not open themselves
-        free = U[:, (values > UNDETERMINED) & (values > 0.01 * values[0])]
+        free = U[:, (values > DIAGNOSIS.undetermined) & (values > DIAGNOSIS.open_share * values[0])]
         if free.shape[1]:
             by_group[name].append((i, free))
     describe = {"pose": _cameras, "plane": _planes, "intrinsics": _parameters, "vector": _parameters}
@@ -41,7 +35,7 @@ def variable_findings(inspection: Inspection, moves: dict[tuple[str, int], Float
 
 
 def _cameras(inspection: Inspection, name: str, found: list[tuple[int, FloatArray]]) -> list[Finding]:
-    if len(found) > ONE_BY_ONE:
+    if len(found) > DIAGNOSIS.one_by_one:
         return [_many(inspection, "camera_open", name, found, "cameras can move or turn without the data noticing")]
     rotations = inspection.problem.variables[name].ambient().reshape(-1, 3, 4)[:, :, :3]
     findings = []
@@ -55,7 +49,7 @@ def _cameras(inspection: Inspection, name: str, found: list[tuple[int, FloatArra
 
 
 def _planes(inspection: Inspection, name: str, found: list[tuple[int, FloatArray]]) -> list[Finding]:
-    if len(found) > ONE_BY_ONE:
+    if len(found) > DIAGNOSIS.one_by_one:
         return [_many(inspection, "plane_open", name, found, "planes are not held by what lies on them")]
     ambient = inspection.problem.variables[name].ambient()
     findings = []
@@ -77,7 +71,7 @@ def _parameters(inspection: Inspection, name: str, found: list[tuple[int, FloatA
     alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
     for i, moves in found:
         size = np.abs(moves).max(axis=1)
-        alike[tuple(np.flatnonzero(size > NAMED * size.max()).tolist())].append(i)
+        alike[tuple(np.flatnonzero(size > DIAGNOSIS.named * size.max()).tolist())].append(i)
     findings = []
     for which, members in alike.items():
         known = [words[k] for k in which] if words else [f"parameter {k}" for k in which]
@@ -123,7 +117,7 @@ def _edge_on(inspection: Inspection, name: str, i: int) -> bool:
     ambient = inspection.problem.variables[name].ambient()[i]
     off = np.abs(centers @ ambient[:3] + ambient[3]) / np.linalg.norm(ambient[:3])
     away = np.linalg.norm(centers - inspection.on_planes(name)[i], axis=1)
-    return bool((off < EDGE_ON * np.maximum(away, 1e-300)).all())
+    return bool((off < DIAGNOSIS.edge_on * np.maximum(away, 1e-300)).all())
 
 
 def _landmarks_on(inspection: Inspection, name: str, i: int) -> str:

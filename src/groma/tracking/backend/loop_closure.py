@@ -13,38 +13,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.factors.contract import Ref
+from groma.adjustment.pose_graph import motion_problem
 from groma.factors.losses import Huber
-from groma.factors.priors.pose_between import PoseBetween
 from groma.geometry import se3
-from groma.geometry.charts.pose_charts import POSE_CHARTS
-from groma.problem.problem import Problem
-from groma.problem.variables import Variables
 from groma.scene.landmarks import Lines
+from groma.scene.pose_graph import Motions
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, back, into, planes_back, planes_into
+from groma.tracking.gates import LoopGates, TrackingGates
 from groma.tracking.map.feature_points import match_features
 from groma.tracking.map.landmarks import DEAD
 from groma.tracking.map.track_map import Keyframe, TrackMap
-from groma.tracking.pose.depth_check import DENIES, depth_agreement
+from groma.tracking.pose.depth_check import depth_agreement
 from groma.tracking.pose.relocalise import feature_places, pose_from_matches
-
-#: Keyframes between a new one and those it may close a loop with.
-GAP = 12
-#: Older keyframes compared with each new one, an even choice if there are more.
-COMPARED = 25
-#: Strongest features of the new keyframe that vote for older ones.
-VOTERS = 200
-#: Features that must match, and agree on the pose.
-MIN_MATCHES, MIN_INLIERS = 60, 35
-#: A keyframe that shares this much with the new one is no loop.
-SHARED = 30
-#: Noise of relative poses: translation (share of the median depth of the map), rotation (radians).
-SIGMA = np.array([0.02] * 3 + [0.01] * 3)
-#: A loop that moves the newest keyframe by more than so many standard deviations of what adds up on the way is none:
-#: two places are alike.
-GATE = 6.0
 
 
 @dataclass(frozen=True)
@@ -53,65 +35,70 @@ class LoopSearch:
 
     newest: Keyframe
     candidates: list[Keyframe]
+    gates: TrackingGates
 
     def run(self) -> list[tuple[Keyframe, IntArray, IntArray]]:
         """Return the candidates whose descriptions match best, with the rows of the pairs; looks at no map."""
-        features = self.newest.features
-        strongest = np.argsort(-features.response, kind="stable")[:VOTERS]
+        features, gates, max_bits = self.newest.features, self.gates.loops, self.gates.features.max_bits
+        strongest = np.argsort(-features.response, kind="stable")[: gates.voters]
         voters = replace(features, pixel=features.pixel[strongest], descriptor=features.descriptor[strongest])
-        votes = np.array([len(match_features(other.features, voters)[0]) for other in self.candidates])
+        votes = np.array([len(match_features(other.features, voters, max_bits)[0]) for other in self.candidates])
         out = []
-        for k in np.argsort(-votes, kind="stable")[:2]:
-            first, second = match_features(self.candidates[k].features, features)
-            if len(first) >= MIN_MATCHES:
+        for k in np.argsort(-votes, kind="stable")[: gates.searched]:
+            first, second = match_features(self.candidates[k].features, features, max_bits)
+            if len(first) >= gates.min_matches:
                 out.append((self.candidates[k], first, second))
         return out
 
 
-def search_for_loop(track_map: TrackMap, metric: bool) -> LoopSearch | None:
+def search_for_loop(track_map: TrackMap, metric: bool, gates: TrackingGates) -> LoopSearch | None:
     """Return the search that the newest keyframe is worth, or None if it sees what older ones see anyway."""
     newest = track_map.last
-    living = [k for k in track_map.living() if k.index < newest.index - GAP]
+    living = [k for k in track_map.living() if k.index < newest.index - gates.loops.gap]
     if not living or not metric:
         return None
     shared = track_map.shared(newest, living)
-    if shared.max(initial=0) >= SHARED:
+    if shared.max(initial=0) >= gates.loops.shared:
         return None
-    chosen = np.unique(np.linspace(0, len(living) - 1, COMPARED).astype(int))
-    return LoopSearch(newest, [living[k] for k in chosen])
+    chosen = np.unique(np.linspace(0, len(living) - 1, gates.loops.compared).astype(int))
+    return LoopSearch(newest, [living[k] for k in chosen], gates)
 
 
 def close_loop(
-    track_map: TrackMap, camera: TrackCamera, newest: Keyframe, pairs: list[tuple[Keyframe, IntArray, IntArray]]
+    track_map: TrackMap,
+    camera: TrackCamera,
+    newest: Keyframe,
+    pairs: list[tuple[Keyframe, IntArray, IntArray]],
+    gates: TrackingGates,
 ) -> bool:
     """Close a loop with what a search found, if the places agree on one pose; return whether the map was changed."""
     best = None
     for keyframe, first, second in pairs:
         if not (keyframe.alive and newest.alive):
             continue
-        found = agreeing_pose(track_map, camera, keyframe, newest, first, second, MIN_INLIERS)
+        found = agreeing_pose(track_map, camera, keyframe, newest, first, second, gates)
         better = found is not None and (best is None or len(found[1]) > len(best[2]))
-        if found is not None and better and _can_be(track_map, keyframe, newest, found[0]):
+        if found is not None and better and _can_be(track_map, keyframe, newest, found[0], gates.loops):
             best = (keyframe, *found)
     if best is None:
         return False
     keyframe, pose, first, second = best
     measured = se3.compose(keyframe.pose[None], se3.inverse(pose[None]))[0]
     track_map.loops.append((keyframe.index, newest.index, measured))
-    _spread_error(track_map)
+    _spread_error(track_map, gates.loops)
     join_points(track_map, keyframe, newest, first, second)
     return True
 
 
-def _can_be(track_map: TrackMap, keyframe: Keyframe, newest: Keyframe, pose: FloatArray) -> bool:
+def _can_be(track_map: TrackMap, keyframe: Keyframe, newest: Keyframe, pose: FloatArray, gates: LoopGates) -> bool:
     """Whether errors that add up at random between two keyframes explain how far the newest is from a pose (7,)."""
     way = [one for one in track_map.living() if keyframe.index <= one.index <= newest.index]
     centers = se3.inverse(np.array([one.pose for one in way]))[:, 4:]
     lever = float(np.linalg.norm(centers - centers[-1], axis=1).max())
     away = se3.log(se3.compose(pose[None], se3.inverse(newest.pose[None])))[0]
-    many = GATE * math.sqrt(newest.index - keyframe.index)
-    went = np.linalg.norm(away[:3]) < many * (SIGMA[0] * newest.depth + SIGMA[3] * lever)
-    return bool(went and np.linalg.norm(away[3:]) < many * SIGMA[3])
+    many = gates.jump * math.sqrt(newest.index - keyframe.index)
+    went = np.linalg.norm(away[:3]) < many * (gates.shift_sigma * newest.depth + gates.turn_sigma * lever)
+    return bool(went and np.linalg.norm(away[3:]) < many * gates.turn_sigma)
 
 
 def agreeing_pose(
@@ -121,19 +108,24 @@ def agreeing_pose(
     newest: Keyframe,
     first: IntArray,
     second: IntArray,
-    least: int,
+    gates: TrackingGates,
 ) -> tuple[FloatArray, IntArray, IntArray] | None:
     """Pose (7,) of a keyframe by matches to features of another in a map, and the matches that agree; None without."""
     places = feature_places(track_map, camera, keyframe, first)
     known = np.isfinite(places[:, 0])
     first, second, places = first[known], second[known], places[known]
-    found = pose_from_matches(camera, places, newest.features.pixel[second], least)
-    if found is None or depth_agreement(camera, [keyframe], newest.depth_grid, found[0])[1] > DENIES:
+    found = pose_from_matches(
+        camera, places, newest.features.pixel[second], gates.loops.min_inliers, gates.finding.max_error
+    )
+    if found is None:
+        return None
+    through = depth_agreement(camera, [keyframe], newest.depth_grid, found[0], gates)[1]
+    if through > gates.depth_check.denies:
         return None
     return found[0], first[found[1]], second[found[1]]
 
 
-def _spread_error(track_map: TrackMap) -> None:
+def _spread_error(track_map: TrackMap, gates: LoopGates) -> None:
     """Solve the pose graph and move keyframes with what they first saw."""
     living = track_map.living()
     place = {keyframe.index: k for k, keyframe in enumerate(living)}
@@ -142,9 +134,10 @@ def _spread_error(track_map: TrackMap) -> None:
     relative = [se3.compose(poses[:-1], se3.inverse(poses[1:]))]
     # Keyframes that see the same hold each other too.
     for k, keyframe in enumerate(living):
-        earlier = living[max(0, k - 8) : max(0, k - 1)]
+        begin = max(0, k - gates.held_by)
+        earlier = living[begin : max(0, k - 1)]
         if earlier:
-            index = np.flatnonzero(track_map.shared(keyframe, earlier) > 60) + max(0, k - 8)
+            index = np.flatnonzero(track_map.shared(keyframe, earlier) > gates.held_shared) + begin
             first.append(index)
             second.append(np.full(len(index), k))
             relative.append(se3.compose(poses[index], se3.inverse(np.tile(poses[k], (len(index), 1)))))
@@ -155,14 +148,15 @@ def _spread_error(track_map: TrackMap) -> None:
             relative.append(measured[None])
     held = np.zeros(len(living), dtype=bool)
     held[0] = True
-    factor = PoseBetween(
-        first=Ref("poses", np.concatenate(first)), second=Ref("poses", np.concatenate(second)),
-        first_from_second=np.concatenate(relative), sqrt_information=np.diag(1.0 / SIGMA)[None].repeat(
-            sum(map(len, first)), axis=0
-        ), loss=Huber(3.0),
-    )  # fmt: skip
-    problem = Problem({"poses": Variables(POSE_CHARTS["left"], poses, held)}, [factor])
-    solved = solve(problem, SolverOptions(max_iterations=30, threads=1))["poses"]
+    sigma = np.array([gates.shift_sigma] * 3 + [gates.turn_sigma] * 3)
+    motions = Motions(
+        np.concatenate(first),
+        np.concatenate(second),
+        np.concatenate(relative),
+        np.tile(np.diag((1.0 / sigma) ** 2), (sum(map(len, first)), 1, 1)),
+    )
+    problem = motion_problem(poses, held, motions, [(np.arange(len(motions)), Huber(gates.loss))])
+    solved = solve(problem, SolverOptions(max_iterations=gates.max_iterations, threads=1))["poses"]
     _move(track_map, living, solved)
 
 

@@ -147,7 +147,7 @@ class Mapper:
                 present.followed = carry(
                     self.map, self.camera, chosen.data, present.data, followed, present.followed, present.pose
                 )
-            merge_planes(self.map.planes)
+            merge_planes(self.map.planes, self.options.gates.planes)
             if self.options.relations:
                 find_lines_on_planes(self.map)
         present.frames_since_keyframe = 0
@@ -167,8 +167,9 @@ class Mapper:
                 elif self._search is None:
                     self._search = (search, self._pool.submit(search.run))
         with watch("culling"):
-            drop_unseen(self.map)
-            drop_repeating_keyframes(self.map, self._pending.job.keyframes if self._pending else [])
+            drop_unseen(self.map, self.options.gates.points.max_misses)
+            busy = self._pending.job.keyframes if self._pending else []
+            drop_repeating_keyframes(self.map, busy, self.options.gates.culling)
 
     def take_up(self, present: Present, now: bool = False) -> None:
         """Take up the result of the thread when it is due."""
@@ -190,14 +191,14 @@ class Mapper:
         """Search the older maps until this one is joined to one of them, then this map for loops."""
         newest = len(self.maps) - 1
         if 0 < newest == self.current and newest not in self.joints and self.metric:
-            return search_older_maps(self.maps, self.map.last)
-        return search_for_loop(self.map, self.metric)
+            return search_older_maps(self.maps, self.map.last, self.options.gates)
+        return search_for_loop(self.map, self.metric, self.options.gates)
 
     def _close_loop(self, present: Present, search: LoopSearch, pairs: list) -> None:
         if search.newest is not self.map.keyframes[search.newest.index]:
             return
         if pairs and not any(pair[0] in self.map.living() for pair in pairs):
-            joint = find_joint(self.maps, self.camera, search.newest, pairs)
+            joint = find_joint(self.maps, self.camera, search.newest, pairs, self.options.gates)
             if joint is not None:
                 self.joints[self.current] = joint
                 self.map.pinned.add(joint.newest.index)
@@ -205,7 +206,7 @@ class Mapper:
             return
         last = self.map.last
         before = last.pose.copy()
-        if close_loop(self.map, self.camera, search.newest, pairs):
+        if close_loop(self.map, self.camera, search.newest, pairs, self.options.gates):
             self.loops += 1
             _follow_world(present, se3.compose(se3.inverse(last.pose[None]), before[None])[0])
 
@@ -220,8 +221,9 @@ class Mapper:
             return None
         held = np.zeros(len(living), dtype=bool)
         held[0] = True
+        most = self.options.gates.loops.final_iterations
         for _ in range(2):
-            job = job_of(self.map, self.camera, living, held, self.options.relations, max_iterations=15)
+            job = job_of(self.map, self.camera, living, held, self.options.relations, most)
             if job is not None:
                 job.solve()
                 job.apply(self.map)

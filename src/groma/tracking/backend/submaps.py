@@ -14,13 +14,12 @@ from groma.io.trajectories import Trajectory
 from groma.scene import Scene
 from groma.scene.landmarks import Lines
 from groma.tracking.backend.loop_closure import (
-    COMPARED,
-    MIN_INLIERS,
     LoopSearch,
     agreeing_pose,
     join_points,
 )
 from groma.tracking.frame.camera import TrackCamera, into, planes_into
+from groma.tracking.gates import TrackingGates
 from groma.tracking.map.track_map import Keyframe, TrackMap
 
 
@@ -53,23 +52,27 @@ class Joint:
         return se3.compose(there, self.newest.pose[None])[0]
 
 
-def search_older_maps(maps: list[TrackMap], newest: Keyframe) -> LoopSearch | None:
+def search_older_maps(maps: list[TrackMap], newest: Keyframe, gates: TrackingGates) -> LoopSearch | None:
     """Return the search for the newest keyframe in all maps but the last, or None if there are no keyframes."""
     keyframes = [keyframe for older in maps[:-1] for keyframe in older.living()]
     if not keyframes:
         return None
-    chosen = np.unique(np.linspace(0, len(keyframes) - 1, 2 * COMPARED).astype(int))
-    return LoopSearch(newest, [keyframes[k] for k in chosen])
+    chosen = np.unique(np.linspace(0, len(keyframes) - 1, 2 * gates.loops.compared).astype(int))
+    return LoopSearch(newest, [keyframes[k] for k in chosen], gates)
 
 
 def find_joint(
-    maps: list[TrackMap], camera: TrackCamera, newest: Keyframe, pairs: list[tuple[Keyframe, IntArray, IntArray]]
+    maps: list[TrackMap],
+    camera: TrackCamera,
+    newest: Keyframe,
+    pairs: list[tuple[Keyframe, IntArray, IntArray]],
+    gates: TrackingGates,
 ) -> Joint | None:
     """Return how the newest map joins an older one, if what a search found agrees on one pose."""
     best: Joint | None = None
     for keyframe, first, second in pairs:
         older = next(k for k, part in enumerate(maps) if keyframe in part.living())
-        found = agreeing_pose(maps[older], camera, keyframe, newest, first, second, MIN_INLIERS)
+        found = agreeing_pose(maps[older], camera, keyframe, newest, first, second, gates)
         if found is not None and (best is None or len(found[1]) > len(best.first)):
             pose, first, second = found
             relative = se3.compose(keyframe.pose[None], se3.inverse(pose[None]))[0]

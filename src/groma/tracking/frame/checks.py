@@ -11,18 +11,14 @@ from groma._counted import counted
 from groma.errors import InputError, ShapeError
 from groma.io.sequences.frame import Frame
 from groma.tracking.frame.camera import TrackCamera
-
-#: A picture whose grey levels spread less than this shows nothing.
-MIN_CONTRAST = 4.0
-#: A depth image with less than this share of known depths is reported once.
-SPARSE_DEPTH = 0.2
+from groma.tracking.gates import DEFAULT, CheckGates
 
 
 class FrameChecks:
     """Checks frames one by one, and keeps what is worth saying at the end."""
 
-    def __init__(self, camera: TrackCamera) -> None:
-        self._camera = camera
+    def __init__(self, camera: TrackCamera, gates: CheckGates = DEFAULT.checks) -> None:
+        self._camera, self._gates = camera, gates
         self._last_time = -math.inf
         self._last_small: np.ndarray | None = None
         self._counts: dict[str, int] = {}
@@ -38,7 +34,7 @@ class FrameChecks:
         else:
             small = frame.gray[::8, ::8].astype(np.float32)
             level, contrast = float(small.mean()), float(small.std())
-            if contrast < MIN_CONTRAST:
+            if contrast < self._gates.min_contrast:
                 reason = "it is black" if level < 60 else "it is overexposed" if level > 200 else "it shows nothing"
             self._last_time = frame.timestamp
             if not reason:
@@ -47,7 +43,7 @@ class FrameChecks:
                 self._last_small = small
                 if frame.depth is not None:
                     known = float((frame.depth[::8, ::8] > 0).mean())
-                    if known < SPARSE_DEPTH:
+                    if known < self._gates.sparse_depth:
                         self._count("had depth in less than a fifth of the picture")
         if reason:
             self._count(f"skipped: {reason}")

@@ -15,31 +15,26 @@ import numpy.typing as npt
 from groma._typing import FloatArray
 from groma.geometry import quaternion, se3, so3
 from groma.tracking.frame.camera import TrackCamera, into, rotation
+from groma.tracking.gates import DEFAULT, TurnGates
 
-#: Width of the small images, pixels.
-SMALL = 64
-#: Steps of the alignment.
-STEPS = 12
-#: Least share of the image that must overlap.
-MIN_OVERLAP = 0.25
-#: Correlation of the surroundings of the points above which a prediction needs no help, and what a turn must gain.
-AGREES, GAIN = 0.8, 0.04
-#: Places that a judgement needs.
-MIN_PLACES = 8
-#: Noise of a turn found so, radians.
-TURN_SIGMA = 0.03
 _SmallImage = npt.NDArray[np.float32]
 
 
-def small_image(gray: npt.NDArray[np.uint8]) -> _SmallImage:
-    """Return a blurred image :data:`SMALL` pixels wide."""
+def small_image(gray: npt.NDArray[np.uint8], gates: TurnGates = DEFAULT.turns) -> _SmallImage:
+    """Return a small, blurred image."""
     height, width = gray.shape
-    size = (SMALL, max(round(SMALL * height / width), 8))
+    size = (gates.width, max(round(gates.width * height / width), 8))
     reduced = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(reduced, (0, 0), 0.8), np.float32)
+    return np.asarray(cv2.GaussianBlur(reduced, (0, 0), gates.blur), np.float32)
 
 
-def turn_between(camera: TrackCamera, before: _SmallImage, now: _SmallImage, starts: list[FloatArray]) -> FloatArray:
+def turn_between(
+    camera: TrackCamera,
+    before: _SmallImage,
+    now: _SmallImage,
+    starts: list[FloatArray],
+    gates: TurnGates = DEFAULT.turns,
+) -> FloatArray:
     """Return the rotation (3, 3) now_from_before that brings two small images to agree best.
 
     Parameters
@@ -50,14 +45,16 @@ def turn_between(camera: TrackCamera, before: _SmallImage, now: _SmallImage, sta
         From :func:`small_image`.
     starts
         Rotations to begin from, beside the shift that correlation finds.
+    gates
+        Numbers of the alignment.
     """
     first, second = (np.asarray(cv2.pyrDown(image), np.float32) for image in (before, now))
     K = _matrix(camera, before.shape)
     dx, dy = _shift(before, now)
     shifted = so3.exp(np.array([[-dy / K[1, 1], dx / K[0, 0], 0.0]]))[0]
-    tried = [_align(_matrix(camera, first.shape), first, second, start) for start in [*starts, shifted]]
+    tried = [_align(_matrix(camera, first.shape), first, second, start, gates) for start in [*starts, shifted]]
     best = max(tried, key=lambda one: one[1])[0]
-    return _align(K, before, now, best)[0]
+    return _align(K, before, now, best, gates)[0]
 
 
 def _matrix(camera: TrackCamera, shape: tuple[int, ...]) -> FloatArray:
@@ -78,7 +75,9 @@ def _shift(before: _SmallImage, now: _SmallImage) -> FloatArray:
     return np.array([column - left, row - top], dtype=float)
 
 
-def _align(K: FloatArray, before: _SmallImage, now: _SmallImage, start: FloatArray) -> tuple[FloatArray, float]:
+def _align(
+    K: FloatArray, before: _SmallImage, now: _SmallImage, start: FloatArray, gates: TurnGates
+) -> tuple[FloatArray, float]:
     """Gauss-Newton on the rotation; return the best one with the correlation of the images where they overlap."""
     height, width = now.shape
     inverse = np.linalg.inv(K)
@@ -89,12 +88,12 @@ def _align(K: FloatArray, before: _SmallImage, now: _SmallImage, start: FloatArr
     along_v = K[1, 1] * np.stack([-1.0 - y * y, x * y, x], axis=1)
     inside = np.ones(before.shape, np.uint8)
     turn, best, best_score = start, start, -np.inf
-    for _ in range(STEPS):
+    for _ in range(gates.steps):
         homography = K @ turn @ inverse
         moved = cv2.warpPerspective(before, homography, (width, height), flags=cv2.INTER_LINEAR)
         both = cv2.warpPerspective(inside, homography, (width, height), flags=cv2.INTER_NEAREST)
         seen = np.asarray(cv2.erode(both, np.ones((3, 3), np.uint8))).ravel() > 0
-        if seen.sum() < MIN_OVERLAP * seen.size:
+        if seen.sum() < gates.min_overlap * seen.size:
             break
         a, b = np.asarray(moved, np.float64).ravel()[seen], now.ravel()[seen].astype(np.float64)
         a, b = a - a.mean(), b - b.mean()
@@ -105,18 +104,23 @@ def _align(K: FloatArray, before: _SmallImage, now: _SmallImage, start: FloatArr
         gradient = [0.125 * np.asarray(cv2.Sobel(moved, cv2.CV_32F, *of)).ravel()[seen] for of in ((1, 0), (0, 1))]
         J = -(gradient[0][:, None] * along_u[seen] + gradient[1][:, None] * along_v[seen])
         size = np.abs(a - b)
-        weight = 1.0 / (1.0 + (size / max(3.0 * float(np.median(size)), 1.0)) ** 2)
+        weight = 1.0 / (1.0 + (size / max(gates.outlier * float(np.median(size)), 1.0)) ** 2)
         weighted = weight[:, None] * J
         H = weighted.T @ J
         omega = -np.linalg.solve(H + 1e-6 * (np.trace(H) + 1.0) * np.eye(3), weighted.T @ (a - b))
         turn = so3.exp(omega[None])[0] @ turn
-        if np.abs(omega).max() * K[0, 0] < 0.02:
+        if np.abs(omega).max() * K[0, 0] < gates.converged:
             break
     return best, best_score
 
 
 def surroundings_agree(
-    before: _SmallImage, now: _SmallImage, shape: tuple[int, int], pixels: FloatArray, guesses: FloatArray
+    before: _SmallImage,
+    now: _SmallImage,
+    shape: tuple[int, int],
+    pixels: FloatArray,
+    guesses: FloatArray,
+    noise: float = DEFAULT.turns.noise,
 ) -> tuple[float, float]:
     """Correlation of the surroundings of places in the first image with those of guesses in the second.
 
@@ -140,15 +144,19 @@ def surroundings_agree(
         patches.append(np.asarray(values, np.float64))
     a, b = (patch - patch.mean(axis=1, keepdims=True) for patch in patches)
     aa, bb, ab = (a * a).sum(axis=1), (b * b).sum(axis=1), (a * b).sum(axis=1)
-    each = ab / np.sqrt((aa + 4.0) * (bb + 4.0))
-    return float(np.median(each)), float(ab.sum() / np.sqrt((aa.sum() + 4.0) * (bb.sum() + 4.0)))
+    each = ab / np.sqrt((aa + noise) * (bb + noise))
+    return float(np.median(each)), float(ab.sum() / np.sqrt((aa.sum() + noise) * (bb.sum() + noise)))
 
 
 def turned(
-    camera: TrackCamera, before: npt.NDArray[np.uint8], now: npt.NDArray[np.uint8], pose: FloatArray
+    camera: TrackCamera,
+    before: npt.NDArray[np.uint8],
+    now: npt.NDArray[np.uint8],
+    pose: FloatArray,
+    gates: TurnGates = DEFAULT.turns,
 ) -> FloatArray:
     """Return the pose (7,) of a frame whose predecessor had one, from the turn between their images alone."""
-    return _after(turn_between(camera, small_image(before), small_image(now), [np.eye(3)]), pose)
+    return _after(turn_between(camera, small_image(before, gates), small_image(now, gates), [np.eye(3)], gates), pose)
 
 
 def _after(turn: FloatArray, pose: FloatArray) -> FloatArray:
@@ -165,6 +173,7 @@ def turned_prediction(
     spread: tuple[FloatArray, FloatArray],
     previous: FloatArray,
     predicted: FloatArray,
+    gates: TurnGates = DEFAULT.turns,
 ) -> FloatArray | None:
     """Return a pose (7,) that explains a frame better than a prediction, or None where the prediction is good.
 
@@ -180,28 +189,30 @@ def turned_prediction(
         The same spread over the image where depth is known there: these judge it, with the others.
     previous, predicted : (7,)
         Pose of the frame before, and the prediction for this one.
+    gates
+        What counts as agreement.
     """
-    small = small_image(before), small_image(now)
+    small = small_image(before, gates), small_image(now, gates)
 
     def agree(pose: FloatArray, pixels: FloatArray, places: FloatArray) -> tuple[float, float]:
         moved = pixels + camera.project(into(pose, places)) - camera.project(into(previous, places))
-        return surroundings_agree(*small, now.shape, pixels, np.where(np.isfinite(moved), moved, -1e6))
+        return surroundings_agree(*small, now.shape, pixels, np.where(np.isfinite(moved), moved, -1e6), gates.noise)
 
-    if len(followed[0]) >= MIN_PLACES and agree(predicted, *followed)[0] > AGREES:
+    if len(followed[0]) >= gates.min_places and agree(predicted, *followed)[0] > gates.agrees:
         return None
     every = np.concatenate([followed[0], spread[0]]), np.concatenate([followed[1], spread[1]])
-    if len(every[0]) < MIN_PLACES:
+    if len(every[0]) < gates.min_places:
         return None
     expected = agree(predicted, *every)[1]
     turns = [rotation(predicted) @ rotation(previous).T, np.eye(3)]
     # The same turn, with the way that was predicted or without any.
     center = se3.inverse(predicted[None])[0, 4:]
-    stayed = _after(turn_between(camera, *small, turns), previous)
+    stayed = _after(turn_between(camera, *small, turns, gates), previous)
     went = stayed.copy()
     went[4:] = -rotation(stayed) @ center
     scores = [agree(pose, *every)[1] for pose in (stayed, went)]
     k = int(np.argmax(scores))
-    return (stayed, went)[k] if scores[k] > expected + GAIN else None
+    return (stayed, went)[k] if scores[k] > expected + gates.gain else None
 
 
 __all__ = ["small_image", "surroundings_agree", "turn_between", "turned", "turned_prediction"]

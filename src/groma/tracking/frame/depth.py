@@ -10,24 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray
-from groma.features.depth.lines import fit_depth_lines
+from groma.features.depth.lines import DepthLineGates, fit_depth_lines
 from groma.features.depth.noise import DepthNoise
+from groma.tracking.gates import DEFAULT, DepthGates
 
 DepthImage = npt.NDArray[np.float32]
-#: Standard deviation of an inverse depth, 1 / scene unit: 3 mm at 1 m, 12 mm at 2 m.
-INVERSE_DEPTH_SIGMA = 0.003
-#: A depth is not known better than this, scene units.
-DEPTH_FLOOR = 0.003
-#: Depth beside a segment is looked at between these distances, pixels: near enough that narrow faces are not missed.
-NEAR, FAR = 0.5, 4.5
 
 
-def depth_sigma(depth: FloatArray) -> FloatArray:
+def depth_sigma(depth: FloatArray, gates: DepthGates = DEFAULT.depth) -> FloatArray:
     """Standard deviation of measured depths, scene units."""
-    return np.hypot(DEPTH_FLOOR, INVERSE_DEPTH_SIGMA * depth**2)
+    return np.hypot(gates.min_sigma, gates.inverse_sigma * depth**2)
 
 
-def depth_at(image: DepthImage, pixels: FloatArray, max_depth: float) -> FloatArray:
+def depth_at(image: DepthImage, pixels: FloatArray, max_depth: float, gates: DepthGates = DEFAULT.depth) -> FloatArray:
     """Depths (N,) at pixels; NaN where unknown, too far, or at a jump of depth."""
     height, width = image.shape
     column = np.clip(pixels[:, 0].astype(np.int64), 1, width - 2)
@@ -38,18 +33,25 @@ def depth_at(image: DepthImage, pixels: FloatArray, max_depth: float) -> FloatAr
     lone = known == 0
     near[lone] = 0.0
     low, high, middle = np.nanmin(near, axis=1), np.nanmax(near, axis=1), np.nanmedian(near, axis=1)
-    good = ~lone & (known >= 4) & (high - low < 0.01 + 0.04 * low) & (middle <= max_depth)
+    good = (
+        ~lone & (known >= gates.min_known) & (high - low < gates.jump + gates.jump_share * low) & (middle <= max_depth)
+    )
     return np.where(good, middle, np.nan)
 
 
 def segment_inverse_depths(
-    image: DepthImage, ends: FloatArray, pinhole: FloatArray, noise: DepthNoise
+    image: DepthImage,
+    ends: FloatArray,
+    pinhole: FloatArray,
+    noise: DepthNoise,
+    gates: DepthGates = DEFAULT.depth,
 ) -> tuple[FloatArray, FloatArray]:
     """Inverse depths (L, 2) at the ends of segments and their standard deviations; NaN where unknown."""
-    found = fit_depth_lines(ends, image, pinhole, noise, near=NEAR, far=FAR, max_relative_sigma=1.0)
+    own = DepthLineGates(near=gates.near, far=gates.far, max_relative_sigma=1.0)
+    found = fit_depth_lines(ends, image, pinhole, noise, gates=own)
     sigma = np.sqrt(np.diagonal(found.inverse_depth_covariances, axis1=1, axis2=2))
     good = found.good[:, None]
     return np.where(good, found.inverse_depth, np.nan), np.where(good, sigma, np.nan)
 
 
-__all__ = ["DEPTH_FLOOR", "INVERSE_DEPTH_SIGMA", "DepthImage", "depth_at", "depth_sigma", "segment_inverse_depths"]
+__all__ = ["DepthImage", "depth_at", "depth_sigma", "segment_inverse_depths"]

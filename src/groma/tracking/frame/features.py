@@ -18,8 +18,6 @@ from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.depth import (
-    DEPTH_FLOOR,
-    INVERSE_DEPTH_SIGMA,
     DepthImage,
     depth_at,
     depth_sigma,
@@ -27,16 +25,10 @@ from groma.tracking.frame.depth import (
 )
 from groma.tracking.frame.planes import FramePlanes, frame_planes
 from groma.tracking.frame.sparse_depth import fill_sparse
-from groma.tracking.frame.stereo import DISPARITY_SIGMA, Disparities, dense_disparities, match_columns
+from groma.tracking.frame.stereo import Disparities, dense_disparities, match_columns
+from groma.tracking.gates import DEFAULT, DepthGates
 from groma.tracking.options import TrackOptions
 
-#: Depths of a stereo pair are used where their noise is below this share of the depth. An error of the disparity shifts
-#: a point in the next image by that error times motion over baseline, far or near, so far points serve as well.
-FAR_SHARE = 0.25
-#: Errors of depth beside a segment: so many neighbours err alike.
-SEGMENT_NOISE = DepthNoise(DEPTH_FLOOR, INVERSE_DEPTH_SIGMA, 0.0, correlation=6.0, tilt=0.0, shift=0.0)
-#: Pixels from one place of the grid of depths to the next.
-GRID = 20
 Descriptors = npt.NDArray[np.uint8]
 
 
@@ -76,7 +68,7 @@ class FrameFeatures:
     @cached_property
     def features(self) -> Features:
         """ORB features over several scales."""
-        return describe(self.gray, self.options.num_features, self.depths)
+        return describe(self.gray, self.options.num_features, self.depths, self.options.gates.features.fast_threshold)
 
     @cached_property
     def detected(self) -> DetectedSegments:
@@ -106,22 +98,25 @@ class FrameFeatures:
         """Planes of the depth image; None without one."""
         if self.depth is None or not self.options.planes:
             return None
-        return frame_planes(self.camera, self.depth, self.options.max_depth)
+        return frame_planes(self.camera, self.depth, self.options.max_depth, self.options.gates)
 
     @cached_property
     def depth(self) -> DepthImage | None:
         """The depth image; small holes are filled where most of it is missing."""
-        return None if self.frame.depth is None else fill_sparse(self.frame.depth, self.options.max_depth)
+        if self.frame.depth is None:
+            return None
+        return fill_sparse(self.frame.depth, self.options.max_depth, self.options.gates)
 
     def depths(self, pixels: FloatArray) -> FloatArray:
         """Depths (N,) at pixels from the depth image or the right image; NaN where unknown."""
         if self.depth is not None:
-            return depth_at(self.depth, pixels, self.options.max_depth)
+            return depth_at(self.depth, pixels, self.options.max_depth, self.options.gates.depth)
         if self.frame.right is not None:
             disparity = pixels[:, 0] - self.right_columns(pixels)
             with np.errstate(divide="ignore"):
                 depth = self.camera.fx * self.camera.baseline / disparity
-            far = self.camera.fx * self.camera.baseline * FAR_SHARE / DISPARITY_SIGMA
+            gates = self.options.gates
+            far = self.camera.fx * self.camera.baseline * gates.depth.far_share / gates.stereo.disparity_sigma
             return np.where((depth > 0) & (depth < far), depth, np.nan)
         return np.full(len(pixels), np.nan)
 
@@ -129,7 +124,9 @@ class FrameFeatures:
     def disparities(self) -> Disparities | None:
         """Dense disparities of a pair of images."""
         right = self.frame.right
-        return None if right is None else dense_disparities(self.gray, np.ascontiguousarray(right))
+        if right is None:
+            return None
+        return dense_disparities(self.gray, np.ascontiguousarray(right), self.options.gates.stereo)
 
     def right_columns(self, pixels: FloatArray, expected: FloatArray | None = None) -> FloatArray:
         """Columns (N,) in the right image; NaN where not found or without one.
@@ -139,52 +136,62 @@ class FrameFeatures:
         if self.frame.right is None:
             return np.full(len(pixels), np.nan)
         right = np.ascontiguousarray(self.frame.right)
+        gates = self.options.gates.stereo
         if expected is None:
-            return match_columns(self.gray, right, pixels, np.full(len(pixels), np.nan), self.disparities)
-        return match_columns(self.gray, right, pixels, expected, None)
+            return match_columns(self.gray, right, pixels, np.full(len(pixels), np.nan), self.disparities, gates)
+        return match_columns(self.gray, right, pixels, expected, None, gates)
 
     @cached_property
     def depth_grid(self) -> FloatArray:
         """Depths at :func:`grid_pixels`; NaN where unknown."""
-        return self.depths(grid_pixels(self.camera))
+        return self.depths(grid_pixels(self.camera, self.options.gates.depth))
 
     def depth_sigma(self, depth: FloatArray) -> FloatArray:
         """Standard deviations of depths from :meth:`depths`."""
         if self.frame.right is not None and self.frame.depth is None:
-            return DISPARITY_SIGMA * depth**2 / (self.camera.fx * self.camera.baseline)
-        return depth_sigma(depth)
+            return self.options.gates.stereo.disparity_sigma * depth**2 / (self.camera.fx * self.camera.baseline)
+        return depth_sigma(depth, self.options.gates.depth)
 
     def inverse_depths(self, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Inverse depths at the ends of segments (L, 2) and their standard deviations; NaN where unknown."""
+        gates = self.options.gates
         if self.depth is not None and len(ends):
-            noise = replace(SEGMENT_NOISE, max_depth=self.options.max_depth)
-            return segment_inverse_depths(self.depth, ends, self.camera.params, noise)
+            noise = replace(segment_noise(gates.depth), max_depth=self.options.max_depth)
+            return segment_inverse_depths(self.depth, ends, self.camera.params, noise, gates.depth)
         if self.frame.right is not None and len(ends):
             assert self.disparities is not None
             scale = self.camera.fx * self.camera.baseline
             with np.errstate(divide="ignore"):
                 depth = np.where(self.disparities > 0, np.float32(scale) / self.disparities, np.float32(0.0))
-            noise = replace(SEGMENT_NOISE, constant=0.0, quadratic=2.0 * DISPARITY_SIGMA / scale, max_depth=1e4)
-            return segment_inverse_depths(depth, ends, self.camera.params, noise)
+            quadratic = 2.0 * gates.stereo.disparity_sigma / scale
+            noise = replace(segment_noise(gates.depth), constant=0.0, quadratic=quadratic, max_depth=1e4)
+            return segment_inverse_depths(depth, ends, self.camera.params, noise, gates.depth)
         unknown = np.full((len(ends), 2), np.nan)
         return unknown, unknown.copy()
 
 
-def grid_pixels(camera: TrackCamera) -> FloatArray:
+def segment_noise(gates: DepthGates = DEFAULT.depth) -> DepthNoise:
+    """Errors of depth beside a segment."""
+    return DepthNoise(gates.min_sigma, gates.inverse_sigma, 0.0, correlation=gates.correlation, tilt=0.0, shift=0.0)
+
+
+def grid_pixels(camera: TrackCamera, gates: DepthGates = DEFAULT.depth) -> FloatArray:
     """Pixels (N, 2) of an even grid over the image, row by row: the middles of cells."""
-    rows, columns = grid_shape(camera)
+    rows, columns = grid_shape(camera, gates)
     v, u = np.mgrid[0:rows, 0:columns].reshape(2, -1)
     return (np.column_stack([u, v]) + 0.5) * (camera.width / columns, camera.height / rows)
 
 
-def grid_shape(camera: TrackCamera) -> tuple[int, int]:
+def grid_shape(camera: TrackCamera, gates: DepthGates = DEFAULT.depth) -> tuple[int, int]:
     """Rows and columns of :func:`grid_pixels`."""
-    return max(camera.height // GRID, 2), max(camera.width // GRID, 2)
+    return max(camera.height // gates.grid, 2), max(camera.width // gates.grid, 2)
 
 
-def describe(gray: npt.NDArray[np.uint8], count: int, depths: Callable[[FloatArray], FloatArray]) -> Features:
+def describe(
+    gray: npt.NDArray[np.uint8], count: int, depths: Callable[[FloatArray], FloatArray], fast_threshold: int
+) -> Features:
     """Find and describe ORB features."""
-    orb = cv2.ORB.create(nfeatures=count, fastThreshold=7)
+    orb = cv2.ORB.create(nfeatures=count, fastThreshold=fast_threshold)
     keypoints, descriptor = orb.detectAndCompute(gray, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
     if not keypoints:
         none = np.zeros(0)
@@ -196,4 +203,4 @@ def describe(gray: npt.NDArray[np.uint8], count: int, depths: Callable[[FloatArr
     return Features(pixel, response, scale, np.asarray(descriptor, np.uint8), depths(pixel), none)
 
 
-__all__ = ["Descriptors", "DetectedSegments", "Features", "FrameFeatures", "grid_pixels", "grid_shape"]
+__all__ = ["Descriptors", "DetectedSegments", "Features", "FrameFeatures", "grid_pixels", "grid_shape", "segment_noise"]

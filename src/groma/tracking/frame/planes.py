@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,16 +13,8 @@ from groma.factors.observations.plane_observation import PlaneObservation
 from groma.features.depth.noise import DepthNoise
 from groma.features.depth.planes import PlaneSearchOptions, find_depth_planes
 from groma.tracking.frame.camera import TrackCamera
-from groma.tracking.frame.depth import DEPTH_FLOOR, INVERSE_DEPTH_SIGMA, DepthImage
-
-#: Neighbouring samples err alike, and a depth camera bends planes: so many count as one, and no plane is known better
-#: than to this tilt (radians) and distance (scene units).
-NOISE = DepthNoise(DEPTH_FLOOR, INVERSE_DEPTH_SIGMA, 0.0, correlation=100.0, tilt=0.004, shift=0.003)
-OPTIONS = PlaneSearchOptions(min_share=0.015, max_planes=10)
-#: Pixels from one place on a plane to the next.
-SPACING = 20
-#: Places that a plane has at least; thin strips have fewer.
-MIN_PLACES = 8
+from groma.tracking.frame.depth import DepthImage
+from groma.tracking.gates import DEFAULT, TrackingGates
 
 
 @dataclass(frozen=True)
@@ -47,11 +39,19 @@ class FramePlanes:
         return self.places[self.place_plane == row]
 
 
-def frame_planes(camera: TrackCamera, depth: DepthImage, max_depth: float) -> FramePlanes:
+def frame_planes(
+    camera: TrackCamera, depth: DepthImage, max_depth: float, gates: TrackingGates = DEFAULT
+) -> FramePlanes:
     """Find the planes of a depth image, largest first."""
-    found = find_depth_planes(depth, camera.params, replace(NOISE, max_depth=max_depth), OPTIONS)
+    own = gates.frame_planes
+    noise = DepthNoise(
+        gates.depth.min_sigma, gates.depth.inverse_sigma, 0.0,
+        correlation=own.correlation, tilt=own.tilt, shift=own.shift, max_depth=max_depth,
+    )  # fmt: skip
+    options = PlaneSearchOptions(min_share=own.min_share, max_planes=own.max_planes)
+    found = find_depth_planes(depth, camera.params, noise, options)
     planes, step = found.planes, found.step
-    every = max(SPACING // step, 1)
+    every = max(gates.depth.grid // step, 1)
     labels = found.labels[every // 2 :: every, every // 2 :: every]
     row, column = np.nonzero(labels >= 0)
     of = labels[row, column].astype(np.int64)
@@ -60,7 +60,7 @@ def frame_planes(camera: TrackCamera, depth: DepthImage, max_depth: float) -> Fr
     # Where the ray meets the plane, which is less noisy than the depth there.
     places = rays * (-planes[of, 3] / (planes[of, :3] * rays).sum(axis=1))[:, None]
     support = found.num_samples.astype(np.float64) * step**2
-    kept = np.flatnonzero(np.bincount(of, minlength=len(planes)) >= MIN_PLACES)
+    kept = np.flatnonzero(np.bincount(of, minlength=len(planes)) >= own.min_places)
     renumbered = np.full(len(planes), -1)
     renumbered[kept] = np.arange(len(kept))
     on = renumbered[of] >= 0

@@ -13,53 +13,46 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from groma.tracking.frame.depth import DEPTH_FLOOR, INVERSE_DEPTH_SIGMA, DepthImage
-
-#: Images of which a smaller share is known are filled.
-DENSE = 0.35
-#: Side of a cell, pixels, and of a window, cells.
-CELL, WINDOW = 4, 11
-#: Samples that a window has at least; neighbours err alike, so many count as one.
-LEAST, CORRELATION = 12, 6.0
-#: Largest deviation of samples from their plane, and of a reading, in standard deviations of one sample.
-MAX_SCATTER, MAX_READING = 2.5, 2.0
+from groma.tracking.frame.depth import DepthImage
+from groma.tracking.gates import DEFAULT, TrackingGates
 
 
-def fill_sparse(depth: DepthImage, max_depth: float) -> DepthImage:
+def fill_sparse(depth: DepthImage, max_depth: float, gates: TrackingGates = DEFAULT) -> DepthImage:
     """Return the depth image with holes filled where samples around them lie on a plane; dense images as they are."""
+    sparse, cell, window = gates.sparse_depth, gates.sparse_depth.cell, gates.sparse_depth.window
     known = (depth > 0) & (depth <= max_depth)
-    if known.mean() >= DENSE or min(depth.shape) < CELL * WINDOW:
+    if known.mean() >= sparse.dense or min(depth.shape) < cell * window:
         return depth
-    rows, columns = (size // CELL for size in depth.shape)
-    rho = np.zeros((rows * CELL, columns * CELL))
-    inside = known[: rows * CELL, : columns * CELL]
-    np.divide(1.0, depth[: rows * CELL, : columns * CELL], out=rho, where=inside)
-    y, x = (np.arange(size, dtype=np.float64) / CELL for size in rho.shape)
+    rows, columns = (size // cell for size in depth.shape)
+    rho = np.zeros((rows * cell, columns * cell))
+    inside = known[: rows * cell, : columns * cell]
+    np.divide(1.0, depth[: rows * cell, : columns * cell], out=rho, where=inside)
+    y, x = (np.arange(size, dtype=np.float64) / cell for size in rho.shape)
     terms = np.stack([inside.astype(np.float64), rho, rho * rho, inside * x, inside * y[:, None], rho * x,
                       rho * y[:, None], inside * x * x, inside * y[:, None] ** 2, inside * x * y[:, None]])  # fmt: skip
-    cells = terms.reshape(10, rows, CELL, columns, CELL).sum(axis=(2, 4))
+    cells = terms.reshape(10, rows, cell, columns, cell).sum(axis=(2, 4))
     sums = np.stack([
-        cv2.boxFilter(term, -1, (WINDOW, WINDOW), normalize=False, borderType=cv2.BORDER_CONSTANT) for term in cells
+        cv2.boxFilter(term, -1, (window, window), normalize=False, borderType=cv2.BORDER_CONSTANT) for term in cells
     ])  # fmt: skip
     count = np.maximum(sums[0], 1.0)
     r, rr, mx, my, xr, yr, xx, yy, xy = sums[1:] / count
     rr, xr, yr = rr - r * r, xr - r * mx, yr - r * my
     xx, yy, xy = xx - mx * mx, yy - my * my, xy - mx * my
     determinant = xx * yy - xy * xy
-    good = (sums[0] >= LEAST) & (determinant > 1e-2)
+    good = (sums[0] >= sparse.min_samples) & (determinant > 1e-2)
     determinant = np.where(good, determinant, 1.0)
     a, b = (yy * xr - xy * yr) / determinant, (xx * yr - xy * xr) / determinant
     scatter = np.sqrt(np.maximum(rr - a * xr - b * yr, 0.0))
     # Of the middle of the cell.
     dx, dy = np.arange(columns) + 0.5 - mx, np.arange(rows)[:, None] + 0.5 - my
-    variance = (1.0 + (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant) * CORRELATION / count
-    sigma = INVERSE_DEPTH_SIGMA + DEPTH_FLOOR * r * r
-    good &= (scatter < MAX_SCATTER * sigma) & (variance < MAX_READING**2) & (r > 0)
-    wide = [np.repeat(np.repeat(value, CELL, axis=0), CELL, axis=1) for value in (good, r - a * mx - b * my, a, b)]
+    variance = (1.0 + (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinant) * gates.depth.correlation / count
+    sigma = gates.depth.inverse_sigma + gates.depth.min_sigma * r * r
+    good &= (scatter < sparse.max_scatter * sigma) & (variance < sparse.max_reading**2) & (r > 0)
+    wide = [np.repeat(np.repeat(value, cell, axis=0), cell, axis=1) for value in (good, r - a * mx - b * my, a, b)]
     reading = wide[1] + wide[2] * x + wide[3] * y[:, None]
     filled = depth.copy()
     fill = wide[0] & ~inside & (reading > 1.0 / max_depth)
-    filled[: rows * CELL, : columns * CELL][fill] = 1.0 / reading[fill]
+    filled[: rows * cell, : columns * cell][fill] = 1.0 / reading[fill]
     return filled
 
 

@@ -6,36 +6,30 @@ from __future__ import annotations
 import numpy as np
 
 from groma.geometry import se3
+from groma.tracking.gates import CullingGates
 from groma.tracking.map.landmarks import DEAD
 from groma.tracking.map.track_map import Keyframe, TrackMap
 
-#: A point looked for this often in a row and not found is dropped.
-MAX_MISSES = 12
-#: A keyframe repeats the others if this share of its points is seen by at least this many of them.
-REPEATED, SEEN_BY = 0.85, 3
-#: The newest keyframes are never dropped.
-NEWEST = 4
 
-
-def drop_unseen(track_map: TrackMap) -> None:
+def drop_unseen(track_map: TrackMap, max_misses: int) -> None:
     """Take out points that were in view many times and not found."""
     points = track_map.points
-    points.state[points.alive & (points.misses > MAX_MISSES)] = DEAD
+    points.state[points.alive & (points.misses > max_misses)] = DEAD
 
 
-def drop_repeating_keyframes(track_map: TrackMap, busy: list[Keyframe]) -> None:
+def drop_repeating_keyframes(track_map: TrackMap, busy: list[Keyframe], gates: CullingGates) -> None:
     """Drop at most one keyframe whose points others see as well."""
     living = track_map.living()
-    if len(living) <= NEWEST + 2:
+    if len(living) <= gates.newest + 2:
         return
     newest = living[-1]
-    others = living[1:-NEWEST]
+    others = living[1 : -gates.newest]
     shared = track_map.shared(newest, others)
     used = {keyframe.index for keyframe in busy}
     counts = np.zeros(len(track_map.points), np.int32)
     for keyframe in living:
         counts[np.unique(keyframe.measured.points.index)] += 1
-    for k in np.flatnonzero(shared > 20):
+    for k in np.flatnonzero(shared > gates.min_shared):
         keyframe = others[k]
         if (
             keyframe.index == track_map.reference
@@ -46,12 +40,12 @@ def drop_repeating_keyframes(track_map: TrackMap, busy: list[Keyframe]) -> None:
             continue
         rows = keyframe.measured.points.index
         rows = rows[track_map.points.alive[rows]]
-        if len(rows) > 20 and (counts[rows] - 1 >= SEEN_BY).mean() > REPEATED:
-            _drop(track_map, keyframe, living)
+        if len(rows) > gates.min_shared and (counts[rows] - 1 >= gates.seen_by).mean() > gates.repeated:
+            _drop(track_map, keyframe, living, gates.heirs)
             return
 
 
-def _drop(track_map: TrackMap, keyframe: Keyframe, living: list[Keyframe]) -> None:
+def _drop(track_map: TrackMap, keyframe: Keyframe, living: list[Keyframe], num_heirs: int) -> None:
     position = next(k for k, other in enumerate(living) if other is keyframe)
     parent = living[position - 1]
     keyframe.parent = parent.index
@@ -59,7 +53,7 @@ def _drop(track_map: TrackMap, keyframe: Keyframe, living: list[Keyframe]) -> No
     keyframe.alive = False
     # Patches and first views go to another keyframe that sees the point.
     points = track_map.points
-    for other in (living[position + 1 :] + living[:position][::-1])[:12]:
+    for other in (living[position + 1 :] + living[:position][::-1])[:num_heirs]:
         table = other.measured.points
         for owner, pixel in ((points.keyframe, points.pixel), (points.first_keyframe, points.first_pixel)):
             of = np.flatnonzero(owner[table.index] == keyframe.index)

@@ -17,16 +17,13 @@ from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.map.triangulation import triangulate
 
-#: Hamming distance beyond which descriptors do not match.
-FARTHEST = 64
 
-
-def match_features(first: Features, second: Features) -> tuple[IntArray, IntArray]:
-    """Pair features whose descriptors are nearest to each other, both ways."""
+def match_features(first: Features, second: Features, max_bits: int) -> tuple[IntArray, IntArray]:
+    """Pair features whose descriptors are nearest to each other, both ways, and differ in at most so many bits."""
     if not len(first.pixel) or not len(second.pixel):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(first.descriptor, second.descriptor)
-    pairs = [pair for pair in pairs if pair.distance <= FARTHEST]
+    pairs = [pair for pair in pairs if pair.distance <= max_bits]
     return np.array([p.queryIdx for p in pairs], np.int64), np.array([p.trainIdx for p in pairs], np.int64)
 
 
@@ -78,7 +75,7 @@ def place_by_motion(
         Points that are followed already.
     """
     points, features, own = track_map.points, data.features, keyframe.features
-    first, second = match_features(own, features)
+    first, second = match_features(own, features, data.options.gates.features.max_bits)
     index = own.point[first]
     placed = index >= 0
     placed[placed] = points.state[index[placed]] == ALIVE
@@ -87,7 +84,7 @@ def place_by_motion(
     if not len(first):
         return PointTracks.empty()
     poses = np.tile(keyframe.pose, (len(first), 1))
-    places, good = triangulate(camera, poses, own.pixel[first], pose, features.pixel[second])
+    places, good = triangulate(camera, poses, own.pixel[first], pose, features.pixel[second], data.options.gates.points)
     first, second, places = first[good], second[good], places[good]
     index = own.point[first]
     begun = index >= 0

@@ -16,6 +16,7 @@ from groma.scene.landmarks import Lines
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.gates import LineGates
 from groma.tracking.map.feature_points import place_by_motion
 from groma.tracking.map.landmarks import ALIVE, PENDING
 from groma.tracking.map.lines import FollowedSegments, assign, expected_segments, line_ends
@@ -24,17 +25,6 @@ from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.map.triangulation import triangulate
 from groma.tracking.options import TrackOptions
-
-#: A feature within this distance of a followed point is that point, pixels.
-SAME_FEATURE = 2.0
-#: Below this share of the wanted points, one camera alone places described features by motion.
-FEW = 0.33
-#: A new line must be longer than this share of its depth, and its direction known to this angle.
-MIN_LENGTH, LINE_ANGLE = 0.04, 0.15
-#: A keyframe within this share of the motion that makes a new one stands for it.
-NEARBY = 0.5
-#: Most frames between keyframes while the camera moves.
-MAX_FRAMES = 30
 
 
 @dataclass(frozen=True)
@@ -54,7 +44,7 @@ def wants_keyframe(
     track_map: TrackMap, pose: FloatArray, followed: Followed, frames_since: int, options: TrackOptions
 ) -> bool:
     """Whether a tracked frame should become a keyframe."""
-    last = track_map.near
+    gates, last = options.gates.keyframes, track_map.near
     now = len(followed.points)
     before = max(len(last.measured.points), 1)
     motion = se3.log(se3.compose(pose[None], se3.inverse(last.pose[None])))[0]
@@ -65,9 +55,9 @@ def wants_keyframe(
         return True
     if frames_since >= 2 and now < options.keyframe_share * before:
         return True
-    few_lines = options.lines and len(followed.lines.index) < 0.5 * len(last.measured.lines)
-    moved = shift > 0.25 * options.keyframe_motion or turn > 0.25 * options.keyframe_turn
-    return moved and (frames_since >= MAX_FRAMES or (few_lines and frames_since >= 5))
+    few_lines = options.lines and len(followed.lines.index) < gates.few_lines * len(last.measured.lines)
+    moved = shift > gates.moved * options.keyframe_motion or turn > gates.moved * options.keyframe_turn
+    return moved and (frames_since >= gates.max_frames or (few_lines and frames_since >= gates.few_lines_frames))
 
 
 def keyframe_nearby(track_map: TrackMap, pose: FloatArray, options: TrackOptions) -> Keyframe | None:
@@ -81,7 +71,7 @@ def keyframe_nearby(track_map: TrackMap, pose: FloatArray, options: TrackOptions
     far = np.maximum(shift, turn)
     far[[keyframe.index == track_map.reference for keyframe in living]] = np.inf
     best = int(far.argmin())
-    return living[best] if far[best] < NEARBY else None
+    return living[best] if far[best] < options.gates.keyframes.nearby else None
 
 
 def add_keyframe(
@@ -137,7 +127,7 @@ def measure_points(
 
 def _add_points(track_map, camera, data, pose, tracks: PointTracks, index: int, options) -> PointTracks:
     """Place followed points whose place has become known, start new ones, and link described features to points."""
-    points = track_map.points
+    points, gates = track_map.points, options.gates.points
     features = data.features
     _place_pending(track_map, camera, data, pose, tracks)
     if len(tracks):
@@ -145,13 +135,13 @@ def _add_points(track_map, camera, data, pose, tracks: PointTracks, index: int, 
     if options.points:
         # Described features near followed points are these points.
         if len(features.pixel) and len(tracks):
-            found = KDTree(features.pixel).query(tracks.pixel, distance_upper_bound=SAME_FEATURE)
+            found = KDTree(features.pixel).query(tracks.pixel, distance_upper_bound=gates.same_feature)
             distance, nearest = np.asarray(found[0]), np.asarray(found[1])
             rows = np.flatnonzero(np.isfinite(distance))
             free = features.point[nearest[rows]] < 0
             features.point[nearest[rows[free]]] = tracks.index[rows[free]]
         depthless = data.frame.depth is None and data.frame.right is None
-        if depthless and track_map.keyframes and points.alive[tracks.index].sum() < FEW * options.num_points:
+        if depthless and track_map.keyframes and points.alive[tracks.index].sum() < gates.few * options.num_points:
             # After a wide step hardly any point was followed, but many features are seen again.
             before = track_map.near
             tracks = tracks.joined(place_by_motion(track_map, camera, before, data, pose, tracks.index))
@@ -164,12 +154,12 @@ def _add_points(track_map, camera, data, pose, tracks: PointTracks, index: int, 
         new = [features.pixel[free]]
         room -= len(free)
         if room > 0:
-            found = corners(data.gray, options.num_points, 0.7 * cell)
+            found = corners(data.gray, options.num_points, gates.corner_distance * cell)
             taken = np.concatenate([tracks.pixel, new[0]])
             rank = -np.arange(len(found), dtype=float)
             new.append(found[spread(found, rank, taken, data.gray.shape, room, cell)])
         pixel = np.concatenate(new)
-        pixel_rows = camera.inside(pixel, 8.0)
+        pixel_rows = camera.inside(pixel, gates.border)
         rows = points.extend(int(pixel_rows.sum()))
         every = np.full(len(pixel), -1, dtype=np.int64)
         every[pixel_rows] = rows
@@ -199,7 +189,7 @@ def _place_pending(track_map: TrackMap, camera: TrackCamera, data: FrameFeatures
     index, pixel = index[~known], pixel[~known]
     if len(index):
         first = _poses_of(track_map, points.first_keyframe[index])
-        places, good = triangulate(camera, first, points.first_pixel[index], pose, pixel)
+        places, good = triangulate(camera, first, points.first_pixel[index], pose, pixel, data.options.gates.points)
         points.xyz[index[good]] = places[good]
         points.state[index[good]] = ALIVE
 
@@ -215,21 +205,23 @@ def _poses_of(track_map: TrackMap, keyframes: IntArray) -> FloatArray:
 
 def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index: int, options):
     """Assign detected segments to followed lines and to lines of the map, and start new lines with the rest."""
-    lines, detected = track_map.lines, data.detected
+    lines, detected, gates = track_map.lines, data.detected, options.gates.lines
     segments = detected.segments
     of_segment = np.full(len(segments), -1)
     # Segments of lines that are followed already.
-    rows, hits = assign(followed.ends, segments.ends, 2.5, 0.06)
+    rows, hits = assign(followed.ends, segments.ends, gates.followed_distance, gates.followed_angle, gates=gates)
     of_segment[hits] = followed.index[rows]
     # Segments of other lines of the map.
     alive = np.flatnonzero(lines.alive)
     alive = alive[~np.isin(alive, of_segment)]
-    expected, seen = expected_segments(camera, lines, alive, pose)
+    expected, seen = expected_segments(camera, lines, alive, pose, gates)
     alive, expected = alive[seen], expected[seen]
     free = np.flatnonzero(of_segment < 0)
     middle = 1.0 / np.maximum(into(pose, lines.segment[alive].mean(axis=1))[:, 2], 1e-6)
     inverse = detected.inverse_depth.mean(axis=1)
-    rows, hits = assign(expected, segments.ends[free], 5.0, 0.1, middle, inverse[free])
+    rows, hits = assign(
+        expected, segments.ends[free], gates.map_distance, gates.map_angle, middle, inverse[free], gates
+    )
     of_segment[free[hits]] = alive[rows]
     # New lines: with a place where the depth is known along the segment, else followed until motion gives one.
     free = np.flatnonzero(of_segment < 0)[: max(options.num_lines - int((of_segment >= 0).sum()), 0)]
@@ -237,14 +229,14 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     of_segment[free] = new
     lines.strength[new] = segments.strength[free]
     lines.first_keyframe[new], lines.first_ends[new] = index, segments.ends[free]
-    place_from_depth(track_map, camera, pose, new, segments.ends[free], detected, free)
+    place_from_depth(track_map, camera, pose, new, segments.ends[free], detected, free, gates)
     rows = np.flatnonzero(of_segment >= 0)
     known = of_segment[rows]
-    _place_pending_lines(track_map, camera, pose, known, segments.ends[rows], detected, rows, index)
+    _place_pending_lines(track_map, camera, pose, known, segments.ends[rows], detected, rows, index, gates)
     lines.found[known] += 1
     lines.strength[known] = segments.strength[rows]
-    _extend_lines(track_map, camera, pose, known, segments.ends[rows])
-    sigma = np.maximum(segments.sigma[rows], 0.3)
+    _extend_lines(track_map, camera, pose, known, segments.ends[rows], gates.max_extension)
+    sigma = np.maximum(segments.sigma[rows], gates.detected_sigma)
     table = LineMeasurements(
         known, segments.ends[rows], sigma, detected.inverse_depth[rows], detected.inverse_depth_sigma[rows]
     )
@@ -254,7 +246,7 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     return followed.take(first), table.take(first)
 
 
-def place_from_depth(track_map, camera, pose, index, ends, detected, rows) -> None:
+def place_from_depth(track_map, camera, pose, index, ends, detected, rows, gates: LineGates) -> None:
     """Place lines whose segment has a depth along it that is known well enough."""
     inverse, sigma = detected.inverse_depth[rows], detected.inverse_depth_sigma[rows]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -262,7 +254,8 @@ def place_from_depth(track_map, camera, pose, index, ends, detected, rows) -> No
         noise = (sigma * depth**2).max(axis=1)
         in_cam = np.stack([camera.bearings(ends[:, :2]), camera.bearings(ends[:, 2:])], axis=1) * depth[..., None]
         length = np.linalg.norm(in_cam[:, 1] - in_cam[:, 0], axis=1)
-        good = (depth > 0).all(axis=1) & (length > MIN_LENGTH * depth.mean(axis=1)) & (noise < LINE_ANGLE * length)
+        good = (depth > 0).all(axis=1) & (length > gates.min_length_share * depth.mean(axis=1))
+        good &= noise < gates.max_angle * length
     _place(track_map, index[good], back(pose, in_cam[good]))
 
 
@@ -273,13 +266,13 @@ def _place(track_map: TrackMap, index, segments: FloatArray) -> None:
         track_map.lines.state[index] = ALIVE
 
 
-def _place_pending_lines(track_map, camera, pose, known, ends, detected, rows, index) -> None:
+def _place_pending_lines(track_map, camera, pose, known, ends, detected, rows, index, gates) -> None:
     """Place followed lines: from depth, or where the planes through two camera centres and the segments meet."""
     lines = track_map.lines
     pending = np.flatnonzero((lines.state[known] == PENDING) & (lines.first_keyframe[known] < index))
     if not len(pending):
         return
-    place_from_depth(track_map, camera, pose, known[pending], ends[pending], detected, rows[pending])
+    place_from_depth(track_map, camera, pose, known[pending], ends[pending], detected, rows[pending], gates)
     pending = pending[lines.state[known[pending]] == PENDING]
     if not len(pending):
         return
@@ -289,7 +282,7 @@ def _place_pending_lines(track_map, camera, pose, known, ends, detected, rows, i
     normal2, center2 = _ray_planes(camera, np.tile(pose, (len(row), 1)), segment)
     direction = np.cross(normal1, normal2)
     sine = np.linalg.norm(direction, axis=1)
-    good = sine > 0.03
+    good = sine > gates.min_sine
     # The rays of the present ends meet the first plane.
     out = np.zeros((len(row), 2, 3))
     for k in (0, 1):
@@ -300,7 +293,8 @@ def _place_pending_lines(track_map, camera, pose, known, ends, detected, rows, i
         out[:, k] = center2 + share[:, None] * ray
     depth = into(pose, out)[..., 2]
     length = np.linalg.norm(out[:, 1] - out[:, 0], axis=1)
-    good &= (depth.max(axis=1) < 3.0 * depth.min(axis=1)) & (length > 0.01 * depth.mean(axis=1))
+    good &= depth.max(axis=1) < gates.max_depth_ratio * depth.min(axis=1)
+    good &= length > gates.min_motion_length * depth.mean(axis=1)
     _place(track_map, row[good], out[good])
 
 
@@ -314,7 +308,7 @@ def _ray_planes(camera: TrackCamera, poses: FloatArray, ends: FloatArray) -> tup
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12), center
 
 
-def _extend_lines(track_map: TrackMap, camera: TrackCamera, pose, index, ends) -> None:
+def _extend_lines(track_map: TrackMap, camera: TrackCamera, pose, index, ends, max_extension: float) -> None:
     """Lengthen lines to what is seen of them now."""
     lines = track_map.lines
     alive = np.flatnonzero(lines.alive[index])
@@ -327,7 +321,7 @@ def _extend_lines(track_map: TrackMap, camera: TrackCamera, pose, index, ends) -
     along = np.einsum("lej,lj->le", np.concatenate([lines.segment[rows], seen], axis=1), direction)
     old = np.abs(along[:, 1] - along[:, 0])
     low, high = along.min(axis=1), along.max(axis=1)
-    good &= (high - low) < 2.0 * old + 1e-9
+    good &= (high - low) < max_extension * old + 1e-9
     segment = foot[:, None] + np.stack([low, high], axis=1)[..., None] * direction[:, None]
     forward = ((lines.segment[rows, 1] - lines.segment[rows, 0]) * direction).sum(axis=1) > 0
     segment = np.where(forward[:, None, None], segment, segment[:, ::-1])
@@ -341,14 +335,15 @@ def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> P
     """Assign planes of the frame to planes of the map, which grow, and start new ones with the rest."""
     seen = data.planes
     assert seen is not None
-    index, rows = assign_planes(track_map.planes, seen, pose, math.radians(8.0), 0.08)
+    gates = data.options.gates.planes
+    index, rows = assign_planes(track_map.planes, seen, pose, gates.angle, gates.distance, gates)
     for k, row in zip(index, rows, strict=True):
-        grow(track_map.planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]))
+        grow(track_map.planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]), gates)
     rest = np.setdiff1d(np.arange(len(seen)), rows)
     # Nothing new beside a plane that is there already but did not agree well enough.
-    _, doubtful = assign_planes(track_map.planes, seen, pose, math.radians(15.0), 0.15)
+    _, doubtful = assign_planes(track_map.planes, seen, pose, gates.doubtful_angle, gates.doubtful_distance, gates)
     rest = np.setdiff1d(rest, doubtful)
-    index = np.concatenate([index, add_planes(track_map.planes, seen, rest, pose)])
+    index = np.concatenate([index, add_planes(track_map.planes, seen, rest, pose, gates)])
     rows = np.concatenate([rows, rest])
     return PlaneMeasurements(index, seen.plane[rows], seen.sqrt_information[rows])
 

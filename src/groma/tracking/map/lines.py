@@ -20,20 +20,14 @@ from groma.features.images import GrayImage
 from groma.features.matching.flow import Flow
 from groma.geometry import segment2
 from groma.tracking.frame.camera import TrackCamera, into, rotation
+from groma.tracking.gates import DEFAULT, LineGates
 from groma.tracking.map.landmarks import LineTable
 
-#: The coarse flow is computed on images reduced by this factor.
-REDUCTION = 2
-#: Points that vote for where a segment went.
-VOTERS = 12
-#: Standard deviation of segments whose edge could not be fitted, pixels.
-_UNFITTED = 0.45
 
-
-def coarse_flow(image_1: GrayImage, image_2: GrayImage) -> Flow:
-    """Dense flow (h, w, 2) of reduced images, in pixels of the full ones."""
+def coarse_flow(image_1: GrayImage, image_2: GrayImage, reduction: int) -> Flow:
+    """Dense flow (h, w, 2) of images reduced by a factor, in pixels of the full ones."""
     height, width = image_1.shape
-    size = (max(width // REDUCTION, 32), max(height // REDUCTION, 32))
+    size = (max(width // reduction, 32), max(height // reduction, 32))
     small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (image_1, image_2)]
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     flow = method.calc(small[0], small[1], None)  # pyright: ignore[reportCallIssue, reportArgumentType]
@@ -70,9 +64,11 @@ class FollowedSegments:
         return FollowedSegments(np.zeros(0, np.int64), np.zeros((0, 4)), np.zeros(0), np.zeros(0))
 
 
-def carried(flow: Flow, ends: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, BoolArray]:
+def carried(
+    flow: Flow, ends: FloatArray, shape: tuple[int, int], gates: LineGates = DEFAULT.lines
+) -> tuple[FloatArray, BoolArray]:
     """Segments carried by flow: the line that most of their points vote for, and whether they agree."""
-    t = (np.arange(VOTERS) + 0.5) / VOTERS - 0.5
+    t = (np.arange(gates.voters) + 0.5) / gates.voters - 0.5
     middle, half = 0.5 * (ends[:, :2] + ends[:, 2:]), ends[:, 2:] - ends[:, :2]
     points = middle[:, None] + t[:, None] * half[:, None]
     height, width = flow.shape[:2]
@@ -83,7 +79,7 @@ def carried(flow: Flow, ends: FloatArray, shape: tuple[int, int]) -> tuple[Float
     weight = np.ones(shift.shape[:2])
     base = np.median(shift, axis=1)
     slope = np.zeros_like(base)
-    for gate in (8.0, 4.0, 3.0):
+    for gate in gates.vote_distances:
         away = np.linalg.norm(shift - base[:, None] - t[:, None] * slope[:, None], axis=2)
         weight = (away < gate).astype(float)
         s0, s1, s2 = weight.sum(1), (weight * t).sum(1), (weight * t * t).sum(1)
@@ -91,28 +87,31 @@ def carried(flow: Flow, ends: FloatArray, shape: tuple[int, int]) -> tuple[Float
         r0, r1 = (weight[..., None] * shift).sum(1), ((weight * t)[..., None] * shift).sum(1)
         base = (s2[:, None] * r0 - s1[:, None] * r1) / det[:, None]
         slope = (s0[:, None] * r1 - s1[:, None] * r0) / det[:, None]
-    good = weight.sum(axis=1) >= 0.5 * VOTERS
+    good = weight.sum(axis=1) >= 0.5 * gates.voters
     return ends + np.hstack([base - 0.5 * slope, base + 0.5 * slope]), good
 
 
-def measured_edges(image: GrayImage, guess: FloatArray, strength: FloatArray) -> tuple[FollowedSegments, IntArray]:
+def measured_edges(
+    image: GrayImage, guess: FloatArray, strength: FloatArray, gates: LineGates
+) -> tuple[FollowedSegments, IntArray]:
     """Fit guessed segments to the image; keep those with an edge of the right sign and like strength.
 
     Returns the segments (their index is the row of the guess), and those rows.
     """
     ends, sigma, found = measure_edges(image, guess)
     same_way = ((ends[:, 2:] - ends[:, :2]) * (guess[:, 2:] - guess[:, :2])).sum(axis=1) > 0
-    good = same_way & (sigma < _UNFITTED) & (found > 0.35 * strength) & (found < 3.0 * strength) & (found > 2.0)
+    good = same_way & (sigma < gates.max_sigma) & (found > gates.min_strength)
+    good &= (found > gates.weaker * strength) & (found < gates.stronger * strength)
     rows = np.flatnonzero(good)
-    return FollowedSegments(rows, ends[rows], np.maximum(sigma[rows], 0.15), found[rows]), rows
+    return FollowedSegments(rows, ends[rows], sigma[rows], found[rows]), rows
 
 
 def expected_segments(
-    camera: TrackCamera, lines: LineTable, rows: IntArray, pose: FloatArray
+    camera: TrackCamera, lines: LineTable, rows: IntArray, pose: FloatArray, gates: LineGates
 ) -> tuple[FloatArray, BoolArray]:
     """Where lines of the map should appear (n, 4), and which of them are in view with a length worth looking at."""
-    ends, seen = camera.project_segments(into(pose, lines.segment[rows]), border=4.0)
-    return ends, seen & (segment2.length(ends) > 15.0)
+    ends, seen = camera.project_segments(into(pose, lines.segment[rows]), border=gates.border)
+    return ends, seen & (segment2.length(ends) > gates.min_length)
 
 
 def assign(
@@ -122,7 +121,7 @@ def assign(
     max_angle: float,
     expected_inverse: FloatArray | None = None,
     inverse: FloatArray | None = None,
-    tolerance: float = 0.05,
+    gates: LineGates = DEFAULT.lines,
 ) -> tuple[IntArray, IntArray]:
     """Pair expected segments (N, 4) with detected ones (M, 4): one to one, best for both.
 
@@ -136,8 +135,8 @@ def assign(
         Largest angle, radians.
     expected_inverse, inverse : (N,), (M,), optional
         Inverse depths of the middles; where both are known they must agree.
-    tolerance : float
-        ... to this share of their size.
+    gates : LineGates
+        How well the rest must agree.
 
     Returns
     -------
@@ -156,13 +155,13 @@ def assign(
     length, own = segment2.length(expected)[:, None], segment2.length(ends)[None]
     overlap = np.minimum(along.max(axis=0), length) - np.maximum(along.min(axis=0), 0.0)
     offset = np.abs(across).max(axis=0)
-    score = np.abs(across).mean(axis=0) + 0.3 * np.maximum(-overlap, 0)
-    good = (direction @ other.T > np.cos(max_angle)) & (offset < 1.5 * max_distance) & (score < max_distance)
-    good &= overlap > 0.3 * np.minimum(length, own)
+    score = np.abs(across).mean(axis=0)
+    good = (direction @ other.T > np.cos(max_angle)) & (offset < gates.end_distance * max_distance)
+    good &= (score < max_distance) & (overlap > gates.min_overlap * np.minimum(length, own))
     if expected_inverse is not None and inverse is not None:
         one, two = expected_inverse[:, None], inverse[None]
         with np.errstate(invalid="ignore"):
-            good &= ~(np.abs(one - two) > tolerance * np.maximum(one, two) + 0.015)
+            good &= ~(np.abs(one - two) > gates.depth_share * np.maximum(one, two) + gates.depth_floor)
     score = np.where(good, score, np.inf)
     best = np.argmin(score, axis=1)
     rows = np.flatnonzero(np.isfinite(score[np.arange(len(expected)), best]))

@@ -8,14 +8,17 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.tracking.frame.camera import back, planes_back, planes_into
 from groma.tracking.frame.planes import FramePlanes
+from groma.tracking.gates import DEFAULT, PlaneGates
 from groma.tracking.map.landmarks import ALIVE, DEAD, PlaneTable
-
-#: The seen parts of one plane lie within this distance of each other, scene units.
-REACH = 0.6
 
 
 def assign_planes(
-    planes: PlaneTable, seen: FramePlanes, pose: FloatArray, max_angle: float, max_distance: float
+    planes: PlaneTable,
+    seen: FramePlanes,
+    pose: FloatArray,
+    max_angle: float,
+    max_distance: float,
+    gates: PlaneGates = DEFAULT.planes,
 ) -> tuple[IntArray, IntArray]:
     """Pair planes of the map with planes of a frame by angle, distance and overlap.
 
@@ -37,7 +40,7 @@ def assign_planes(
     good = (cosine > np.cos(max_angle)) & (distance < max_distance)
     score = np.where(good, np.arccos(np.clip(cosine, -1, 1)) / max_angle + distance / max_distance, np.inf)
     for i, j in np.argwhere(good):
-        if not _overlap(planes.samples[alive[i]], back(pose, seen.places_of(j))):
+        if not _overlap(planes.samples[alive[i]], back(pose, seen.places_of(j)), gates):
             score[i, j] = np.inf
     best = score.argmin(axis=1)
     rows = np.flatnonzero(np.isfinite(score[np.arange(len(alive)), best]))
@@ -45,35 +48,37 @@ def assign_planes(
     return alive[rows], best[rows]
 
 
-def add_planes(planes: PlaneTable, seen: FramePlanes, rows: IntArray, pose: FloatArray) -> IntArray:
+def add_planes(
+    planes: PlaneTable, seen: FramePlanes, rows: IntArray, pose: FloatArray, gates: PlaneGates = DEFAULT.planes
+) -> IntArray:
     """Make landmarks of planes of a frame; return their indices."""
     index = planes.extend(len(rows))
     planes.hesse[index] = planes_back(pose, seen.plane[rows])
     planes.state[index] = ALIVE
     for k, row in zip(index, rows, strict=True):
-        grow(planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]))
+        grow(planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]), gates)
     return index
 
 
-def grow(planes: PlaneTable, index: int, places: FloatArray, support: float) -> None:
+def grow(planes: PlaneTable, index: int, places: FloatArray, support: float, gates: PlaneGates) -> None:
     """Add the part of a plane that a frame sees: samples stay spread over all that was seen."""
     old = planes.samples[index]
     both = np.concatenate([old[np.isfinite(old[:, 0])], places])
     # One sample per box; boxes grow until the samples fit.
-    size = 0.15
+    size = gates.box
     while True:
         cells = np.floor(both / size).astype(np.int64)
         rows = np.unique(cells, axis=0, return_index=True)[1]
         if len(rows) <= planes.samples_kept:
             break
-        size *= 1.3
+        size *= gates.box_growth
     planes.samples[index] = np.nan
     planes.samples[index, : len(rows)] = both[rows]
     planes.support[index] += support
     planes.found[index] += 1
 
 
-def merge_planes(planes: PlaneTable, max_angle: float = 0.06, max_distance: float = 0.03) -> list[tuple[int, int]]:
+def merge_planes(planes: PlaneTable, gates: PlaneGates = DEFAULT.planes) -> list[tuple[int, int]]:
     """Merge planes of the map that have come to lie on each other; return (kept, dropped) pairs."""
     alive = np.flatnonzero(planes.alive)
     merged: list[tuple[int, int]] = []
@@ -82,17 +87,17 @@ def merge_planes(planes: PlaneTable, max_angle: float = 0.06, max_distance: floa
             if planes.state[first] != ALIVE or planes.state[second] != ALIVE:
                 continue
             one, two = planes.hesse[first], planes.hesse[second]
-            if one[:3] @ two[:3] < np.cos(max_angle):
+            if one[:3] @ two[:3] < np.cos(gates.merge_angle):
                 continue
             samples = [planes.samples[k][np.isfinite(planes.samples[k][:, 0])] for k in (first, second)]
             apart = max(
                 float(np.median(np.abs(samples[1] @ one[:3] + one[3]))),
                 float(np.median(np.abs(samples[0] @ two[:3] + two[3]))),
             )
-            if apart > max_distance or not _overlap(planes.samples[first], samples[1]):
+            if apart > gates.merge_distance or not _overlap(planes.samples[first], samples[1], gates):
                 continue
             keep, drop = (first, second) if planes.support[first] >= planes.support[second] else (second, first)
-            grow(planes, int(keep), samples[1] if keep == first else samples[0], float(planes.support[drop]))
+            grow(planes, int(keep), samples[1] if keep == first else samples[0], float(planes.support[drop]), gates)
             planes.state[drop] = DEAD
             planes.merged_into[drop] = keep
             merged.append((int(keep), int(drop)))
@@ -106,12 +111,12 @@ def _region_means(seen: FramePlanes) -> FloatArray:
     )
 
 
-def _overlap(samples: FloatArray, places: FloatArray) -> bool:
+def _overlap(samples: FloatArray, places: FloatArray, gates: PlaneGates) -> bool:
     samples = samples[np.isfinite(samples[:, 0])]
     if not len(samples) or not len(places):
         return False
-    thinned = places[:: max(1, len(places) // 40)]
-    return bool(np.linalg.norm(samples[:, None] - thinned[None], axis=2).min() < REACH)
+    thinned = places[:: max(1, len(places) // gates.compared)]
+    return bool(np.linalg.norm(samples[:, None] - thinned[None], axis=2).min() < gates.reach)
 
 
 __all__ = ["add_planes", "assign_planes", "grow", "merge_planes"]

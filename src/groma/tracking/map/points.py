@@ -11,12 +11,8 @@ import numpy.typing as npt
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.point_tracks import follow
 from groma.tracking.frame.camera import TrackCamera, into
+from groma.tracking.gates import PointGates
 from groma.tracking.map.track_map import TrackMap
-
-#: A patch of the keyframe may move a followed point by this much, pixels.
-MAX_CORRECTION = 2.5
-#: Keyframes whose patches are looked for in one frame.
-PATCH_KEYFRAMES = 2
 
 
 @dataclass(frozen=True)
@@ -52,6 +48,7 @@ def follow_points(
     now: npt.NDArray[np.uint8],
     predicted: FloatArray,
     previous: FloatArray,
+    max_correction: float,
 ) -> PointTracks:
     """Follow points from the frame before; those that the last keyframe saw are then held to its patches."""
     if not len(tracks):
@@ -74,7 +71,7 @@ def follow_points(
     if keyframe.gray is not None and len(own):
         patch = points.pixel[tracks.index[own]]
         pixel, good = follow(keyframe.gray, now, patch, tracks.pixel[own], levels=0, round_trip=None)
-        good &= np.linalg.norm(pixel - tracks.pixel[own], axis=1) < MAX_CORRECTION
+        good &= np.linalg.norm(pixel - tracks.pixel[own], axis=1) < max_correction
         held = tracks.pixel.copy()
         held[own[good]] = pixel[good]
         tracks = PointTracks(tracks.index, held)
@@ -88,8 +85,7 @@ def find_again(
     pose: FloatArray,
     tracks: PointTracks,
     limit: int,
-    radius: float = 6.0,
-    keyframes: int = PATCH_KEYFRAMES,
+    gates: PointGates,
 ) -> PointTracks:
     """Look for points of the map that are in view but not followed, by their patches in keyframes."""
     points = track_map.points
@@ -101,7 +97,7 @@ def find_again(
         return PointTracks.empty()
     place = into(pose, points.xyz[rows])
     pixel = camera.project(place)
-    view = camera.inside(pixel, 12.0)
+    view = camera.inside(pixel, gates.again_border)
     rows, pixel = rows[view], pixel[view]
     living = np.array([k.alive and k.gray is not None for k in track_map.keyframes])
     rows, pixel = rows[living[points.keyframe[rows]]], pixel[living[points.keyframe[rows]]]
@@ -109,14 +105,14 @@ def find_again(
         return PointTracks.empty()
     count = np.bincount(points.keyframe[rows], minlength=len(living))
     found = PointTracks.empty()
-    for index in np.argsort(-count, kind="stable")[:keyframes]:
+    for index in np.argsort(-count, kind="stable")[: gates.patch_keyframes]:
         of = np.flatnonzero(points.keyframe[rows] == index)[:limit]
-        if len(of) < 5:
+        if len(of) < gates.again_min:
             break
         patch = track_map.keyframes[index].gray
         assert patch is not None
         there, good = follow(patch, now, points.pixel[rows[of]], pixel[of], levels=1)
-        good &= np.linalg.norm(there - pixel[of], axis=1) < radius
+        good &= np.linalg.norm(there - pixel[of], axis=1) < gates.again_radius
         points.visible[rows[of]] += 1
         points.misses[rows[of[~good]]] += 1
         points.misses[rows[of[good]]] = 0

@@ -8,6 +8,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.geometry import se3
 from groma.tracking.frame.camera import TrackCamera, back, into
+from groma.tracking.gates import DEFAULT, PointGates
 
 
 def triangulate(
@@ -16,13 +17,12 @@ def triangulate(
     first_pixel: FloatArray,
     second: FloatArray,
     second_pixel: FloatArray,
-    least_parallax: float = 0.015,
-    max_error: float = 2.5,
+    gates: PointGates = DEFAULT.points,
 ) -> tuple[FloatArray, np.ndarray]:
     """Intersect rays from many first poses (N, 7) with rays from one second pose (7,): middle of the shortest link.
 
     Returns (N, 3) places in the world, and which of them are in front of both cameras, with enough parallax (radians)
-    and reprojected within ``max_error`` pixels.
+    and reprojected near the pixels.
     """
     origin = se3.inverse(first)[:, 4:]
     tips = se3.transform_points(se3.inverse(first), camera.bearings(first_pixel))
@@ -37,11 +37,11 @@ def triangulate(
     share1 = ((link * ray1).sum(axis=1) - cosine * (link * ray2).sum(axis=1)) / sine2
     share2 = (cosine * (link * ray1).sum(axis=1) - (link * ray2).sum(axis=1)) / sine2
     places = 0.5 * (origin + share1[:, None] * ray1 + center + share2[:, None] * ray2)
-    good = (np.sqrt(sine2) > least_parallax) & (share1 > 0) & (share2 > 0)
+    good = (np.sqrt(sine2) > gates.min_parallax) & (share1 > 0) & (share2 > 0)
     with np.errstate(invalid="ignore"):
         error1 = np.linalg.norm(camera.project(se3.transform_points(first, places)) - first_pixel, axis=1)
         error2 = np.linalg.norm(camera.project(into(second, places)) - second_pixel, axis=1)
-        good &= (error1 < max_error) & (error2 < max_error)
+        good &= (error1 < gates.max_error) & (error2 < gates.max_error)
     return places, good
 
 

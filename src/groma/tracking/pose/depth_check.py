@@ -11,18 +11,16 @@ from groma._typing import FloatArray
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.depth import depth_sigma
 from groma.tracking.frame.features import grid_pixels, grid_shape
+from groma.tracking.gates import DEFAULT, TrackingGates
 from groma.tracking.map.track_map import Keyframe
-
-#: Depth is asked at so many places at least; this share of them confirms a pose, this share seen through denies it.
-MIN_PLACES, CONFIRMS, DENIES = 40, 0.8, 0.35
-#: Two depths agree to this share and so many standard deviations.
-DEPTH_SHARE, DEPTH_GATE = 0.04, 3.0
-#: Depth is read between places of the grid that differ by less than this share.
-SMOOTH = 0.15
 
 
 def depth_agreement(
-    camera: TrackCamera, keyframes: Sequence[Keyframe], grid: FloatArray, pose: FloatArray
+    camera: TrackCamera,
+    keyframes: Sequence[Keyframe],
+    grid: FloatArray,
+    pose: FloatArray,
+    gates: TrackingGates = DEFAULT,
 ) -> tuple[float, float]:
     """Compare depths that keyframes measured with those of a frame at a pose.
 
@@ -36,6 +34,8 @@ def depth_agreement(
         Depths of the frame at :func:`~groma.tracking.frame.features.grid_pixels`; NaN where unknown.
     pose : (7,)
         Supposed pose of the frame.
+    gates
+        When two depths agree.
 
     Returns
     -------
@@ -43,24 +43,25 @@ def depth_agreement(
         Share of the places in view that are measured where they are, and share that the frame looks through (it
         measures something farther away). The rest is hidden. Both NaN where too few are known.
     """
-    rays = camera.bearings(grid_pixels(camera))
+    check = gates.depth_check
+    rays = camera.bearings(grid_pixels(camera, gates.depth))
     places = [back(k.pose, (rays * k.depth_grid[:, None])[np.isfinite(k.depth_grid)]) for k in keyframes]
     in_cam = into(pose, np.concatenate(places))
     pixel = camera.project(in_cam)
     rows = camera.inside(pixel)
-    measured, expected = _read(camera, grid, pixel[rows]), in_cam[rows, 2]
+    measured, expected = _read(camera, grid, pixel[rows], gates), in_cam[rows, 2]
     known = np.isfinite(measured)
-    if known.sum() < MIN_PLACES:
+    if known.sum() < check.min_places:
         return np.nan, np.nan
     measured, expected = measured[known], expected[known]
-    tolerance = DEPTH_SHARE * measured + DEPTH_GATE * depth_sigma(measured)
+    tolerance = gates.depth.jump_share * measured + check.sigma * depth_sigma(measured, gates.depth)
     away = measured - expected
     return float((np.abs(away) < tolerance).mean()), float((away > tolerance).mean())
 
 
-def _read(camera: TrackCamera, grid: FloatArray, pixel: FloatArray) -> FloatArray:
+def _read(camera: TrackCamera, grid: FloatArray, pixel: FloatArray, gates: TrackingGates) -> FloatArray:
     """Depths (M,) at pixels between the places of a grid; NaN at its border and where it is not smooth."""
-    rows, columns = grid_shape(camera)
+    rows, columns = grid_shape(camera, gates.depth)
     at = pixel * (columns / camera.width, rows / camera.height) - 0.5
     u, v = at[:, 0], at[:, 1]
     inside = (u >= 0) & (v >= 0) & (u < columns - 1) & (v < rows - 1)
@@ -68,8 +69,8 @@ def _read(camera: TrackCamera, grid: FloatArray, pixel: FloatArray) -> FloatArra
     a, b = u - j, v - i
     near = np.stack([grid[(i + y) * columns + j + x] for y in (0, 1) for x in (0, 1)])
     weight = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
-    smooth = near.max(axis=0) < (1.0 + SMOOTH) * near.min(axis=0)
+    smooth = near.max(axis=0) < (1.0 + gates.depth_check.smooth) * near.min(axis=0)
     return np.where(inside & smooth, (weight * near).sum(axis=0), np.nan)
 
 
-__all__ = ["CONFIRMS", "DENIES", "depth_agreement"]
+__all__ = ["depth_agreement"]

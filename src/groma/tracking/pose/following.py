@@ -17,12 +17,7 @@ from groma.tracking.map.points import PointTracks, follow_points
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
-from groma.tracking.pose.relocalise import FRAME_GATES, match_planes
-
-#: Below this many followed points, the depth along segments is measured too.
-FEW_POINTS = 120
-#: A followed line may be this far from where the estimated pose says, pixels.
-LINE_GATE = 4.0
+from groma.tracking.pose.relocalise import match_planes
 
 
 def follow_frame(
@@ -38,11 +33,13 @@ def follow_frame(
     watch,
 ) -> tuple[PoseEstimate | None, Followed]:
     """Return the pose of a frame that follows another, and what is still followed."""
-    tracks, segments = followed.points, followed.lines
+    tracks, segments, gates = followed.points, followed.lines, options.gates
     with watch("points"):
         tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
         if options.points:
-            tracks = follow_points(track_map, camera, tracks, before.gray, data.gray, predicted, previous)
+            tracks = follow_points(
+                track_map, camera, tracks, before.gray, data.gray, predicted, previous, gates.points.max_correction
+            )
     alive = track_map.points.alive[tracks.index]
     with watch("depth"):
         measured = measure_points(data, tracks.take(alive), options, track_map, predicted, camera)
@@ -52,12 +49,12 @@ def follow_frame(
         lines = LineMeasurements.empty()
         if options.lines and len(segments.index):
             segments = follow_lines(track_map, before, data, segments)
-            lines = measure_lines(track_map, data, segments, few_points=len(measured) < FEW_POINTS)
+            lines = measure_lines(track_map, data, segments, few_points=len(measured) < gates.lines.few_points)
     with watch("planes"):
         planes = PlaneMeasurements.empty()
         if data.planes is not None:
-            planes = match_planes(track_map, data, predicted, *FRAME_GATES)
-    if len(measured) + 2 * len(lines) + 3 * len(planes) < 6:
+            planes = match_planes(track_map, data, predicted, gates.planes.frame_angle, gates.planes.frame_distance)
+    if len(measured) + 2 * len(lines) + 3 * len(planes) < gates.verification.min_followed:
         return None, Followed.nothing()
     with watch("pose"):
         estimate = estimate_pose(camera, track_map.view, Measurements(measured, lines, planes), predicted, prior_sigma)
@@ -68,7 +65,7 @@ def follow_frame(
     segments = segments.take(~np.isin(segments.index, wrong))
     with watch("lines"):
         if options.lines:
-            segments = _find_lines_again(track_map, camera, data, estimate.pose, segments, options)
+            segments = _find_lines_again(track_map, camera, data, estimate.pose, segments)
     points, line_table = track_map.points, track_map.lines
     points.found[tracks.index[keep]] += 1
     points.visible[tracks.index] += 1
@@ -106,18 +103,19 @@ def follow_lines(
     track_map: TrackMap, before: FrameFeatures, data: FrameFeatures, segments: FollowedSegments
 ) -> FollowedSegments:
     """Carry segments by flow and measure their edges in the new image."""
-    flow = coarse_flow(before.gray, data.gray)
-    guess, agree = carried(flow, segments.ends, data.gray.shape)
+    gates = data.options.gates.lines
+    flow = coarse_flow(before.gray, data.gray, gates.reduction)
+    guess, agree = carried(flow, segments.ends, data.gray.shape, gates)
     agree &= track_map.lines.state[segments.index] != DEAD
-    guess, good = _inside(guess, data.gray.shape)
+    guess, good = _inside(guess, data.gray.shape, gates.min_length)
     rows = np.flatnonzero(agree & good)
-    found, of = measured_edges(data.gray, guess[rows], segments.strength[rows])
+    found, of = measured_edges(data.gray, guess[rows], segments.strength[rows], gates)
     kept = rows[of]
     return FollowedSegments(segments.index[kept], found.ends, found.sigma, found.strength)
 
 
-def _inside(ends: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, np.ndarray]:
-    """Cut segments to the image; those of less than 15 pixels are gone."""
+def _inside(ends: FloatArray, shape: tuple[int, int], min_length: float) -> tuple[FloatArray, np.ndarray]:
+    """Cut segments to the image; those that become too short are gone."""
     height, width = shape
     start, way = ends[:, :2], ends[:, 2:] - ends[:, :2]
     low, high = np.zeros(len(ends)), np.ones(len(ends))
@@ -129,7 +127,7 @@ def _inside(ends: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, np.nd
                 high = np.where(sign * way[:, axis] < 0, np.minimum(high, share), high)
     cut = np.hstack([start + low[:, None] * way, start + high[:, None] * way])
     inside = ((cut[:, :2] >= 2) & (cut[:, :2] <= (width - 2, height - 2))).all(axis=1)
-    good = inside & ((high - low) * np.linalg.norm(way, axis=1) > 15.0)
+    good = inside & ((high - low) * np.linalg.norm(way, axis=1) > min_length)
     return np.where(good[:, None], cut, 10.0), good
 
 
@@ -142,27 +140,33 @@ def measure_lines(
     inverse, sigma = np.full((len(rows), 2), np.nan), np.full((len(rows), 2), np.nan)
     if few_points:
         inverse, sigma = data.inverse_depths(ends)
-    return LineMeasurements(segments.index[rows], ends, np.maximum(segments.sigma[rows], 0.5), inverse, sigma)
+    return LineMeasurements(
+        segments.index[rows],
+        ends,
+        np.maximum(segments.sigma[rows], data.options.gates.lines.measured_sigma),
+        inverse,
+        sigma,
+    )
 
 
 def _find_lines_again(
-    track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose: FloatArray, segments: FollowedSegments, options
+    track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose: FloatArray, segments: FollowedSegments
 ) -> FollowedSegments:
     """Look for lines of the map that are in view but not followed, where the pose says they are."""
-    lines = track_map.lines
-    room = options.num_lines - len(segments.index)
-    if room < 5:
+    lines, gates = track_map.lines, data.options.gates.lines
+    room = data.options.num_lines - len(segments.index)
+    if room < gates.again_room:
         return segments
     wanted = lines.alive.copy()
     wanted[segments.index] = False
-    rows = np.flatnonzero(wanted)[-400:]
-    expected, seen = expected_segments(camera, lines, rows, pose)
+    rows = np.flatnonzero(wanted)[-gates.again_recent :]
+    expected, seen = expected_segments(camera, lines, rows, pose, gates)
     rows, expected = rows[seen][-room:], expected[seen][-room:]
     if not len(rows):
         return segments
-    found, of = measured_edges(data.gray, expected, lines.strength[rows])
+    found, of = measured_edges(data.gray, expected, lines.strength[rows], gates)
     away = np.abs(found.ends - expected[of]).max(axis=1)
-    good = (away < LINE_GATE) & (found.sigma < 0.4)
+    good = (away < gates.again_distance) & (found.sigma < gates.max_sigma_again)
     return segments.joined(FollowedSegments(rows[of[good]], found.ends[good], found.sigma[good], found.strength[good]))
 
 

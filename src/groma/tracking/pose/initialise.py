@@ -7,6 +7,8 @@ depth of the first points becomes the unit of length.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from scipy.spatial import KDTree
@@ -24,10 +26,6 @@ from groma.tracking.map.track_map import TrackMap
 from groma.tracking.map.triangulation import triangulate
 from groma.tracking.options import TrackOptions
 
-#: Landmarks with depth that a first frame must have.
-MIN_KNOWN = 15
-#: Two frames: median displacement (share of the image width), points placed, and their median parallax (radians).
-MIN_DISPLACEMENT, MIN_POINTS, MIN_PARALLAX = 0.02, 60, 0.02
 IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
 
@@ -35,7 +33,7 @@ class Initialiser:
     """Waits for frames a map can be made of."""
 
     def __init__(self, camera: TrackCamera, options: TrackOptions) -> None:
-        self._camera, self._options = camera, options
+        self._camera, self._options, self._gates = camera, options, options.gates.start
         self.metric = True
         self._first: FrameFeatures | None = None
         self._before: FrameFeatures | None = None
@@ -52,7 +50,7 @@ class Initialiser:
                 known += 2 * int(np.isfinite(data.detected.inverse_depth).all(axis=1).sum())
             if data.planes is not None:
                 known += 5 * len(data.planes)
-            if known < MIN_KNOWN:
+            if known < self._gates.min_known:
                 return None
             self._first = data
             return IDENTITY[None]
@@ -62,10 +60,10 @@ class Initialiser:
         assert self._before is not None
         pixel, good = follow(self._before.gray, data.gray, self._pixel)
         self._start, self._pixel, self._before = self._start[good], pixel[good], data
-        if len(self._pixel) < MIN_POINTS:
+        if len(self._pixel) < self._gates.min_points:
             return self._restart(data)
         away = float(np.median(np.linalg.norm(self._pixel - self._start, axis=1)))
-        if away < MIN_DISPLACEMENT * self._camera.width:
+        if away < self._gates.min_displacement * self._camera.width:
             return None
         pose = self._relative_pose()
         if pose is None:
@@ -78,25 +76,26 @@ class Initialiser:
         self._pixel = self._start = data.features.pixel.copy()
 
     def _relative_pose(self) -> FloatArray | None:
-        K = self._camera.matrix_opencv
+        K, gates = self._camera.matrix_opencv, self._gates
         one, two = self._start - 0.5, self._pixel - 0.5
-        E, mask = cv2.findEssentialMat(one, two, K, method=cv2.USAC_MAGSAC, prob=0.999, threshold=1.0)
+        E, mask = cv2.findEssentialMat(one, two, K, method=cv2.USAC_MAGSAC, prob=0.999, threshold=gates.max_error)
         if E is None or E.shape != (3, 3):
             return None
         count, R, t, mask = cv2.recoverPose(E, one, two, K, mask=mask)
-        if count < MIN_POINTS or count < 0.6 * len(one):
+        if count < gates.min_points or count < gates.min_inliers * len(one):
             return None
         pose = np.concatenate([quaternion.from_matrix(np.asarray(R, np.float64)), np.asarray(t, np.float64).ravel()])
         first = np.tile(IDENTITY, (len(one), 1))
-        places, good = triangulate(self._camera, first, self._start, pose, self._pixel, 0.01)
-        if good.sum() < MIN_POINTS:
+        placing = replace(self._options.gates.points, min_parallax=gates.min_parallax / 2)
+        places, good = triangulate(self._camera, first, self._start, pose, self._pixel, placing)
+        if good.sum() < gates.min_points:
             return None
         ray1 = places[good] / np.linalg.norm(places[good], axis=1, keepdims=True)
         center = se3.inverse(pose[None])[0, 4:]
         ray2 = places[good] - center
         ray2 /= np.linalg.norm(ray2, axis=1, keepdims=True)
         parallax = np.arccos(np.clip((ray1 * ray2).sum(axis=1), -1, 1))
-        if np.median(parallax) < MIN_PARALLAX:
+        if np.median(parallax) < gates.min_parallax:
             return None
         pose[4:] /= float(np.median(places[good, 2]))
         return pose
@@ -116,7 +115,7 @@ class Initialiser:
         tracks = PointTracks(tracks.index[good], pixel[good])
         first = np.tile(IDENTITY, (len(tracks), 1))
         places, placed = triangulate(
-            camera, first, track_map.points.first_pixel[tracks.index], self._pose, tracks.pixel
+            camera, first, track_map.points.first_pixel[tracks.index], self._pose, tracks.pixel, options.gates.points
         )
         index = tracks.index[placed]
         track_map.points.xyz[index], track_map.points.state[index] = places[placed], ALIVE

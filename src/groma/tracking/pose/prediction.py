@@ -11,32 +11,31 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.geometry import se3
-
-#: Motions are extrapolated over at most this many steps like the last one.
-MAX_STEPS = 3.0
-#: Standard deviation of the prior at least (share of what the velocity says, and radians / scene units).
-FLOOR = np.array([0.02] * 3 + [0.01] * 3)
+from groma.tracking.gates import DEFAULT, MotionGates
 
 
 class MotionModel:
     """Constant velocity and the noise of its predictions."""
 
-    def __init__(self) -> None:
+    def __init__(self, gates: MotionGates = DEFAULT.motion) -> None:
+        self._gates = gates
+        self._floor = np.repeat([gates.shift_floor, gates.turn_floor], 3)
         self._velocity = np.zeros(6)
         self._last_time: float | None = None
         self._step = 0.0
-        self._error = np.array([0.15] * 3 + [0.15] * 3)
+        self._error = np.full(6, gates.start)
         self._predicted: FloatArray | None = None
 
     def predict(self, pose: FloatArray, timestamp: float) -> tuple[FloatArray, FloatArray]:
         """Return the pose expected at a time, and the standard deviations (6,) of that expectation."""
         gap = timestamp - self._last_time if self._last_time is not None else 0.0
         steps = gap / self._step if self._step > 0 else 1.0
-        gap = min(gap, MAX_STEPS * self._step) if self._step > 0 else 0.0
+        gap = min(gap, self._gates.max_steps * self._step) if self._step > 0 else 0.0
         twist = self._velocity * gap
         predicted = se3.compose(se3.exp(twist[None]), pose[None])[0]
         self._predicted = predicted
-        sigma = np.maximum(FLOOR, 3.0 * self._error) * max(1.0, steps) + 0.5 * np.abs(twist)
+        sigma = np.maximum(self._floor, self._gates.safety * self._error) * max(1.0, steps)
+        sigma += self._gates.velocity_share * np.abs(twist)
         return predicted, sigma
 
     def update(self, before: FloatArray | None, pose: FloatArray, timestamp: float) -> None:
@@ -47,11 +46,13 @@ class MotionModel:
             if self._predicted is not None:
                 miss = np.abs(se3.log(se3.compose(pose[None], se3.inverse(self._predicted[None])))[0])
                 grouped = np.repeat([np.linalg.norm(miss[:3]), np.linalg.norm(miss[3:])], 3)
-                self._error = np.maximum(0.8 * self._error + 0.2 * grouped, 0.5 * grouped)
+                self._error = np.maximum(
+                    (1.0 - self._gates.learnt) * self._error + self._gates.learnt * grouped, self._gates.last * grouped
+                )
             self._velocity = twist / self._step
         else:
             self._velocity = np.zeros(6)
-            self._error = np.array([0.15] * 6)
+            self._error = np.full(6, self._gates.start)
         self._last_time = timestamp
 
 

@@ -9,7 +9,6 @@ with them, and the best are estimated from all that agrees: points, lines and pl
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -21,6 +20,7 @@ from groma.geometry import quaternion, se3
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.features import Descriptors, Features, FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.gates import DEFAULT
 from groma.tracking.map.feature_points import match_features, points_of_features
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.lines import FollowedSegments, assign, expected_segments
@@ -28,19 +28,6 @@ from groma.tracking.map.planes import assign_planes
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
-
-#: A feature agrees with a pose within this distance, pixels (features of coarse scales are not precise).
-NEAR = 6.0
-#: Hamming distance beyond which descriptors do not match near where a feature is expected.
-FARTHEST_NEAR = 75
-#: Features are looked for within this share of the image's width around where a guess says.
-SEARCH = 0.07
-#: A pose with this score needs no further proposals.
-STRONG = 70.0
-#: Poses refined at most; one that starts near an earlier result (share of its median depth, radians) is left out.
-MAX_REFINED, SAME_SHARE, SAME_TURN = 4, 0.01, 0.006
-#: Agreements that a line and a plane count for, in points.
-LINE_WEIGHT, PLANE_WEIGHT = 2.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -73,7 +60,13 @@ def known_features(track_map: TrackMap, camera: TrackCamera, keyframes: list[Key
 
 
 def match_near(
-    camera: TrackCamera, known: KnownFeatures, features: Features, tree: KDTree, pose: FloatArray, radius: float
+    camera: TrackCamera,
+    known: KnownFeatures,
+    features: Features,
+    tree: KDTree,
+    pose: FloatArray,
+    radius: float,
+    max_bits: int = DEFAULT.features.max_bits_near,
 ) -> IntArray:
     """Pair known features with features of a frame (n, 2): near where a pose says, and most alike for both."""
     expected = camera.project(into(pose, known.places))
@@ -83,7 +76,7 @@ def match_near(
     near = KDTree(expected[rows]).sparse_distance_matrix(tree, radius, output_type="ndarray")
     first, second = rows[near["i"]], near["j"]
     bits = np.bitwise_count(known.descriptor[first] ^ features.descriptor[second]).sum(axis=1, dtype=np.int64)
-    alike = np.flatnonzero(bits <= FARTHEST_NEAR)
+    alike = np.flatnonzero(bits <= max_bits)
     # Nearest in the image among equals.
     alike = alike[np.lexsort((near["v"][alike], bits[alike]))]
     first, second = first[alike], second[alike]
@@ -106,7 +99,11 @@ def feature_places(track_map: TrackMap, camera: TrackCamera, keyframe: Keyframe,
 
 
 def pose_from_matches(
-    camera: TrackCamera, places: FloatArray, pixel: FloatArray, min_inliers: int = 10, error: float = 4.0
+    camera: TrackCamera,
+    places: FloatArray,
+    pixel: FloatArray,
+    min_inliers: int = DEFAULT.finding.min_inliers,
+    max_error: float = DEFAULT.finding.max_error,
 ) -> tuple[FloatArray, BoolArray] | None:
     """Pose (7,) from places in the world and their pixels, by P3P with RANSAC, and which agree; None without one."""
     if len(places) < max(min_inliers, 6):
@@ -114,7 +111,7 @@ def pose_from_matches(
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
             np.ascontiguousarray(places), np.ascontiguousarray(pixel - 0.5), camera.matrix_opencv, np.zeros(0),
-            iterationsCount=500, reprojectionError=error, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
+            iterationsCount=500, reprojectionError=max_error, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
         )  # fmt: skip
     except cv2.error:  # its last step asserts that the inliers, not known before, are spread well
         return None
@@ -155,7 +152,7 @@ def find_pose(
     if guesses:
         near = [search.proposal_near(guess) for guess in guesses]
         best = search.best_of([*guesses, *(pose for pose in near if pose is not None)])
-        if best is not None and best.score >= STRONG:
+        if best is not None and best.score >= data.options.gates.finding.strong:
             return best
     return search.best_of([pose for pose in map(search.proposal, keyframes) if pose is not None])
 
@@ -166,39 +163,42 @@ class _Search:
     def __init__(self, track_map, camera, data, known, predicted, prior_sigma) -> None:
         self.track_map, self.camera, self.data, self.known = track_map, camera, data, known
         self.predicted, self.prior_sigma = predicted, prior_sigma
+        self.gates, self.all_gates = data.options.gates.finding, data.options.gates
         self._tree = KDTree(data.features.pixel if len(data.features.pixel) else np.zeros((1, 2)))
         self._best: Found | None = None
         self._tried: list[FloatArray] = []
 
     def near(self, pose: FloatArray, radius: float) -> IntArray:
         """Pairs (n, 2) of known features and features of the frame, near where a pose says."""
-        return match_near(self.camera, self.known, self.data.features, self._tree, pose, radius)
+        max_bits = self.all_gates.features.max_bits_near
+        return match_near(self.camera, self.known, self.data.features, self._tree, pose, radius, max_bits)
 
     def proposal_near(self, guess: FloatArray) -> FloatArray | None:
         """Pose from features matched in wide surroundings of where a guess says."""
-        pairs = self.near(guess, SEARCH * self.camera.width)
+        pairs = self.near(guess, self.gates.search * self.camera.width)
         return self._from_pairs(self.known.places[pairs[:, 0]], pairs[:, 1])
 
     def proposal(self, keyframe: Keyframe) -> FloatArray | None:
         """Pose from all features that match those of one keyframe."""
-        first, second = match_features(keyframe.features, self.data.features)
+        first, second = match_features(keyframe.features, self.data.features, self.all_gates.features.max_bits)
         places = feature_places(self.track_map, self.camera, keyframe, first)
         known = np.isfinite(places[:, 0])
         return self._from_pairs(places[known], second[known])
 
     def _from_pairs(self, places: FloatArray, second: IntArray) -> FloatArray | None:
-        found = pose_from_matches(self.camera, places, self.data.features.pixel[second])
+        pixel = self.data.features.pixel[second]
+        found = pose_from_matches(self.camera, places, pixel, self.gates.min_inliers, self.gates.max_error)
         return found[0] if found is not None else None
 
     def best_of(self, starts: list[FloatArray]) -> Found | None:
         """Refine the starts that most agrees with; return the best pose so far."""
         planes, seen = self.track_map.planes, self.data.planes
-        judged = [
-            len(self.near(start, 3 * NEAR))
-            + PLANE_WEIGHT * (len(assign_planes(planes, seen, start, 0.15, 0.12)[0]) if seen else 0)
-            for start in starts
-        ]
-        for k in np.argsort(-np.array(judged), kind="stable")[:MAX_REFINED]:
+        judged = [len(self.near(start, 3 * self.gates.near)) for start in starts]
+        if seen:
+            near = self.gates.judged_angle, self.gates.judged_distance, self.all_gates.planes
+            agreeing = [len(assign_planes(planes, seen, start, *near)[0]) for start in starts]
+            judged = [one + self.gates.plane_weight * other for one, other in zip(judged, agreeing, strict=True)]
+        for k in np.argsort(-np.array(judged), kind="stable")[: self.gates.max_refined]:
             if self._is_known(starts[k]):
                 continue
             found = self._refine(starts[k])
@@ -216,19 +216,23 @@ class _Search:
         tried = np.array(self._tried)
         apart = np.abs(se3.log(se3.compose(np.tile(start, (len(tried), 1)), se3.inverse(tried))))
         depth = self.track_map.near.depth
-        return bool(((apart[:, :3].max(axis=1) < SAME_SHARE * depth) & (apart[:, 3:].max(axis=1) < SAME_TURN)).any())
+        same = apart[:, :3].max(axis=1) < self.gates.same_shift * depth
+        return bool((same & (apart[:, 3:].max(axis=1) < self.gates.same_turn)).any())
 
     def _refine(self, start: FloatArray) -> Found | None:
         """Estimate the pose from all that agrees with a start, with narrowing gates."""
-        track_map, camera, data = self.track_map, self.camera, self.data
+        track_map, camera, data, gates = self.track_map, self.camera, self.data, self.gates
         pose, estimate, lines = start, None, FollowedSegments.empty()
         pairs = np.zeros((0, 2), np.int64)
-        for gate in (3.0, 1.0):
-            pairs = self.near(pose, gate * NEAR)
+        for factor in gates.rounds:
+            pairs = self.near(pose, factor * gates.near)
             # Features that are no point of the map yet take part by their place alone.
             temporary, table = _temporary_points(self.known, pairs, data)
-            lines, line_table = match_lines(track_map, camera, data, pose, 8.0 * gate, 0.08 + 0.06 * gate)
-            planes = match_planes(track_map, data, pose, 0.1 + 0.06 * gate, 0.06 + 0.04 * gate)
+            line_angle, plane_angle, plane_distance = (
+                first + second * factor for first, second in (gates.line_angle, gates.plane_angle, gates.plane_distance)
+            )
+            lines, line_table = match_lines(track_map, camera, data, pose, factor * gates.line_distance, line_angle)
+            planes = match_planes(track_map, data, pose, plane_angle, plane_distance)
             if len(pairs) + len(line_table) + len(planes) < 3:
                 return None
             view = replace(track_map.view, points=temporary)
@@ -238,7 +242,7 @@ class _Search:
         assert estimate is not None
         agree = pairs[estimate.points] if data.options.points else pairs[:0]
         counts = estimate.counts
-        score = counts["points"] + LINE_WEIGHT * counts["lines"] + PLANE_WEIGHT * counts["planes"]
+        score = counts["points"] + gates.line_weight * counts["lines"] + gates.plane_weight * counts["planes"]
         in_view = int(camera.inside(camera.project(into(pose, self.known.places))).sum())
         share = len(agree) / max(in_view, 1)
         return Found(estimate, self.known, agree, lines.take(estimate.lines), score, share)
@@ -256,7 +260,7 @@ def _temporary_points(known: KnownFeatures, pairs: IntArray, data: FrameFeatures
     count = len(rows)
     depth = data.features.depth[rows]
     sigma = data.features.scale[rows] * data.options.point_sigma_px
-    depth_sigma = 1.5 * data.depth_sigma(depth)
+    depth_sigma = data.options.gates.finding.depth_factor * data.depth_sigma(depth)
     unknown = np.full(count, np.nan)
     table = PointMeasurements(np.arange(count), data.features.pixel[rows], sigma, depth, depth_sigma, unknown)
     return _Places(known.places[pairs[:, 0]]), table
@@ -293,14 +297,15 @@ def match_lines(
     """Assign detected segments to lines of the map by where a pose says they are, and how deep."""
     if not data.options.lines:
         return FollowedSegments.empty(), LineMeasurements.empty()
-    lines, detected = track_map.lines, data.detected
+    lines, detected, gates = track_map.lines, data.detected, data.options.gates.lines
     alive = np.flatnonzero(lines.alive)
-    expected, seen = expected_segments(camera, lines, alive, pose)
+    expected, seen = expected_segments(camera, lines, alive, pose, gates)
     alive, expected = alive[seen], expected[seen]
     inverse = 1.0 / np.maximum(into(pose, lines.segment[alive].mean(axis=1))[:, 2], 1e-6)
     segments = detected.segments
-    rows, hits = assign(expected, segments.ends, distance, angle, inverse, detected.inverse_depth.mean(axis=1))
-    sigma = np.maximum(segments.sigma[hits], 0.5)
+    own = detected.inverse_depth.mean(axis=1)
+    rows, hits = assign(expected, segments.ends, distance, angle, inverse, own, gates)
+    sigma = np.maximum(segments.sigma[hits], gates.measured_sigma)
     followed = FollowedSegments(alive[rows], segments.ends[hits], sigma, segments.strength[hits])
     table = LineMeasurements(
         alive[rows], segments.ends[hits], sigma, detected.inverse_depth[hits], detected.inverse_depth_sigma[hits]
@@ -314,15 +319,11 @@ def match_planes(
     """Assign planes of a frame to planes of the map."""
     if data.planes is None:
         return PlaneMeasurements.empty()
-    index, rows = assign_planes(track_map.planes, data.planes, pose, angle, distance)
+    index, rows = assign_planes(track_map.planes, data.planes, pose, angle, distance, data.options.gates.planes)
     return PlaneMeasurements(index, data.planes.plane[rows], data.planes.sqrt_information[rows])
 
 
-#: Widest gates of planes between two frames: angle, and distance of the seen part (scene units).
-FRAME_GATES = (math.radians(12.0), 0.12)
-
 __all__ = [
-    "FRAME_GATES",
     "Found",
     "KnownFeatures",
     "feature_places",

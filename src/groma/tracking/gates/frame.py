@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Numbers of what one frame gives: checks, turns, depth, planes, the right image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from groma.gates import gate
+
+SEQUENCES = "chosen on cabinet, redkitchen and KITTI 06"
+
+
+@dataclass(frozen=True)
+class CheckGates:
+    """Frames that are of no use."""
+
+    min_contrast: float = gate(
+        4.0,
+        "grey levels",
+        "images whose grey levels spread less show nothing",
+        "derived from the noise of 8-bit images",
+    )
+    sparse_depth: float = gate(
+        0.2, "share", "depth images with fewer known depths are reported", "convention: a sentence for the reader only"
+    )
+
+
+@dataclass(frozen=True)
+class TurnGates:
+    """Turns between two frames, from small images."""
+
+    width: int = gate(64, "px", "width of the small images", SEQUENCES + " and rendered turns")
+    steps: int = gate(12, "steps", "Gauss-Newton steps of an alignment", "cost: converges in fewer")
+    blur: float = gate(0.8, "px", "standard deviation of the blur of small images", SEQUENCES + " and rendered turns")
+    min_overlap: float = gate(0.25, "share", "smallest overlap of two aligned images", SEQUENCES)
+    outlier: float = gate(
+        3.0,
+        "medians",
+        "scale of the robust weight of a difference of grey levels",
+        "derived from normal noise: 2 sigma",
+    )
+    converged: float = gate(
+        0.02, "px", "an alignment ends when steps are smaller", "cost: a tenth of what it is good for"
+    )
+    noise: float = gate(
+        4.0, "grey levels squared", "energy of noise in the surroundings of a place", "derived from camera noise"
+    )
+    agrees: float = gate(0.8, "correlation", "a prediction that agrees so well needs no help", SEQUENCES)
+    gain: float = gate(0.04, "correlation", "by how much a turn must agree better than a prediction", SEQUENCES)
+    min_places: int = gate(8, "places", "places that a judgement needs", SEQUENCES)
+    sigma: float = gate(0.03, "rad", "noise of a turn found so", SEQUENCES + " and rendered turns")
+
+
+@dataclass(frozen=True)
+class DepthGates:
+    """Depth images: noise, and where a depth can be read."""
+
+    inverse_sigma: float = gate(
+        0.003,
+        "1 / scene unit",
+        "noise of an inverse depth: 3 mm at 1 m, 12 mm at 2 m",
+        "derived from Kinect disparities",
+    )
+    min_sigma: float = gate(0.003, "scene units", "a depth is not known better", "derived from millimetres in files")
+    near: float = gate(0.5, "px", "depth beside a segment is read from this distance on", SEQUENCES)
+    far: float = gate(4.5, "px", "and up to this distance, so that narrow faces are not missed", SEQUENCES)
+    correlation: float = gate(6.0, "samples", "neighbouring samples that err alike count as one", SEQUENCES)
+    jump: float = gate(0.01, "scene units", "depths around a pixel differ by less, plus a share", SEQUENCES)
+    jump_share: float = gate(0.04, "share", "share of the depth by which they may differ", SEQUENCES)
+    min_known: int = gate(4, "pixels", "known depths among a pixel and its eight neighbours", SEQUENCES)
+    grid: int = gate(20, "px", "distance of the places whose depth is kept, and on planes", "cost: 768 in 640 x 480")
+    far_share: float = gate(
+        0.25, "share", "largest noise of a stereo depth; far points serve as well as near ones", SEQUENCES
+    )
+
+
+@dataclass(frozen=True)
+class SparseDepthGates:
+    """Depth images that are mostly holes, and how they are filled."""
+
+    dense: float = gate(0.35, "share", "images with more known depths are left alone", SEQUENCES)
+    cell: int = gate(4, "px", "side of a cell", SEQUENCES)
+    window: int = gate(11, "cells", "side of a window", SEQUENCES)
+    min_samples: int = gate(12, "samples", "samples in a window", SEQUENCES)
+    max_scatter: float = gate(2.5, "sigma", "largest deviation of samples from their plane", SEQUENCES)
+    max_reading: float = gate(2.0, "sigma", "largest deviation of a reading between samples", SEQUENCES)
+
+
+@dataclass(frozen=True)
+class FramePlaneGates:
+    """Planes in one depth image."""
+
+    correlation: float = gate(100.0, "samples", "neighbouring samples that err alike count as one", SEQUENCES)
+    tilt: float = gate(0.004, "rad", "no plane is known better: depth cameras bend planes", SEQUENCES)
+    shift: float = gate(0.003, "scene units", "no plane is known better", SEQUENCES)
+    min_share: float = gate(0.015, "share", "smallest share of the image on a plane", SEQUENCES)
+    max_planes: int = gate(10, "planes", "planes of one frame", "cost: frames show fewer")
+    min_places: int = gate(8, "places", "places on a plane; thin strips have fewer", SEQUENCES)
+
+
+@dataclass(frozen=True)
+class StereoGates:
+    """Columns of points in the right image."""
+
+    disparity_sigma: float = gate(0.5, "px", "standard deviation of a disparity", "chosen on KITTI 06")
+    block: int = gate(13, "px", "width of the compared blocks", "chosen on KITTI 06")
+    max_disparity: float = gate(0.12, "share", "largest disparity, of the width of the image", "chosen on KITTI 06")
+    uniqueness: int = gate(15, "percent", "margin over the second best block", "convention: OpenCV's default")
+    texture: int = gate(8, "grey levels", "sum of gradients of a block that is matched at all", "chosen on KITTI 06")
+    around: int = gate(6, "px", "a disparity is looked for within this distance", "chosen on KITTI 06")
+    window: int = gate(17, "px", "width of the patches that refine a column", "chosen on KITTI 06")
+    max_shift: float = gate(2.5, "px", "distance of a refined column from where it was expected", "chosen on KITTI 06")
+    max_row: float = gate(1.5, "px", "distance of a point from its row: rectification errs", "chosen on KITTI 06")
+
+
+@dataclass(frozen=True)
+class FeatureGates:
+    """Described features."""
+
+    fast_threshold: int = gate(7, "grey levels", "contrast of a corner (FAST)", SEQUENCES)
+    max_bits: int = gate(
+        64, "bits", "descriptors of a pair differ in at most so many of 256",
+        "derived from chance: unlike descriptors differ in fewer once in 10^15",
+    )  # fmt: skip
+    max_bits_near: int = gate(75, "bits", "the same near where a feature is expected", SEQUENCES)

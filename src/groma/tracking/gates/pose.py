@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Numbers of poses: predicted, followed, judged, found again; and of loops and new maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from groma.gates import gate
+from groma.tracking.gates.frame import SEQUENCES
+
+
+@dataclass(frozen=True)
+class MotionGates:
+    """Constant velocity and its noise."""
+
+    max_steps: float = gate(3.0, "frames", "a motion is extrapolated over at most so many steps", SEQUENCES)
+    shift_floor: float = gate(0.02, "scene units", "smallest standard deviation of a predicted position", SEQUENCES)
+    turn_floor: float = gate(0.01, "rad", "smallest standard deviation of a predicted rotation", SEQUENCES)
+    start: float = gate(0.15, "scene units, rad", "error of predictions before any was seen", SEQUENCES)
+    safety: float = gate(3.0, "ratio", "standard deviation in terms of the errors of recent predictions", SEQUENCES)
+    velocity_share: float = gate(0.5, "share", "share of the predicted motion that is added to it", SEQUENCES)
+    learnt: float = gate(0.2, "share", "weight of the last error against earlier ones", SEQUENCES)
+    last: float = gate(0.5, "share", "the error is at least this share of the last one", SEQUENCES)
+
+
+@dataclass(frozen=True)
+class StartGates:
+    """The first frames of a map."""
+
+    min_known: int = gate(15, "points", "points with depth (a line counts 2, a plane 5)", SEQUENCES)
+    min_displacement: float = gate(
+        0.02, "share", "median displacement, of the width of the image", "chosen on rendered rooms"
+    )
+    min_points: int = gate(60, "points", "points followed and placed", "chosen on rendered rooms")
+    min_inliers: float = gate(0.6, "share", "share of the points in front of both cameras", "chosen on rendered rooms")
+    min_parallax: float = gate(0.02, "rad", "median parallax", "chosen on rendered rooms")
+    max_error: float = gate(1.0, "px", "distance from an epipolar line", "convention: one pixel")
+
+
+@dataclass(frozen=True)
+class DepthCheckGates:
+    """Whether the depths of a frame go with a pose."""
+
+    min_places: int = gate(40, "places", "places that must be known", SEQUENCES)
+    confirms: float = gate(0.8, "share", "this share of the places confirms a pose", SEQUENCES)
+    denies: float = gate(0.35, "share", "this share of the places seen through denies it", SEQUENCES)
+    sigma: float = gate(3.0, "sigma", "and this many standard deviations", "derived from normal noise: 1 in 370")
+    smooth: float = gate(0.15, "share", "depths are read where four neighbours differ by less", SEQUENCES)
+
+
+@dataclass(frozen=True)
+class FindingGates:
+    """Poses found by described features. A score counts points; lines and planes count for more."""
+
+    line_weight: float = gate(2.0, "points", "what a line counts: two ends", "convention: an end is a point across")
+    plane_weight: float = gate(6.0, "points", "what a plane counts", SEQUENCES)
+    near: float = gate(6.0, "px", "a feature agrees within this distance; coarse scales are not precise", SEQUENCES)
+    search: float = gate(0.07, "share", "where features are looked for around a guess, of the image's width", SEQUENCES)
+    strong: float = gate(70.0, "score", "a pose that needs no further proposals", "cost: time to find a pose")
+    max_refined: int = gate(4, "poses", "proposals that are refined", "cost: time to find a pose")
+    same_shift: float = gate(
+        0.01, "share", "a proposal this near to an earlier one is left out, of the depth", "cost: time"
+    )
+    same_turn: float = gate(0.006, "rad", "and this angle", "cost: time to find a pose")
+    min_inliers: int = gate(10, "points", "points that agree on a proposal", SEQUENCES)
+    max_error: float = gate(4.0, "px", "distance at which they do", SEQUENCES)
+    rounds: tuple[float, ...] = gate((3.0, 1.0), "1", "factors of the distances, round by round", SEQUENCES)
+    line_distance: float = gate(8.0, "px", "a segment is a line of the map within this distance", SEQUENCES)
+    line_angle: tuple[float, float] = gate(
+        (0.08, 0.06), "rad", "and angle: plus the second times the factor", SEQUENCES
+    )
+    plane_angle: tuple[float, float] = gate((0.1, 0.06), "rad", "the same for planes", SEQUENCES)
+    plane_distance: tuple[float, float] = gate((0.06, 0.04), "scene units", "and their distance", SEQUENCES)
+    judged_angle: float = gate(0.15, "rad", "a plane speaks for a proposal within this angle", SEQUENCES)
+    judged_distance: float = gate(0.12, "scene units", "and distance", SEQUENCES)
+    depth_factor: float = gate(1.5, "ratio", "features are less precise than points: noise of depth", SEQUENCES)
+
+
+@dataclass(frozen=True)
+class VerificationGates:
+    """Whether a pose is to be believed."""
+
+    min_followed: int = gate(
+        6, "score", "measurements that a pose is estimated from (line 2, plane 3)", "derived from 6 unknowns"
+    )
+    nearest: int = gate(3, "keyframes", "keyframes that are tried first", "cost: time to find a pose")
+    most: int = gate(30, "keyframes", "keyframes that are tried at all", "cost: time to find a pose")
+    min_score: float = gate(18.0, "score", "agreeing measurements", SEQUENCES)
+    min_share: float = gate(0.35, "share", "share of what was looked at that agrees", SEQUENCES)
+    min_kept: float = gate(0.12, "share", "share of what the last keyframe measured", SEQUENCES)
+    min_evidence: float = gate(16.0, "score", "agreeing points and lines", SEQUENCES)
+    found_share: float = gate(0.75, "share", "share of it for a pose found by features", SEQUENCES)
+    confirmed_evidence: float = gate(6.0, "score", "points and lines where depth confirms a pose", SEQUENCES)
+    confirmed_share: float = gate(0.6, "share", "share of what was looked at that must then agree", SEQUENCES)
+    certain: float = gate(40.0, "score", "a found pose with this score needs no share", SEQUENCES)
+    min_agreeing: float = gate(0.03, "share", "share of the features in view that agree with a found pose", SEQUENCES)
+    anywhere: float = gate(36.0, "score", "a pose found without a prediction", SEQUENCES)
+    anywhere_without_points: float = gate(0.75, "share", "share of it where no points are followed", SEQUENCES)
+    enough: float = gate(120.0, "score", "no other keyframe is tried", "cost: time to find a pose")
+    doubtful: float = gate(80.0, "score", "below, half of the planes must agree and depth must confirm", SEQUENCES)
+    surprise: float = gate(2.0, "sigma", "a pose farther from the prediction is looked at twice", SEQUENCES)
+    sure_share: float = gate(0.7, "share", "unless this share of what was looked at agrees", SEQUENCES)
+    wider: float = gate(3.0, "ratio", "the prior of a pose found by features is wider", SEQUENCES)
+    jump: float = gate(6.0, "sigma", "distance of a found pose from the prediction", SEQUENCES)
+    near_frames: int = gate(5, "frames", "lost frames after which the camera can be anywhere", SEQUENCES)
+    restart_frames: int = gate(5, "frames", "lost frames after which a new map is begun", SEQUENCES)
+    restart_seconds: float = gate(0.5, "s", "and time", SEQUENCES)
+
+
+@dataclass(frozen=True)
+class LoopGates:
+    """Loops and joints of maps."""
+
+    gap: int = gate(12, "keyframes", "keyframes between a new one and those it closes a loop with", SEQUENCES)
+    compared: int = gate(25, "keyframes", "keyframes that are compared", "cost: time per keyframe")
+    voters: int = gate(200, "features", "strongest features that vote for keyframes", "cost: time per keyframe")
+    searched: int = gate(2, "keyframes", "keyframes with most votes that are matched", "cost: time per keyframe")
+    min_matches: int = gate(60, "features", "features that match", SEQUENCES)
+    min_inliers: int = gate(35, "features", "features that agree on a pose", SEQUENCES)
+    shared: int = gate(30, "points", "a keyframe that shares so much with the new one is no loop", SEQUENCES)
+    shift_sigma: float = gate(0.02, "share", "noise of a relative position, of the median depth", SEQUENCES)
+    turn_sigma: float = gate(0.01, "rad", "noise of a relative rotation", SEQUENCES)
+    jump: float = gate(6.0, "sigma", "a loop moves the newest keyframe by less: places are alike", SEQUENCES)
+    held_by: int = gate(
+        8, "keyframes", "earlier keyframes that hold each one in the pose graph", "cost: time of a loop"
+    )
+    held_shared: int = gate(60, "points", "if they share so much with it", SEQUENCES)
+    loss: float = gate(3.0, "sigma", "scale of the Huber loss of the pose graph", "derived from normal noise: 1 in 370")
+    max_iterations: int = gate(30, "steps", "steps of the pose graph", "cost: converges in fewer")
+    final_iterations: int = gate(15, "steps", "steps of the adjustment at the end, twice", "cost: converges in fewer")
