@@ -20,7 +20,7 @@ CLASSES = gate_classes()
 
 def test_all_rooms_have_gates():
     rooms = {kind.__module__.split(".")[1] for kind in CLASSES}
-    assert {"estimators", "evaluation", "features", "solver", "tracking"} <= rooms
+    assert {"estimators", "evaluation", "features", "mapping", "solver", "tracking"} <= rooms
     assert len(CLASSES) == len(set(CLASSES)) > 25
     assert TrackingGates not in CLASSES  # a group of gates has no numbers of its own
 

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Tracks are values, filters name what they reject, and work per image keeps its order and can be ended."""
 
-import inspect
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from _wireframe import arc, random_lines, wireframe
 
-from groma.gates import ORIGINS, is_gate_class, table
 from groma.mapping.lines.filters import FILTERS, Evidence, filtered, long_enough, seen_by_enough_images
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
@@ -95,18 +93,3 @@ def test_work_keeps_its_order_and_ends_with_an_error(threads):
     assert len(done) < 10_000
     with pytest.raises(ZeroDivisionError):
         map_work(lambda i: 1 // i, [1, 0, 1], None, threads)
-
-
-def test_gates_of_mapping_say_where_they_come_from():
-    import groma.mapping.map
-    from groma.adjustment.rescue import restart, slips
-    from groma.mapping.lines import consensus, gates, growth, known_points, merge, proposals, texture
-    from groma.mapping.noise import observations, shared
-    from groma.mapping.structure import relations
-
-    modules = (groma.mapping.map, restart, slips, consensus, gates, growth, known_points, merge, proposals, texture)
-    for module in (*modules, observations, shared, relations):
-        for _, gates_of in inspect.getmembers(module, is_gate_class):
-            for name, number, unit, meaning, origin in table(gates_of):
-                assert unit and meaning and number is not None, name
-                assert origin.startswith(ORIGINS), name

@@ -11,6 +11,7 @@ from groma.cli.commands.map import map_
 from groma.mapping.groups import distinct_pairs, num_distinct
 from groma.mapping.lines import merge as _line_merge
 from groma.mapping.lines.build import LineMap, explain
+from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.merge import MergeGates
 from groma.mapping.lines.outcomes import REMEDIES, WORDS, Outcome
 from groma.mapping.unused import without_unused
@@ -39,7 +40,7 @@ def all_pairs(X, reach):
                 continue
             t = (X[b] - X[a, 0]) @ d / (d @ d)
             low, high = max(0.0, t.min()), min(1.0, t.max())
-            if high - low < MergeGates().min_overlap * min(1.0, np.ptp(t)):
+            if high - low < AGREEMENT.min_overlap * min(1.0, np.ptp(t)):
                 continue
             places = np.array([low, high])
             on_b = X[b, 0] + ((places - t[0]) / (t[1] - t[0]))[:, None] * e

@@ -56,7 +56,10 @@ class MappingGates:
     """How noise becomes weight, and when lines are mapped again."""
 
     loss_scale: float = gate(
-        6.0, "sigma", "scale of the first loss: matches have a narrow core and heavy tails", "chosen on ETH3D facades"
+        6.0,
+        "sigma",
+        "scale of the first loss: matches have a narrow core and heavy tails",
+        "chosen on benchmarks/surveyed.py",
     )
     last_loss_scale: float = gate(
         4.0,
@@ -68,7 +71,7 @@ class MappingGates:
         0.1,
         "share",
         "of the points that moved by more than the lines allow for: lines are mapped again",
-        "chosen on ETH3D facades",
+        "chosen on benchmarks/surveyed.py",
     )
     max_rounds: int = gate(4, "rounds", "of adjusting and mapping lines again", "cost: most maps need one")
 

@@ -37,7 +37,10 @@ class PointRefinementGates:
     """What no image tells of a place, and how much is held in memory."""
 
     sigma_floor: float = gate(
-        0.03, "px", "deviation that lens model, shading and surfaces that are not flat leave", "chosen on ETH3D facades"
+        0.03,
+        "px",
+        "deviation that lens model, shading and surfaces that are not flat leave",
+        "chosen on benchmarks/surveyed.py",
     )
     points_at_once: int = gate(100_000, "points", "whose templates are held together", "cost: a hundred megabytes")
 

@@ -52,7 +52,7 @@ class RestartGates:
         0.02,
         "1",
         "distance over its length by which a line moved, if its old end points say little",
-        "chosen on wireframes",
+        "chosen on benchmarks/surveyed.py",
     )
     max_steps: int = gate(20, "steps", "of a line on its own", "cost: most need two or three")
 

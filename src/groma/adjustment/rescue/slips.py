@@ -36,7 +36,10 @@ class SlipGates:
     """Which observations of a line are false."""
 
     nearest: float = gate(
-        0.01, "1", "depth of a segment over the usual one of its line, below which it is false", "chosen on wireframes"
+        0.01,
+        "1",
+        "depth of a segment over the usual one of its line, below which it is false",
+        "chosen on benchmarks/surveyed.py",
     )
 
 

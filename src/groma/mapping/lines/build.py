@@ -93,13 +93,11 @@ def map_lines(
             f"segments must hold one set per image of the scene ({scene.num_images}); got {len(segments)}. "
             "Pass Segments.empty() for images without."
         )
-
     report = progress or (lambda stage, done, total: None)
-
-    if neighbors is None:
-        compared = covisible_neighbors(scene, options.num_neighbors, options.min_shared)
-    else:
-        compared = neighbors(scene)
+    choose = neighbors or partial(
+        covisible_neighbors, num_neighbors=options.num_neighbors, min_shared=options.min_shared
+    )
+    compared = choose(scene)
     views = build_views(scene, segments, options.min_length, options.noise, options.depth_margin)
     ratios = depth_ratios(scene, segments, views) if options.use_directions else np.zeros((len(views.image_idx), 2))
     places = find_places(scene, views, ratios, compared, matches, options, partial(report, "proposals"))

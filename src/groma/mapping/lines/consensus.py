@@ -33,7 +33,10 @@ class ConsensusGates:
     )
     fusing_rounds: int = gate(3, "rounds", "of fusing and comparing again", "cost: the second changes little")
     half_weight: float = gate(
-        4.0, "sigma^2", "squared distance at which a proposal counts half in the fused place", "chosen on wireframes"
+        4.0,
+        "sigma^2",
+        "squared distance at which a proposal counts half in the fused place",
+        "chosen on benchmarks/lines.py",
     )
 
 

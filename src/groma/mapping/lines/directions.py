@@ -39,9 +39,9 @@ class DirectionGates:
     num_voters: int = gate(
         200, "segments", "per image that look for vanishing points, the longest", "cost: time of a search"
     )
-    min_voters: int = gate(10, "segments", "fewer tell no vanishing point", "chosen on wireframes")
+    min_voters: int = gate(10, "segments", "fewer tell no vanishing point", "chosen on benchmarks/lines.py")
     max_sigma: float = gate(
-        0.01, "rad", "standard deviation of a direction that tells something", "chosen on wireframes"
+        0.01, "rad", "standard deviation of a direction that tells something", "chosen on benchmarks/lines.py"
     )
 
 

@@ -27,7 +27,7 @@ class DuplicateGates:
     """When a line is explained by another one."""
 
     min_ratio: float = gate(
-        2.0, "1", "times as many images has a line that only runs near the segments", "chosen on ETH3D facades"
+        2.0, "1", "times as many images has a line that only runs near the segments", "chosen on benchmarks/lines.py"
     )
 
 

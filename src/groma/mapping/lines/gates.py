@@ -16,10 +16,10 @@ class AgreementGates:
         0.0027, "probability", "of noise alone making one line look like two", "convention: three standard deviations"
     )
     min_overlap: float = gate(
-        0.3, "share", "of the shorter of two, that overlaps along the line", "chosen on wireframes"
+        0.3, "share", "of the shorter of two, that overlaps along the line", "chosen on benchmarks/lines.py"
     )
     min_common: float = gate(
-        0.6, "share", "of the images of a line, in which another explains it", "chosen on fountain"
+        0.6, "share", "of the images of a line, in which another explains it", "chosen on benchmarks/lines.py"
     )
     same_edge: float = gate(
         1.0, "px", "apart, two segments of an image are one edge", "derived from the width of an edge"

@@ -34,9 +34,9 @@ class KindGates:
     """What is asked of the kind of a line's segments, beside ``MapLinesOptions.min_repeatability``."""
 
     top_share: float = gate(
-        0.6, "1", "asked at most, over what the best kind of segment reaches", "chosen on ETH3D facades"
+        0.6, "1", "asked at most, over what the best kind of segment reaches", "chosen on benchmarks/lines.py"
     )
-    top_quantile: float = gate(0.9, "quantile", "of p that stands for the best kind", "chosen on ETH3D facades")
+    top_quantile: float = gate(0.9, "quantile", "of p that stands for the best kind", "chosen on benchmarks/lines.py")
 
 
 #: Newton steps of the fit at most.

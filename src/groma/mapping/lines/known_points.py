@@ -28,9 +28,11 @@ class KnownPointGates:
     """Which points lie on a segment, and agree."""
 
     max_distance: float = gate(
-        2.0, "px", "of a point from a segment, across it and beyond its ends", "chosen on wireframes"
+        2.0, "px", "of a point from a segment, across it and beyond its ends", "chosen on benchmarks/lines.py"
     )
-    tolerance: float = gate(0.01, "1", "relative difference of inverse depths that agree", "chosen on wireframes")
+    tolerance: float = gate(
+        0.01, "1", "relative difference of inverse depths that agree", "chosen on benchmarks/lines.py"
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels

@@ -40,6 +40,7 @@ class MergeGates:
         "bounds of the deviation that poses add",
         "chosen on fountain, herz: the upper one says nothing there",
     )
+    min_pairs: int = gate(5, "pairs", "fewer do not tell the deviation of the poses", "chosen on synthetic wireframes")
     max_distance: float = gate(8.0, "px", "between lines that are compared", "chosen on fountain, herz")
     max_angle: float = gate(0.2, "rad", "between lines that are compared", "chosen on fountain, herz")
 
@@ -293,7 +294,7 @@ def _pose_deviation(pairs: _Pairs, count: int, gates: MergeGates) -> float:
     floor = gates.pose_px[0]
     good = pairs.take(_preferred(pairs.lines, pairs.squared_distance(floor), count))
     excess = (good.offset**2).mean(1) - np.einsum("mii->m", good.covariance) / 4.0
-    if len(excess) == 0:
+    if len(excess) < gates.min_pairs:
         return floor
     return float(np.clip(np.sqrt(max(np.median(excess / good.unit**2), 0.0) / _MEDIAN_SQUARE), *gates.pose_px))
 

@@ -29,19 +29,22 @@ class NeighborGates:
     """Which images are good neighbours."""
 
     min_angle_deg: float = gate(
-        4.0, "deg", "between rays of shared points, below which they count less", "chosen on ETH3D facades"
+        4.0, "deg", "between rays of shared points, below which they count less", "chosen on benchmarks/lines.py"
     )
     max_angle_deg: float = gate(
-        25.0, "deg", "between rays of shared points, above which they count less", "chosen on ETH3D facades"
+        25.0, "deg", "between rays of shared points, above which they count less", "chosen on benchmarks/lines.py"
     )
     sample: int = gate(
         64, "points", "looked at per pair of images for the angle", "cost: the median of so many is enough"
     )
     max_turn_deg: float = gate(
-        60.0, "deg", "between viewing directions, where there are no points", "chosen on wireframes"
+        60.0, "deg", "between viewing directions, where there are no points", "chosen on benchmarks/lines.py"
     )
     turn_scale_deg: float = gate(
-        20.0, "deg", "of turn that counts like the usual distance, where there are no points", "chosen on wireframes"
+        20.0,
+        "deg",
+        "of turn that counts like the usual distance, where there are no points",
+        "chosen on benchmarks/lines.py",
     )
 
 

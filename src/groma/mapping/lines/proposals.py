@@ -52,7 +52,7 @@ class ProposalGates:
         2.0,
         "1",
         "factor by which the ends of a segment may leave the range of depths of its middle",
-        "chosen on wireframes",
+        "chosen on benchmarks/lines.py",
     )
 
     def limits(self) -> tuple[float, float, float]:
@@ -94,23 +94,8 @@ def _use_direction(ratio, max_squared, out):
 
 @kernel
 def _propose(
-    ray,
-    across,
-    sigma,
-    q_low,
-    q_high,
-    ratio,
-    line,
-    ends,
-    sigma_j,
-    M,
-    a,
-    directed,
-    min_overlap,
-    max_relative,
-    limits,
-    out,
-):
+    ray, across, sigma, q_low, q_high, ratio, line, ends, sigma_j, M, a, directed, min_overlap, max_relative, limits, out,
+):  # fmt: skip
     """One pair of segments: fill out = q1 q2 c11 c12 c22; return how far it got.
 
     ``limits`` are the least change over the range of depths in sigma, the margin of the ends, and the largest squared

@@ -37,16 +37,21 @@ class TextureGates:
     """The two populations, and the priors."""
 
     edge: tuple[float, float] = gate(
-        (0.6, 6.0), "1", "mean and concentration of the rate at which images show an edge", "chosen on ETH3D facades"
+        (0.6, 6.0),
+        "1",
+        "mean and concentration of the rate at which images show an edge",
+        "chosen on benchmarks/lines.py",
     )
-    texture: tuple[float, float] = gate((0.22, 15.0), "1", "the same of a line of texture", "chosen on ETH3D facades")
+    texture: tuple[float, float] = gate(
+        (0.22, 15.0), "1", "the same of a line of texture", "chosen on benchmarks/lines.py"
+    )
     line_shares: tuple[float, float] = gate(
         (0.06, 0.35),
         "share",
         "of what texture, and edges, give that becomes a line: middle of the prior",
-        "chosen on ETH3D facades",
+        "chosen on benchmarks/lines.py",
     )
-    share_sigma: float = gate(0.5, "log odds", "deviation of the prior of the shares", "chosen on ETH3D facades")
+    share_sigma: float = gate(0.5, "log odds", "deviation of the prior of the shares", "chosen on benchmarks/lines.py")
     weight_sigma: tuple[float, float] = gate(
         (10.0, 1.5),
         "log odds",

@@ -29,15 +29,20 @@ class TrackGates:
     )
 
     min_overlap_px: float = gate(
-        5.0, "px", "shortest projection of a line, and shortest overlap with a segment", "chosen on wireframes"
+        5.0, "px", "shortest projection of a line, and shortest overlap with a segment", "chosen on benchmarks/lines.py"
     )
-    min_common_images: int = gate(2, "images", "images that show that two lines are one", "chosen on wireframes")
+    min_common_images: int = gate(
+        2, "images", "images that show that two lines are one", "chosen on benchmarks/lines.py"
+    )
     min_observations: int = gate(
         4, "observations", "of a line whose residuals tell the noise", "derived from two of four numbers being left"
     )
     min_residuals: int = gate(30, "observations", "fewer tell nothing of the noise", "derived from 10 % of its error")
     noise_quantile: float = gate(
-        0.75, "quantile", "of the residuals, compared with that of normal ones", "chosen on wireframes: tails are heavy"
+        0.75,
+        "quantile",
+        "of the residuals, compared with that of normal ones",
+        "chosen on benchmarks/lines.py: tails are heavy",
     )
 
 

@@ -32,16 +32,19 @@ class ViewGates:
     """Where segments are looked for in depth."""
 
     num_near: int = gate(
-        6, "points", "around each end and the middle of a segment that tell its depth", "chosen on wireframes"
+        6, "points", "around each end and the middle of a segment that tell its depth", "chosen on benchmarks/lines.py"
     )
     depth_quantile: float = gate(
-        0.01, "quantile", "of the inverse depths in an image, at either end of its range", "chosen on wireframes"
+        0.01,
+        "quantile",
+        "of the inverse depths in an image, at either end of its range",
+        "chosen on benchmarks/lines.py",
     )
     num_baselines: int = gate(
-        5, "images", "nearest cameras that tell the scale where there are no points", "chosen on wireframes"
+        5, "images", "nearest cameras that tell the scale where there are no points", "chosen on benchmarks/lines.py"
     )
     inverse_depth_range: tuple[float, float] = gate(
-        (1e-3, 2.0), "1/baseline", "inverse depths searched where there are no points", "chosen on wireframes"
+        (1e-3, 2.0), "1/baseline", "inverse depths searched where there are no points", "chosen on benchmarks/lines.py"
     )
 
 

@@ -31,7 +31,10 @@ class LandmarkNoiseGates:
         0.02, "px", "deviation of a coordinate at least", "convention: synthetic scenes may have none"
     )
     max_share: float = gate(
-        3.0, "1", "lengths of a line from its middle, where a ray still tells where it ends", "chosen on wireframes"
+        3.0,
+        "1",
+        "lengths of a line from its middle, where a ray still tells where it ends",
+        "chosen on benchmarks/surveyed.py",
     )
 
 

@@ -42,9 +42,6 @@ from groma.scene import Scene
 class ObservationNoiseGates:
     """From how many residuals noise is estimated, and what is believed of it."""
 
-    min_observations: int = gate(
-        10, "observations", "fewer tell nothing", "derived from a third of the noise as its error"
-    )
     unknown_px: float = gate(1.0, "px", "noise where nothing tells it", "convention: a pixel")
     max_fitted: float = gate(
         0.8, "share", "of the residuals that landmarks take at most", "derived from five tracks of two"
@@ -55,18 +52,14 @@ class ObservationNoiseGates:
     min_landmarks: int = gate(
         100, "landmarks", "of so many views, that tell the noise of all", "derived from 10 % of its error"
     )
-    min_square: float = gate(
-        1e-4, "1", "smallest squared residual, over the usual one", "convention: a logarithm is taken"
-    )
-    shapes: tuple[float, float] = gate(
-        (0.5, 1e4), "1", "bounds of half the degrees of freedom", "convention: heavy tails to normal"
-    )
-    max_correlation: float = gate(0.8, "1", "of the two ends of segments", "chosen on ETH3D facades")
+    max_correlation: float = gate(0.8, "1", "of the two ends of segments", "chosen on benchmarks/surveyed.py")
 
 
 GATES = ObservationNoiseGates()
 #: The median of the squared norm of two normal coordinates, in variances.
 _MEDIAN = 2.0 * math.log(2.0)
+#: Guards: smallest squared residual over the usual one (its logarithm is taken), bounds of half the degrees of freedom.
+_MIN_SQUARE, _SHAPES = 1e-4, (0.5, 1e4)
 #: Rounds of expectation maximisation.
 _STEPS = 20
 
@@ -83,7 +76,7 @@ def noise_px(scene: Scene, kind: Literal["points", "lines"], end_correlation: fl
     )
     assembly = assemble(scene, options)
     squares = squared_residuals_px(assembly, weighted=True).get(kind)
-    if squares is None or len(squares) < GATES.min_observations:
+    if squares is None or len(squares) == 0:
         return GATES.unknown_px
     unknowns = 3 * scene.num_points if kind == "points" else 4 * scene.num_lines
     share = 1.0 - min(unknowns / (2 * len(squares)), GATES.max_fitted)
@@ -142,7 +135,7 @@ def with_point_noise(scene: Scene) -> Scene:
     usual = float(np.median(squares / share)) / _MEDIAN
     if usual < LANDMARK_GATES.min_sigma_px**2:
         return scene
-    squares = np.maximum(squares, GATES.min_square * usual * share)
+    squares = np.maximum(squares, _MIN_SQUARE * usual * share)
     between, within = _degrees_of_freedom(np.log(squares / share), owner, number)
     variance = np.full(count, usual)
     for _ in range(_STEPS):
@@ -169,7 +162,7 @@ def _degrees_of_freedom(levels: FloatArray, owner: IntArray, number: IntArray) -
 
 def _inverse_trigamma(value: float) -> float:
     """Where the trigamma function, which falls, has a value; the nearer end where that is out of bounds."""
-    shapes = np.geomspace(*GATES.shapes, 1000)[::-1]
+    shapes = np.geomspace(*_SHAPES, 1000)[::-1]
     return float(np.interp(value, polygamma(1, shapes), shapes))
 
 

@@ -38,7 +38,7 @@ class SharedNoiseGates:
         (1.0, 2.0, 4.0, 8.0, 16.0), "cells", "distances at which rings of pairs end", "convention: doubling"
     )
     min_observations: int = gate(
-        1000, "observations", "fewer tell nothing of what they share", "chosen on ETH3D facades"
+        1000, "observations", "fewer tell nothing of what they share", "chosen on benchmarks/surveyed.py"
     )
     min_share: float = gate(
         0.25, "share", "of the variance of errors that residuals have at least", "derived from points of two views"

@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -161,12 +160,16 @@ def detect_structure(
     found["line_along_direction"] = along.renumbered(new)
     found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()
     orthogonal, parallel = _orthogonal(planes, directions)
-    pairs: dict[str, Any] = {name: relation.pairs for name, relation in found.items()}
     return Structure(
         scene=scene.replace(
             planes=Planes(np.arange(len(planes)) + 1, planes.planes),
             directions=Directions(np.arange(len(directions)) + 1, directions.vectors),
-            relations=Relations(**pairs),
+            relations=Relations(
+                point_on_plane=found["point_on_plane"].pairs,
+                line_on_plane=found["line_on_plane"].pairs,
+                line_along_direction=found["line_along_direction"].pairs,
+                point_on_line=found["point_on_line"].pairs,
+            ),
         ),
         planes=planes,
         directions=directions,

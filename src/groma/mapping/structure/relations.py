@@ -28,17 +28,16 @@ class RelationGates:
     """What competes for a landmark, and where landmarks are looked for."""
 
     competing: float = gate(
-        0.26, "rad", "between the normals of planes that compete for a landmark", "chosen on ETH3D facades"
+        0.26, "rad", "between the normals of planes that compete for a landmark", "chosen on benchmarks/surveyed.py"
     )
-    min_cap: float = gate(0.035, "rad", "half width of the band around a direction at least", "chosen on ETH3D facades")
     line_margin: float = gate(
-        0.02, "1", "of the length of a line, that points on it may be beyond", "chosen on ETH3D facades"
+        0.02, "1", "of the length of a line, that points on it may be beyond", "chosen on benchmarks/surveyed.py"
     )
     pooled: float = gate(
         4.0, "features", "that the share of all lines counts in that of each", "chosen on walls full of points"
     )
     neighbor: int = gate(
-        8, "neighbours", "at whose distance a landmark has its surroundings", "chosen on ETH3D facades"
+        8, "neighbours", "at whose distance a landmark has its surroundings", "chosen on benchmarks/surveyed.py"
     )
     num_nearest: int = gate(12, "samples", "of segments that a point is compared with", "cost: time of a search")
     num_samples: tuple[int, int] = gate(
@@ -138,7 +137,6 @@ def along_directions(
     sigma: float,
     level: float,
     least: float,
-    gates: RelationGates = RelationGates(),
 ) -> Pairs:
     """Lines along directions, at most one direction for each line."""
     rows = np.flatnonzero(marks.line_usable)
@@ -156,7 +154,7 @@ def along_directions(
         spread = np.sqrt(np.linalg.eigvalsh(noise)[:, 1])
         angle = norm(across)
         passing = squared < largest
-        bands[k] = max(gates.min_cap, BAND * float(np.median(spread[passing])) if passing.any() else 0.0)
+        bands[k] = BAND * float(np.median(spread[passing])) if passing.any() else 0.0
         near = angle < bands[k]
         tables.append(_with_plane(rows[near], k, angle[near], spread[near], squared[near], largest))
     table = np.concatenate(tables)
