@@ -37,9 +37,16 @@ COMPILED = ("kernel", "loop", "njit")
 def numbers_of(path: Path) -> Iterator[tuple[str, int, float | str]]:
     """Yield kind, line and number of all that is counted in a file; of a gate the first word of its origin."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
+    words = {}
     for node in tree.body:
         yield from _named(node)
-    yield from _inside(tree, False)
+        if (
+            isinstance(node, ast.Assign)
+            and isinstance(node.value, ast.Constant)
+            and isinstance(node.targets[0], ast.Name)
+        ):
+            words[node.targets[0].id] = node.value.value
+    yield from _inside(tree, False, words)
 
 
 def count(root: str | Path) -> dict[str, Counter[str]]:
@@ -62,15 +69,15 @@ def _named(node: ast.stmt) -> Iterator[tuple[str, int, float | str]]:
         yield from (("named", node.lineno, value) for value in _numbers(node.value))
 
 
-def _inside(node: ast.AST, compiled: bool) -> Iterator[tuple[str, int, float | str]]:
+def _inside(node: ast.AST, compiled: bool, words: dict[str, object]) -> Iterator[tuple[str, int, float | str]]:
     """Walk through classes and functions."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.ClassDef):
             gates = child.name.endswith("Gates")
             for item in child.body:
                 if isinstance(item, ast.AnnAssign) and item.value is not None:
-                    yield from _gate(item) if gates else _defaults([item.value])
-            yield from _inside(child, False)
+                    yield from _gate(item, words) if gates else _defaults([item.value])
+            yield from _inside(child, False, words)
         elif isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
             decorators = {
                 name.id for one in child.decorator_list for name in ast.walk(one) if isinstance(name, ast.Name)
@@ -81,13 +88,18 @@ def _inside(node: ast.AST, compiled: bool) -> Iterator[tuple[str, int, float | s
             for statement in child.body:
                 yield from _literals(statement, inner, False)
         elif isinstance(child, ast.If | ast.Try | ast.With):
-            yield from _inside(child, compiled)
+            yield from _inside(child, compiled, words)
 
 
-def _gate(item: ast.AnnAssign) -> Iterator[tuple[str, int, float | str]]:
-    origins = [value for value in ast.walk(item) if isinstance(value, ast.Constant) and isinstance(value.value, str)]
-    words = str(origins[-1].value).split() if origins else []
-    yield "gates", item.lineno, words[0].rstrip(":") if words else "without"
+def _gate(item: ast.AnnAssign, words: dict[str, object]) -> Iterator[tuple[str, int, float | str]]:
+    call = item.value
+    if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.func.id != "gate":
+        return
+    origin = call.args[-1]
+    while isinstance(origin, ast.BinOp):  # begins with a name: NAME + " and more"
+        origin = origin.left
+    text = words.get(origin.id, "chosen on") if isinstance(origin, ast.Name) else ast.literal_eval(origin)
+    yield "gates", item.lineno, str(text).split()[0].rstrip(":")
 
 
 def _defaults(values: list[ast.expr]) -> Iterator[tuple[str, int, float | str]]:
@@ -117,6 +129,9 @@ def _literals(node: ast.AST, compiled: bool, ordered: bool) -> Iterator[tuple[st
 
 def _numbers(node: ast.expr) -> list[float]:
     """Return the numbers in an expression that is made of literals, tuples, arithmetic and calls of them."""
+    calls = [part.func for part in ast.walk(node) if isinstance(part, ast.Call)]
+    if any(ast.unparse(call).split(".")[-1] not in ("radians", "array", "float32", "sqrt", "log") for call in calls):
+        return []
     allowed = (ast.Constant, ast.Tuple, ast.List, ast.UnaryOp, ast.BinOp, ast.Call, ast.Attribute, ast.Name)
     context = (ast.Load, ast.operator, ast.unaryop, ast.keyword)
     parts = list(ast.walk(node))

@@ -29,6 +29,7 @@ extensions = [
     "sphinx.ext.viewcode",
     "_factor_table",
     "_reference",
+    "_thresholds",
 ]
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3

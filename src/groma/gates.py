@@ -19,8 +19,11 @@ pixels. Options that a user is meant to change stay in the ``...Options`` classe
 
 from __future__ import annotations
 
+import re
 from dataclasses import field, fields, is_dataclass
 from functools import lru_cache
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 #: How the origin of a number may begin.
@@ -50,6 +53,21 @@ def is_gate_class(value: object) -> bool:
     return isinstance(value, type) and is_dataclass(value) and value.__name__.endswith("Gates")
 
 
+def gate_classes() -> list[type]:
+    """Return all classes of gates of the package, by module and name; imports the modules that declare some."""
+    found: list[type] = []
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        if not re.search(r"^class \w+Gates\b", path.read_text(encoding="utf-8"), re.MULTILINE):
+            continue
+        parts = path.relative_to(Path(__file__).parents[1]).with_suffix("").parts
+        module = import_module(".".join(parts).removesuffix(".__init__"))
+        declared = [
+            kind for kind in vars(module).values() if is_gate_class(kind) and kind.__module__ == module.__name__
+        ]
+        found += [kind for kind in declared if any("unit" in item.metadata for item in fields(kind))]
+    return found
+
+
 def table(gates: type) -> list[tuple[str, Any, str, str, str]]:
     """Return name, number, unit, meaning and origin of every gate of a class."""
     return [
@@ -74,4 +92,4 @@ def chi_square_gate(probability: float, dof: int) -> float:
     return float(chdtri(dof, probability))
 
 
-__all__ = ["ORIGINS", "chi_square_gate", "gate", "is_gate_class", "numbers", "table"]
+__all__ = ["ORIGINS", "chi_square_gate", "gate", "gate_classes", "is_gate_class", "numbers", "table"]

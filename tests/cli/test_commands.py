@@ -63,6 +63,17 @@ def test_adjust(scenes, here, capsys):
     assert sorted(os.listdir(here)) == ["out.npz", "p.html", "r.json"]
 
 
+@pytest.mark.parametrize("form", ["bearing", "normal"])
+def test_adjust_by_other_residuals_of_lines(scenes, here, form):
+    arguments = ["adjust", str(scenes / "start.npz"), "--no-planes", "--gauge", "first_camera", "--json", "r.json"]
+    arguments += ["--loss", "none", "--force"]
+    assert run([*arguments, "-o", "usual.npz"]) == 0
+    assert run([*arguments, "-o", "other.npz", "--line-residual", form]) == 0
+    usual, other = (read_scene(f"{name}.npz").cam_centers_in_world for name in ("usual", "other"))
+    assert not np.array_equal(usual, other)
+    np.testing.assert_allclose(usual, other, atol=0.05)
+
+
 def test_adjust_does_not_change_its_input(scenes, here):
     before = (scenes / "start.npz").read_bytes()
     assert run(["adjust", str(scenes / "start.npz"), "-o", "out.npz", "--max-iterations", "1"]) == 0

@@ -6,25 +6,24 @@ from scipy.optimize import least_squares
 
 from groma._numba import kernel
 from groma.errors import InputError
-from groma.estimators.batch_least_squares import problem_kind, solve_batch
+from groma.estimators.batch_least_squares import Observations, problem_kind, solve_batch
 
 pytestmark = pytest.mark.kernels
 
 
 @kernel
-def _frame(data, x, B):
+def _frame(x, B):
     B[0] = np.exp(x[1])  # what depends on the state alone is computed once for all observations
 
 
 @kernel
-def _residuals(data, m, x, B, r, J):
+def _residuals(shared, k, own, m, x, B, r, J):
     """y = a exp(-exp(b) t) + c, and a weak prior on c in the second row."""
-    t, y = data
-    decay = np.exp(-np.exp(x[1]) * t[m])
-    r[0] = x[0] * decay + x[2] - y[m]
-    r[1] = 0.01 * x[2]
-    J[0, 0], J[0, 1], J[0, 2] = decay, -x[0] * B[0] * t[m] * decay, 1.0
-    J[1, 0], J[1, 1], J[1, 2] = 0.0, 0.0, 0.01
+    decay = np.exp(-np.exp(x[1]) * own[m, 0])
+    r[0] = x[0] * decay + x[2] - own[m, 1]
+    r[1] = shared[k, 0] * x[2]
+    J[0, 0], J[0, 1], J[0, 2] = decay, -x[0] * B[0] * own[m, 0] * decay, 1.0
+    J[1, 0], J[1, 1], J[1, 2] = 0.0, 0.0, shared[k, 0]
 
 
 @kernel
@@ -48,6 +47,12 @@ def problems(seed, count=60, noise=0.02, wrong=0.0):
     return pointers, truth, t, y, truth + rng.normal(0, 0.2, truth.shape)
 
 
+def observed(t, y, pointers, active=None):
+    """All observations share the root of the prior's weight."""
+    every = np.ones(len(t), bool) if active is None else active
+    return Observations(np.full((1, 1), 0.01), np.zeros(len(t), np.int64), np.stack([t, y], axis=1), pointers, every)
+
+
 def scipy_minimum(t, y, x, cauchy_scale):
     """The same problem: every observation has both rows under one loss, so SciPy gets the root of each cost."""
 
@@ -63,9 +68,7 @@ def scipy_minimum(t, y, x, cauchy_scale):
 def test_finds_the_minima_that_scipy_finds(cauchy_scale):
     pointers, truth, t, y, start = problems(0, wrong=0.05 if np.isfinite(cauchy_scale) else 0.0)
     before = start.copy()
-    found = solve_batch(
-        DECAY, (t, y), pointers, np.ones(len(t), bool), start, 100, 1e-14, floor=0.0, cauchy_scale=cauchy_scale
-    )
+    found = solve_batch(DECAY, observed(t, y, pointers), start, 100, 1e-14, floor=0.0, cauchy_scale=cauchy_scale)
     np.testing.assert_array_equal(start, before)
     assert found.converged.mean() > 0.95
     for n in np.flatnonzero(found.converged):
@@ -84,7 +87,7 @@ def test_finds_the_minima_that_scipy_finds(cauchy_scale):
 
 def test_information_is_that_of_the_jacobian():
     pointers, _, t, y, start = problems(1, count=5)
-    found = solve_batch(DECAY, (t, y), pointers, np.ones(len(t), bool), start, 100)
+    found = solve_batch(DECAY, observed(t, y, pointers), start, 100)
     for n, (a, b, _c) in enumerate(found.states):
         at = t[pointers[n] : pointers[n + 1]]
         decay = np.exp(-np.exp(b) * at)
@@ -98,8 +101,8 @@ def test_what_is_left_out_has_no_part():
     pointers, _, t, y, start = problems(2)
     active = np.random.default_rng(3).random(len(t)) < 0.8
     kept = np.concatenate([[0], np.cumsum(active)])[pointers]
-    with_all = solve_batch(DECAY, (t, np.where(active, y, 1e6)), pointers, active, start, 50)
-    alone = solve_batch(DECAY, (t[active], y[active]), kept, np.ones(active.sum(), bool), start, 50)
+    with_all = solve_batch(DECAY, observed(t, np.where(active, y, 1e6), pointers, active), start, 50)
+    alone = solve_batch(DECAY, observed(t[active], y[active], kept), start, 50)
     np.testing.assert_array_equal(with_all.states, alone.states)
     np.testing.assert_array_equal(with_all.steps, alone.steps)
 
@@ -107,20 +110,20 @@ def test_what_is_left_out_has_no_part():
 def test_odd_cases():
     pointers, _, t, y, start = problems(4, count=4)
     active = np.ones(len(t), bool)
-    nothing = solve_batch(DECAY, (t, y), np.zeros(1, np.int64), active, start[:0])
+    nothing = solve_batch(DECAY, observed(t, y, np.zeros(1, np.int64)), start[:0])
     assert nothing.states.shape == (0, 3) and nothing.information.shape == (0, 3, 3)
     active[pointers[1] : pointers[2]] = False  # nothing is known of the second
     active[pointers[2] + 1 : pointers[3]] = False  # one observation does not determine three numbers
-    found = solve_batch(DECAY, (t, y), pointers, active, start, 50)
+    found = solve_batch(DECAY, observed(t, y, pointers, active), start, 50)
     np.testing.assert_array_equal(found.states[1], start[1])
     assert found.cost[1] == 0.0 and np.isfinite(found.states).all()
     assert found.cost[2] < 1e-3
     np.testing.assert_allclose(
         found.states[[0, 3]],
-        solve_batch(DECAY, (t, y), pointers, np.ones(len(t), bool), start, 50).states[[0, 3]],
+        solve_batch(DECAY, observed(t, y, pointers), start, 50).states[[0, 3]],
         rtol=1e-12,
     )
-    untouched = solve_batch(DECAY, (t, y), pointers, active, start, 0)
+    untouched = solve_batch(DECAY, observed(t, y, pointers, active), start, 0)
     np.testing.assert_array_equal(untouched.states, start)
     assert not untouched.converged.any()
 

@@ -13,7 +13,7 @@ from groma.errors import InputError, ShapeError
 from groma.features import LsdDetector, SegmentDetector, Segments
 from groma.features.edge_fit import measure_edges
 from groma.features.images import to_gray
-from groma.features.merging import merge_collinear
+from groma.features.merging import MergeGates, merge_collinear
 
 pytestmark = pytest.mark.kernels
 
@@ -214,7 +214,7 @@ def test_merging_joins_only_what_is_collinear_and_alike():
     steps = np.linspace(0.0, 1.2, 25)  # an arc of short pieces: each neighbour fits, the whole does not
     arc = 100.0 * np.stack([np.cos(steps), np.sin(steps)], axis=1)
     pieces = np.hstack([arc[:-1], arc[1:]])
-    np.testing.assert_array_equal(merge_collinear(pieces, angle=0.1), pieces)
+    np.testing.assert_array_equal(merge_collinear(pieces, MergeGates(angle=0.1)), pieces)
 
 
 def test_fitting_leaves_what_has_no_edge():

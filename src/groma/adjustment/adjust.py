@@ -9,23 +9,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._counted import counted
-from groma.adjustment.assemble import (
-    LINE_FACTORS,
-    POINT_FACTORS,
-    Assembly,
-    AssemblyOptions,
-    assemble,
-    at_places_of,
-    disassemble,
-)
+from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, at_places_of, disassemble
+from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.relation_outcome import drop_failed_relations
 from groma.adjustment.report import AdjustReport, AdjustResult, Progress
 from groma.adjustment.rescue.clusters import settle_clusters
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
-from groma.adjustment.stages import combined, stage_entries, with_costs_at, with_loss
-from groma.adjustment.terms.relations import SURFACE_SIGMA_PX
+from groma.adjustment.stages import METRIC_LOSS, METRIC_RELATION_LOSS, combined, stage_entries, with_costs_at, with_loss
+from groma.adjustment.terms.contract import Term
 from groma.errors import InputError
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
@@ -47,6 +40,8 @@ STAGE_TOLERANCE = 1e-2
 #: The same for the first stage of plain least squares with lines, after which lines may be restarted. It also ends at
 #: the first step that is refused: mostly a single line in a wrong minimum is to blame.
 RESTART_TOLERANCE = 0.3
+#: Terms that a report counts among the observations, and among the relations.
+_COUNTED_OTHERWISE = ("point observations", "line observations", "relations", "relations in pixels")
 
 
 @dataclass(frozen=True)
@@ -54,7 +49,8 @@ class AdjustOptions:
     """Options of :func:`adjust`. The defaults suit scenes that come from matching images."""
 
     #: ``none``, ``huber``, ``soft_l1``, ``cauchy``, ``tukey``, ``geman_mcclure``, ``barron`` or ``truncated``;
-    #: ``auto`` is none for BAL problems, else Cauchy and then Geman-McClure, because matches contain outliers.
+    #: ``auto`` is none for BAL problems; Cauchy for scenes with depths, stereo pairs or planes measured in the cameras,
+    #: as in tracking; else Cauchy and then Geman-McClure, because matches contain outliers.
     loss: str = "auto"
     #: Where the loss begins to bend, in standard deviations (pixels by default); None takes 1, and 2 in the second
     #: stage of ``auto``.
@@ -77,6 +73,12 @@ class AdjustOptions:
     line_sigma_px: float = 1.0
     #: Correlation of the errors of a segment's two ends: see :class:`groma.adjustment.assemble.AssemblyOptions`.
     line_end_correlation: float = 0.0
+    #: How segments and measured planes are compared with landmarks: ``endpoints``, ``bearing`` or ``normal``, and
+    #: ``normal_offset`` or ``quaternion``: see :class:`groma.adjustment.assemble.AssemblyOptions`.
+    line_residual: str = "endpoints"
+    plane_residual: str = "normal_offset"
+    #: Kinds of measurements from outside: see :mod:`groma.adjustment.terms.contract`.
+    terms: tuple[Term, ...] = ()
     #: How relations between landmarks are measured: ``metric`` or ``pixels``, and how well they hold if metric: see
     #: :class:`groma.adjustment.assemble.AssemblyOptions`.
     structure_form: str = "metric"
@@ -144,7 +146,8 @@ def adjust(
 def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
     """Adjust a scene that is near the origin of its world."""
     stages = _stages(scene, options)
-    assembly = assemble(scene, _assembly_options(scene, options, stages[-1]))
+    relation_loss = _relation_loss(scene, options)
+    assembly = assemble(scene, _assembly_options(scene, options, stages[-1], relation_loss), options.terms)
     if not assembly.problem.factors:
         raise InputError(
             f"There is nothing to adjust: the scene has {counted(scene.num_images, 'images')}, "
@@ -175,7 +178,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
 
         if last and number:
             loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
-        staged = Problem(problem.variables, [with_loss(factor, loss) for factor in problem.factors])
+        staged = Problem(problem.variables, [with_loss(factor, loss, relation_loss) for factor in problem.factors])
         solution = solve(staged, solver_options, tell)
         problem = solution.problem
         reports.append(solution.report)
@@ -194,14 +197,14 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
     if any(map(len, moved)):
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
     before, after = (_rmse_px(replace(assembly, problem=p)) for p in (assembly.problem, problem))
+    counts = assembly.num_measurements
     outcome = AdjustReport(
         num_images=scene.num_images,
         num_points=scene.num_points if "points" in assembly.problem.variables else 0,
         num_lines=scene.num_lines if "lines" in assembly.problem.variables else 0,
         num_planes=scene.num_planes if "planes" in assembly.problem.variables else 0,
-        num_observations=sum(
-            len(factor) for factor in assembly.problem.factors if factor.type_name in POINT_FACTORS + LINE_FACTORS
-        ),
+        num_observations=sum(len(group.factor) for group in assembly.groups if group.observes),
+        num_measurements={name: count for name, count in counts.items() if name not in _COUNTED_OTHERWISE},
         rmse_px={kind: {"before": before[kind], "after": after[kind]} for kind in before},
         solve=report,
         relations=relations,
@@ -222,8 +225,15 @@ def _stages(scene: Scene, options: AdjustOptions) -> list[Loss]:
         return [Trivial(), Trivial()] if with_lines else [Trivial()]
     if options.loss == "auto":
         scale = 1.0 if options.loss_scale is None else options.loss_scale
+        if scene.is_metric:
+            return [replace(METRIC_LOSS, scale=METRIC_LOSS.scale * scale)]
         return [make_loss(name, scale * factor) for name, factor in ROBUST_STAGES]
     return [make_loss(options.loss, 1.0 if options.loss_scale is None else options.loss_scale)]
+
+
+def _relation_loss(scene: Scene, options: AdjustOptions) -> Loss | None:
+    """Return the loss of relations between landmarks, if it does not follow from that of the observations."""
+    return METRIC_RELATION_LOSS if options.loss == "auto" and scene.is_metric else None
 
 
 def _wide_enough(loss: Loss, assembly: Assembly) -> Loss:
@@ -263,7 +273,7 @@ def _is_coupled(problem: Problem) -> bool:
     return any(factor.type_name == "point_on_line" for factor in problem.factors)
 
 
-def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss) -> AssemblyOptions:
+def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss, relation_loss: Loss | None) -> AssemblyOptions:
     is_bal = _is_bal(scene)
     refine = is_bal if options.refine_intrinsics is None else options.refine_intrinsics
     return AssemblyOptions(
@@ -279,9 +289,12 @@ def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss) -> Assem
         point_sigma_px=options.point_sigma_px,
         line_sigma_px=options.line_sigma_px,
         line_end_correlation=options.line_end_correlation,
+        line_residual=options.line_residual,
+        plane_residual=options.plane_residual,
         structure_form=options.structure_form,
         structure_sigma_px=options.structure_sigma_px,
         loss=loss,
+        relation_loss=relation_loss,
         drop_behind=not is_bal,
     )
 

@@ -122,9 +122,7 @@ def _variants(scene: Scene, options: AdjustOptions) -> list[tuple[str, Scene, Ad
     if with_lines:
         steps.append(("lines", Relations(), True, False))
     if with_planes:
-        steps.append(
-            ("planes and directions", replace(all_of, point_on_line=all_of.point_on_line[:0]), with_lines, True)
-        )
+        steps.append(("planes and directions", all_of.take(point_on_line=[]), with_lines, True))
     if with_lines and len(all_of.point_on_line):
         steps.append(("points on lines", all_of, True, with_planes))
     return [

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.adjustment.assemble import LINE_FACTORS, POINT_FACTORS, Assembly
+from groma.adjustment.assemble import Assembly
 from groma.problem.residuals import residuals_of
 
 
@@ -29,16 +29,22 @@ def squared_residuals_px(assembly: Assembly, weighted: bool = False) -> dict[str
     """
     parts: dict[str, list[FloatArray]] = {}
     problem = assembly.problem
-    for number, factor in enumerate(problem.factors):
-        kind = "points" if factor.type_name in POINT_FACTORS else "lines" if factor.type_name in LINE_FACTORS else None
-        if kind is None or len(factor) == 0:
+    for group, factor in zip(assembly.groups, problem.factors, strict=True):
+        if not group.observes or len(factor) == 0:
             continue
         residual = residuals_of(factor, problem.variables)
-        if kind == "lines" and not weighted:
+        unit = np.asarray(factor.sqrt_information if weighted else _or_1(group.pixels_of_residual))
+        if unit.ndim == 3:
+            residual, unit = np.einsum("nij,nj->ni", unit, residual), np.ones(1)
+        if group.observes == "lines" and not weighted:
             residual = at_ends(residual, assembly.reach)
-        unit = factor.sqrt_information if weighted else assembly.pixels_of_residual.get(number, 1.0)
-        parts.setdefault(kind, []).append(np.einsum("ni,ni->n", residual, residual) * np.asarray(unit) ** 2)
+        residual = residual[:, :2]  # of a stereo pair the left image
+        parts.setdefault(group.observes, []).append(np.einsum("ni,ni->n", residual, residual) * unit**2)
     return {kind: np.concatenate(squares) for kind, squares in parts.items()}
+
+
+def _or_1(pixels: FloatArray | None) -> FloatArray:
+    return np.ones(1) if pixels is None else pixels
 
 
 def at_ends(residual: FloatArray, reach: float) -> FloatArray:

@@ -12,17 +12,18 @@ from the motions.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from groma._counted import counted
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.report import Progress
 from groma.errors import InputError
 from groma.factors.contract import Ref
+from groma.factors.losses import Loss, Trivial
 from groma.factors.losses import loss as make_loss
 from groma.factors.priors.pose_between import PoseBetween
 from groma.geometry import se3
@@ -30,7 +31,7 @@ from groma.geometry.charts.pose_charts import POSE_CHARTS
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
 from groma.problem.variables import Variables
-from groma.scene.pose_graph import PoseGraph
+from groma.scene.pose_graph import Motions, PoseGraph
 from groma.solver.options import SolverOptions
 from groma.solver.report import Iteration, SolveReport
 from groma.solver.solve import solve
@@ -171,17 +172,40 @@ def pose_graph_problem(graph: PoseGraph, options: PoseGraphOptions | None = None
     held = held.copy()
     held[first[~has_held]] = True
     constant = held[:, None] | (_OUT_OF_PLANE & graph.planar)
-    state = se3.inverse(graph.poses.world_from_body)
     robust = make_loss(options.loss, LOSS_SCALE if options.loss_scale is None else options.loss_scale)
-    every = PoseBetween(
-        first=Ref("poses", graph.motions.first_idx),
-        second=Ref("poses", graph.motions.second_idx),
-        first_from_second=graph.motions.first_from_second,
-        sqrt_information=_roots(graph.motions.information),
-    )
     trusted, doubted = _rows(graph, options)
-    factors = [every.take(trusted), replace(every.take(doubted), loss=robust)]
-    return Problem({"poses": Variables(POSE_CHARTS["left"], state, constant)}, factors)
+    return motion_problem(
+        se3.inverse(graph.poses.world_from_body), constant, graph.motions, [(trusted, Trivial()), (doubted, robust)]
+    )
+
+
+def motion_problem(
+    body_from_world: FloatArray,
+    constant: BoolArray,
+    motions: Motions,
+    losses: Sequence[tuple[IntArray, Loss]],
+) -> Problem:
+    """Return the problem of poses with motions measured between them.
+
+    Parameters
+    ----------
+    body_from_world : (N, 7)
+        The poses: the variables ``poses``.
+    constant : (N,) or (N, 6) bool
+        Which of them, or of their coordinates, are held.
+    motions : Motions
+        What was measured.
+    losses : sequence of (rows, loss)
+        The loss of some motions each: one group of factors.
+    """
+    every = PoseBetween(
+        first=Ref("poses", motions.first_idx),
+        second=Ref("poses", motions.second_idx),
+        first_from_second=motions.first_from_second,
+        sqrt_information=_roots(motions.information),
+    )
+    factors = [replace(every.take(rows), loss=loss) for rows, loss in losses]
+    return Problem({"poses": Variables(POSE_CHARTS["left"], body_from_world, constant)}, factors)
 
 
 def _rows(graph: PoseGraph, options: PoseGraphOptions) -> tuple[IntArray, IntArray]:
@@ -204,4 +228,4 @@ def _roots(information: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
 
 
-__all__ = ["PoseGraphOptions", "PoseGraphResult", "adjust_pose_graph", "pose_graph_problem"]
+__all__ = ["PoseGraphOptions", "PoseGraphResult", "adjust_pose_graph", "motion_problem", "pose_graph_problem"]

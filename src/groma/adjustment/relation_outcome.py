@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from groma._typing import BoolArray
@@ -39,5 +37,5 @@ def drop_failed_relations(scene: Scene, problem: Problem) -> tuple[Scene, dict[s
             failed = np.asarray(factor.loss.evaluate(squared)[1] < MIN_WEIGHT)
         outcome[name] = {"held": int((~failed).sum()), "dropped": int(failed.sum())}
         if failed.any():
-            relations = replace(relations, **{name: getattr(relations, name)[~failed]})
+            relations = relations.take(**{name: ~failed})
     return (scene.replace(relations=relations) if relations is not scene.relations else scene), outcome

@@ -54,10 +54,13 @@ class AdjustReport:
     stages: tuple[dict[str, Any], ...] = ()
     #: Relations between landmarks by kind: how many held, and how many the loss gave up, which the scene then drops.
     relations: dict[str, dict[str, int]] = field(default_factory=dict)
+    #: Other measurements than points and segments in images, by kind: depths, columns in right images and so on.
+    num_measurements: dict[str, int] = field(default_factory=dict)
 
     def __str__(self) -> str:
         counts = {"images": self.num_images, "points": self.num_points, "lines": self.num_lines}
         counts |= {"planes": self.num_planes, "observations": self.num_observations}
+        counts |= self.num_measurements
         rows = [", ".join(counted(number, kind) for kind, number in counts.items() if number)]
         rows += [
             f"{kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms)"
@@ -89,6 +92,7 @@ class AdjustReport:
             "num_lines": self.num_lines,
             "num_planes": self.num_planes,
             "num_observations": self.num_observations,
+            "num_measurements": self.num_measurements,
             "num_residuals": solve.num_residuals,
             "num_unknowns": solve.num_unknowns,
             "initial_cost": solve.initial_cost,

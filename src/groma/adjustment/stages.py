@@ -8,7 +8,7 @@ from typing import Any
 
 from groma.adjustment.terms.relations import RELATION_FACTORS
 from groma.factors.contract import Factor
-from groma.factors.losses import Loss
+from groma.factors.losses import Cauchy, Loss
 from groma.factors.losses import loss as make_loss
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
@@ -17,11 +17,21 @@ from groma.solver.solve import solve
 
 #: Scales of the losses of matches for relations between landmarks, in standard deviations of those.
 RELATION_SCALES = {"cauchy": 2.0, "geman_mcclure": 4.0}
+#: The loss of scenes with depths, stereo pairs or planes measured in the cameras, and that of their relations: each
+#: measurement has a standard deviation of its own, and what does not belong was left out in tracking.
+METRIC_LOSS, METRIC_RELATION_LOSS = Cauchy(2.0), Cauchy(1.0)
 
 
-def with_loss(factor: Factor, loss: Loss) -> Factor:
-    """Return the factors under a loss; relations between landmarks have a noise of their own, and the plain scale."""
-    if factor.type_name in RELATION_FACTORS and loss.name in RELATION_SCALES:
+def with_loss(factor: Factor, loss: Loss, relation_loss: Loss | None = None) -> Factor:
+    """Return the factors under a loss; priors stay without one.
+
+    Relations between landmarks have a noise of their own, and a given loss or the plain scale.
+    """
+    if factor.type_name == "pose_prior":
+        return factor
+    if factor.type_name in RELATION_FACTORS and relation_loss is not None:
+        loss = relation_loss
+    elif factor.type_name in RELATION_FACTORS and loss.name in RELATION_SCALES:
         loss = make_loss(loss.name, RELATION_SCALES[loss.name])
     return factor if factor.loss == loss else replace(factor, loss=loss)
 

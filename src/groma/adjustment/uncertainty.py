@@ -94,7 +94,7 @@ def uncertainty(
         The noise and the losses it was adjusted with; ``gauge`` in it is overridden.
     gauge : str
         ``inner``: a free network; the camera centres vary least together. ``held``: the first camera and the scale are
-        certain. ``auto``: inner, or held where relations between landmarks, measured in lengths, tie the scale.
+        certain. ``auto``: inner, or held where lengths in the cameras or between landmarks tie the scale.
     sigma0 : float
         Covariances are multiplied by its square; pass the root of the report's ``reduced_chi_square`` where the stated
         noise is not to be believed.
@@ -133,7 +133,7 @@ def _uncertainty(
     """Return the covariances of a scene that is near the origin of its world."""
     if gauge == "auto":
         metric = options.planes and len(scene.relations) > 0 and options.structure_form == "metric"
-        gauge = "held" if metric else "inner"
+        gauge = "held" if metric or scene.is_metric else "inner"
     if problem is None:
         held = "first_camera" if gauge == "held" else "free"
         problem = assemble(scene, replace(options, gauge=held)).problem

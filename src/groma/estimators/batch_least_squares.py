@@ -17,9 +17,13 @@ Python once for each would take longer than solving them.
 
 A kind of problem is three kernels, and is registered with a number (:func:`problem_kind`)::
 
-    frame(data, x, B)                   write to B what its two other kernels need to know at the state x
-    residuals(data, m, x, B, r, J)      write the residuals of observation m and their derivatives by a step
+    frame(x, B)                         write to B what the two other kernels need to know at the state x
+    residuals(shared, k, own, m, x, B, r, J)
+                                        write the residuals of an observation and their derivatives by a step
     move(x, B, step, out)               write the state after a step
+
+An observation has a row of numbers of its own, ``own[m]`` (a segment), and one that it may share with others,
+``shared[k]`` (its camera). The arrays are passed whole: views of rows would take half of the time.
 
 The loop takes the kind as a tuple of zeros whose length is the number, so it is compiled for each kind and calls the
 kernels directly, as :mod:`groma.cameras.dispatch` does for camera models.
@@ -30,7 +34,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba.extending import overload
@@ -53,31 +56,31 @@ FIRST_DAMPING, MIN_DAMPING, MAX_ATTEMPTS = 1e-4, 1e-12, 8
 PIVOT_TOLERANCE = 1e-12
 
 
-def _frame(kind, data, x, B):
-    _FRAME[len(kind)](data, x, B)
+def _frame(kind, x, B):
+    _FRAME[len(kind)](x, B)
 
 
-def _residuals(kind, data, m, x, B, r, J):
-    _RESIDUALS[len(kind)](data, m, x, B, r, J)
+def _residuals(kind, shared, k, own, m, x, B, r, J):
+    _RESIDUALS[len(kind)](shared, k, own, m, x, B, r, J)
 
 
 def _move(kind, x, B, step, out):
     _MOVE[len(kind)](x, B, step, out)
 
 
-@overload(_frame)
-def _overload_frame(kind, data, x, B):
+@overload(_frame, inline="always")
+def _overload_frame(kind, x, B):
     chosen = _FRAME[kind.count]
-    return lambda kind, data, x, B: chosen(data, x, B)
+    return lambda kind, x, B: chosen(x, B)
 
 
-@overload(_residuals)
-def _overload_residuals(kind, data, m, x, B, r, J):
+@overload(_residuals, inline="always")
+def _overload_residuals(kind, shared, k, own, m, x, B, r, J):
     chosen = _RESIDUALS[kind.count]
-    return lambda kind, data, m, x, B, r, J: chosen(data, m, x, B, r, J)
+    return lambda kind, shared, k, own, m, x, B, r, J: chosen(shared, k, own, m, x, B, r, J)
 
 
-@overload(_move)
+@overload(_move, inline="always")
 def _overload_move(kind, x, B, step, out):
     chosen = _MOVE[kind.count]
     return lambda kind, x, B, step, out: chosen(x, B, step, out)
@@ -120,7 +123,7 @@ def _cost_of(square, cauchy):
 
 
 @kernel
-def _linearize(kind, data, begin, end, active, x, B, cauchy, r, J, H, g, parameters, rows):
+def _linearize(kind, shared, index, own, begin, end, active, x, B, cauchy, r, J, H, g, parameters, rows):
     """Write the normal equations of one problem, lower triangle; return the cost."""
     H[:, :] = 0.0
     g[:] = 0.0
@@ -128,7 +131,7 @@ def _linearize(kind, data, begin, end, active, x, B, cauchy, r, J, H, g, paramet
     for m in range(begin, end):
         if not active[m]:
             continue
-        _residuals(kind, data, m, x, B, r, J)
+        _residuals(kind, shared, index[m], own, m, x, B, r, J)
         square = 0.0
         for k in range(len(rows)):
             square += r[k] * r[k]
@@ -148,12 +151,12 @@ def _linearize(kind, data, begin, end, active, x, B, cauchy, r, J, H, g, paramet
 
 
 @kernel
-def _evaluate(kind, data, begin, end, active, x, B, cauchy, r, J, rows):
+def _evaluate(kind, shared, index, own, begin, end, active, x, B, cauchy, r, J, rows):
     """Return the cost of one problem."""
     cost = 0.0
     for m in range(begin, end):
         if active[m]:
-            _residuals(kind, data, m, x, B, r, J)
+            _residuals(kind, shared, index[m], own, m, x, B, r, J)
             square = 0.0
             for k in range(len(rows)):
                 square += r[k] * r[k]
@@ -162,25 +165,29 @@ def _evaluate(kind, data, begin, end, active, x, B, cauchy, r, J, rows):
 
 
 @loop
-def _solve_all(kind, data, pointers, active, x, B, rules, cost, information, steps, converged, parameters, rows):
+def _solve_all(
+    kind, shared, index, own, pointers, active, x, B, rules, cost, information, steps, converged, parameters, rows
+):
     """Minimise every problem from its row of x, in place."""
     max_steps, tolerance, floor, cauchy = rules
     size = len(parameters)
     r, J, H, g = np.zeros(len(rows)), np.zeros((len(rows), size)), np.zeros((size, size)), np.zeros(size)
     L, step, trial = np.zeros((size, size)), np.zeros(size), np.zeros(x.shape[1:])
     for n in range(len(pointers) - 1):
-        begin, end = pointers[n], pointers[n + 1]
+        begin, end, here, frame = pointers[n], pointers[n + 1], x[n], B[n]
         damping = FIRST_DAMPING
         while steps[n] < max_steps:
             steps[n] += 1
-            _frame(kind, data, x[n], B[n])
-            before = _linearize(kind, data, begin, end, active, x[n], B[n], cauchy, r, J, H, g, parameters, rows)
+            _frame(kind, here, frame)
+            before = _linearize(
+                kind, shared, index, own, begin, end, active, here, frame, cauchy, r, J, H, g, parameters, rows
+            )
             done = better = False
             for _ in range(MAX_ATTEMPTS):
                 better = False
                 if solve_damped(H, g, damping, L, step, parameters):
-                    _move(kind, x[n], B[n], step, trial)
-                    after = _evaluate(kind, data, begin, end, active, trial, B[n], cauchy, r, J, rows)
+                    _move(kind, here, frame, step, trial)
+                    after = _evaluate(kind, shared, index, own, begin, end, active, trial, frame, cauchy, r, J, rows)
                     better = after <= before
                     done = after >= before * (1.0 - tolerance) - floor
                 if better:
@@ -191,8 +198,10 @@ def _solve_all(kind, data, pointers, active, x, B, rules, cost, information, ste
             if done or not better:
                 converged[n] = done
                 break
-        _frame(kind, data, x[n], B[n])
-        cost[n] = _linearize(kind, data, begin, end, active, x[n], B[n], 0.0, r, J, H, g, parameters, rows)
+        _frame(kind, here, frame)
+        cost[n] = _linearize(
+            kind, shared, index, own, begin, end, active, here, frame, 0.0, r, J, H, g, parameters, rows
+        )
         for a in range(size):
             for b in range(a + 1):
                 information[n, a, b] = information[n, b, a] = H[a, b]
@@ -211,6 +220,21 @@ class ProblemKind:
     num_rows: int
     #: Shape of what the kernel ``frame`` writes.
     frame_shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What small problems are made of."""
+
+    #: (K, ...) rows that observations share, and the one (M,) of each.
+    shared: FloatArray
+    shared_idx: IntArray
+    #: (M, ...) what each observation has for itself.
+    own: FloatArray
+    #: (N + 1,) where the observations of each problem begin and end.
+    pointers: IntArray
+    #: (M,) whether they take part.
+    active: BoolArray
 
 
 @dataclass(frozen=True)
@@ -250,9 +274,7 @@ def problem_kind(
 
 def solve_batch(
     kind: ProblemKind,
-    data: tuple[Any, ...],
-    pointers: IntArray,
-    active: BoolArray,
+    observations: Observations,
     states: FloatArray,
     max_steps: int = 20,
     tolerance: float = 1e-9,
@@ -265,12 +287,8 @@ def solve_batch(
     ----------
     kind
         What the problems are.
-    data
-        Arrays that the kernels of the kind read.
-    pointers : (N + 1,) int64
-        Where the observations of each problem begin and end.
-    active : (M,) bool
-        Observations that take part.
+    observations
+        Of all problems.
     states : (N, ...) float64
         Where each problem begins; not changed.
     max_steps
@@ -285,11 +303,12 @@ def solve_batch(
     cost, information = np.zeros(count), np.zeros((count, kind.num_parameters, kind.num_parameters))
     steps, converged = np.zeros(count, np.int64), np.zeros(count, np.bool_)
     rules = (max_steps, tolerance, floor, 1.0 / cauchy_scale**2)
+    seen = observations
     _solve_all(
-        width(kind.number), data, pointers, active, found, frames, rules, cost, information, steps, converged,
-        width(kind.num_parameters), width(kind.num_rows),
+        width(kind.number), seen.shared, seen.shared_idx, seen.own, seen.pointers, seen.active, found, frames, rules,
+        cost, information, steps, converged, width(kind.num_parameters), width(kind.num_rows),
     )  # fmt: skip
     return BatchSolution(found, frames, cost, information, steps, converged)
 
 
-__all__ = ["BatchSolution", "ProblemKind", "problem_kind", "solve_batch", "solve_damped"]
+__all__ = ["BatchSolution", "Observations", "ProblemKind", "problem_kind", "solve_batch", "solve_damped"]

@@ -23,7 +23,7 @@ from groma.estimators._line_observations import (
     sum_by_line,
     to_world,
 )
-from groma.estimators.batch_least_squares import solve_batch
+from groma.estimators.batch_least_squares import Observations, solve_batch
 from groma.estimators.two_point_line import TWO_POINT_LINE
 from groma.geometry import line3
 from groma.geometry.algebra import apply, norm, ratio, stack, unit, vectors
@@ -117,12 +117,11 @@ def refine_lines(
     owner = np.repeat(np.arange(len(line)), np.diff(pointers))
     local = _cameras_in(origin[owner], scale[owner], cameras[image_idx])
 
-    each = np.arange(len(segments))
-    measured = np.where(usable[:, None], segments, 0.0)
-    data = (local, each, measured, 1.0 / np.where(usable, weights, 1.0), each)
-    begin = start[:, None, 3:] * np.array([-1.0, 1.0])[:, None]
+    own = np.column_stack([np.where(usable[:, None], segments, 0.0), 1.0 / np.where(usable, weights, 1.0)])
     active = usable & (valid & enough)[owner]
-    found = solve_batch(TWO_POINT_LINE, data, pointers, active, begin, max_iterations, tolerance, floor=0.0)
+    begin = start[:, None, 3:] * np.array([-1.0, 1.0])[:, None]
+    observations = Observations(local, np.arange(len(segments)), own, pointers, active)
+    found = solve_batch(TWO_POINT_LINE, observations, begin, max_iterations, tolerance, floor=0.0)
     chart = _Chart(found.states, found.frames)
     hessian = np.swapaxes(chart.motion, 1, 2) @ found.information @ chart.motion
     moment = np.asarray(np.cross(chart.foot, chart.along), dtype=np.float64)

@@ -18,14 +18,18 @@ from groma.estimators.batch_least_squares import problem_kind
 
 
 @kernel
-def line_residuals(P, ends, sigma, X, U, r, J):
-    """Distances over sigma of the two measured end points to the projected line, and their derivatives (2, 4)."""
-    x0 = P[0, 0] * X[0, 0] + P[0, 1] * X[0, 1] + P[0, 2] * X[0, 2] + P[0, 3]
-    y0 = P[1, 0] * X[0, 0] + P[1, 1] * X[0, 1] + P[1, 2] * X[0, 2] + P[1, 3]
-    z0 = P[2, 0] * X[0, 0] + P[2, 1] * X[0, 1] + P[2, 2] * X[0, 2] + P[2, 3]
-    x1 = P[0, 0] * X[1, 0] + P[0, 1] * X[1, 1] + P[0, 2] * X[1, 2] + P[0, 3]
-    y1 = P[1, 0] * X[1, 0] + P[1, 1] * X[1, 1] + P[1, 2] * X[1, 2] + P[1, 3]
-    z1 = P[2, 0] * X[1, 0] + P[2, 1] * X[1, 1] + P[2, 2] * X[1, 2] + P[2, 3]
+def line_residuals(cameras, i, segments, s, X, U, r, J):
+    """Distances over sigma of the ends of segment ``s`` to the line seen by camera ``i``, and derivatives (2, 4).
+
+    Segments (S, 5) are two end points and sigma.
+    """
+    sigma = segments[s, 4]
+    x0 = cameras[i, 0, 0] * X[0, 0] + cameras[i, 0, 1] * X[0, 1] + cameras[i, 0, 2] * X[0, 2] + cameras[i, 0, 3]
+    y0 = cameras[i, 1, 0] * X[0, 0] + cameras[i, 1, 1] * X[0, 1] + cameras[i, 1, 2] * X[0, 2] + cameras[i, 1, 3]
+    z0 = cameras[i, 2, 0] * X[0, 0] + cameras[i, 2, 1] * X[0, 1] + cameras[i, 2, 2] * X[0, 2] + cameras[i, 2, 3]
+    x1 = cameras[i, 0, 0] * X[1, 0] + cameras[i, 0, 1] * X[1, 1] + cameras[i, 0, 2] * X[1, 2] + cameras[i, 0, 3]
+    y1 = cameras[i, 1, 0] * X[1, 0] + cameras[i, 1, 1] * X[1, 1] + cameras[i, 1, 2] * X[1, 2] + cameras[i, 1, 3]
+    z1 = cameras[i, 2, 0] * X[1, 0] + cameras[i, 2, 1] * X[1, 1] + cameras[i, 2, 2] * X[1, 2] + cameras[i, 2, 3]
     a, b, c = y0 * z1 - z0 * y1, z0 * x1 - x0 * z1, x0 * y1 - y0 * x1
     h2 = a * a + b * b
     if not h2 > 1e-24 * (z0 * z0 + z1 * z1):
@@ -33,20 +37,20 @@ def line_residuals(P, ends, sigma, X, U, r, J):
         J[:, :] = 0.0
         return False
     h = math.sqrt(h2)
-    r[0] = (a * ends[0] + b * ends[1] + c) / h
-    r[1] = (a * ends[2] + b * ends[3] + c) / h
+    r[0] = (a * segments[s, 0] + b * segments[s, 1] + c) / h
+    r[1] = (a * segments[s, 2] + b * segments[s, 3] + c) / h
     for k in range(4):
         w = k % 2
-        dx = P[0, 0] * U[w, 0] + P[0, 1] * U[w, 1] + P[0, 2] * U[w, 2]
-        dy = P[1, 0] * U[w, 0] + P[1, 1] * U[w, 1] + P[1, 2] * U[w, 2]
-        dz = P[2, 0] * U[w, 0] + P[2, 1] * U[w, 1] + P[2, 2] * U[w, 2]
+        dx = cameras[i, 0, 0] * U[w, 0] + cameras[i, 0, 1] * U[w, 1] + cameras[i, 0, 2] * U[w, 2]
+        dy = cameras[i, 1, 0] * U[w, 0] + cameras[i, 1, 1] * U[w, 1] + cameras[i, 1, 2] * U[w, 2]
+        dz = cameras[i, 2, 0] * U[w, 0] + cameras[i, 2, 1] * U[w, 1] + cameras[i, 2, 2] * U[w, 2]
         if k < 2:
             da, db, dc = dy * z1 - dz * y1, dz * x1 - dx * z1, dx * y1 - dy * x1
         else:
             da, db, dc = y0 * dz - z0 * dy, z0 * dx - x0 * dz, x0 * dy - y0 * dx
         dh = (a * da + b * db) / h2
-        J[0, k] = ((da * ends[0] + db * ends[1] + dc) / h - r[0] * dh) / sigma
-        J[1, k] = ((da * ends[2] + db * ends[3] + dc) / h - r[1] * dh) / sigma
+        J[0, k] = ((da * segments[s, 0] + db * segments[s, 1] + dc) / h - r[0] * dh) / sigma
+        J[1, k] = ((da * segments[s, 2] + db * segments[s, 3] + dc) / h - r[1] * dh) / sigma
     r[0] /= sigma
     r[1] /= sigma
     return True
@@ -71,18 +75,6 @@ def across_basis(X, U):
 
 
 @kernel
-def _frame(data, X, U):
-    across_basis(X, U)
-
-
-@kernel
-def _residuals(data, m, X, U, r, J):
-    cameras, image, ends, sigma, rows = data
-    s = rows[m]
-    line_residuals(cameras[image[s]], ends[s], sigma[s], X, U, r, J)
-
-
-@kernel
 def _move(X, U, step, out):
     for c in range(3):
         out[0, c] = X[0, c] + step[0] * U[0, c] + step[1] * U[1, c]
@@ -91,8 +83,8 @@ def _move(X, U, step, out):
 
 # ----------------------------------------------------------------------------------------------------------- Public
 
-#: Lines through points (2, 3), from data: cameras (C, 3, 4); image (S,), end points (S, 4) and sigma (S,) of segments;
-#: segment (M,) of each observation. The frame (2, 3) is what :func:`across_basis` writes.
-TWO_POINT_LINE = problem_kind(1, 4, 2, (2, 3), _frame, _residuals, _move)
+#: Lines through points (2, 3). Observations share cameras (3, 4); their own are two end points and sigma (5,). The
+#: frame (2, 3) is what :func:`across_basis` writes.
+TWO_POINT_LINE = problem_kind(1, 4, 2, (2, 3), across_basis, line_residuals, _move)
 
 __all__ = ["TWO_POINT_LINE", "across_basis", "line_residuals"]

@@ -43,6 +43,8 @@ def write_archive(scene: Scene, path: str | os.PathLike[str], force: bool = Fals
         for table in fields(scene):
             for item in fields(getattr(scene, table.name)):
                 value = getattr(getattr(scene, table.name), item.name)
+                if len(value) == 0 and _may_lack(type(getattr(scene, table.name)), item):
+                    continue
                 fill = item.metadata.get("fill")
                 if fill is not None and not isinstance(value, tuple) and (value == fill).all():
                     continue  # as if left out; readers that do not know the column can read the file
@@ -76,15 +78,23 @@ def read_archive(path: str | os.PathLike[str]) -> Scene:
         for table in fields(Scene):
             kind: Any = table.default_factory
             columns = {
-                item.name: _read_column(file, members, f"{table.name}.{item.name}", item) for item in fields(kind)
+                item.name: _read_column(file, members, f"{table.name}.{item.name}", item, _may_lack(kind, item))
+                for item in fields(kind)
             }
             tables[table.name] = kind(**columns)
         return Scene(**tables)
 
 
-def _read_column(file: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], name: str, item: Field[Any]) -> Any:
+def _may_lack(kind: Any, item: Field[Any]) -> bool:
+    """Whether a file may lack a column: those of tables that came later, and that few scenes have."""
+    return bool(getattr(kind, "optional", False) or item.metadata.get("optional"))
+
+
+def _read_column(
+    file: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], name: str, item: Field[Any], may_lack: bool
+) -> Any:
     info = members.get(f"{name}.npy")
-    if info is None and item.metadata.get("fill") is not None:
+    if info is None and (may_lack or item.metadata.get("fill") is not None):
         return np.zeros((0, *item.metadata["row"]), item.metadata["dtype"])
     if info is None:
         raise FileFormatError(f"Array {name} is missing. The file is incomplete or of another program.")

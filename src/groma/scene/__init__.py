@@ -4,6 +4,7 @@
 from groma.scene.camera import Cameras, Rigs, Sensors
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
+from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.scene import Scene
 from groma.scene.similarity import Similarity
@@ -14,12 +15,17 @@ __all__ = [
     "Frames",
     "Images",
     "Keypoints",
+    "LineDepths",
     "LineObservations",
     "Lines",
+    "PlaneObservations",
     "Planes",
+    "PointDepths",
     "PointObservations",
     "Points",
+    "PosePriors",
     "Relations",
+    "RightColumns",
     "Rigs",
     "Scene",
     "Sensors",

@@ -56,6 +56,11 @@ class Cameras(Table):
         known = {name: camera_models.model(name).num_parameters for name in set(self.models)}
         return [known[name] for name in self.models]
 
+    def by_model(self) -> dict[str, IntArray]:
+        """Return the rows of the cameras of each model."""
+        models = np.array(self.models, dtype=object)
+        return {str(name): np.flatnonzero(models == name) for name in dict.fromkeys(models)}
+
     def params_of(self, camera_idx: int) -> FloatArray:
         """Return the parameters of one camera, without padding."""
         return self.params[camera_idx, : self.num_params[camera_idx]].copy()
@@ -79,7 +84,7 @@ class Sensors(Table):
 
     noun: ClassVar[str] = "sensor"
     #: (S,) the rig it is mounted on.
-    rig_idx: IntArray = column(np.int64)
+    rig_idx: IntArray = column(np.int64, refers="rigs")
     #: (S,) ``CAMERA`` (0) or ``OTHER`` (1, for example an inertial unit; carried along, not used).
     kind: IntArray = column(np.int64)
     #: (S,) identifier; for cameras that of the camera.
@@ -87,7 +92,7 @@ class Sensors(Table):
     #: (S,) the camera; -1 for other sensors.
     camera_idx: IntArray = column(np.int64)
     #: (S, 7) pose [qx qy qz qw tx ty tz]; the identity for reference sensors and where unknown.
-    cam_from_rig: FloatArray = column(np.float64, 7)
+    cam_from_rig: FloatArray = column(np.float64, 7, length=(0, 0, 0, 0, 1, 1, 1))
     #: (S,) 1 for the reference sensor of its rig.
     is_reference: IntArray = column(np.int64)
     #: (S,) 1 where ``cam_from_rig`` is known.

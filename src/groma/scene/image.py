@@ -21,9 +21,9 @@ class Frames(Table):
     #: (F,) identifiers.
     ids: IntArray = column(np.int64)
     #: (F,) the rig.
-    rig_idx: IntArray = column(np.int64)
+    rig_idx: IntArray = column(np.int64, refers="rigs")
     #: (F, 7) pose [qx qy qz qw tx ty tz], unit quaternions, scene units.
-    rig_from_world: FloatArray = column(np.float64, 7)
+    rig_from_world: FloatArray = column(np.float64, 7, world="poses")
 
     def _check(self) -> None:
         check_unique("Frames.ids", self.ids)
@@ -39,11 +39,11 @@ class Images(Table):
     #: (N,) file names.
     names: tuple[str, ...] = text_column()
     #: (N,) the camera (calibration).
-    camera_idx: IntArray = column(np.int64)
+    camera_idx: IntArray = column(np.int64, refers="cameras")
     #: (N,) the frame.
-    frame_idx: IntArray = column(np.int64)
+    frame_idx: IntArray = column(np.int64, refers="frames")
     #: (N,) the sensor.
-    sensor_idx: IntArray = column(np.int64)
+    sensor_idx: IntArray = column(np.int64, refers="sensors")
 
     def _check(self) -> None:
         check_unique("Images.ids", self.ids)

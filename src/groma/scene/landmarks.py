@@ -18,7 +18,8 @@ from groma.scene.table import Table, check_unique, column
 _UNIT_TOLERANCE = 1e-6
 
 
-def _check_unit(name: str, vectors: FloatArray) -> None:
+def check_unit(name: str, vectors: FloatArray) -> None:
+    """Raise when a row is not of length one."""
     if len(vectors) == 0:
         return
     deviation = np.abs(np.einsum("ij,ij->i", vectors, vectors) - 1)
@@ -35,7 +36,7 @@ class Points(Table):
     #: (P,) identifiers.
     ids: IntArray = column(np.int64)
     #: (P, 3) coordinates, scene units.
-    xyz: FloatArray = column(np.float64, 3)
+    xyz: FloatArray = column(np.float64, 3, world="points")
     #: (P, 3) red, green, blue.
     color: npt.NDArray[np.uint8] = column(np.uint8, 3)
     #: (P,) mean reprojection error, pixels; -1 where unknown.
@@ -60,13 +61,13 @@ class Lines(Table):
     #: (L,) identifiers.
     ids: IntArray = column(np.int64)
     #: (L, 6) Plücker vectors (moment, direction), unit direction, moment = point x direction.
-    plucker: FloatArray = column(np.float64, 6)
+    plucker: FloatArray = column(np.float64, 6, world="lines")
     #: (L, 2, 3) end points of the segment, scene units.
-    segments: FloatArray = column(np.float64, 2, 3)
+    segments: FloatArray = column(np.float64, 2, 3, world="points")
 
     def _check(self) -> None:
         check_unique("Lines.ids", self.ids)
-        _check_unit("Lines.plucker[:, 3:]", self.plucker[:, 3:])
+        check_unit("Lines.plucker[:, 3:]", self.plucker[:, 3:])
         if len(self):
             moment, direction = self.plucker[:, :3], self.plucker[:, 3:]
             slip = np.abs(np.einsum("ij,ij->i", moment, direction)) / (1 + np.linalg.norm(moment, axis=1))
@@ -136,11 +137,11 @@ class Planes(Table):
     #: (K,) identifiers.
     ids: IntArray = column(np.int64)
     #: (K, 4) unit normal n and offset w with n.X + w = 0.
-    hesse: FloatArray = column(np.float64, 4)
+    hesse: FloatArray = column(np.float64, 4, world="planes")
 
     def _check(self) -> None:
         check_unique("Planes.ids", self.ids)
-        _check_unit("Planes.hesse[:, :3]", self.hesse[:, :3])
+        check_unit("Planes.hesse[:, :3]", self.hesse[:, :3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +152,8 @@ class Directions(Table):
     #: (D,) identifiers.
     ids: IntArray = column(np.int64)
     #: (D, 3) unit vectors; the sign has no meaning.
-    vectors: FloatArray = column(np.float64, 3)
+    vectors: FloatArray = column(np.float64, 3, world="directions")
 
     def _check(self) -> None:
         check_unique("Directions.ids", self.ids)
-        _check_unit("Directions.vectors", self.vectors)
+        check_unit("Directions.vectors", self.vectors)

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
 # ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
-"""What was measured in the images, and which landmarks belong together."""
+"""Points and segments found in the images, and which landmarks belong together."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
-from groma.scene.table import Table, check_sigma, column, convert
+from groma.errors import InputError, ShapeError
+from groma.scene.table import Table, check_sigma, column, convert, rows_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,9 +22,9 @@ class PointObservations(Table):
 
     noun: ClassVar[str] = "observation"
     #: (N,) the image.
-    image_idx: IntArray = column(np.int64)
+    image_idx: IntArray = column(np.int64, refers="images")
     #: (N,) the point.
-    point_idx: IntArray = column(np.int64)
+    point_idx: IntArray = column(np.int64, refers="points")
     #: (N, 2) measured place, pixels.
     pixel: FloatArray = column(np.float64, 2)
     #: (N,) number of the 2D point within its image (COLMAP's ``point2D_idx``).
@@ -34,7 +36,9 @@ class PointObservations(Table):
         check_sigma("PointObservations.sigma", self.sigma)
 
     @classmethod
-    def numbered(cls, image_idx: npt.ArrayLike, point_idx: npt.ArrayLike, pixel: npt.ArrayLike) -> Self:
+    def numbered(
+        cls, image_idx: npt.ArrayLike, point_idx: npt.ArrayLike, pixel: npt.ArrayLike, sigma: npt.ArrayLike = ()
+    ) -> Self:
         """Return observations whose 2D points are numbered 0, 1, 2, ... within each image, in the order given.
 
         Parameters
@@ -43,6 +47,8 @@ class PointObservations(Table):
             The image and the point of each.
         pixel : (N, 2) float
             Measured places, pixels.
+        sigma : (N,) float, optional
+            Standard deviations, relative to the usual one.
         """
         image = np.asarray(image_idx)
         order = np.argsort(image, kind="stable")
@@ -57,7 +63,7 @@ class Keypoints(Table):
 
     noun: ClassVar[str] = "keypoint"
     #: (N,) the image.
-    image_idx: IntArray = column(np.int64)
+    image_idx: IntArray = column(np.int64, refers="images")
     #: (N, 2) place, pixels.
     pixel: FloatArray = column(np.float64, 2)
     #: (N,) number of the 2D point within its image.
@@ -70,9 +76,9 @@ class LineObservations(Table):
 
     noun: ClassVar[str] = "observation"
     #: (N,) the image.
-    image_idx: IntArray = column(np.int64)
+    image_idx: IntArray = column(np.int64, refers="images")
     #: (N,) the line.
-    line_idx: IntArray = column(np.int64)
+    line_idx: IntArray = column(np.int64, refers="lines")
     #: (N, 4) end points u1 v1 u2 v2 of the detected segment, pixels; no correspondence with the 3D end points.
     segment: FloatArray = column(np.float64, 4)
     #: (N,) standard deviation of an end point across the segment, relative to the usual one; 1 if left out.
@@ -84,21 +90,76 @@ class LineObservations(Table):
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """Which landmarks belong together: (R, 2) pairs of indices, first and second landmark as the names say."""
+    """Which landmarks belong together: (R, 2) pairs of indices, first and second landmark as the names say.
+
+    Each kind may have standard deviations, one for each pair: how far the first is off the second, in scene units;
+    angles in radians. Where one is 0 it follows from the noise of the images (see
+    :class:`groma.adjustment.assemble.AssemblyOptions`).
+    """
 
     #: (R, 2) point, plane.
-    point_on_plane: IntArray = column(np.int64, 2)
+    point_on_plane: IntArray = column(np.int64, 2, refers=("points", "planes"))
     #: (R, 2) line, plane.
-    line_on_plane: IntArray = column(np.int64, 2)
+    line_on_plane: IntArray = column(np.int64, 2, refers=("lines", "planes"))
     #: (R, 2) line, direction.
-    line_along_direction: IntArray = column(np.int64, 2)
+    line_along_direction: IntArray = column(np.int64, 2, refers=("lines", "directions"))
     #: (R, 2) point, line.
-    point_on_line: IntArray = column(np.int64, 2)
+    point_on_line: IntArray = column(np.int64, 2, refers=("points", "lines"))
+    #: (R, 2) plane, plane.
+    parallel_planes: IntArray = column(np.int64, 2, refers=("planes", "planes"), optional=True)
+    #: (R, 2) plane, plane.
+    perpendicular_planes: IntArray = column(np.int64, 2, refers=("planes", "planes"), optional=True)
+    #: (R,) standard deviations: distance from the plane, also of the ends of a line; angle; distance from the line.
+    point_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="point_on_plane")
+    line_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="line_on_plane")
+    line_along_direction_sigma: FloatArray = column(np.float64, fill=0.0, of="line_along_direction")
+    point_on_line_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="point_on_line")
+    parallel_planes_sigma: FloatArray = column(np.float64, fill=0.0, of="parallel_planes")
+    perpendicular_planes_sigma: FloatArray = column(np.float64, fill=0.0, of="perpendicular_planes")
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            pairs = convert(f"Relations.{item.name}", getattr(self, item.name), item)
-            object.__setattr__(self, item.name, pairs)
+            value = convert(f"Relations.{item.name}", getattr(self, item.name), item)
+            if owner := item.metadata["of"]:
+                count = len(getattr(self, owner))
+                value = value if value.any() else np.zeros(count)  # none of its own is as if left out
+                if len(value) != count:
+                    raise ShapeError(f"Relations.{item.name} must have one row for each of {count}; got {len(value)}.")
+                if count and value.min() < 0.0:
+                    raise InputError(f"Relations.{item.name} must not be negative; got {value.min()}.")
+            object.__setattr__(self, item.name, value)
 
     def __len__(self) -> int:
-        return sum(len(getattr(self, item.name)) for item in fields(self))
+        return sum(len(getattr(self, name)) for name in self.kinds())
+
+    @classmethod
+    def kinds(cls) -> tuple[str, ...]:
+        """Return the names of the columns that hold pairs."""
+        return tuple(item.name for item in fields(cls) if not item.metadata["of"])
+
+    def sigma(self, kind: str) -> FloatArray:
+        """Return the standard deviations (R,) of one kind; 0 where the noise of the images tells them."""
+        return getattr(self, f"{kind}_sigma")
+
+    def take(self, **rows: npt.ArrayLike) -> Self:
+        """Return the relations with the chosen rows (indices or a mask) of some kinds, and all of the others."""
+        columns = {}
+        for kind, chosen in rows.items():
+            pairs = getattr(self, kind)
+            kept = rows_of(f"rows of Relations.{kind}", chosen, len(pairs), "relations")
+            columns |= {kind: pairs[kept], f"{kind}_sigma": self.sigma(kind)[kept]}
+        return replace(self, **columns)
+
+    def renumbered(self, new_index: Mapping[str, IntArray]) -> tuple[Self, None]:
+        """See :meth:`groma.scene.table.Table.renumbered`."""
+        moved, kept = {}, {}
+        for item in fields(self):
+            refers = item.metadata["refers"]
+            if not new_index.keys() & set(refers):
+                continue
+            pairs = getattr(self, item.name).copy()
+            for side, table in enumerate(refers):
+                pairs[:, side] = new_index[table][pairs[:, side]] if table in new_index else pairs[:, side]
+            kept[item.name] = (pairs >= 0).all(axis=1)
+            moved[item.name] = pairs[kept[item.name]]
+        return (replace(self.take(**kept), **moved) if moved else self), None

@@ -11,6 +11,12 @@ all references are checked when it is made. Every change gives a new scene.
     images -> cameras, frames, sensors
     point_observations -> images, points          keypoints -> images
     line_observations  -> images, lines           relations -> points, lines, planes, directions
+    point_depths       -> images, points          right_columns -> point_observations
+    plane_observations -> images, planes          line_depths   -> line_observations
+    pose_priors        -> frames
+
+Each column declares in its table what it refers to and how it changes when the world moves (see
+:func:`groma.scene.table.column`); checks, selections and transforms here go by that.
 """
 
 from __future__ import annotations
@@ -28,11 +34,11 @@ from groma.geometry import quaternion, se3
 from groma.scene.camera import CAMERA, Cameras, Rigs, Sensors
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
+from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
-from groma.scene.table import check_index, rows_of
+from groma.scene.table import check_index, check_quaternions, moved_column, new_index_of, references, rows_of
 
-_QUATERNION_TOLERANCE = 1e-6
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
 
@@ -66,41 +72,39 @@ class Scene:
     directions: Directions = field(default_factory=Directions)
     #: Which landmarks belong together.
     relations: Relations = field(default_factory=Relations)
+    #: Depths of points.
+    point_depths: PointDepths = field(default_factory=PointDepths)
+    #: Observed points in the right images of stereo pairs.
+    right_columns: RightColumns = field(default_factory=RightColumns)
+    #: Inverse depths of the ends of observed segments.
+    line_depths: LineDepths = field(default_factory=LineDepths)
+    #: Planes measured in the cameras.
+    plane_observations: PlaneObservations = field(default_factory=PlaneObservations)
+    #: Poses known beforehand.
+    pose_priors: PosePriors = field(default_factory=PosePriors)
 
     def __post_init__(self) -> None:
-        num_rigs, num_cameras = len(self.rigs), len(self.cameras)
-        check_index("sensors.rig_idx", self.sensors.rig_idx, num_rigs, "rigs")
+        for name, column, side, target in references(Scene):
+            index = getattr(getattr(self, name), column)
+            where = f"{name}.{column}" if side is None else f"{name}.{column}[:, {side}]"
+            index = index if side is None else index[:, side]
+            check_index(where, index, len(getattr(self, target)), target.replace("_", " "))
         is_camera = self.sensors.kind == CAMERA
-        check_index("sensors.camera_idx", self.sensors.camera_idx[is_camera], num_cameras, "cameras")
-        check_index("frames.rig_idx", self.frames.rig_idx, num_rigs, "rigs")
-        check_index("images.camera_idx", self.images.camera_idx, num_cameras, "cameras")
-        check_index("images.frame_idx", self.images.frame_idx, len(self.frames), "frames")
-        check_index("images.sensor_idx", self.images.sensor_idx, len(self.sensors), "sensors")
-        _check_quaternions("frames.rig_from_world", self.frames.rig_from_world)
-        _check_quaternions("sensors.cam_from_rig", self.sensors.cam_from_rig)
+        check_index("sensors.camera_idx", self.sensors.camera_idx[is_camera], len(self.cameras), "cameras")
+        check_quaternions("frames.rig_from_world", self.frames.rig_from_world)
+        check_quaternions("sensors.cam_from_rig", self.sensors.cam_from_rig)
+        check_quaternions("pose_priors.rig_from_world", self.pose_priors.rig_from_world)
         if len(self.images):
             sensor = self.images.sensor_idx
             if (self.sensors.camera_idx[sensor] != self.images.camera_idx).any() or (~is_camera[sensor]).any():
                 raise InputError("images.camera_idx must be the camera of the image's sensor. Correct one of the two.")
             if (self.sensors.rig_idx[sensor] != self.frames.rig_idx[self.images.frame_idx]).any():
                 raise InputError("images.sensor_idx must be a sensor of the rig of the image's frame. Correct one.")
-        sizes = {"image": len(self.images), "point": len(self.points), "line": len(self.lines)}
-        sizes |= {"plane": len(self.planes), "direction": len(self.directions)}
-        for name in ("point_observations", "line_observations", "keypoints"):
-            table = getattr(self, name)
-            for kind in ("image", "point", "line"):
-                index = getattr(table, f"{kind}_idx", None)
-                if index is not None:
-                    check_index(f"{name}.{kind}_idx", index, sizes[kind], f"{kind}s")
-        for item in fields(self.relations):
-            first, second = item.name.replace("_along_", "_on_").split("_on_")
-            pairs = getattr(self.relations, item.name)
-            check_index(f"relations.{item.name}[:, 0]", pairs[:, 0], sizes[first], f"{first}s")
-            check_index(f"relations.{item.name}[:, 1]", pairs[:, 1], sizes[second], f"{second}s")
 
     def __repr__(self) -> str:
         counts = [(name, getattr(self, f"num_{name}")) for name in ("images", "cameras", "points", "lines", "planes")]
         counts += [("directions", self.num_directions), ("observations", self.num_observations)]
+        counts += list(self.num_measurements.items())
         return f"Scene({', '.join(f'{count:,} {name}' for name, count in counts if count) or 'empty'})"
 
     @classmethod
@@ -199,6 +203,19 @@ class Scene:
         """Number of observations of points and lines together."""
         return len(self.point_observations) + len(self.line_observations)
 
+    @property
+    def num_measurements(self) -> dict[str, int]:
+        """Numbers of measurements besides those of points and lines in images, by kind; only kinds that there are."""
+        kinds = {"point depths": self.point_depths, "right columns": self.right_columns}
+        kinds |= {"line depths": self.line_depths, "plane observations": self.plane_observations}
+        kinds |= {"pose priors": self.pose_priors}
+        return {name: len(table) for name, table in kinds.items() if len(table)}
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether anything measured in the cameras tells the scale: depths, stereo pairs, planes."""
+        return any(map(len, (self.point_depths, self.right_columns, self.line_depths, self.plane_observations)))
+
     # Poses
 
     @property
@@ -228,7 +245,21 @@ class Scene:
     # New scenes
 
     def replace(self, **tables: Any) -> Self:
-        """Return a copy with some tables replaced."""
+        """Return a copy with some tables replaced.
+
+        Raises
+        ------
+        InputError
+            If a table of observations gets another number of rows while measurements refer to the old ones.
+        """
+        for name, column, _, target in references(Scene):
+            if target.endswith("_observations") and target in tables and name not in tables:
+                before, after = len(getattr(self, target)), len(tables[target])
+                if before != after and len(getattr(self, name)):
+                    raise InputError(
+                        f"{name}.{column} refers to the {before} rows of {target}; got {after} new ones. "
+                        f"Use scene.keep({target}=rows), or replace {name} too."
+                    )
         return replace(self, **tables)
 
     def with_poses(self, cam_from_world: npt.ArrayLike) -> Self:
@@ -277,14 +308,8 @@ class Scene:
         return self.replace(planes=self.planes.replace(hesse=planes / length))
 
     def points_only(self) -> Self:
-        """Return the scene without lines, planes, directions and relations."""
-        return self.replace(
-            lines=Lines(),
-            line_observations=LineObservations(),
-            planes=Planes(),
-            directions=Directions(),
-            relations=Relations(),
-        )
+        """Return the scene without lines, planes, directions, and what was measured of them."""
+        return self.keep(lines=[], planes=[], directions=[])
 
     def transformed(self, new_from_old: Similarity | FloatArray) -> Self:
         """Return the scene seen from another world frame; what the cameras see stays the same.
@@ -294,19 +319,17 @@ class Scene:
         """
         if not isinstance(new_from_old, Similarity):
             new_from_old = Similarity.from_array(new_from_old)
-        mounted = self.sensors.cam_from_rig.copy()
-        mounted[:, 4:] *= new_from_old.scale
-        lines = self.lines.replace(
-            plucker=new_from_old.lines(self.lines.plucker), segments=new_from_old.points(self.lines.segments)
-        )
-        return self.replace(
-            frames=self.frames.replace(rig_from_world=new_from_old.poses(self.frames.rig_from_world)),
-            sensors=self.sensors.replace(cam_from_rig=mounted),
-            points=self.points.replace(xyz=new_from_old.points(self.points.xyz)),
-            lines=lines,
-            planes=self.planes.replace(hesse=new_from_old.planes(self.planes.hesse)),
-            directions=self.directions.replace(vectors=new_from_old.directions(self.directions.vectors)),
-        )
+        tables = {}
+        for item in fields(self):
+            table = getattr(self, item.name)
+            columns = {
+                column.name: moved_column(getattr(table, column.name), column.metadata, new_from_old)
+                for column in fields(table)
+                if (column.metadata.get("world") or column.metadata.get("length")) and len(getattr(table, column.name))
+            }
+            if columns:
+                tables[item.name] = replace(table, **columns)
+        return self.replace(**tables)
 
     def subset(self, image_idx: npt.ArrayLike, min_observations: int = 1) -> Self:
         """Return the scene of some images, with the points and lines that they see.
@@ -321,15 +344,16 @@ class Scene:
             Points and lines seen less often are dropped; 0 keeps all of them.
         """
         chosen = rows_of("image_idx", image_idx, self.num_images, "images")
-        new_image = _new_index(chosen, self.num_images)
         kept_frames, frame_idx = np.unique(self.images.frame_idx[chosen], return_inverse=True)
-        seen = self.replace(
-            frames=self.frames.take(kept_frames),
-            images=self.images.take(chosen).replace(frame_idx=frame_idx),
-            point_observations=_renumbered(self.point_observations, image_idx=new_image),
-            keypoints=_renumbered(self.keypoints, image_idx=new_image),
-            line_observations=_renumbered(self.line_observations, image_idx=new_image),
-        )
+        tables = {
+            "frames": self.frames.take(kept_frames),
+            "images": self.images.take(chosen).replace(frame_idx=frame_idx),
+        }
+        new_index = {
+            "frames": new_index_of(kept_frames, self.num_frames),
+            "images": new_index_of(chosen, self.num_images),
+        }
+        seen = self._with(tables, new_index)
         points = np.bincount(seen.point_observations.point_idx, minlength=self.num_points)
         lines = np.bincount(seen.line_observations.line_idx, minlength=self.num_lines)
         return seen.keep(points=points >= min_observations, lines=lines >= min_observations)
@@ -341,54 +365,37 @@ class Scene:
         lines: npt.ArrayLike | None = None,
         planes: npt.ArrayLike | None = None,
         directions: npt.ArrayLike | None = None,
+        point_observations: npt.ArrayLike | None = None,
+        line_observations: npt.ArrayLike | None = None,
     ) -> Self:
-        """Return the scene with some of its landmarks, what was observed of them, and the relations among them.
+        """Return the scene with some of its landmarks or observations, what was measured of them, and their relations.
 
         Parameters
         ----------
         points, lines, planes, directions : (n,) int or (P,), (L,), (K,), (D,) bool, optional
             Which to keep, integers in their new order; all of a kind that is left out.
+        point_observations, line_observations : (n,) int or (N,) bool, optional
+            Which to keep of the observations; those of landmarks that go, go anyhow.
         """
-        chosen = {"point": points, "line": lines, "plane": planes, "direction": directions}
-        new, tables = {}, {}
-        for kind, rows in chosen.items():
-            table = getattr(self, f"{kind}s")
-            new[kind] = np.arange(len(table))
+        chosen = {"points": points, "lines": lines, "planes": planes, "directions": directions}
+        chosen |= {"point_observations": point_observations, "line_observations": line_observations}
+        tables, new_index = {}, {}
+        for name, rows in chosen.items():
             if rows is not None:
-                kept = rows_of(f"{kind}s", rows, len(table), f"{kind}s")
-                new[kind], tables[f"{kind}s"] = _new_index(kept, len(table)), table.take(kept)
-        for kind in {"point", "line"} & {name.removesuffix("s") for name in tables}:
-            seen = getattr(self, f"{kind}_observations")
-            tables[f"{kind}_observations"] = _renumbered(seen, **{f"{kind}_idx": new[kind]})
-        relations = {}
-        for item in fields(self.relations):
-            first, second = item.name.replace("_along_", "_on_").split("_on_")
-            pairs = getattr(self.relations, item.name)
-            pairs = np.column_stack([new[first][pairs[:, 0]], new[second][pairs[:, 1]]])
-            relations[item.name] = pairs[(pairs >= 0).all(axis=1)]
-        return self.replace(**tables, relations=Relations(**relations))
+                table = getattr(self, name)
+                kept = rows_of(name, rows, len(table), name.replace("_", " "))
+                tables[name], new_index[name] = table.take(kept), new_index_of(kept, len(table))
+        return self._with(tables, new_index)
 
-
-def _new_index(kept: IntArray, size: int) -> IntArray:
-    index = np.full(size, -1, np.int64)
-    index[kept] = np.arange(len(kept))
-    return index
-
-
-def _renumbered(table: Any, **new_index: IntArray) -> Any:
-    columns = {name: index[getattr(table, name)] for name, index in new_index.items()}
-    kept = np.all([column >= 0 for column in columns.values()], axis=0)
-    return table.replace(**columns).take(kept)
-
-
-def _check_quaternions(name: str, poses: FloatArray) -> None:
-    if len(poses) == 0:
-        return
-    with np.errstate(over="ignore"):
-        deviation = np.abs(np.einsum("ij,ij->i", poses[:, :4], poses[:, :4]) - 1)
-    if deviation.max() > 2 * _QUATERNION_TOLERANCE:
-        row = int(deviation.argmax())
-        raise InputError(
-            f"{name} must begin with a unit quaternion [qx qy qz qw]; row {row} has {poses[row, :4].tolist()}. "
-            "Divide it by its length."
-        )
+    def _with(self, tables: dict[str, Any], new_index: dict[str, IntArray]) -> Self:
+        """Return the scene with new tables, and all others renumbered; fields come before those that refer to them."""
+        given = tables.keys() & {"frames", "images"}
+        for name in [item.name for item in fields(self) if item.name not in given]:
+            before = tables.get(name, getattr(self, name))
+            table, kept = before.renumbered(new_index)
+            if table is not before:
+                tables[name] = table
+            if kept is not None:
+                first = new_index.get(name, np.arange(len(before)))
+                new_index[name] = np.append(new_index_of(kept, len(before)), -1)[first]
+        return self.replace(**tables)

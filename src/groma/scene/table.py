@@ -2,15 +2,17 @@
 """The common form of everything a scene holds: a frozen table of equally long columns.
 
 A table is a frozen dataclass whose fields are made by :func:`column`. A column knows its dtype and the shape of one
-row, so that conversion, validation, selection of rows, comparison and storage are written once, here. Every column
-defaults to no rows.
+row, which table its indices refer to, and how its numbers change when the world moves. So conversion, validation,
+selection of rows, renumbering, similarity transforms, comparison and storage are written once, here and in
+:mod:`groma.scene.scene`. Every column defaults to no rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, replace
-from typing import Any, ClassVar, Self
+from functools import cache
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -18,22 +20,55 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 
+if TYPE_CHECKING:
+    from groma.scene.similarity import Similarity
 
-def column(dtype: type, *row: int | None, fill: float | None = None) -> Any:
-    """Declare a column of arrays: dtype and the shape of one row (None: any, but the same in all rows).
+#: How far a stored quaternion may be from length one.
+_QUATERNION_TOLERANCE = 1e-6
 
-    A column with a ``fill`` may be left out: its rows then hold that number.
+
+def column(
+    dtype: type,
+    *row: int | None,
+    fill: float | None = None,
+    refers: str | tuple[str, ...] = (),
+    world: str = "",
+    length: int | tuple[int, ...] = 0,
+    optional: bool = False,
+    of: str = "",
+) -> Any:
+    """Declare a column of arrays.
+
+    Parameters
+    ----------
+    dtype : type
+        Type of its numbers.
+    *row : int or None
+        Shape of one row; None: any, but the same in all rows.
+    fill : float, optional
+        The column may be left out: its rows then hold this number.
+    refers : str or (str, str)
+        The table of the scene that the indices refer to; of pairs of indices the two tables.
+    world : str
+        What the rows are in the world, for the column to move with it: ``points``, ``directions``, ``lines``,
+        ``planes`` or ``poses``, the methods of :class:`~groma.scene.similarity.Similarity`.
+    length : int or tuple of int
+        The power of the scene's unit of length in numbers that do not belong to the world, or one for each of a row:
+        1 for depths and their standard deviations, -1 for inverse depths.
+    optional : bool
+        Whether files may lack the column; it then has no rows.
+    of : str
+        In :class:`~groma.scene.observations.Relations`: the column that this one has a row for each row of.
     """
     empty = tuple(0 if size is None else size for size in row)
-    return field(
-        default_factory=lambda: np.zeros((0, *empty), dtype),
-        metadata={"dtype": np.dtype(dtype), "row": row, "fill": fill},
-    )
+    about = {"dtype": np.dtype(dtype), "row": row, "fill": fill, "optional": optional, "of": of}
+    about |= {"refers": (refers,) if isinstance(refers, str) else refers, "world": world, "length": length}
+    return field(default_factory=lambda: np.zeros((0, *empty), dtype), metadata=about)
 
 
 def text_column() -> Any:
     """Declare a column of strings, kept as a tuple."""
-    return field(default=(), metadata={"dtype": None, "row": ()})
+    return field(default=(), metadata={"dtype": None, "row": (), "refers": ()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +77,8 @@ class Table:
 
     #: What one row is called in messages.
     noun: ClassVar[str] = "row"
+    #: Whether files may lack the whole table; it then has no rows.
+    optional: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         length, first = -1, ""
@@ -85,6 +122,30 @@ class Table:
             value = getattr(self, item.name)
             columns[item.name] = tuple(value[i] for i in chosen) if isinstance(value, tuple) else value[chosen]
         return type(self)(**columns)
+
+    def renumbered(self, new_index: Mapping[str, IntArray]) -> tuple[Self, IntArray | None]:
+        """Return the table after rows of tables that it refers to moved or went, and which of its own rows are left.
+
+        Parameters
+        ----------
+        new_index : mapping
+            By name of the table in the scene: the new row of each old one, -1 for rows that went. Columns that refer to
+            other tables stay as they are.
+
+        Returns
+        -------
+        table, rows
+            The table itself and None if it does not depend on any of them.
+        """
+        columns = {
+            item.name: new_index[item.metadata["refers"][0]][getattr(self, item.name)]
+            for item in fields(self)
+            if item.metadata["refers"] and item.metadata["refers"][0] in new_index
+        }
+        if not columns:
+            return self, None
+        kept = np.flatnonzero(np.all([column >= 0 for column in columns.values()], axis=0))
+        return self.take(kept).replace(**{name: column[kept] for name, column in columns.items()}), kept
 
 
 def convert(name: str, value: Any, item: Field[Any]) -> Any:
@@ -161,10 +222,35 @@ def rows_of(name: str, chosen: npt.ArrayLike, size: int, target: str) -> IntArra
     return rows
 
 
+@cache
+def references(scene: type) -> tuple[tuple[str, str, int | None, str], ...]:
+    """Return (table, column, side of a pair or None, table it refers to) of all columns of indices of a scene."""
+    return tuple(
+        (table.name, item.name, side if len(item.metadata["refers"]) > 1 else None, target)
+        for table in fields(scene)
+        for item in fields(table.default_factory)  # type: ignore[arg-type]  # the factories are the classes
+        for side, target in enumerate(item.metadata["refers"])
+    )
+
+
+def moved_column(values: FloatArray, about: Mapping[str, Any], new_from_old: Similarity) -> FloatArray:
+    """Return a column seen from another world, or in another unit of length, as its declaration says."""
+    if about["world"]:
+        return getattr(new_from_old, about["world"])(values)
+    return values * new_from_old.scale ** np.asarray(about["length"], float)
+
+
+def new_index_of(kept: IntArray, size: int) -> IntArray:
+    """Return the new row of each of ``size`` old ones, -1 for those that are not kept."""
+    index = np.full(size, -1, np.int64)
+    index[kept] = np.arange(len(kept))
+    return index
+
+
 def check_sigma(name: str, sigma: FloatArray) -> None:
-    """Raise when a standard deviation is not positive."""
+    """Raise when a standard deviation, or another number, is not positive."""
     if len(sigma) and not sigma.min() > 0.0:
-        row = int(np.argmin(sigma))
+        row = int(np.argwhere(sigma == sigma.min())[0, 0])
         raise InputError(f"{name} must be positive; row {row} is {sigma[row]}. Leave out what is not known at all.")
 
 
@@ -187,3 +273,17 @@ def check_index(name: str, index: IntArray, size: int, target: str) -> None:
     raise InputError(
         f"{name}[{row}] is {index[row]}, which is not in the scene ({there}). Drop that row or add what it refers to."
     )
+
+
+def check_quaternions(name: str, poses: FloatArray) -> None:
+    """Raise when poses (N, 7) do not begin with unit quaternions."""
+    if len(poses) == 0:
+        return
+    with np.errstate(over="ignore"):
+        deviation = np.abs(np.einsum("ij,ij->i", poses[:, :4], poses[:, :4]) - 1)
+    if deviation.max() > 2 * _QUATERNION_TOLERANCE:
+        row = int(deviation.argmax())
+        raise InputError(
+            f"{name} must begin with a unit quaternion [qx qy qz qw]; row {row} has {poses[row, :4].tolist()}. "
+            "Divide it by its length."
+        )

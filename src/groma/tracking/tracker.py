@@ -319,7 +319,7 @@ class Tracker:
 
     def scene(self) -> Scene:
         """Return the keyframes with points, lines and planes of the map that is followed now; changes nothing."""
-        return map_to_scene(self.map, self.camera)
+        return map_to_scene(self.map, self.camera, self.options.relations)
 
     def finish(self) -> TrackResult:
         """End the track: join its maps where that is possible, adjust all keyframes together and return the result."""
@@ -346,7 +346,11 @@ class Tracker:
     def _part(self, root: int) -> Part:
         track_map = self._mapper.maps[root]
         stamps = np.array([keyframe.timestamp for keyframe in track_map.living()])
-        return Part(self._history.trajectory(track_map, root), map_to_scene(track_map, self.camera), stamps)
+        return Part(
+            self._history.trajectory(track_map, root),
+            map_to_scene(track_map, self.camera, self.options.relations),
+            stamps,
+        )
 
     def statistics(self, report: SolveReport | None = None, right_offset_px: float = 0.0) -> dict:
         """Return counts and times so far as plain numbers."""

@@ -1,29 +1,33 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Relations between landmarks as factors: what lies on what, and what runs along what."""
+"""Relations between landmarks as lengths and angles: what lies on what, and what runs along what."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
+from groma.adjustment.terms.contract import Draft, Group, Term
 from groma.cameras import model as camera_model
 from groma.factors.contract import Factor, Ref
-from groma.factors.losses import Loss
 from groma.factors.relations.line_direction import LineDirection
 from groma.factors.relations.line_on_plane import SegmentOnPlane
+from groma.factors.relations.orthogonal import OrthogonalPlanes
+from groma.factors.relations.parallel import ParallelPlanes
 from groma.factors.relations.point_on_line import PointOnLine
 from groma.factors.relations.point_on_plane import PointOnPlane
-from groma.problem.variables import Variables
-from groma.scene import Scene
+from groma.scene import Relations, Scene
 
-#: How well landmarks keep to what they lie on, as a length in the images, pixels: walls are not flat.
-SURFACE_SIGMA_PX = 0.2
 #: Types of the factors of relations, and the relation of the scene each stands for.
 RELATION_FACTORS = {
     "point_on_plane": "point_on_plane",
     "segment_on_plane": "line_on_plane",
     "line_direction": "line_along_direction",
     "point_on_line": "point_on_line",
+    "parallel_planes": "parallel_planes",
+    "orthogonal_planes": "perpendicular_planes",
 }
 #: Points on lines tie points to lines, and only one of the two can be eliminated. With more lines than this they are
 #: measured in pixels instead, which leaves points and lines uncoupled. The solver keeps no more of its own accord.
@@ -70,59 +74,97 @@ def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
     return np.where(count > 0, mean, fallback)
 
 
-def structure_factors(scene: Scene, sigma_px: float, loss: Loss, variables: dict[str, Variables]) -> list[Factor]:
-    """Return the factors of the relations, for the landmarks that are variables.
+def _weights(draft: Draft, kind: str, of: str, rows: IntArray) -> FloatArray:
+    """Inverse standard deviations of distances: those of the relations, else what the images tell at the landmark."""
+    relations = draft.scene.relations
+    sigma, landmark = relations.sigma(kind)[rows], getattr(relations, kind)[rows, 0]
+    if (sigma > 0.0).all():
+        return 1.0 / sigma
+    usual = draft.options.structure_sigma_px * lengths_per_pixel(draft.scene, of)[landmark]
+    return 1.0 / np.where(sigma > 0.0, sigma, usual)
 
-    ``sigma_px`` says how well landmarks keep to what they lie on, as a length in the images.
-    """
-    relations = scene.relations
-    factors: list[Factor] = []
-    have = {name: name in variables for name in ("points", "lines", "planes", "directions")}
-    if have["points"] and (len(relations.point_on_plane) or len(relations.point_on_line)):
-        per_point = 1.0 / (sigma_px * lengths_per_pixel(scene, "point"))
-        if have["planes"] and len(relations.point_on_plane):
-            point, plane = relations.point_on_plane.T
-            factors.append(
-                PointOnPlane(
-                    point=Ref("points", point),
-                    plane=Ref("planes", plane),
-                    sqrt_information=per_point[point],
-                    loss=loss,
-                )
-            )
-        if have["lines"] and len(relations.point_on_line) and scene.num_lines <= MAX_COUPLED_LINES:
-            point, line = relations.point_on_line.T
-            factors.append(
-                PointOnLine(
-                    point=Ref("points", point),
-                    line=Ref("lines", line),
-                    sqrt_information=per_point[point],
-                    loss=loss,
-                )
-            )
-    if have["lines"] and (len(relations.line_on_plane) or len(relations.line_along_direction)):
-        per_line = 1.0 / (sigma_px * lengths_per_pixel(scene, "line"))
-        ends = scene.lines.segments
-        if have["planes"] and len(relations.line_on_plane):
-            line, plane = relations.line_on_plane.T
-            factors.append(
-                SegmentOnPlane(
-                    line=Ref("lines", line),
-                    plane=Ref("planes", plane),
-                    ends=ends[line],
-                    sqrt_information=per_line[line],
-                    loss=loss,
-                )
-            )
-        if have["directions"] and len(relations.line_along_direction):
-            line, direction = relations.line_along_direction.T
-            length = np.linalg.norm(ends[line, 1] - ends[line, 0], axis=1)
-            factors.append(
-                LineDirection(
-                    line=Ref("lines", line),
-                    direction=Ref("directions", direction),
-                    sqrt_information=per_line[line] * np.maximum(0.5 * length, 1e-12),
-                    loss=loss,
-                )
-            )
-    return factors
+
+def metric_rows(draft: Draft, kind: str) -> IntArray:
+    """Return the relations of a kind that are measured in lengths: all, or those with a standard deviation."""
+    count = len(getattr(draft.scene.relations, kind))
+    if kind == "point_on_line" and draft.scene.num_lines > MAX_COUPLED_LINES:
+        return np.zeros(0, np.int64)
+    if draft.options.structure_form == "metric":
+        return np.arange(count)
+    return np.flatnonzero(draft.scene.relations.sigma(kind) > 0.0)
+
+
+def _factors(draft: Draft) -> Iterator[Group]:
+    """Yield the factors of the relations whose landmarks take part."""
+    for kind, make in _MAKERS.items():
+        groups = next(item.metadata["refers"] for item in fields(Relations) if item.name == kind)
+        if set(groups) <= draft.variables.keys() and len(rows := metric_rows(draft, kind)):
+            yield Group(make(draft, rows))
+
+
+def _points_on_planes(draft: Draft, rows: IntArray) -> Factor:
+    point, plane = draft.scene.relations.point_on_plane[rows].T
+    weights = _weights(draft, "point_on_plane", "point", rows)
+    return PointOnPlane(
+        point=Ref("points", point), plane=Ref("planes", plane), sqrt_information=weights, loss=draft.relation_loss
+    )
+
+
+def _points_on_lines(draft: Draft, rows: IntArray) -> Factor:
+    point, line = draft.scene.relations.point_on_line[rows].T
+    weights = _weights(draft, "point_on_line", "point", rows)
+    return PointOnLine(
+        point=Ref("points", point), line=Ref("lines", line), sqrt_information=weights, loss=draft.relation_loss
+    )
+
+
+def _lines_on_planes(draft: Draft, rows: IntArray) -> Factor:
+    line, plane = draft.scene.relations.line_on_plane[rows].T
+    return SegmentOnPlane(
+        line=Ref("lines", line),
+        plane=Ref("planes", plane),
+        ends=draft.scene.lines.segments[line],
+        sqrt_information=_weights(draft, "line_on_plane", "line", rows),
+        loss=draft.relation_loss,
+    )
+
+
+def _lines_along_directions(draft: Draft, rows: IntArray) -> Factor:
+    """Lines along directions; the noise of the ends of a line is that of its angle at half its length."""
+    relations, ends = draft.scene.relations, draft.scene.lines.segments
+    line, direction = relations.line_along_direction[rows].T
+    half = np.maximum(0.5 * np.linalg.norm(ends[line, 1] - ends[line, 0], axis=1), 1e-12)
+    angle = relations.sigma("line_along_direction")[rows]
+    weights = _weights(draft, "line_along_direction", "line", rows)
+    return LineDirection(
+        line=Ref("lines", line),
+        direction=Ref("directions", direction),
+        sqrt_information=np.where(angle > 0.0, weights, weights * half),
+        loss=draft.relation_loss,
+    )
+
+
+def _plane_pairs(factor: type[ParallelPlanes] | type[OrthogonalPlanes], kind: str) -> Callable[..., Factor]:
+    def make(draft: Draft, rows: IntArray) -> Factor:
+        first, second = getattr(draft.scene.relations, kind)[rows].T
+        sigma = draft.scene.relations.sigma(kind)[rows]
+        sigma = np.where(sigma > 0.0, sigma, draft.options.plane_angle_sigma)
+        return factor(
+            first=Ref("planes", first),
+            second=Ref("planes", second),
+            sqrt_information=1.0 / sigma,
+            loss=draft.relation_loss,
+        )
+
+    return make
+
+
+_MAKERS: dict[str, Callable[[Draft, IntArray], Factor]] = {
+    "point_on_plane": _points_on_planes,
+    "point_on_line": _points_on_lines,
+    "line_on_plane": _lines_on_planes,
+    "line_along_direction": _lines_along_directions,
+    "parallel_planes": _plane_pairs(ParallelPlanes, "parallel_planes"),
+    "perpendicular_planes": _plane_pairs(OrthogonalPlanes, "perpendicular_planes"),
+}
+TERM = Term("relations", ("relations",), (), _factors, is_relation=True)

@@ -4,136 +4,129 @@
 Every image that sees a landmark adds a factor. What lies on a plane is compared with its foot on the plane; a point on
 a line is tied to it through what the images saw of the other: the point keeps to the segments of the line, the line to
 the pixels of the point. Points and lines stay uncoupled, so both are still eliminated.
+
+Relations with a standard deviation of their own are measured in lengths (:mod:`groma.adjustment.terms.relations`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.adjustment.terms.contract import Draft, Group, Term
+from groma.adjustment.terms.relations import metric_rows
 from groma.cameras import model as camera_model
 from groma.factors.contract import Factor, Ref
-from groma.factors.losses import Loss
 from groma.factors.relations.line_direction import LineDirection
 from groma.factors.relations.line_to_pixel import LineToPixel
 from groma.factors.relations.on_plane_pixels import PointOnPlanePixels, SegmentOnPlanePixels
 from groma.factors.relations.point_to_image_line import PointToImageLine
 from groma.geometry import segment2
-from groma.problem.variables import Variables
-from groma.scene import Scene
 
 
-def structure_pixel_factors(
-    scene: Scene,
-    sigma_px: tuple[float, float],
-    loss: Loss,
-    variables: dict[str, Variables],
-    camera_refs,
-    by_model,
-) -> list[Factor]:
-    """Return the factors of the relations, for the landmarks that are variables.
+def _factors(draft: Draft) -> Iterator[Group]:
+    """Yield the factors of the relations whose landmarks take part and that are not measured in lengths."""
+    present, in_pixels = draft.variables.keys(), draft.options.structure_form == "pixels"
+    if in_pixels and {"points", "planes"} <= present:
+        yield from _points_on_planes(draft)
+    if in_pixels and {"lines", "planes"} <= present:
+        yield from _lines_on_planes(draft)
+    if {"points", "lines"} <= present:
+        yield from _points_on_lines(draft)
+    if in_pixels and {"lines", "directions"} <= present and len(pairs := _pairs(draft, "line_along_direction")):
+        yield Group(_along_directions(draft, pairs))
 
-    Parameters
-    ----------
-    scene : Scene
-        The scene.
-    sigma_px : (float, float)
-        Standard deviation of points and of segment end points, pixels.
-    loss : Loss
-        Robust loss of all factors.
-    variables : dict
-        The groups that take part.
-    camera_refs, by_model : callable
-        References to the pose of images, and the observations by camera model: see the assembly of a problem.
-    """
-    relations, factors = scene.relations, []
+
+def _pairs(draft: Draft, kind: str) -> IntArray:
+    """Return the pairs of a relation that are not measured in lengths."""
+    pairs = getattr(draft.scene.relations, kind)
+    return np.delete(pairs, metric_rows(draft, kind), axis=0)
+
+
+def _points_on_planes(draft: Draft) -> Iterator[Group]:
+    seen = draft.scene.point_observations
+    of, plane = _join(seen.point_idx, _pairs(draft, "point_on_plane"), draft.scene.num_points)
+    for name, rows, intrinsics in draft.by_model(seen.image_idx[of]):
+        yield Group(
+            PointOnPlanePixels(
+                point=Ref("points", seen.point_idx[of[rows]]),
+                plane=Ref("planes", plane[rows]),
+                camera_model=name,
+                intrinsics=intrinsics,
+                sqrt_information=1.0 / draft.options.point_sigma_px,
+                loss=draft.relation_loss,
+                **draft.camera_refs(seen.image_idx[of[rows]]),
+            )
+        )
+
+
+def _lines_on_planes(draft: Draft) -> Iterator[Group]:
+    seen = draft.scene.line_observations
+    of, plane = _join(seen.line_idx, _pairs(draft, "line_on_plane"), draft.scene.num_lines)
+    for name, rows, intrinsics in draft.by_model(seen.image_idx[of]):
+        line = seen.line_idx[of[rows]]
+        yield Group(
+            SegmentOnPlanePixels(
+                line=Ref("lines", line),
+                plane=Ref("planes", plane[rows]),
+                ends=draft.scene.lines.segments[line],
+                camera_model=name,
+                intrinsics=intrinsics,
+                sqrt_information=1.0 / draft.options.line_sigma_px,
+                loss=draft.relation_loss,
+                **draft.camera_refs(seen.image_idx[of[rows]]),
+            )
+        )
+
+
+def _points_on_lines(draft: Draft) -> Iterator[Group]:
+    scene, pairs = draft.scene, _pairs(draft, "point_on_line")
     points, lines = scene.point_observations, scene.line_observations
-    have = {name: name in variables for name in ("points", "lines", "planes", "directions")}
-    if have["points"] and have["planes"]:
-        seen, plane = _join(points.point_idx, relations.point_on_plane, scene.num_points)
-        for name, rows, camera in by_model(scene, points.image_idx[seen]):
-            factors.append(
-                PointOnPlanePixels(
-                    point=Ref("points", points.point_idx[seen[rows]]),
-                    plane=Ref("planes", plane[rows]),
-                    camera_model=name,
-                    intrinsics=Ref(f"intrinsics/{name}", camera),
-                    sqrt_information=1.0 / sigma_px[0],
-                    loss=loss,
-                    **camera_refs(scene, points.image_idx[seen[rows]]),
-                )
-            )
-    if have["lines"] and have["planes"]:
-        seen, plane = _join(lines.line_idx, relations.line_on_plane, scene.num_lines)
-        for name, rows, camera in by_model(scene, lines.image_idx[seen]):
-            line = lines.line_idx[seen[rows]]
-            factors.append(
-                SegmentOnPlanePixels(
-                    line=Ref("lines", line),
-                    plane=Ref("planes", plane[rows]),
-                    ends=scene.lines.segments[line],
-                    camera_model=name,
-                    intrinsics=Ref(f"intrinsics/{name}", camera),
-                    sqrt_information=1.0 / sigma_px[1],
-                    loss=loss,
-                    **camera_refs(scene, lines.image_idx[seen[rows]]),
-                )
-            )
-    if have["points"] and have["lines"] and len(relations.point_on_line):
-        factors += wireframe_factors(scene, sigma_px, loss, camera_refs, by_model)
-    if have["lines"] and have["directions"] and len(relations.line_along_direction):
-        factors.append(_along_directions(scene, sigma_px[1], loss))
-    return factors
-
-
-def wireframe_factors(scene: Scene, sigma_px: tuple[float, float], loss: Loss, camera_refs, by_model) -> list[Factor]:
-    """Return the factors of points on lines; parameters as for :func:`structure_pixel_factors`."""
-    points, lines, factors = scene.point_observations, scene.line_observations, []
-    by_line = scene.relations.point_on_line[:, ::-1]
-    seen, point = _join(lines.line_idx, by_line, scene.num_lines)
-    image_lines = segment2.to_line(lines.segment[seen])
-    for name, rows, camera in by_model(scene, lines.image_idx[seen]):
-        factors.append(
+    of, point = _join(lines.line_idx, pairs[:, ::-1], scene.num_lines)
+    image_lines = segment2.to_line(lines.segment[of])
+    for name, rows, intrinsics in draft.by_model(lines.image_idx[of]):
+        yield Group(
             PointToImageLine(
                 point=Ref("points", point[rows]),
                 image_lines=image_lines[rows],
                 camera_model=name,
-                intrinsics=Ref(f"intrinsics/{name}", camera),
-                sqrt_information=1.0 / sigma_px[1],
-                loss=loss,
-                **camera_refs(scene, lines.image_idx[seen[rows]]),
+                intrinsics=intrinsics,
+                sqrt_information=1.0 / draft.options.line_sigma_px,
+                loss=draft.relation_loss,
+                **draft.camera_refs(lines.image_idx[of[rows]]),
             )
         )
-    seen, line = _join(points.point_idx, scene.relations.point_on_line, scene.num_points)
-    for name, rows, camera in by_model(scene, points.image_idx[seen]):
+    of, line = _join(points.point_idx, pairs, scene.num_points)
+    for name, rows, intrinsics in draft.by_model(points.image_idx[of]):
         if camera_model(name).has_pinhole_parameters:
-            factors.append(
+            yield Group(
                 LineToPixel(
                     line=Ref("lines", line[rows]),
-                    pixels=points.pixel[seen[rows]],
+                    pixels=points.pixel[of[rows]],
                     camera_model=name,
-                    intrinsics=Ref(f"intrinsics/{name}", camera),
-                    sqrt_information=1.0 / sigma_px[0],
-                    loss=loss,
-                    **camera_refs(scene, points.image_idx[seen[rows]]),
+                    intrinsics=intrinsics,
+                    sqrt_information=1.0 / draft.options.point_sigma_px,
+                    loss=draft.relation_loss,
+                    **draft.camera_refs(points.image_idx[of[rows]]),
                 )
             )
-    return factors
 
 
-def _along_directions(scene: Scene, sigma_px: float, loss: Loss) -> Factor:
+def _along_directions(draft: Draft, pairs: IntArray) -> Factor:
     """Lines along directions: the angle that the noise of end points allows for the length seen in the images."""
-    line, direction = scene.relations.line_along_direction.T
-    table = scene.line_observations
+    line, direction = pairs.T
+    table = draft.scene.line_observations
     length = segment2.length(table.segment)
-    squares = np.bincount(table.line_idx, weights=length**2, minlength=scene.num_lines)
+    squares = np.bincount(table.line_idx, weights=length**2, minlength=draft.scene.num_lines)
     # the two ends of n segments of length s fix an angle to sigma sqrt(2 / sum of s^2) in the image
     spread: FloatArray = np.sqrt(np.maximum(squares, 1e-12) / 2.0)
     return LineDirection(
         line=Ref("lines", line),
         direction=Ref("directions", direction),
-        sqrt_information=spread[line] / sigma_px,
-        loss=loss,
+        sqrt_information=spread[line] / draft.options.line_sigma_px,
+        loss=draft.relation_loss,
     )
 
 
@@ -148,3 +141,6 @@ def _join(landmark: IntArray, relation: IntArray, count: int) -> tuple[IntArray,
     within = np.arange(len(owner)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
     observation = order[first[of_relation[owner]] + within] if len(owner) else np.zeros(0, np.int64)
     return observation, (relation[owner, 1] if len(owner) else np.zeros(0, np.int64))
+
+
+TERM = Term("relations in pixels", ("relations",), (), _factors, is_relation=True)

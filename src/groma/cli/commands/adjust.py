@@ -9,6 +9,8 @@ import typer
 from groma.cli.shared import options as _options
 from groma.errors import InputError
 
+LineResidual = Literal["endpoints", "bearing", "normal"]
+PlaneResidual = Literal["normal_offset", "quaternion"]
 CovarianceGauge = Literal["auto", "inner", "held"]
 
 
@@ -80,6 +82,17 @@ def adjust(
             help="How lines move: cartesian (default), orthonormal_left, orthonormal_right, free_left or free_right.",
         ),
     ] = None,
+    line_residual: Annotated[
+        LineResidual,
+        typer.Option(
+            help="How segments are compared with lines: endpoints, distances in the image; bearing, angles of rays; "
+            "normal, the plane through camera and segment, also against the ray to the line's anchor.",
+        ),
+    ] = "endpoints",
+    plane_residual: Annotated[
+        PlaneResidual,
+        typer.Option(help="How measured planes are compared: normal_offset, in the camera; quaternion, in the world."),
+    ] = "normal_offset",
     gauge: Annotated[
         str | None,
         typer.Option(
@@ -173,7 +186,7 @@ def adjust(
         loss=loss, loss_scale=loss_scale, refine_intrinsics=refine_intrinsics,
         refine_principal_point=refine_principal_point, refine_rigs=refine_rigs, points=points, lines=lines,
         planes=planes, max_iterations=max_iterations, linear_solver=linear_solver, line_chart=line_chart, gauge=gauge,
-        threads=threads,
+        line_residual=line_residual, plane_residual=plane_residual, threads=threads,
     ))  # fmt: skip
     wanted = Wanted(
         output, page, covariance, covariance_gauge, sigma0, diagnosis, contributions, truth, json_target, force

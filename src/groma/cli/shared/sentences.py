@@ -34,6 +34,8 @@ def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, c
     """
     kinds = ("images", "points", "lines", "planes", "observations")
     lines = [", ".join(counted(numbers[f"num_{kind}"], kind) for kind in kinds if numbers.get(f"num_{kind}"))]
+    if others := numbers.get("num_measurements"):
+        lines.append("  also measured: " + ", ".join(f"{count:,} {name}" for name, count in others.items()))
     for kind, rmse in numbers.get("rmse_px", {}).items():
         if rmse.get("before") is not None and rmse.get("after") is not None:
             lines.append(f"  {kind + ' error':<16}{rmse['before']:>10.3f} px  -> {rmse['after']:>9.3f} px   (rms)")

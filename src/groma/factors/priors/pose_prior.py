@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -177,7 +178,12 @@ class PosePrior(Factor):
         return 6
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
-        return ambients[0], poses_from_states(self.cam_from_world)
+        return ambients[0], self._priors
+
+    @cached_property
+    def _priors(self) -> FloatArray:
+        """The prior poses (N, 12) as matrices."""
+        return poses_from_states(self.cam_from_world)
 
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

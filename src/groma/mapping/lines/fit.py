@@ -17,7 +17,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._simd import width
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators.batch_least_squares import solve_batch, solve_damped
+from groma.estimators.batch_least_squares import Observations, solve_batch, solve_damped
 from groma.estimators.two_point_line import TWO_POINT_LINE, line_residuals
 from groma.mapping.lines.views import LineViews
 
@@ -41,28 +41,30 @@ def _largest_deviation(H, g, L, x):
 
 
 @loop
-def _examine(camera, image, ends, sigma, rows, pointers, active, X, U, information, squared, uncertainty, unchecked):
+def _examine(camera, image, own, pointers, active, X, U, squared, uncertainty, unchecked):
     """Write what :class:`Fit` tells of lines that were refined."""
     r, J, g, x = np.zeros(2), np.zeros((2, 4)), np.zeros(4), np.zeros(4)
-    L, without = np.zeros((4, 4)), np.zeros((4, 4))
+    L, H, without = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4))
     for n in range(len(pointers) - 1):
-        for m in range(pointers[n], pointers[n + 1]):
-            s = rows[m]
-            line_residuals(camera[image[s]], ends[s], sigma[s], X[n], U[n], r, J)
+        begin, end = pointers[n], pointers[n + 1]
+        H[:, :] = 0.0
+        for m in range(begin, end):
+            line_residuals(camera, image[m], own, m, X[n], U[n], r, J)
             squared[m] = r[0] * r[0] + r[1] * r[1]
-        uncertainty[n] = _largest_deviation(information[n], g, L, x)
-        for m in range(pointers[n], pointers[n + 1]):
-            if not active[m] or (m > pointers[n] and active[m - 1] and image[rows[m]] == image[rows[m - 1]]):
+            if active[m]:
+                for a in range(4):
+                    for b in range(a + 1):
+                        H[a, b] += J[0, a] * J[0, b] + J[1, a] * J[1, b]
+        uncertainty[n] = _largest_deviation(H, g, L, x)
+        for m in range(begin, end):
+            if not active[m] or (m > begin and active[m - 1] and image[m] == image[m - 1]):
                 continue
-            for a in range(4):
-                for b in range(a + 1):
-                    without[a, b] = information[n, a, b]
-            for k in range(m, pointers[n + 1]):
-                s = rows[k]
-                if image[s] != image[rows[m]]:
+            without[:, :] = H
+            for k in range(m, end):
+                if image[k] != image[m]:
                     break
                 if active[k]:
-                    line_residuals(camera[image[s]], ends[s], sigma[s], X[n], U[n], r, J)
+                    line_residuals(camera, image[k], own, k, X[n], U[n], r, J)
                     for a in range(4):
                         for b in range(a + 1):
                             without[a, b] -= J[0, a] * J[0, b] + J[1, a] * J[1, b]
@@ -83,20 +85,24 @@ class Fit:
     unchecked: FloatArray
 
 
-def fit_lines(views: LineViews, pointers: IntArray, rows: IntArray, active: BoolArray, start: FloatArray) -> Fit:
+def fit_lines(
+    views: LineViews, sigma: FloatArray, pointers: IntArray, rows: IntArray, active: BoolArray, start: FloatArray
+) -> Fit:
     """Fit lines to the segments ``rows`` (M,) that are ``active``, from lines through ``start`` (L, 2, 3)."""
-    data = (views.camera, views.image_idx, views.ends, views.sigma, rows)
-    found = solve_batch(TWO_POINT_LINE, data, pointers, active, start, cauchy_scale=_CAUCHY)
+    own = np.column_stack([views.ends[rows], sigma[rows]])
+    observations = Observations(views.camera, views.image_idx[rows], own, pointers, active)
+    found = solve_batch(TWO_POINT_LINE, observations, start, cauchy_scale=_CAUCHY)
     fit = Fit(found.states, np.zeros(len(rows)), np.zeros(len(start)), np.zeros(len(start)))
     _examine(
-        *data, pointers, active, fit.X, found.frames, found.information, fit.squared, fit.uncertainty, fit.unchecked
-    )
+        observations.shared, observations.shared_idx, own, pointers, active, fit.X, found.frames,
+        fit.squared, fit.uncertainty, fit.unchecked,
+    )  # fmt: skip
     return fit
 
 
 # ------------------------------------------------------------------------------------------------------------ Recover
 @loop
-def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_overlap, found, distance):
+def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_overlap, min_px, found, distance):
     """Segments (rows) of one image that lie on projections of lines; return the number written, or needed."""
     count = 0
     for e in range(len(lines)):
@@ -112,7 +118,7 @@ def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_ove
         x0, y0, x1, y1 = x0 / z0, y0 / z0, x1 / z1, y1 / z1
         dx, dy = x1 - x0, y1 - y0
         length = math.sqrt(dx * dx + dy * dy)
-        if length < 5.0:
+        if length < min_px:
             continue
         dx, dy = dx / length, dy / length
         for k in range(len(rows)):
@@ -131,7 +137,7 @@ def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_ove
             if forward[n] * (t1 - t0) < 0.0:
                 continue
             overlap = min(max(t0, t1), length) - max(min(t0, t1), 0.0)
-            if overlap < min_overlap * min(abs(t1 - t0), length) or overlap < 5.0:
+            if overlap < min_overlap * min(abs(t1 - t0), length) or overlap < min_px:
                 continue
             if count < len(found):
                 found[count, 0], found[count, 1] = n, s

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,11 +46,6 @@ class LineMap:
     outcomes: tuple[IntArray, ...]
     #: One array per image: its neighbours, best first.
     neighbors: tuple[IntArray, ...]
-    #: Number of observations whose own proposals include one from known ``points``, or from a point and one of the
-    #: vanishing ``directions``.
-    assisted: dict[str, int] = field(default_factory=dict)
-    #: Seconds per stage.
-    seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def num_lines(self) -> int:
@@ -68,7 +63,7 @@ class LineMap:
         measured = np.concatenate([np.zeros((0, 4)), *(one.ends for one in segments)])[first]
         sigma = np.concatenate([np.zeros(0), *(one.sigma for one in segments)])[first]
         usual = float(np.median(sigma)) if len(sigma) else 1.0
-        return scene.replace(
+        return scene.keep(lines=[]).replace(
             lines=Lines.through(self.segments),
             line_observations=LineObservations(self.image_idx, self.line_idx, measured, sigma / usual),
             relations=Relations(point_on_plane=scene.relations.point_on_plane),

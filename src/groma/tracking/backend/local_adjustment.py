@@ -12,32 +12,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.factors.contract import Factor
-from groma.factors.losses import Cauchy
+from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.geometry import se3
-from groma.geometry.charts.line_charts import LINE_CHARTS
-from groma.geometry.charts.plane_charts import PLANE_CHARTS
-from groma.geometry.charts.pose_charts import POSE_CHARTS
-from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
-from groma.problem.variables import Variables
-from groma.scene.landmarks import Lines
+from groma.scene import Lines, Relations
 from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
 from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, back, into
-from groma.tracking.frame.measurements import (
-    LineMeasurements,
-    PlaneMeasurements,
-    PointMeasurements,
-    constants,
-    line_factors,
-    plane_factors,
-    point_factors,
-)
+from groma.tracking.frame.measurements import LineMeasurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.lines import line_ends
-from groma.tracking.map.relations import structure_factors
+from groma.tracking.map.map_scene import TRACKING, SeenLines, SeenPlanes, SeenPoints, map_scene
+from groma.tracking.map.relations import find_relations
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.estimate import GATE
 
@@ -79,7 +66,7 @@ class AdjustmentJob:
         """Write the result to the map; return new_world_from_old_world (7,) near the newest keyframe."""
         assert self.solved is not None
         states = self.solved.variables
-        poses = states["poses"].state
+        poses = states["frames"].state
         old_last = self.keyframes[-1].pose.copy()
         loose = np.ones(len(track_map.points), dtype=bool)
         loose[self.points] = False
@@ -177,6 +164,7 @@ def job_of(
     held: BoolArray,
     relations: bool,
     max_iterations: int = 6,
+    options: AssemblyOptions = TRACKING,
 ) -> AdjustmentJob | None:
     """Prepare the adjustment of some keyframes and all that at least two of them see."""
     living = [track_map.living_measurements(keyframe) for keyframe in keyframes]
@@ -208,28 +196,21 @@ def job_of(
     point_ids, point_local = np.unique(points.index, return_inverse=True)
     line_ids, line_local = np.unique(lines.index, return_inverse=True)
     plane_ids, plane_local = np.unique(planes.index, return_inverse=True)
-    variables = {"poses": Variables(POSE_CHARTS["left"], np.array([k.pose for k in keyframes]), held)}
-    variables |= constants(camera)
-    if len(point_ids):
-        variables["points"] = Variables(Euclidean(3, "point"), track_map.points.xyz[point_ids])
-    if len(line_ids):
-        chart = LINE_CHARTS["cartesian"]
-        variables["lines"] = Variables(chart, chart.from_ambient(track_map.lines.plucker[line_ids]))
-    if len(plane_ids):
-        chart = PLANE_CHARTS["normal_offset"]
-        variables["planes"] = Variables(chart, chart.from_ambient(track_map.planes.hesse[plane_ids]))
-    loss = Cauchy(2.0)
-    factors: list[Factor] = [
-        *point_factors(camera, replace(points, index=point_local), point_pose, loss),
-        *line_factors(camera, replace(lines, index=line_local), line_pose, loss),
-        *plane_factors(replace(planes, index=plane_local), pose["planes"], loss),
-    ]
-    if not factors:
+    scene = map_scene(
+        camera,
+        track_map.view,
+        np.array([k.pose for k in keyframes]),
+        [str(k.index) for k in keyframes],
+        SeenPoints(point_ids, replace(points, index=point_local), point_pose),
+        SeenLines(line_ids, replace(lines, index=line_local), line_pose),
+        SeenPlanes(plane_ids, replace(planes, index=plane_local), pose["planes"]),
+        relations=find_relations(track_map, line_ids, plane_ids) if relations else Relations(),
+    )
+    problem = assemble(scene, replace(options, held_frames=held)).problem
+    if not problem.factors:
         return None
-    if relations:
-        factors += structure_factors(track_map, line_ids, plane_ids)
     return AdjustmentJob(
-        camera, keyframes, held, point_ids, line_ids, plane_ids, Problem(variables, factors),
+        camera, keyframes, held, point_ids, line_ids, plane_ids, problem,
         points, point_rows, point_pose, lines, line_rows, line_pose, max_iterations,
     )  # fmt: skip
 

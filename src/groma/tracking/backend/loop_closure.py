@@ -13,14 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.factors.contract import Ref
+from groma.adjustment.pose_graph import motion_problem
 from groma.factors.losses import Huber
-from groma.factors.priors.pose_between import PoseBetween
 from groma.geometry import se3
-from groma.geometry.charts.pose_charts import POSE_CHARTS
-from groma.problem.problem import Problem
-from groma.problem.variables import Variables
 from groma.scene.landmarks import Lines
+from groma.scene.pose_graph import Motions
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, back, into, planes_back, planes_into
@@ -152,13 +149,13 @@ def _spread_error(track_map: TrackMap, gates: LoopGates) -> None:
     held = np.zeros(len(living), dtype=bool)
     held[0] = True
     sigma = np.array([gates.shift_sigma] * 3 + [gates.turn_sigma] * 3)
-    factor = PoseBetween(
-        first=Ref("poses", np.concatenate(first)), second=Ref("poses", np.concatenate(second)),
-        first_from_second=np.concatenate(relative), sqrt_information=np.diag(1.0 / sigma)[None].repeat(
-            sum(map(len, first)), axis=0
-        ), loss=Huber(gates.loss),
-    )  # fmt: skip
-    problem = Problem({"poses": Variables(POSE_CHARTS["left"], poses, held)}, [factor])
+    motions = Motions(
+        np.concatenate(first),
+        np.concatenate(second),
+        np.concatenate(relative),
+        np.tile(np.diag((1.0 / sigma) ** 2), (sum(map(len, first)), 1, 1)),
+    )
+    problem = motion_problem(poses, held, motions, [(np.arange(len(motions)), Huber(gates.loss))])
     solved = solve(problem, SolverOptions(max_iterations=gates.max_iterations, threads=1))["poses"]
     _move(track_map, living, solved)
 

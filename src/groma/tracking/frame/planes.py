@@ -51,7 +51,7 @@ def frame_planes(
     options = PlaneSearchOptions(min_share=own.min_share, max_planes=own.max_planes)
     found = find_depth_planes(depth, camera.params, noise, options)
     planes, step = found.planes, found.step
-    every = max(own.spacing // step, 1)
+    every = max(gates.depth.grid // step, 1)
     labels = found.labels[every // 2 :: every, every // 2 :: every]
     row, column = np.nonzero(labels >= 0)
     of = labels[row, column].astype(np.int64)

@@ -68,7 +68,7 @@ class DepthGates:
     jump: float = gate(0.01, "scene units", "depths around a pixel differ by less, plus a share", SEQUENCES)
     jump_share: float = gate(0.04, "share", "share of the depth by which they may differ", SEQUENCES)
     min_known: int = gate(4, "pixels", "known depths among a pixel and its eight neighbours", SEQUENCES)
-    grid: int = gate(20, "px", "distance of the places at which a keyframe keeps its depths", "cost: 768 in 640 x 480")
+    grid: int = gate(20, "px", "distance of the places whose depth is kept, and on planes", "cost: 768 in 640 x 480")
     far_share: float = gate(
         0.25, "share", "largest noise of a stereo depth; far points serve as well as near ones", SEQUENCES
     )
@@ -95,7 +95,6 @@ class FramePlaneGates:
     shift: float = gate(0.003, "scene units", "no plane is known better", SEQUENCES)
     min_share: float = gate(0.015, "share", "smallest share of the image on a plane", SEQUENCES)
     max_planes: int = gate(10, "planes", "planes of one frame", "cost: frames show fewer")
-    spacing: int = gate(20, "px", "distance of the places that tell where a plane was seen", "cost: places kept")
     min_places: int = gate(8, "places", "places on a plane; thin strips have fewer", SEQUENCES)
 
 

@@ -44,7 +44,6 @@ class DepthCheckGates:
     min_places: int = gate(40, "places", "places that must be known", SEQUENCES)
     confirms: float = gate(0.8, "share", "this share of the places confirms a pose", SEQUENCES)
     denies: float = gate(0.35, "share", "this share of the places seen through denies it", SEQUENCES)
-    share: float = gate(0.04, "share", "two depths agree within this share", SEQUENCES)
     sigma: float = gate(3.0, "sigma", "and this many standard deviations", "derived from normal noise: 1 in 370")
     smooth: float = gate(0.15, "share", "depths are read where four neighbours differ by less", SEQUENCES)
 

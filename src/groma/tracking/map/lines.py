@@ -103,7 +103,7 @@ def measured_edges(
     good = same_way & (sigma < gates.max_sigma) & (found > gates.min_strength)
     good &= (found > gates.weaker * strength) & (found < gates.stronger * strength)
     rows = np.flatnonzero(good)
-    return FollowedSegments(rows, ends[rows], np.maximum(sigma[rows], gates.followed_sigma), found[rows]), rows
+    return FollowedSegments(rows, ends[rows], sigma[rows], found[rows]), rows
 
 
 def expected_segments(
@@ -155,7 +155,7 @@ def assign(
     length, own = segment2.length(expected)[:, None], segment2.length(ends)[None]
     overlap = np.minimum(along.max(axis=0), length) - np.maximum(along.min(axis=0), 0.0)
     offset = np.abs(across).max(axis=0)
-    score = np.abs(across).mean(axis=0) + gates.gap_cost * np.maximum(-overlap, 0)
+    score = np.abs(across).mean(axis=0)
     good = (direction @ other.T > np.cos(max_angle)) & (offset < gates.end_distance * max_distance)
     good &= (score < max_distance) & (overlap > gates.min_overlap * np.minimum(length, own))
     if expected_inverse is not None and inverse is not None:

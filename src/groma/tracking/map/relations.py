@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Relations between landmarks that the data support, and their factors.
+"""Relations between landmarks that the data support.
 
 A line lies on a plane if both its ends do and the plane was seen there. Planes whose normals are nearly parallel or
 perpendicular are taken to be so; a robust loss lets go of those that are not.
@@ -12,11 +12,7 @@ import math
 import numpy as np
 
 from groma._typing import IntArray
-from groma.factors.contract import Factor, Ref
-from groma.factors.losses import Cauchy
-from groma.factors.relations.line_on_plane import SegmentOnPlane
-from groma.factors.relations.orthogonal import OrthogonalPlanes
-from groma.factors.relations.parallel import ParallelPlanes
+from groma.scene import Relations
 from groma.tracking.map.track_map import TrackMap
 
 #: Distance of a line's ends from its plane: gate, and standard deviation, scene units.
@@ -57,32 +53,23 @@ def plane_pairs(track_map: TrackMap, rows: IntArray) -> tuple[IntArray, IntArray
     return pairs[cosine > math.cos(SQUARE)], pairs[cosine < math.sin(SQUARE)]
 
 
-def structure_factors(track_map: TrackMap, lines: IntArray, planes: IntArray) -> list[Factor]:
-    """Return the factors of relations among the given landmarks; they count in ``lines`` and ``planes``."""
-    factors: list[Factor] = []
+def find_relations(track_map: TrackMap, lines: IntArray, planes: IntArray) -> Relations:
+    """Return the relations among the given landmarks; they count in ``lines`` and ``planes``."""
     if not len(planes):
-        return factors
+        return Relations()
     place = np.full(len(track_map.planes), -1)
     place[planes] = np.arange(len(planes))
-    if len(lines):
-        plane = track_map.lines.plane[lines]
-        rows = np.flatnonzero((plane >= 0) & (place[plane] >= 0))
-        if len(rows):
-            factors.append(
-                SegmentOnPlane(
-                    line=Ref("lines", rows), plane=Ref("planes", place[plane[rows]]),
-                    ends=track_map.lines.segment[lines[rows]], sqrt_information=1.0 / ON_PLANE_SIGMA, loss=Cauchy(1.0),
-                )
-            )  # fmt: skip
-    for kind, pairs in zip((ParallelPlanes, OrthogonalPlanes), plane_pairs(track_map, planes), strict=True):
-        if len(pairs):
-            factors.append(
-                kind(
-                    first=Ref("planes", pairs[:, 0]), second=Ref("planes", pairs[:, 1]),
-                    sqrt_information=1.0 / SQUARE_SIGMA, loss=Cauchy(1.0),
-                )
-            )  # fmt: skip
-    return factors
+    plane = track_map.lines.plane[lines]
+    rows = np.flatnonzero((plane >= 0) & (place[plane] >= 0))
+    parallel, perpendicular = plane_pairs(track_map, planes)
+    return Relations(
+        line_on_plane=np.column_stack([rows, place[plane[rows]]]),
+        line_on_plane_sigma=np.full(len(rows), ON_PLANE_SIGMA),
+        parallel_planes=parallel,
+        parallel_planes_sigma=np.full(len(parallel), SQUARE_SIGMA),
+        perpendicular_planes=perpendicular,
+        perpendicular_planes_sigma=np.full(len(perpendicular), SQUARE_SIGMA),
+    )
 
 
-__all__ = ["find_lines_on_planes", "plane_pairs", "structure_factors"]
+__all__ = ["find_lines_on_planes", "find_relations", "plane_pairs"]

@@ -54,7 +54,7 @@ def depth_agreement(
     if known.sum() < check.min_places:
         return np.nan, np.nan
     measured, expected = measured[known], expected[known]
-    tolerance = check.share * measured + check.sigma * depth_sigma(measured, gates.depth)
+    tolerance = gates.depth.jump_share * measured + check.sigma * depth_sigma(measured, gates.depth)
     away = measured - expected
     return float((np.abs(away) < tolerance).mean()), float((away > tolerance).mean())
 

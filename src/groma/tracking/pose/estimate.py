@@ -9,44 +9,39 @@ eigenvectors of their information :math:`H = \sum w J^\top J`, scaled so that 1 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.factors.contract import Factor, Ref
-from groma.factors.losses import Cauchy, GemanMcClure, Loss
-from groma.factors.priors.pose_prior import PosePrior
-from groma.geometry.charts.line_charts import LINE_CHARTS
-from groma.geometry.charts.plane_charts import PLANE_CHARTS
-from groma.geometry.charts.pose_charts import POSE_CHARTS
-from groma.geometry.manifold import Euclidean
+from groma.adjustment.assemble import assemble
+from groma.adjustment.stages import with_loss
+from groma.factors.contract import Factor
+from groma.factors.losses import Cauchy, GemanMcClure
 from groma.problem.problem import Problem
-from groma.problem.variables import Variables
+from groma.scene import PosePriors
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, into
-from groma.tracking.frame.measurements import (
-    LineMeasurements,
-    Measurements,
-    PlaneMeasurements,
-    PointMeasurements,
-    constants,
-    line_factors,
-    plane_factors,
-    point_factors,
-)
+from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.map.landmarks import MapView
+from groma.tracking.map.map_scene import TRACKING, SeenLines, SeenPlanes, SeenPoints, map_scene
 
 Table = TypeVar("Table", PointMeasurements, LineMeasurements, PlaneMeasurements)
 #: A residual beyond this many standard deviations is an outlier.
 GATE = 3.5
 #: What counts as a well-known direction: share of the median depth, and radians.
 WEAK_SHARE, WEAK_ANGLE = 0.02, math.radians(1.0)
+#: Losses, one after the other, under held landmarks.
+_LOSSES = (Cauchy(1.5), GemanMcClure(3.0))
+_ASSEMBLY = replace(TRACKING, refine_landmarks=False, loss=_LOSSES[0])
 _SOLVER = SolverOptions(
-    max_iterations=8, function_tolerance=1e-3, initial_damping=1e-6, threads=1, eliminate=("poses",)
+    max_iterations=8, function_tolerance=1e-3, initial_damping=1e-6, threads=1, eliminate=("frames",)
 )
+#: Types of factors that tell which points, lines and planes agree.
+_TELLING = (("point_reprojection", "stereo_point"), ("line_reprojection",), ("plane_observation",))
 _NAMES = ("x", "y", "z", "turn about x", "turn about y", "turn about z")
 
 
@@ -92,46 +87,30 @@ def estimate_pose(
     start : (7,), optional
         Where to start, if not at the prior.
     """
-    variables = {"poses": Variables(POSE_CHARTS["left"], (predicted if start is None else start)[None])}
-    variables |= constants(camera)
-    points, lines, planes = measured.points, measured.lines, measured.planes
-    # The landmarks in question, numbered anew.
-    if len(points):
-        variables["points"] = Variables(Euclidean(3, "point"), view.points.xyz[points.index], constant=True)
-        points = _renumbered(points)
-    if len(lines):
-        chart = LINE_CHARTS["cartesian"]
-        variables["lines"] = Variables(chart, chart.from_ambient(view.lines.plucker[lines.index]), constant=True)
-        lines = _renumbered(lines)
-    if len(planes):
-        chart = PLANE_CHARTS["normal_offset"]
-        variables["planes"] = Variables(chart, chart.from_ambient(view.planes.hesse[planes.index]), constant=True)
-        planes = _renumbered(planes)
-
-    def factors(loss: Loss) -> list[list[Factor]]:
-        pose = [np.zeros(len(table), np.int64) for table in (points, lines, planes)]
-        return [
-            point_factors(camera, points, pose[0], loss),
-            line_factors(camera, lines, pose[1], loss),
-            plane_factors(planes, pose[2], loss),
-        ]
-
-    prior = PosePrior(
-        pose=Ref("poses", np.zeros(1, np.int64)),
-        cam_from_world=predicted[None],
-        sqrt_information=np.diag(1.0 / prior_sigma)[None],
+    tables = (measured.points, measured.lines, measured.planes)
+    # Each landmark in question is one of its own, numbered anew.
+    image = [np.zeros(len(table), np.int64) for table in tables]
+    scene = map_scene(
+        camera,
+        view,
+        (predicted if start is None else start)[None],
+        ["frame"],
+        SeenPoints(tables[0].index, _renumbered(tables[0]), image[0]),
+        SeenLines(tables[1].index, _renumbered(tables[1]), image[1]),
+        SeenPlanes(tables[2].index, _renumbered(tables[2]), image[2]),
+        pose_priors=PosePriors(np.zeros(1, np.int64), predicted[None], prior_sigma[None]),
     )
-    for loss in (Cauchy(1.5), GemanMcClure(3.0)):
-        kinds = factors(loss)
-        every = [factor for group in kinds for factor in group]
-        solution = solve(Problem(variables, [*every, prior]), _SOLVER)
-        variables = {**variables, "poses": solution.problem.variables["poses"]}
-    pose = solution["poses"][0]
+    problem = assemble(scene, _ASSEMBLY).problem
+    for loss in _LOSSES:
+        staged = Problem(problem.variables, [with_loss(factor, loss) for factor in problem.factors])
+        problem = solve(staged, _SOLVER).problem
+    every = problem.factors[:-1]  # all but the prior
+    pose = problem.variables["frames"].state[0]
     kept = [
-        _agreeing(solution.problem, group, len(table))
-        for group, table in zip(kinds, (points, lines, planes), strict=True)
+        _agreeing(problem, [factor for factor in every if factor.type_name in names], len(table))
+        for names, table in zip(_TELLING, tables, strict=True)
     ]
-    information = pose_information(solution.problem, every)
+    information = pose_information(problem, every)
     depth = _median_depth(view, measured, pose)
     return PoseEstimate(pose, kept[0], kept[1], kept[2], information, weak_directions(information, depth))
 
@@ -151,11 +130,11 @@ def _whitened(problem: Problem, factor: Factor, wanted: tuple[int, ...], width: 
 
 
 def _agreeing(problem: Problem, group: list[Factor], count: int) -> BoolArray:
-    """Which measurements have no row beyond the gate in the first factor group(s), which cover all of them."""
+    """Which measurements have no row beyond the gate in the factors that cover all of them."""
     good = np.zeros(count, dtype=bool)
     landmark = ("point", "line", "plane")
     for factor in group:
-        if factor.type_name == "point_depth" or getattr(factor, "extrinsics", None) is not None:
+        if getattr(factor, "extrinsics", None) is not None:  # inverse depths of segments
             continue
         columns = (-1,) * len(factor.references())
         residual = _whitened(problem, factor, columns, 1)[..., 0]
@@ -165,7 +144,7 @@ def _agreeing(problem: Problem, group: list[Factor], count: int) -> BoolArray:
     return good
 
 
-def pose_information(problem: Problem, factors: list[Factor]) -> FloatArray:
+def pose_information(problem: Problem, factors: Sequence[Factor]) -> FloatArray:
     """(6, 6) information of factors on pose 0, with weights that fall for large residuals."""
     total = np.zeros((6, 6))
     for factor in factors:

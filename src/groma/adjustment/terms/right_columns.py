@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Points found in both images of rectified stereo pairs.
+
+The observation in the left image and the column in the right one are one residual of three rows under one loss
+(:mod:`groma.factors.observations.stereo_point`), so :mod:`groma.adjustment.terms.points` leaves these observations to
+this term. Where the right cameras are not quite rectified (``right_turn_sigma_px``), the column is a measurement of its
+own: the reprojection into a right camera that may turn about its vertical axis, of which only the row of the column
+counts. A turn by :math:`\alpha` shifts columns near the middle by :math:`f \alpha` pixels; a prior holds it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.adjustment.terms.contract import Draft, Group, Term
+from groma.cameras import model as camera_model
+from groma.errors import InputError
+from groma.factors.contract import Ref
+from groma.factors.observations.point_reprojection import PointReprojection
+from groma.factors.observations.stereo_point import StereoPoint
+from groma.factors.priors.pose_prior import PosePrior
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.problem.variables import Variables
+
+#: The group of the right cameras (cam_from_left_camera, one for each baseline) where they may turn.
+RIGHT_CAMERAS = "right_cameras"
+
+
+def measured_in_pairs(draft: Draft) -> BoolArray:
+    """Which point observations are part of a residual with their column in the right image."""
+    scene = draft.scene
+    paired = np.zeros(len(scene.point_observations), dtype=bool)
+    if len(scene.right_columns) and draft.options.right_turn_sigma_px is None:
+        paired[_usable(draft)[1]] = True
+    return paired
+
+
+def _usable(draft: Draft) -> tuple[IntArray, IntArray]:
+    """Rows of the table whose left camera has no distortion, and their observations."""
+    scene = draft.scene
+    observation = scene.right_columns.observation_idx
+    rectified = np.array([camera_model(name).has_pinhole_parameters for name in scene.cameras.models], dtype=bool)
+    image = scene.point_observations.image_idx[observation]
+    rows = np.flatnonzero(rectified[scene.images.camera_idx[image]])
+    return rows, observation[rows]
+
+
+def _factors(draft: Draft) -> Iterator[Group]:
+    scene, options = draft.scene, draft.options
+    usable, observation = _usable(draft)
+    if len(usable) < len(scene.right_columns):
+        draft.notes.append("Left out: columns in right images of cameras with distortion. Rectify the pairs first.")
+    if options.right_turn_sigma_px is not None:
+        yield from _turned(draft, usable, observation, options.right_turn_sigma_px)
+        return
+    seen, table = scene.point_observations, scene.right_columns.take(usable)
+    for name, rows, intrinsics in draft.by_model(seen.image_idx[observation]):
+        left = observation[rows]
+        baseline = table.baseline[rows]
+        yield Group(
+            StereoPoint(
+                camera_model=name,
+                point=Ref("points", seen.point_idx[left]),
+                intrinsics=intrinsics,
+                pixels=np.column_stack([seen.pixel[left], table.u_right[rows]]),
+                baseline=float(baseline[0]) if (baseline == baseline[0]).all() else baseline,
+                sqrt_information=_weights(options.point_sigma_px * seen.sigma[left], table.sigma[rows]),
+                loss=options.loss,
+                **draft.camera_refs(seen.image_idx[left]),
+            ),
+            observes="points",
+        )
+
+
+def _weights(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Inverse standard deviations (N,) where those of both images are the same, else matrices (N, 3, 3)."""
+    if np.array_equal(left, right):
+        return 1.0 / left
+    out = np.zeros((len(left), 3, 3))
+    out[:, 0, 0] = out[:, 1, 1] = 1.0 / left
+    out[:, 2, 2] = 1.0 / right
+    return out
+
+
+def _turned(draft: Draft, usable: IntArray, observation: IntArray, sigma_px: float) -> Iterator[Group]:
+    """Columns in right cameras that may turn about their vertical axes, and the prior that holds them."""
+    scene, seen = draft.scene, draft.scene.point_observations
+    if draft.has_rigs:
+        raise InputError("right_turn_sigma_px needs a scene without rigs; its images are those of the left cameras.")
+    table = scene.right_columns.take(usable)
+    baselines, of = np.unique(table.baseline, return_inverse=True)
+    start = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(baselines), 1))
+    start[:, 4] = -baselines
+    all_but_the_turn = np.tile([True, True, True, True, False, True], (len(baselines), 1))
+    draft.variables[RIGHT_CAMERAS] = Variables(POSE_CHARTS["left"], start, all_but_the_turn)
+    focal = np.ones(len(baselines))
+    for name, rows, intrinsics in draft.by_model(seen.image_idx[observation]):
+        left = observation[rows]
+        focal[of[rows]] = draft.params(name, seen.image_idx[left])[:, camera_model(name).focal_indices[0]]
+        weight = np.zeros((len(rows), 2, 2))
+        weight[:, 0, 0] = 1.0 / (draft.options.point_sigma_px * table.sigma[rows])
+        yield Group(
+            PointReprojection(
+                camera_model=name,
+                point=Ref("points", seen.point_idx[left]),
+                intrinsics=intrinsics,
+                pixels=np.column_stack([table.u_right[rows], seen.pixel[left, 1]]),
+                sqrt_information=weight,
+                loss=draft.options.loss,
+                pose=Ref("frames", scene.images.frame_idx[seen.image_idx[left]]),
+                extrinsics=Ref(RIGHT_CAMERAS, of[rows]),
+            )
+        )
+    weight = np.tile(np.eye(6), (len(baselines), 1, 1))
+    weight[:, 4, 4] = focal / sigma_px
+    yield Group(
+        PosePrior(pose=Ref(RIGHT_CAMERAS, np.arange(len(baselines))), cam_from_world=start, sqrt_information=weight)
+    )
+
+
+TERM = Term("right columns", ("right_columns",), ("points",), _factors)
+__all__ = ["RIGHT_CAMERAS", "TERM", "measured_in_pairs"]

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What frames measure of a map, as a scene: of one frame, of a window of keyframes, or of all of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.stages import METRIC_LOSS, METRIC_RELATION_LOSS
+from groma.scene import (
+    Cameras,
+    LineDepths,
+    LineObservations,
+    Lines,
+    PlaneObservations,
+    Planes,
+    PointDepths,
+    PointObservations,
+    Points,
+    Relations,
+    RightColumns,
+    Scene,
+)
+from groma.scene.table import Table
+from groma.tracking.frame.camera import PINHOLE, TrackCamera
+from groma.tracking.frame.measurements import DEPTH_BASELINE, LineMeasurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.map.landmarks import MapView
+
+#: How tracking assembles problems. Points are near and well known, and keep to plain steps.
+TRACKING = AssemblyOptions(
+    point_chart="euclidean",
+    loss=METRIC_LOSS,
+    relation_loss=METRIC_RELATION_LOSS,
+    drop_behind=False,
+    require_in_front=True,
+    gauge="free",
+)
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """Measurements of points by several images: those of landmark ``ids[k]`` have the index k."""
+
+    ids: IntArray
+    table: PointMeasurements
+    image: IntArray
+
+
+@dataclass(frozen=True)
+class SeenLines:
+    """Measurements of lines by several images."""
+
+    ids: IntArray
+    table: LineMeasurements
+    image: IntArray
+
+
+@dataclass(frozen=True)
+class SeenPlanes:
+    """Measurements of planes by several images."""
+
+    ids: IntArray
+    table: PlaneMeasurements
+    image: IntArray
+
+
+def map_scene(
+    camera: TrackCamera,
+    view: MapView,
+    poses: FloatArray,
+    names: list[str],
+    points: SeenPoints,
+    lines: SeenLines,
+    planes: SeenPlanes,
+    **more: Table | Relations,
+) -> Scene:
+    """Return the scene of some images, their landmarks, and everything measured of them.
+
+    Parameters
+    ----------
+    camera
+        Of all images.
+    view
+        The landmarks of the map; those of the scene keep their numbers there, plus one, as identifiers.
+    poses : (F, 7)
+        cam_from_world.
+    names
+        Of the images.
+    points, lines, planes
+        What the images measure.
+    **more
+        Further tables of the scene.
+    """
+    cameras = Cameras(
+        np.array([1]), (PINHOLE,), camera.params[None], np.array([camera.width]), np.array([camera.height])
+    )
+    count = len(points.ids)
+    return Scene.from_images(
+        cameras,
+        names,
+        np.zeros(len(names), int),
+        poses,
+        points=Points(points.ids + 1, view.points.xyz[points.ids], np.full((count, 3), 128), np.zeros(count)),
+        lines=Lines(lines.ids + 1, view.lines.plucker[lines.ids], view.lines.segment[lines.ids]),
+        planes=Planes(planes.ids + 1, view.planes.hesse[planes.ids]),
+        **_point_tables(camera, points.table, points.image),
+        **_line_tables(lines.table, lines.image),
+        plane_observations=PlaneObservations(
+            planes.image, planes.table.index, planes.table.plane, planes.table.sqrt_information
+        ),
+        **more,
+    )
+
+
+def _point_tables(camera: TrackCamera, table: PointMeasurements, image: IntArray) -> dict[str, object]:
+    tables: dict[str, object] = {
+        "point_observations": PointObservations.numbered(image, table.index, table.pixel, table.sigma)
+    }
+    rows = np.flatnonzero(np.isfinite(table.depth))
+    if len(rows):
+        tables["point_depths"] = PointDepths(image[rows], table.index[rows], table.depth[rows], table.depth_sigma[rows])
+    rows = np.flatnonzero(np.isfinite(table.right))
+    if len(rows):
+        baseline = np.full(len(rows), camera.baseline)
+        tables["right_columns"] = RightColumns(rows, table.right[rows], baseline, table.sigma[rows])
+    return tables
+
+
+def _line_tables(table: LineMeasurements, image: IntArray) -> dict[str, object]:
+    if not len(table):
+        return {}
+    tables: dict[str, object] = {
+        "line_observations": LineObservations(image, table.index, table.ends, table.sigma),
+    }
+    rows = np.flatnonzero(np.isfinite(table.inverse_depth).all(axis=1))
+    if len(rows):
+        baseline = np.full(len(rows), DEPTH_BASELINE)
+        tables["line_depths"] = LineDepths(rows, table.inverse_depth[rows], table.inverse_depth_sigma[rows], baseline)
+    return tables
+
+
+__all__ = ["TRACKING", "SeenLines", "SeenPlanes", "SeenPoints", "map_scene"]
