@@ -144,7 +144,8 @@ def track(
         folders = ", ".join(f"part_{number}" for number in range(2, len(result.parts) + 2))
         warnings.append(f"Only the longest part is in trajectory.txt and the report; see also {folders}.")
     scores, not_compared = _compared(result, sequence)
-    tracked = {item.name: getattr(result, item.name) for item in fields(result)} | {"warnings": tuple(warnings)}
+    tracked: dict[str, Any] = {item.name: getattr(result, item.name) for item in fields(result)}
+    tracked["warnings"] = tuple(warnings)
     return SequenceResult(
         **tracked,
         frames=tuple(frames),
