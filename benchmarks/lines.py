@@ -103,8 +103,8 @@ def run_groma(task: Task) -> list[LineSet]:
 def _run_groma(task: Task, name: str, options: MapLinesOptions) -> list[LineSet]:
     settings = MapOptions(lines=options, refine_poses=False, threads=1)
     matches = task.matches or None
-    with tempfile.TemporaryDirectory() as work, Stages(Path(work), task.source.name) as store:
-        points = adjust_points(task.source.scene, settings, store, _silent)
+    with tempfile.TemporaryDirectory() as work, Stages(Path(work), task.source.name, settings) as stages:
+        points = stages.run(adjust_points, task.source.scene)
         map_lines(points, task.segments, matches, options)  # kernels into memory
         start = time.process_time()
         found = map_lines(points, task.segments, matches, options)
@@ -114,13 +114,9 @@ def _run_groma(task: Task, name: str, options: MapLinesOptions) -> list[LineSet]
         if not found.num_lines:
             return [mapped]
         start = time.process_time()
-        result = map_segments(points, task.segments, matches, settings, store, _silent)
+        result = map_segments(points, task.segments, matches, stages)
         seconds = time.process_time() - start
     return [mapped, LineSet(name, task.matching, result.scene.lines.segments, track, seconds)]
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    """Nobody watches."""
 
 
 def run_limap(task: Task, python: str) -> list[LineSet]:

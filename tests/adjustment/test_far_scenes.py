@@ -96,11 +96,11 @@ def test_a_map_is_made_near_the_origin_and_moved_back(tmp_path, monkeypatch, sta
     """What is between the two is looked at without photographs."""
     seen = []
 
-    def mapped(folder, names, model, *others):
-        seen.append(model)
-        return MapResult(near.scene, model, start, near.report, OPTIONS, {}, "", {}, ())
+    def mapped(points, *others):
+        seen.append(points)
+        return MapResult(near.scene, points, start, near.report, OPTIONS, {}, "", {}, ())
 
-    monkeypatch.setattr(mapping, "_mapped", mapped)
+    monkeypatch.setattr(mapping, "map_segments", mapped)
     for name in start.images.names:
         cv2.imwrite(str(tmp_path / name), np.zeros((768, 1024), np.uint8))
     model = start.points_only().transformed(TO_UTM)

@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Edges and texture told apart by the images that show a line and those that should; which images should."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from _wireframe import arc, random_lines, wireframe
+from scipy.special import logit
 
-from groma.mapping.lines.build import TEXTURE_ODDS
-from groma.mapping.lines.texture import EDGE, TEXTURE, edge_odds, num_expected
+from groma.mapping.lines.filters import FilterGates
+from groma.mapping.lines.texture import TextureGates, edge_odds, num_expected
 from groma.mapping.lines.tracks import Tracks
 from groma.mapping.lines.views import build_views
+
+EDGE, TEXTURE = TextureGates().edge, TextureGates().texture
+TEXTURE_ODDS = logit(FilterGates().min_edge_probability)
 
 
 def population(rng, count, rate, length, leftover, expected=12):
@@ -67,9 +73,8 @@ def test_few_lines_and_none():
 def test_images_that_should_show_a_line(size):
     rng = np.random.default_rng(3)
     world = wireframe(arc(5), random_lines(20, rng), rng)
-    tracks = Tracks(build_views(world.scene, world.segments, 5.0, 0.1, 2.0))
-    tracks.X = world.lines.copy()
-    tracks.line_of = np.concatenate(world.truth)
+    views, line_of = build_views(world.scene, world.segments, 5.0, 0.1, 2.0), np.concatenate(world.truth)
+    tracks = replace(Tracks.none(views, np.zeros(len(line_of), np.int64)), lines=world.lines, line_of=line_of)
     neighbors: list[np.ndarray] = [np.delete(np.arange(5), i) for i in range(5)]
     counted = num_expected(tracks, neighbors, np.tile(np.array(size, int), (5, 1)), 30.0)
     limit = np.where(np.array(size) > 0, size, np.inf)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from groma.cli.commands.map import map_
-from groma.mapping.distinct import distinct_pairs, num_distinct
+from groma.mapping.groups import distinct_pairs, num_distinct
 from groma.mapping.lines import merge as _line_merge
 from groma.mapping.lines.build import LineMap, explain
-from groma.mapping.lines.merge import MAX_ANGLE, MIN_OVERLAP
+from groma.mapping.lines.merge import MergeGates
 from groma.mapping.lines.outcomes import REMEDIES, WORDS, Outcome
 from groma.mapping.unused import without_unused
 from groma.scene import Directions, Relations
@@ -35,11 +35,11 @@ def all_pairs(X, reach):
     for a in range(len(X)):
         for b in range(len(X)):
             d, e = X[a, 1] - X[a, 0], X[b, 1] - X[b, 0]
-            if a == b or abs(d @ e) <= np.cos(MAX_ANGLE) * np.linalg.norm(d) * np.linalg.norm(e):
+            if a == b or abs(d @ e) <= np.cos(MergeGates().max_angle) * np.linalg.norm(d) * np.linalg.norm(e):
                 continue
             t = (X[b] - X[a, 0]) @ d / (d @ d)
             low, high = max(0.0, t.min()), min(1.0, t.max())
-            if high - low < MIN_OVERLAP * min(1.0, np.ptp(t)):
+            if high - low < MergeGates().min_overlap * min(1.0, np.ptp(t)):
                 continue
             places = np.array([low, high])
             on_b = X[b, 0] + ((places - t[0]) / (t[1] - t[0]))[:, None] * e
@@ -79,7 +79,7 @@ def test_lines_that_an_image_shows_side_by_side():
     pointers = np.searchsorted(line_of[rows], np.arange(5))
     pairs = np.array([[0, 1], [1, 0], [0, 2], [0, 3]])
     apart = np.zeros(len(pairs), bool)
-    _line_merge._apart(pairs, pointers, rows, image, ends, line, apart)
+    _line_merge._apart(pairs, pointers, rows, image, ends, line, 0.3, 1.0, apart)
     assert apart.tolist() == [True, True, False, False]
 
 

@@ -23,7 +23,8 @@ from groma.features.matches import LineMatches
 from groma.io import read_scene, write_scene
 from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
 from groma.mapping import map as mapping
-from groma.mapping.checkpoints import Stages, digest, has_stages, remove_stages
+from groma.mapping.checkpoint_files import SCENE
+from groma.mapping.checkpoints import Stages, digest, has_stages, remove_stages, stage
 from groma.mapping.map import MapOptions, map_images
 from groma.mapping.photographs import check_names, image_files, read_gray
 from groma.scene import Planes, PointObservations, Points, compare
@@ -171,35 +172,35 @@ def test_the_models_folder_is_named(model):
 def test_stages_are_made_once_and_again_when_something_before_them_changes(tmp_path, model):
     made = []
 
-    def make(name):
-        return lambda: made.append(name) or model
+    def make(name, depends=lambda options: None):
+        return stage(name, SCENE, depends)(lambda scene, options, say: made.append(name) or scene)
 
     for options in (1, 1, 2, 1):
-        with Stages(tmp_path / "work", digest("input")) as store:
-            assert compare.equal(store.scene("a", make("a")), model)
-            store.scene("b", make("b"), options)
-            store.scene("c", make("c"))
+        with Stages(tmp_path / "work", digest("input"), options) as stages:
+            assert compare.equal(stages.run(make("a"), model), model)
+            stages.run(make("b", lambda options: options), model)
+            stages.run(make("c"), model)
     assert made == ["a", "b", "c", "b", "c", "b", "c"]
-    with Stages(tmp_path / "work", digest("other input")) as store:
-        store.scene("a", make("a"))
+    with Stages(tmp_path / "work", digest("other input"), 1) as stages:
+        stages.run(make("a"), model)
     assert made[7:] == ["a"]
     (damaged,) = (tmp_path / "work").glob("a-*.npz")
     damaged.write_bytes(b"PK")
-    with Stages(tmp_path / "work", digest("other input")) as store:
-        assert compare.equal(store.scene("a", make("a")), model)
+    with Stages(tmp_path / "work", digest("other input"), 1) as stages:
+        assert compare.equal(stages.run(make("a"), model), model)
     assert made[7:] == ["a", "a"]
 
 
 def test_two_runs_in_one_folder_are_refused(tmp_path):
-    with Stages(tmp_path / "work", "key"):
+    with Stages(tmp_path / "work", "key", None):
         with (
             pytest.raises(OutputError, match=rf"Another run \(process {os.getpid()}\) works in"),
-            Stages(tmp_path / "work", "key"),
+            Stages(tmp_path / "work", "key", None),
         ):
             pass
         remove_stages(tmp_path / "work")
         assert (tmp_path / "work").exists()
-    with Stages(tmp_path / "work", "key"):
+    with Stages(tmp_path / "work", "key", None):
         pass
     assert not has_stages(tmp_path / "work")
     remove_stages(tmp_path / "work")
@@ -210,7 +211,7 @@ def test_the_lock_is_found_before_anything_is_said(tmp_path, corner, monkeypatch
     images, _ = corner
     monkeypatch.chdir(tmp_path)
     command = ["map", str(images), "-o", "out", "--model", str(images.parent / "model.npz")]
-    with Stages(tmp_path / "out.work", "key"):
+    with Stages(tmp_path / "out.work", "key", None):
         (tmp_path / "out.work" / "points-0123456789ab.npz").write_text("of the other run")
         assert run(command) == 1
     said = capsys.readouterr()
@@ -220,15 +221,18 @@ def test_the_lock_is_found_before_anything_is_said(tmp_path, corner, monkeypatch
 
 def test_a_place_that_cannot_be_written_is_said(tmp_path, model, monkeypatch):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="Cannot keep finished stages in"), Stages(tmp_path / "file", "key"):
+    with pytest.raises(OutputError, match="Cannot keep finished stages in"), Stages(tmp_path / "file", "key", None):
         pass
 
     def full(scene, path):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("groma.mapping.checkpoints.write_archive", full)
-    with Stages(tmp_path / "work", "key") as store, pytest.raises(OutputError, match=r"No space left.*Make room"):
-        store.scene("points", lambda: model)
+    monkeypatch.setattr("groma.mapping.checkpoint_files.write_archive", full)
+    with (
+        Stages(tmp_path / "work", "key", None) as stages,
+        pytest.raises(OutputError, match=r"No space left.*Make room"),
+    ):
+        stages.run(stage("points", SCENE)(lambda *_: model))
 
 
 def test_a_full_disk_ends_the_command_in_one_line_and_loses_nothing(tmp_path, corner, monkeypatch, capsys):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Lines mapped from segments: wireframes with exact truth, degenerate motion, matches, distortion, empty maps."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -15,13 +17,13 @@ from groma.mapping.lines.build import (
     LineMap,
     MapLinesOptions,
     Outcome,
-    _is_sure,
     explain,
     external_matches,
     map_lines,
     segment_matches,
 )
 from groma.mapping.lines.directions import depth_ratios
+from groma.mapping.lines.filters import is_certain
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.proposals import Proposer, angles_about_baseline
 from groma.mapping.lines.tracks import Tracks
@@ -194,7 +196,7 @@ def test_directions_place_what_two_views_cannot():
     ratios = depth_ratios(flat.scene, flat.segments, views)
     P = views.camera[0]
     x = xyz @ P[:, :3].T + P[:, 3]
-    proposer = Proposer(views, ratios, True, 0.3, 0.03)
+    proposer = Proposer(views, ratios, MapLinesOptions())
     found = proposer.propose(
         0, np.array([1]), [(np.empty((0, 2), np.int64), np.empty(0))], (x[:, :2] / x[:, 2:], 1 / x[:, 2])
     )
@@ -311,14 +313,14 @@ def test_lines_of_texture():
 
 
 def test_far_lines_must_be_known_as_well_as_usual_ones(world):
-    tracks = Tracks(build_views(world.scene, world.segments, 12.0, 0.15, 2.0))
-    tracks.X, tracks.line_of = world.lines.copy(), np.concatenate(world.truth)
-    tracks.X[0] *= 1e3 / np.linalg.norm(tracks.X[0].mean(0))
-    seen = np.bincount(tracks.line_of[tracks.line_of >= 0], minlength=len(tracks.X)) > 0
+    views, line_of = build_views(world.scene, world.segments, 12.0, 0.15, 2.0), np.concatenate(world.truth)
+    lines, zero = world.lines.copy(), np.zeros(len(world.lines))
+    lines[0] *= 1e3 / np.linalg.norm(lines[0].mean(0))
+    seen = np.bincount(line_of[line_of >= 0], minlength=len(lines)) > 0
     assert seen[0]
-    tracks.unchecked = np.zeros(len(tracks.X))
-    distance = np.linalg.norm(tracks.X.mean(1)[:, None] - tracks.views.center, axis=2)
+    tracks = replace(Tracks.none(views, np.zeros(len(line_of))), lines=lines, line_of=line_of, unchecked=zero)
+    distance = np.linalg.norm(lines.mean(1)[:, None] - views.center, axis=2)
     usual = float(np.median(distance.mean(1)[seen]))
     for relative, known in ((0.009, True), (0.02, False)):
-        tracks.uncertainty = np.full(len(tracks.X), relative * usual)
-        assert _is_sure(tracks, MapLinesOptions())[0] == known
+        uncertain = replace(tracks, uncertainty=zero + relative * usual)
+        assert is_certain(uncertain, MapLinesOptions())[0] == known

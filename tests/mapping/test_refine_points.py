@@ -96,10 +96,9 @@ def test_observations_of_a_point_agree_to_a_few_hundredths_of_a_pixel(world):
     assert rms[1] < 0.35 * rms[0]
 
 
-def test_points_in_chunks_and_threads_give_the_same(world, monkeypatch):
+def test_points_in_chunks_and_threads_give_the_same(world):
     _, noisy, images = world
     once = refine_points(noisy, images.__getitem__, NOISE, refining.PointRefinementOptions(threads=1))
-    monkeypatch.setattr(refining, "POINTS_AT_ONCE", 40)
     seen = []
     again = refine_points(
         noisy,
@@ -107,6 +106,7 @@ def test_points_in_chunks_and_threads_give_the_same(world, monkeypatch):
         NOISE,
         refining.PointRefinementOptions(threads=2),
         lambda done, total: seen.append((done, total)),
+        refining.PointRefinementGates(points_at_once=40),
     )
     np.testing.assert_array_equal(again.scene.point_observations.pixel, once.scene.point_observations.pixel)
     np.testing.assert_array_equal(again.scene.point_observations.sigma, once.scene.point_observations.sigma)

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The segments of all images, one image in memory at a time; where a lens bends lines, found where they are straight.
+"""The segments of all images, with one image in memory at a time, detected without lens distortion.
 
-A straight edge seen through a distorting lens is an arc. A detector of straight segments breaks it into short chords
-beside it. Images of such cameras are therefore resampled without distortion, with the same camera matrix; segments are
-found there, and their end points taken back to the image as it is, which is what the rest of groma measures in.
+A lens with distortion images a straight edge as an arc, which a detector of straight segments breaks into short chords.
+Images of such cameras are therefore resampled without distortion, with the same camera matrix. Segments are detected
+there, and their end points are mapped back to the original image, in which the rest of groma measures.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -23,21 +24,34 @@ from groma.features.contract import SegmentDetector
 from groma.features.external import ExternalMatches
 from groma.features.images import GrayImage
 from groma.features.segments import Segments
+from groma.gates import gate
 from groma.geometry import segment2
 from groma.mapping.photographs import read_gray
+from groma.mapping.work import map_work
 from groma.scene import Scene
 
-#: A lens that moves no pixel by more than this is taken as it is; pixels.
-NEGLIGIBLE = 0.05
-#: The resampled image is at most so much larger than the original, per side; wide lenses lose their corners.
-MAX_GROWTH = 2.0
+
+@dataclass(frozen=True)
+class LensGates:
+    """When images are resampled without the distortion of their lens, and how large they may become."""
+
+    negligible: float = gate(
+        0.05, "px", "movement of pixels by a lens that is taken as it is", "derived from the noise of segments: a third"
+    )
+    max_growth: float = gate(
+        2.0, "1", "side of the resampled image over that of the original", "cost: wide lenses lose their corners"
+    )
+    max_fold: float = gate(0.5, "px", "of a pixel that is bent and straightened again", "convention: half a pixel")
+
+
+GATES = LensGates()
 #: Places looked at along a segment, to find the part of it inside the image.
 _SAMPLES = 65
 
 
 @dataclass(frozen=True)
 class Straightener:
-    """Resamples the images of one camera without distortion, and takes segments back."""
+    """Resamples the images of one camera without distortion, and maps segments back."""
 
     model: camera_models.CameraModel
     params: FloatArray
@@ -50,15 +64,15 @@ class Straightener:
 
     @staticmethod
     def of(model: camera_models.CameraModel, params: FloatArray, width: int, height: int) -> Straightener | None:
-        """Make one for a camera; None if its lens bends nothing worth the effort."""
+        """Return the one of a camera; None if its distortion is negligible."""
         u, v = np.linspace(0.0, width, 33), np.linspace(0.0, height, 33)
         border = np.concatenate([np.column_stack([u, np.full(33, side)]) for side in (0.0, height)])
         border = np.concatenate([border, *(np.column_stack([np.full(33, side), v]) for side in (0.0, width))])
         straight = model.undistort_pixels(params, border)
         straight = straight[np.isfinite(straight).all(1)]
-        if len(straight) == len(border) and np.abs(straight - border).max() <= NEGLIGIBLE:
+        if len(straight) == len(border) and np.abs(straight - border).max() <= GATES.negligible:
             return None
-        growth = 0.5 * (MAX_GROWTH - 1.0) * np.array([width, height])
+        growth = 0.5 * (GATES.max_growth - 1.0) * np.array([width, height])
         corner = np.array([width, height], float)
         low = np.maximum(np.floor(straight.min(0, initial=0.0)), np.floor(-growth))
         high = np.minimum(np.ceil(straight.max(0, initial=0.0)), np.ceil(corner + growth))
@@ -103,7 +117,7 @@ class Straightener:
         inside = np.all((bent >= 0.0) & (bent <= np.array(self.size)), axis=1)
         # Far out a polynomial lens model folds the plane back into the image; only what comes back was seen there.
         back = self.model.undistort_pixels(self.params, bent[inside]) + self._shift
-        inside[inside] = np.all(np.abs(back - pixels[inside]) < 0.5, axis=1)
+        inside[inside] = np.all(np.abs(back - pixels[inside]) < GATES.max_fold, axis=1)
         return inside
 
     @property
@@ -117,20 +131,18 @@ def detect_segments(
 ) -> list[Segments]:
     """Find the segments of every image of a scene; pixels of the images as they are."""
     straighteners: dict[int, Straightener | None] = {}
-    found = []
-    for i, name in enumerate(scene.images.names):
-        say("finding segments", i, scene.num_images)
-        image = read_gray(folder / name)
-        camera = int(scene.images.camera_idx[i])
+
+    def of_image(i: int) -> Segments:
+        image, camera = read_gray(folder / scene.images.names[i]), int(scene.images.camera_idx[i])
         if camera not in straighteners:
             model = camera_models.model(scene.cameras.models[camera])
             # One is kept: it is larger than the image, and there may be a camera for every image.
-            straighteners = {
-                camera: Straightener.of(model, scene.cameras.params_of(camera), image.shape[1], image.shape[0])
-            }
+            straighteners.clear()
+            straighteners[camera] = Straightener.of(model, scene.cameras.params_of(camera), *image.shape[::-1])
         straightener = straighteners[camera]
-        found.append(detector.detect(image) if straightener is None else straightener.detect(detector, image))
-    return found
+        return detector.detect(image) if straightener is None else straightener.detect(detector, image)
+
+    return map_work(of_image, range(scene.num_images), partial(say, "finding segments"))
 
 
 def given_segments(
@@ -157,11 +169,11 @@ def given_segments(
             f"The line matches refer to segments of {min(used - known)!r}, but do not hold them. Add an array "
             f"'segments|{min(used - known)}'."
         )
-    found = []
-    for i, name in enumerate(scene.images.names):
-        say("reading segments", i, scene.num_images)
-        found.append(external.segments_of(name, read_gray(folder / name)) if name in known else Segments.empty())
-    return found
+
+    def of_image(name: str) -> Segments:
+        return external.segments_of(name, read_gray(folder / name)) if name in known else Segments.empty()
+
+    return map_work(of_image, scene.images.names, partial(say, "reading segments"))
 
 
 __all__ = ["Straightener", "detect_segments", "given_segments"]

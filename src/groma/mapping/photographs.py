@@ -10,6 +10,7 @@ from __future__ import annotations
 import posixpath
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ import numpy as np
 from groma.errors import GromaError, InputError
 from groma.features.images import GrayImage, to_gray
 from groma.io.endings import IMAGES, VIDEOS
+from groma.mapping.work import map_work
 from groma.scene import Scene
 
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
@@ -104,6 +106,43 @@ def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
     )
 
 
+def check_number(folder: Path, names: Sequence[str], model: Scene | None, fewest: int) -> None:
+    """Check that there are images and points enough for a map, and that the folder has the images of the model."""
+    if model is None:
+        if len(names) < 3:
+            raise InputError(f"{folder} holds {_images(len(names))}; a map needs at least 3 that overlap. Take more.")
+        return
+    if model.num_images < max(2, fewest):
+        raise InputError(
+            f"The model has {_images(model.num_images)} with a pose; a map needs at least {max(2, fewest)} that "
+            "overlap. Pass a model with more, or none to have it made."
+        )
+    if len(model.point_observations.image_idx) == 0:
+        raise InputError(
+            "The model has no points that its images observe; they tell which images see the same, and hold the poses. "
+            "Pass a model with points, or none to have it made."
+        )
+    check_names(folder, names, model)
+
+
+def images_left_out(names: Sequence[str], used: Sequence[str], model_given: bool) -> list[str]:
+    """Say which images of the folder have no pose, in at most one sentence."""
+    left = sorted(set(names) - set(used))
+    if not left:
+        return []
+    more = "" if len(left) <= 3 else f" and {len(left) - 3} more"
+    remedy = " They share too few points with the others: take images between them, or pass a --model."
+    have = "has no pose in the model and was" if len(left) == 1 else "have no pose in the model and were"
+    return [
+        f"{len(left)} of {len(names)} images {have} not used: {', '.join(left[:3])}{more}."
+        f"{'' if model_given else remedy}"
+    ]
+
+
+def _images(number: int) -> str:
+    return f"{number} {'image' if number == 1 else 'images'}"
+
+
 def _suggestion(folder: Path, names: Sequence[str], missing: list[str]) -> str:
     """What to do about image names that are not there."""
     by_end = {posixpath.basename(name): name for name in names}
@@ -131,16 +170,18 @@ def check_images(folder: Path, names: Sequence[str], model: Scene | None, say: C
     """Check that every image of the model, or of the folder, can be read, and has the size of its camera."""
     sizes = {} if model is None else _sizes(model)
     used = list(names) if model is None else list(model.images.names)
-    for i, name in enumerate(used):
-        say("checking images", i, len(used))
+
+    def check(name: str) -> None:
         height, width = read_gray(folder / name).shape
         size = sizes.get(name, (0, 0))
-        if size == (0, 0) or size == (width, height):
-            continue
+        if size in ((0, 0), (width, height)):
+            return
         remedy = "Pass the images the model was made from."
         if size == (height, width):
             remedy = "It is turned by 90 degrees: pass the images as they were stored when the model was made."
         raise InputError(f"{folder / name} has {width}x{height} pixels, its camera {size[0]}x{size[1]}. {remedy}")
+
+    map_work(check, used, partial(say, "checking images"))
 
 
 def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
@@ -150,4 +191,4 @@ def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
     return {name: of_camera[camera] for name, camera in zip(model.images.names, model.images.camera_idx, strict=True)}
 
 
-__all__ = ["check_images", "check_names", "image_files", "read_gray"]
+__all__ = ["check_images", "check_names", "check_number", "image_files", "images_left_out", "read_gray"]

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Measure the points of a scene again in its photographs.
 
-A detector places the keypoints of a track one by one. Here one observation of each point, the one most like the others,
-defines it by the grey levels around it; the others are found by aligning that patch to their images
-(:mod:`groma.features.patch_alignment`), from the place where they were and with the shape that poses and a plane facing
-the cameras predict. Every place found comes with its standard deviation, so that an adjustment can weight it.
+A detector localises the keypoints of a track independently. Here one observation of each point, the one most similar to
+the others in viewpoint, becomes the reference, with the patch of grey levels around it. The other observations are
+refined by aligning this patch to their images (:mod:`groma.features.patch_alignment`), starting at the detected pixel
+and with the affine shape that the poses and a plane facing the cameras predict. Every refined pixel has a standard
+deviation, so that an adjustment can weight it.
 
-The error of the defining observation is no error of the others: it only says which physical point is meant. It carries
-no noise but what no image can tell, :data:`SIGMA_FLOOR`.
+An error of the reference pixel does not affect the others: it only selects which physical point is meant. The reference
+therefore has the smallest standard deviation, that of effects which no image shows.
 
-Images are read twice, one per thread at a time; templates are held for :data:`POINTS_AT_ONCE` points.
+Each image is read twice, and each thread holds one; templates are held for a bounded number of points.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,16 +23,23 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.features.images import GrayImage
-from groma.features.patch_alignment import SIZE, Templates, align_templates, cut_templates, smoothed
+from groma.features.patch_alignment import SIZE, Alignment, Templates, align_templates, cut_templates, smoothed
+from groma.gates import gate
 from groma.geometry.algebra import norm, perpendicular, unit
 from groma.mapping.noise.landmarks import project_points
+from groma.mapping.work import map_work
 from groma.problem.parallel import available_cores
 from groma.scene import Scene
 
-#: What no image tells of a place: lens model, shading, surfaces that are not flat; pixels.
-SIGMA_FLOOR = 0.03
-#: Points whose templates are held together: a hundred megabytes.
-POINTS_AT_ONCE = 100_000
+
+@dataclass(frozen=True)
+class PointRefinementGates:
+    """What no image tells of a place, and how much is held in memory."""
+
+    sigma_floor: float = gate(
+        0.03, "px", "deviation that lens model, shading and surfaces that are not flat leave", "chosen on ETH3D facades"
+    )
+    points_at_once: int = gate(100_000, "points", "whose templates are held together", "cost: a hundred megabytes")
 
 
 @dataclass(frozen=True)
@@ -66,6 +73,7 @@ def refine_points(
     sigma_px: float,
     options: PointRefinementOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
+    gates: PointRefinementGates = PointRefinementGates(),
 ) -> PointRefinement:
     """Place the point observations of a scene anew by the grey levels around them.
 
@@ -81,6 +89,8 @@ def refine_points(
         Gates and threads.
     progress : callable, optional
         Called with the number of images read and to be read.
+    gates : PointRefinementGates, optional
+        What no image tells.
 
     Returns
     -------
@@ -99,60 +109,87 @@ def refine_points(
     options = options or PointRefinementOptions()
     if not sigma_px > 0.0:
         raise InputError(f"sigma_px must be positive; got {sigma_px}. Pass the noise of the observations, pixels.")
-    table = scene.point_observations
+    table, count = scene.point_observations, scene.num_points
     by_plane, usable = _moves_in_image(scene)
-    reference = _references(scene, by_plane, usable)
-    is_reference = np.zeros(len(table), dtype=bool)
-    is_reference[reference[reference >= 0]] = True
+    search = _Search(scene, read, by_plane, usable, _references(scene, by_plane, usable))
     pixel, deviation = table.pixel.copy(), np.full(len(table), np.inf)
-    searched = usable & ~is_reference & (reference[table.point_idx] >= 0)
-    chunks = range(0, scene.num_points, POINTS_AT_ONCE)
-    done = 0
-    with ThreadPoolExecutor(options.threads or available_cores()) as pool:
-        for begin in chunks:
-            end = min(begin + POINTS_AT_ONCE, scene.num_points)
-            templates = _blank(end - begin)
+    chunks = [range(first, min(first + gates.points_at_once, count)) for first in range(0, count, gates.points_at_once)]
+    threads = options.threads or available_cores()
 
-            def cut(image: int, begin=begin, end=end, templates=templates) -> None:
-                rows = reference[begin:end]
-                points = np.flatnonzero((rows >= 0) & (table.image_idx[rows] == image))
-                if len(points):
-                    found = cut_templates(smoothed(read(image)), table.pixel[rows[points]])
-                    templates.levels[points], templates.fractions[points] = found.levels, found.fractions
+    say = progress or (lambda done, total: None)
 
-            def align(image: int, begin=begin, end=end, templates=templates) -> None:
-                point = table.point_idx
-                rows = np.flatnonzero(searched & (table.image_idx == image) & (point >= begin) & (point < end))
-                if len(rows) == 0:
-                    return
-                shapes = by_plane[rows] @ np.linalg.inv(by_plane[reference[point[rows]]])
-                found = align_templates(
-                    smoothed(read(image)), templates, point[rows] - begin, table.pixel[rows], shapes
-                )
-                good = found.found & (found.correlation >= options.min_correlation)
-                good &= norm(found.pixels - table.pixel[rows]) <= options.max_shift
-                spread = np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2) + SIGMA_FLOOR**2)
-                good &= spread < sigma_px
-                pixel[rows[good]], deviation[rows[good]] = found.pixels[good], spread[good]
+    def step(number: int) -> Callable[[int, int], None]:
+        return lambda done, images: say(number * images + done, 2 * len(chunks) * images)
 
-            for work in (cut, align):
-                for _ in pool.map(work, range(scene.num_images)):
-                    done += 1
-                    if progress is not None:
-                        progress(done, 2 * len(chunks) * scene.num_images)
-    refined = np.isfinite(deviation)
-    defined = (np.bincount(table.point_idx[refined], minlength=scene.num_points) > 0)[table.point_idx]
+    for k, points in enumerate(chunks):
+        templates = search.templates(points, threads, step(2 * k))
+        for rows, found in search.places(points, templates, threads, step(2 * k + 1)):
+            spread = np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2) + gates.sigma_floor**2)
+            good = found.found & (found.correlation >= options.min_correlation) & (spread < sigma_px)
+            good &= norm(found.pixels - table.pixel[rows]) <= options.max_shift
+            pixel[rows[good]], deviation[rows[good]] = found.pixels[good], spread[good]
+    refined, is_reference = np.isfinite(deviation), search.is_reference()
+    defined = (np.bincount(table.point_idx[refined], minlength=count) > 0)[table.point_idx]
     # What kept its place errs against the defining observation, which errs itself.
     deviation[~refined] = np.where(defined[~refined], np.sqrt(2.0) * sigma_px, sigma_px)
     is_reference &= defined
-    deviation[is_reference] = SIGMA_FLOOR
+    deviation[is_reference] = gates.sigma_floor
     usual = float(np.median(deviation)) if len(deviation) else sigma_px
     observations = table.replace(pixel=pixel, sigma=deviation / usual)
     return PointRefinement(scene.replace(point_observations=observations), refined, is_reference, usual)
 
 
-def _blank(count: int) -> Templates:
-    return Templates(np.zeros((count, SIZE, SIZE), np.float32), np.full((count, 2), np.nan))
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """What the observations of points are looked for with."""
+
+    scene: Scene
+    read: Callable[[int], GrayImage]
+    #: (N, 2, 2) how each observed pixel moves with its point in the plane that faces the cameras, and if it is known.
+    by_plane: FloatArray
+    usable: BoolArray
+    #: (P,) rows of the observations that define the points, -1 for none.
+    reference: IntArray
+
+    def is_reference(self) -> BoolArray:
+        """(N,) whether each observation defines its point."""
+        chosen = np.zeros(len(self.usable), dtype=bool)
+        chosen[self.reference[self.reference >= 0]] = True
+        return chosen
+
+    def templates(self, points: range, threads: int, progress: Callable[[int, int], None]) -> Templates:
+        """Grey levels around the observations that define some points."""
+        table, rows = self.scene.point_observations, self.reference[points.start : points.stop]
+        found = Templates(np.zeros((len(points), SIZE, SIZE), np.float32), np.full((len(points), 2), np.nan))
+
+        def of_image(image: int) -> None:
+            chosen = np.flatnonzero((rows >= 0) & (table.image_idx[rows] == image))
+            if len(chosen):
+                cut = cut_templates(smoothed(self.read(image)), table.pixel[rows[chosen]])
+                found.levels[chosen], found.fractions[chosen] = cut.levels, cut.fractions
+
+        map_work(of_image, range(self.scene.num_images), progress, threads)
+        return found
+
+    def places(
+        self, points: range, templates: Templates, threads: int, progress: Callable[[int, int], None]
+    ) -> list[tuple[IntArray, Alignment]]:
+        """Rows of the other observations of these points in each image, and where their templates are found."""
+        table = self.scene.point_observations
+        point = table.point_idx
+        searched = self.usable & ~self.is_reference() & (self.reference[point] >= 0)
+        searched &= (point >= points.start) & (point < points.stop)
+
+        def of_image(image: int) -> tuple[IntArray, Alignment] | None:
+            rows = np.flatnonzero(searched & (table.image_idx == image))
+            if len(rows) == 0:
+                return None
+            shapes = self.by_plane[rows] @ np.linalg.inv(self.by_plane[self.reference[point[rows]]])
+            gray = smoothed(self.read(image))
+            return rows, align_templates(gray, templates, point[rows] - points.start, table.pixel[rows], shapes)
+
+        found = map_work(of_image, range(self.scene.num_images), progress, threads)
+        return [one for one in found if one is not None]
 
 
 def _moves_in_image(scene: Scene) -> tuple[FloatArray, BoolArray]:

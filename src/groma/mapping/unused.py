@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Landmarks that nothing holds: points and lines that no image sees, planes and directions without enough on them."""
+"""Removal of unobservable landmarks: points and lines without observations, planes and directions with few members."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import numpy as np
 
 from groma.scene import Scene
 
-#: Points, a line counting twice, that fix a plane; lines that make a direction a common one.
+#: Points that determine a plane, a line counting twice; lines that share a direction.
 _MIN_ON_PLANE, _MIN_ALONG = 3, 2
 
 
 def without_unused(scene: Scene, *others: Scene) -> tuple[Scene, ...]:
-    """Return a scene without the landmarks that nothing holds, and others with the same landmarks without them too.
+    """Return a scene without its unobservable landmarks, and other scenes without the same landmarks.
 
     Numbers in files (ids) stay those of the landmarks; only positions in the arrays change.
     """

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Lines have several minima: those that settled in a wrong one are found, placed anew, and solved on their own."""
+"""Lines that converged to a wrong local minimum are detected, triangulated again and solved with cameras held."""

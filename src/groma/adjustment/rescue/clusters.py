@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Lines find their place together with the points that lie on them, under held cameras.
+"""Restart of lines together with the points that lie on them, with cameras held.
 
-A line and the points tied to it are a *cluster*: neither has a place of its own. In a wrong minimum the points hold the
-line and the line holds the points, so that triangulating one of them anew does not help
-(:mod:`groma.adjustment.rescue.restart` moves lines alone). A cluster that fits far worse than clusters usually do is
-solved twice, as it is and with its lines triangulated anew, and the better of the two ends is kept. Cameras and planes
-are held, so clusters do not depend on each other; all that are in doubt are one small problem.
+A line and the points related to it form a *cluster*. In a wrong local minimum they hold each other in place, so moving
+the line alone (:mod:`groma.adjustment.rescue.restart`) does not help. A cluster that fits much worse than the median is
+solved twice, from its present state and with its lines triangulated again, and the better result is kept. With cameras
+and planes held, clusters are independent; all suspicious ones form one small problem.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import LINE_FACTORS, POINT_FACTORS
-from groma.adjustment.rescue.restart import STEPS, SUSPICIOUS, triangulated_anew, went_elsewhere, with_cameras
+from groma.adjustment.rescue.restart import GATES, triangulated_anew, went_elsewhere, with_cameras
 from groma.factors.contract import Factor, Ref
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
@@ -30,15 +29,15 @@ from groma.solver.solve import solve
 
 
 def settle_clusters(scene: Scene, problem: Problem, threads: int | None = None) -> tuple[Problem, IntArray]:
-    """Return the problem with clusters in doubt at the better of two minima, and their lines that moved.
+    """Return the problem with suspicious clusters at the better of two minima, and their lines that moved.
 
     Parameters
     ----------
     scene : Scene
         What the problem was made from.
     problem : Problem
-        A problem at any state, its lines in the order of the scene; without points tied to free lines it comes back as
-        it is.
+        A problem at any state, with its lines in the order of the scene; returned unchanged if no point is related to
+        a free line.
     threads : int, optional
         Threads; None takes one for small problems and all cores for large ones.
     """
@@ -63,7 +62,9 @@ def settle_clusters(scene: Scene, problem: Problem, threads: int | None = None) 
         name: _joined(group, chosen[name], second[name]) if name in chosen else replace(group, constant=True)
         for name, group in variables.items()
     }
-    settled = solve(Problem(starts, doubled), SolverOptions(max_iterations=STEPS, threads=threads)).problem.variables
+    settled = solve(
+        Problem(starts, doubled), SolverOptions(max_iterations=GATES.max_steps, threads=threads)
+    ).problem.variables
     ends = np.zeros(2 * count)
     mine = [label[kept] for label, kept in zip(labels, rows, strict=True) if len(kept)]
     for factor, label in zip(doubled, mine, strict=True):
@@ -114,7 +115,7 @@ def _doubtful(factors, labels: list[IntArray], count: int, variables: Mapping[st
     per_view = (cost / np.maximum(views, 1.0))[:count]
     seen = views[:count] > 0
     usual = float(np.median(per_view[seen])) if seen.any() else 0.0
-    return np.append(seen & (per_view > SUSPICIOUS * max(usual, 1e-12)), False)
+    return np.append(seen & (per_view > GATES.suspicious * max(usual, 1e-12)), False)
 
 
 def _costs(factor: Factor, label: IntArray, count: int, variables: Mapping[str, Variables]) -> FloatArray:

@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Lines get a second chance between two stages of an adjustment, and settle, under held cameras.
+r"""Restart of lines in wrong local minima, between two stages of an adjustment, with cameras held.
 
-The reprojection cost of a line has several local minima: a start on the wrong side of a short baseline ends in one that
-small steps never leave. A few such lines hold up the whole adjustment, because cameras move to please them. With the
-cameras nearly right the linear triangulation of a line is near its global minimum. A line that fits
-:data:`SUSPICIOUS` times worse than lines usually do goes on from there, too, and the better of its two ends is kept.
+The reprojection cost of a line has several local minima. A start on the wrong side of a short baseline converges to one
+that small steps never leave, and a few such lines hold up the whole adjustment because cameras adapt to them. Once the
+cameras are nearly right, the linear triangulation of a line is close to its global minimum. A line that fits much worse
+than the median is therefore solved from there as well, and the better of the two results is kept.
 
-A line that is seen nearly along its length is strongly bent: Gauss-Newton steps of it overshoot, and joint steps of all
-variables are refused because of one line. Lines that start in the minimum that the cameras at hand give them hardly
-move in later steps.
+The cost of a line that is seen almost along its length is strongly nonlinear: Gauss-Newton steps overshoot, and joint
+steps of all variables are rejected because of one line. Lines that start at their minimum for the current cameras
+hardly move in later steps.
 
-All lines, and the second starts of some as lines beside them, are one problem whose variables do not depend on each
-other: it is laid out once, and each line stops when it has converged.
+All lines, and the second starts as additional lines, are one problem of independent variables. It is laid out once, and
+each line stops when it has converged.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from groma.estimators.line_ends import trim
 from groma.estimators.line_triangulation import triangulate_planes
 from groma.estimators.trimming import TrimStatus, trim_to_ray
 from groma.factors.contract import Factor, Ref
+from groma.gates import gate
 from groma.geometry import line3, quaternion, segment2
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
@@ -35,24 +36,39 @@ from groma.scene import Scene
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
-#: A line is suspicious if its mean squared residual is this many times the median of all lines. A few that are in the
-#: right place are too; to start them twice costs little, and some wrong minima fit hardly worse than the right one.
-SUSPICIOUS = 2.0
-#: A line went elsewhere if it moved by more than this share of its length: its old end points then say little.
-ELSEWHERE = 0.02
-#: Most steps of a line on its own; most need two or three.
-STEPS = 20
+
+@dataclass(frozen=True)
+class RestartGates:
+    """Which lines are started again, and which of them went elsewhere."""
+
+    suspicious: float = gate(
+        2.0,
+        "1",
+        "mean squared residual over the median of all lines, from which a line is started twice",
+        "cost: a few right lines are started twice; some wrong minima fit hardly worse than the right one",
+    )
+    min_views: int = gate(3, "observations", "of a line that can be suspicious", "derived from two that fix a line")
+    elsewhere: float = gate(
+        0.02,
+        "1",
+        "distance over its length by which a line moved, if its old end points say little",
+        "chosen on wireframes",
+    )
+    max_steps: int = gate(20, "steps", "of a line on its own", "cost: most need two or three")
+
+
+GATES = RestartGates()
 
 
 def renew_lines(scene: Scene, problem: Problem, threads: int | None = None) -> tuple[Problem, IntArray]:
-    """Return the problem with each line at a minimum of its own cost, all else held, and suspicious lines that moved.
+    """Return the problem with each line at a minimum of its cost, all else held, and the restarted lines that moved.
 
     Parameters
     ----------
     scene : Scene
         What the problem was made from.
     problem : Problem
-        A problem at any state, its lines in the order of the scene; without free lines it comes back as it is.
+        A problem at any state, with its lines in the order of the scene; returned unchanged if no line is free.
     threads : int, optional
         Threads; None takes one for small problems and all cores for large ones.
     """
@@ -65,7 +81,7 @@ def renew_lines(scene: Scene, problem: Problem, threads: int | None = None) -> t
     used = {ref.group for factor in factors for _, ref in factor.references()} - {"lines"}
     held = {name: replace(problem.variables[name], constant=True) for name in used}
     starts = Problem({**held, "lines": _joined(lines, chosen, second)}, doubled)
-    options = SolverOptions(max_iterations=STEPS, threads=threads)
+    options = SolverOptions(max_iterations=GATES.max_steps, threads=threads)
     settled = solve(starts, options).problem
     first, other = np.split(settled.variables["lines"].state, [len(lines)])
     cost = _line_costs(settled, doubled)[0] if len(chosen) else np.zeros(len(lines))
@@ -81,7 +97,7 @@ def went_elsewhere(segments: FloatArray, before: FloatArray, after: FloatArray) 
     """Whether the places of segments (n, 2, 3) on lines before (n, 6) are far from the lines after; also if unknown."""
     feet = line3.closest_point(before[:, None], segments)
     away = line3.distance_to_point(after[:, None], feet).max(axis=1)
-    return np.asarray(~(away <= ELSEWHERE * np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)))
+    return np.asarray(~(away <= GATES.elsewhere * np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)))
 
 
 def _slot_of_lines(factor: Factor) -> str | None:
@@ -117,10 +133,10 @@ def _joined(lines: Variables, chosen: IntArray, second: FloatArray) -> Variables
 def _second_starts(scene: Scene, problem: Problem, factors: list[Factor]) -> tuple[IntArray, FloatArray]:
     """Return the lines that are suspicious, and each triangulated anew, (n, 6)."""
     cost, count = _line_costs(problem, [factor for factor in factors if factor.type_name in LINE_FACTORS])
-    enough: BoolArray = np.asarray(count >= 3)
+    enough: BoolArray = np.asarray(count >= GATES.min_views)
     per_view = cost / np.maximum(count, 1)
     usual = float(np.median(per_view[enough])) if enough.any() else 0.0
-    chosen = np.flatnonzero(enough & (per_view > SUSPICIOUS * max(usual, 1e-12)))
+    chosen = np.flatnonzero(enough & (per_view > GATES.suspicious * max(usual, 1e-12)))
     if len(chosen) == 0:
         return chosen, np.zeros((0, 6))
     triangulated, found = triangulated_anew(with_cameras(scene, problem), chosen)
@@ -164,8 +180,8 @@ def triangulated_anew(scene: Scene, lines: IntArray) -> tuple[FloatArray, BoolAr
 def with_seen_ends(scene: Scene, lines: IntArray) -> Scene:
     """Return the scene with new end points of lines that went elsewhere: where its images end them.
 
-    The feet of the old end points may lie anywhere on such a line. The rule is that of mapping
-    (:mod:`groma.estimators.line_ends`), from where the medians of the segments' ends are.
+    The projections of the old end points may lie anywhere on such a line. New ones follow the rule of mapping
+    (:mod:`groma.estimators.line_ends`), starting at the medians of the ends of the segments.
     """
     table = scene.line_observations
     rows = np.flatnonzero(np.isin(table.line_idx, lines))

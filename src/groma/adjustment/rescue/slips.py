@@ -1,48 +1,55 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Lines that passed through a camera, or behind it, to please a wrong observation are brought back.
+r"""Recovery of lines that moved through a camera, or behind it, because of a wrong observation.
 
-In the image of a camera on a line every direction is as good as another: a line that passes through the centre of one
-of its cameras fits any segment there, and under a robust loss the others may bend for it. Behind a camera, too, a line
-has an image, though nothing there can be seen. With :math:`(m, d)` the line in the camera and b the bearing of the
-middle of the segment, the ray meets the line, or passes it, at the depth
+A line through the centre of a camera fits every segment in that image, and under a robust loss it may move there at the
+expense of its other observations. A line behind a camera also has an image, although it is invisible. With :math:`(m,
+d)` the line in the camera and b the bearing of the middle of the segment, the ray meets the line, or passes it, at the
+depth
 
 .. math:: z = \frac{(d \times m)^\top b}{\|d\|^2 - (d^\top b)^2} .
 
-An observation is false if z is negative or tiny beside what the other observations of the line have. The line goes
-back to where the others want it; the false one then counts as what it is, an outlier.
+An observation is false if z is negative, or very small compared with the other observations of the line. The line is
+solved without its false observations, which then are the outliers they should be.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.adjustment.rescue.restart import GATES as RESTART_GATES
 from groma.estimators.trimming import trim_to_ray
 from groma.factors.observations.line_bearing import LineBearing
 from groma.factors.observations.line_reprojection import LineReprojection
+from groma.gates import gate
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
 Observing = LineReprojection | LineBearing
 
-#: A segment this many times nearer to its camera than usual for its line is not seen there.
-NEAREST = 0.01
-#: Most steps of a line on its own.
-STEPS = 20
-#: Sine of the angle from which on a line has turned: its old end points then say little about the new ones.
-TURNED = 0.02
+
+@dataclass(frozen=True)
+class SlipGates:
+    """Which observations of a line are false."""
+
+    nearest: float = gate(
+        0.01, "1", "depth of a segment over the usual one of its line, below which it is false", "chosen on wireframes"
+    )
+
+
+GATES = SlipGates()
 
 
 def without_slips(problem: Problem, threads: int | None = None) -> tuple[Problem, IntArray]:
-    """Return the problem with lines that slipped through or behind a camera back in their place, and those that turned.
+    """Return the problem with the lines recovered that slipped through or behind a camera, and which of them turned.
 
     Parameters
     ----------
     problem : Problem
-        A problem at any state, under robust losses; it comes back as it is where no line slipped.
+        A problem at any state, with robust losses; returned unchanged if no line slipped.
     threads : int, optional
         Threads; None takes one for small problems and all cores for large ones.
     """
@@ -65,11 +72,11 @@ def without_slips(problem: Problem, threads: int | None = None) -> tuple[Problem
         factors.append(factor.take(np.flatnonzero(keep)))
     used = {ref.group for factor in factors for _, ref in factor.references()} - {"lines"}
     held = {name: replace(problem.variables[name], constant=True) for name in used}
-    options = SolverOptions(max_iterations=STEPS, threads=threads)
+    options = SolverOptions(max_iterations=RESTART_GATES.max_steps, threads=threads)
     settled = solve(Problem({**held, "lines": lines}, factors), options).problem.variables["lines"]
     before, after = (group.ambient()[mine, 3:] for group in (lines, settled))
     sine = np.linalg.norm(np.cross(before, after), axis=1)
-    turned = sine > TURNED * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    turned = sine > RESTART_GATES.elsewhere * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
     return Problem({**problem.variables, "lines": settled}, problem.factors), mine[turned]
 
 
@@ -83,7 +90,7 @@ def _slipped(problem: Problem, factors: list[Observing]) -> list[BoolArray]:
     usual = np.zeros(len(count))
     seen = count > 0
     usual[seen] = depth[order[(first + count // 2)[seen]]]  # of two, the farther
-    limit = np.where(usual > 0, NEAREST * usual, -np.inf)
+    limit = np.where(usual > 0, GATES.nearest * usual, -np.inf)
     return [z < limit[factor.line.index] for z, factor in zip(depths, factors, strict=True)]
 
 

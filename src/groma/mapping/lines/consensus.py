@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Which of a segment's proposals several images agree on.
+r"""The place of a segment on which most of its neighbours agree.
 
 Proposals q, q' of different neighbours with covariances support each other by
 :math:`(q - q')^\top (\Sigma + \Sigma')^{-1} (q - q')`. The best supported ones are fused in information form,
 
 .. math:: \Sigma_f^{-1} = \sum w_j \Sigma_j^{-1}, \qquad \Sigma_f^{-1} q_f = \sum w_j \Sigma_j^{-1} q_j,
 
-one proposal per neighbour, compared again, and the place that most neighbours agree on is kept. What the image itself
-proposes, from points or a vanishing direction, takes part like a neighbour, but cannot make up for one.
+with one proposal per neighbour, and compared with all proposals again; the place with the largest support is kept.
+Proposals from points and vanishing directions take part like those of a neighbour, but do not replace one.
 """
 
 from __future__ import annotations
@@ -19,12 +19,22 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.gates import gate
+from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.proposals import Proposals
 
-#: Mahalanobis distance up to which two proposals agree: 99.7 % for two degrees of freedom.
-GATE = 11.6
-#: Hypotheses per segment that are fused and compared.
-NUM_SEEDS = 3
+
+@dataclass(frozen=True)
+class ConsensusGates:
+    """When proposals agree."""
+
+    num_seeds: int = gate(
+        3, "proposals", "per segment that are fused with what agrees, and compared", "cost: the best is among the first"
+    )
+    fusing_rounds: int = gate(3, "rounds", "of fusing and comparing again", "cost: the second changes little")
+    half_weight: float = gate(
+        4.0, "sigma^2", "squared distance at which a proposal counts half in the fused place", "chosen on wireframes"
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -71,15 +81,15 @@ def _support(pointers, order, neighbor, values, num_neighbors, gate, total):
 
 
 @loop
-def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate, min_support, q, covariance, score,
-            supporters, rival, assisted):  # fmt: skip
+def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate, half_weight, num_seeds, num_rounds,
+            min_support, q, covariance, score, supporters, rival):  # fmt: skip
     """Fuse the best supported proposals of each segment and keep the one that most neighbours agree on."""
     chosen = np.empty(num_neighbors + 2, np.int64)
     nearest = np.empty(num_neighbors + 2)
     for i in range(len(pointers) - 1):
         begin, end = pointers[i], pointers[i + 1]
         used = np.zeros(end - begin, np.bool_)
-        for _ in range(NUM_SEEDS):
+        for _ in range(num_seeds):
             seed, top = -1, 0.0
             for k in range(begin, end):
                 if not used[k - begin] and total[order[k]] > top:
@@ -89,7 +99,7 @@ def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate
             p = order[seed]
             q1, q2, c11, c12, c22 = values[p, 0], values[p, 1], values[p, 2], values[p, 3], values[p, 4]
             number, points, value = 0, 0, 0.0
-            for _ in range(3):  # fuse, compare again
+            for _ in range(num_rounds):  # fuse, compare again
                 nearest[:] = gate
                 chosen[:] = -1
                 for k in range(begin, end):
@@ -113,7 +123,7 @@ def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate
                         points = 1
                     else:
                         number += 1
-                    weight = 1.0 / (1.0 + nearest[n] / 4.0)
+                    weight = 1.0 / (1.0 + nearest[n] / half_weight)
                     value += values[r, 5] * (1.0 - nearest[n] / gate)
                     determinant = values[r, 2] * values[r, 4] - values[r, 3] * values[r, 3]
                     if not determinant > 0.0:
@@ -134,7 +144,6 @@ def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate
                 score[i] = value
                 q[i, 0], q[i, 1] = q1, q2
                 covariance[i, 0], covariance[i, 1], covariance[i, 2] = c11, c12, c22
-                assisted[i, 0], assisted[i, 1] = chosen[num_neighbors] >= 0, chosen[num_neighbors + 1] >= 0
                 for n in range(num_neighbors):
                     supporters[i, n] = other[chosen[n]] if chosen[n] >= 0 else -1
             elif value > rival[i]:
@@ -158,22 +167,29 @@ class Choice:
     rival: FloatArray
     #: (n, num_neighbors) rows of the supporting segments, -1 for none.
     supporters: IntArray
-    #: (n, 2) whether known points, and a point with a vanishing direction, have a part in it.
-    assisted: BoolArray
 
 
-def choose(proposals: Proposals, num_segments: int, num_neighbors: int, min_support: int) -> Choice:
+def choose(
+    proposals: Proposals,
+    num_segments: int,
+    num_neighbors: int,
+    min_support: int,
+    gates: ConsensusGates = ConsensusGates(),
+) -> Choice:
     """Choose the place of each segment by the summed support of distinct neighbours."""
     by_segment = np.lexsort([proposals.values[:, 0], proposals.segment])
     pointers = np.searchsorted(proposals.segment[by_segment], np.arange(num_segments + 1))
-    total = np.zeros(len(proposals.segment))
-    _support(pointers, by_segment, proposals.neighbor, proposals.values, num_neighbors, GATE, total)
+    total, max_squared = np.zeros(len(proposals.segment)), AGREEMENT.max_squared(2)
+    _support(pointers, by_segment, proposals.neighbor, proposals.values, num_neighbors, max_squared, total)
     q, covariance = np.zeros((num_segments, 2)), np.zeros((num_segments, 3))
     score, rival = np.zeros(num_segments), np.zeros(num_segments)
     supporters = np.full((num_segments, num_neighbors), -1, np.int64)
-    assisted = np.zeros((num_segments, 2), bool)
     _choose(
-        pointers, by_segment, proposals.neighbor, proposals.other, proposals.values, total, num_neighbors, GATE,
-        min_support, q, covariance, score, supporters, rival, assisted,
+        pointers, by_segment, proposals.neighbor, proposals.other, proposals.values, total, num_neighbors,
+        max_squared, gates.half_weight, gates.num_seeds, gates.fusing_rounds, min_support, q, covariance, score,
+        supporters, rival,
     )  # fmt: skip
-    return Choice(score > 0.0, q, covariance, score, rival, supporters, assisted)
+    return Choice(score > 0.0, q, covariance, score, rival, supporters)
+
+
+__all__ = ["Choice", "ConsensusGates", "choose"]

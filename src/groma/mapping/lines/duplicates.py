@@ -1,46 +1,50 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Lines that only repeat another one, beside it.
+"""Duplicates: lines that are explained by another line beside them.
 
-Two edges that are a pixel or two apart in an image, such as those of a thin board, are one segment there, up to a pixel
-away from either. A few such segments of neighbouring images agree on a line where there is nothing, or agree with a
-segment elsewhere by chance. What gives that line away is another one: in most images of the first it runs within
-:data:`REACH` of the segments if it has many more images, or within their noise if it has more; and no image shows both
-of them side by side. Without the images that are so explained, fewer are left than make a line.
+Two edges that are a pixel or two apart in an image, such as those of a thin board, are detected as one segment there,
+up to a pixel away from either. A few such segments can agree on a line where there is no edge. It is recognised by
+another line that, in most of its images, passes within the noise of its segments and has more images, or passes within
+a pixel and has many more; no image shows both side by side. A line is rejected if fewer images than a line needs remain
+unexplained.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from groma._typing import BoolArray, IntArray
-from groma.mapping.distinct import distinct_pairs
+from groma.gates import gate
+from groma.mapping.lines.gates import AGREEMENT
+from groma.mapping.lines.growth import near_lines, votes_for_same
 from groma.mapping.lines.merge import seen_apart
 from groma.mapping.lines.tracks import Tracks
 
-#: Edges nearer than that to each other are one segment in an image, pixels.
-REACH = 1.0
-#: Share of a line's images in which another one explains its segments.
-MIN_SHARE = 0.6
-#: How many times more images the other line must have, where it only runs near the segments.
-MIN_RATIO = 2
+
+@dataclass(frozen=True)
+class DuplicateGates:
+    """When a line is explained by another one."""
+
+    min_ratio: float = gate(
+        2.0, "1", "times as many images has a line that only runs near the segments", "chosen on ETH3D facades"
+    )
 
 
-def not_duplicates(tracks: Tracks, neighbors: list[IntArray], min_images: int) -> BoolArray:
+def not_duplicates(
+    tracks: Tracks, neighbors: list[IntArray], min_images: int, gates: DuplicateGates = DuplicateGates()
+) -> BoolArray:
     """(L,) lines that no other line explains."""
-    good, images = np.ones(len(tracks.X), bool), tracks.num_images()
-    for reach, ratio in ((REACH, MIN_RATIO), (None, 1.0)):
-        hit = tracks.near_lines(neighbors, reach)
+    good, images = np.ones(tracks.num_lines, bool), tracks.num_images()
+    for reach, ratio in ((AGREEMENT.same_edge, gates.min_ratio), (None, 1.0)):
+        hit = near_lines(tracks, neighbors, reach)
         owner = tracks.line_of[hit[:, 1]]
         stronger = (owner >= 0) & (images[hit[:, 0]] > images[owner]) & (images[hit[:, 0]] >= ratio * images[owner])
-        hit, owner = hit[stronger], owner[stronger]
-        seen, _ = distinct_pairs(hit[:, 0] * len(tracks.X) + owner, tracks.views.image_idx[hit[:, 1]])
-        key, votes = np.unique(seen[:, 0], return_counts=True)
-        pairs = np.column_stack([key // len(tracks.X), key % len(tracks.X)])
+        pairs, votes = votes_for_same(tracks, hit, stronger)
         weak = images[pairs[:, 1]]
-        explained = (votes >= MIN_SHARE * weak) & (weak - votes < min_images)
-        pairs = pairs[explained]
+        pairs = pairs[(votes >= AGREEMENT.min_common * weak) & (weak - votes < min_images)]
         good[pairs[~seen_apart(tracks, pairs), 1]] = False
     return good
 
 
-__all__ = ["not_duplicates"]
+__all__ = ["DuplicateGates", "not_duplicates"]

@@ -85,9 +85,11 @@ class Fit:
     unchecked: FloatArray
 
 
-def fit_lines(views: LineViews, pointers: IntArray, rows: IntArray, active: BoolArray, start: FloatArray) -> Fit:
+def fit_lines(
+    views: LineViews, sigma: FloatArray, pointers: IntArray, rows: IntArray, active: BoolArray, start: FloatArray
+) -> Fit:
     """Fit lines to the segments ``rows`` (M,) that are ``active``, from lines through ``start`` (L, 2, 3)."""
-    own = np.column_stack([views.ends[rows], views.sigma[rows]])
+    own = np.column_stack([views.ends[rows], sigma[rows]])
     observations = Observations(views.camera, views.image_idx[rows], own, pointers, active)
     found = solve_batch(TWO_POINT_LINE, observations, start, cauchy_scale=_CAUCHY)
     fit = Fit(found.states, np.zeros(len(rows)), np.zeros(len(start)), np.zeros(len(start)))
@@ -100,7 +102,7 @@ def fit_lines(views: LineViews, pointers: IntArray, rows: IntArray, active: Bool
 
 # ------------------------------------------------------------------------------------------------------------ Recover
 @loop
-def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_overlap, found, distance):
+def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_overlap, min_px, found, distance):
     """Segments (rows) of one image that lie on projections of lines; return the number written, or needed."""
     count = 0
     for e in range(len(lines)):
@@ -116,7 +118,7 @@ def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_ove
         x0, y0, x1, y1 = x0 / z0, y0 / z0, x1 / z1, y1 / z1
         dx, dy = x1 - x0, y1 - y0
         length = math.sqrt(dx * dx + dy * dy)
-        if length < 5.0:
+        if length < min_px:
             continue
         dx, dy = dx / length, dy / length
         for k in range(len(rows)):
@@ -135,7 +137,7 @@ def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_ove
             if forward[n] * (t1 - t0) < 0.0:
                 continue
             overlap = min(max(t0, t1), length) - max(min(t0, t1), 0.0)
-            if overlap < min_overlap * min(abs(t1 - t0), length) or overlap < 5.0:
+            if overlap < min_overlap * min(abs(t1 - t0), length) or overlap < min_px:
                 continue
             if count < len(found):
                 found[count, 0], found[count, 1] = n, s

@@ -1,36 +1,44 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Lines of segments of a kind that is found again, and lines of segments of a kind that is not.
+r"""Repeatability: how often segments of a given length and contrast become part of a line.
 
-The border of a blotch, a vein of marble and a blade of grass give segments like the edge of a box does, and some of
-them agree in three images. What tells them apart is the others of their kind: an edge is found in most images that see
-it, while of the segments that texture gives few are ever found again. How often is learned from the images themselves.
-Of a segment with length l and gradient s, among all segments that could have become part of a line, the probability to
-be part of one is
+Texture such as stains, marble and grass gives segments, as the edge of a box does, and some of them agree in three
+images by chance. Their repeatability differs: edges are found in most images that see them, segments of texture rarely.
+It is learned from the images at hand. Among all segments that could be part of a line, one with length l and gradient s
+is part of a line with the probability
 
 .. math:: p = \frac{1}{1 + \exp(-w_0 - w_1 \log l - w_2 \log s)},
 
-fitted to what became of them (logistic regression, maximum posterior with a standard normal prior of the slopes, which
-leaves p the same for all where there are too few to tell). A line is of a kind that is found again if the mean of p
-over its segments reaches
+fitted by logistic regression (maximum a posteriori, with a standard normal prior on the slopes, which makes p constant
+where data are few). A line is kept if the mean of p over its segments reaches
 
 .. math:: \min(\max(p_\text{least},\ 1 - \bar p),\ 0.6\,p_\text{top}).
 
-:math:`\bar p` is the share of all segments that are part of a line. For :math:`p \ge 1 - \bar p` the odds of the kind
-times the odds of the scene are at least one: the less of a scene is found again, the more is asked of a line.
-:math:`p_\text{top}` is what the best tenth of the segments reach; where images are few or far apart that is
-little, and then little is asked.
+:math:`\bar p` is the fraction of all segments that are part of a line. For :math:`p \ge 1 - \bar p` the product of
+the odds of the segments and of the scene is at least one: the less of a scene is repeatable, the more is required of a
+line. :math:`p_\text{top}` is reached by the best tenth of the segments; it is small, and so is the requirement, where
+images are few or far apart.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.gates import gate
 
-#: What is at most asked of a line, over what the best kind of segment reaches.
-TOP_SHARE = 0.6
-#: The quantile of p that stands for the best kind.
-TOP_QUANTILE = 0.9
+
+@dataclass(frozen=True)
+class KindGates:
+    """What is asked of the kind of a line's segments, beside ``MapLinesOptions.min_repeatability``."""
+
+    top_share: float = gate(
+        0.6, "1", "asked at most, over what the best kind of segment reaches", "chosen on ETH3D facades"
+    )
+    top_quantile: float = gate(0.9, "quantile", "of p that stands for the best kind", "chosen on ETH3D facades")
+
+
 #: Newton steps of the fit at most.
 _STEPS = 50
 
@@ -63,7 +71,13 @@ def repeatability(length: FloatArray, strength: FloatArray, eligible: BoolArray,
 
 
 def found_again(
-    length: FloatArray, strength: FloatArray, line_of: IntArray, eligible: BoolArray, num_lines: int, least: float
+    length: FloatArray,
+    strength: FloatArray,
+    line_of: IntArray,
+    eligible: BoolArray,
+    num_lines: int,
+    least: float,
+    gates: KindGates = KindGates(),
 ) -> BoolArray:
     """Lines whose segments are of a kind that is found again.
 
@@ -79,6 +93,8 @@ def found_again(
         Number of lines.
     least : float
         The mean probability asked of a line where most segments are part of one; 0 keeps all lines.
+    gates : KindGates, optional
+        What is asked of a line beside.
 
     Returns
     -------
@@ -89,12 +105,11 @@ def found_again(
     if least <= 0.0 or not member.any():
         return np.ones(num_lines, bool)
     p = repeatability(length, strength, eligible, member)
-    asked = min(
-        max(least, 1.0 - float(member[eligible].mean())), TOP_SHARE * float(np.quantile(p[eligible], TOP_QUANTILE))
-    )
+    best = gates.top_share * float(np.quantile(p[eligible], gates.top_quantile))
+    asked = min(max(least, 1.0 - float(member[eligible].mean())), best)
     number = np.bincount(line_of[member], minlength=num_lines)
     mean = np.bincount(line_of[member], p[member], minlength=num_lines) / np.maximum(number, 1)
     return mean >= asked
 
 
-__all__ = ["features_of", "found_again", "repeatability"]
+__all__ = ["KindGates", "features_of", "found_again", "repeatability"]

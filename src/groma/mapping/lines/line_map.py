@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,11 +46,6 @@ class LineMap:
     outcomes: tuple[IntArray, ...]
     #: One array per image: its neighbours, best first.
     neighbors: tuple[IntArray, ...]
-    #: Number of observations whose own proposals include one from known ``points``, or from a point and one of the
-    #: vanishing ``directions``.
-    assisted: dict[str, int] = field(default_factory=dict)
-    #: Seconds per stage.
-    seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def num_lines(self) -> int:

@@ -1,45 +1,51 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""One line where several were mapped along the same edge.
+r"""Merging of lines that were mapped along the same edge.
 
 An edge is mapped more than once where its darker side changes with the view, where occlusions separate the images that
-see it, and where poses are bent: around a loop the same edge lies elsewhere. Two lines are one if they agree in space,
+see it, and where drift of the poses displaces it around a loop. Two lines are merged if they agree in space,
 
 .. math:: \delta^\top (\Sigma_a + \Sigma_b + \tau^2 I)^{-1} \delta \le \gamma,
 
 with :math:`\delta` the offsets of line b from line a across it at both ends of their overlap (four numbers) and
-:math:`\Sigma` their covariances; and if no image shows them as two segments side by side. The deviation
-:math:`\tau` stands for the poses. It is a floor in pixels at the lines' distance, or what the pairs that may be one
-line disagree by, if that is more.
+:math:`\Sigma` their covariances; and if no image shows them as two segments side by side. The deviation :math:`\tau`
+accounts for errors of the poses. It is estimated from the disagreement of the candidate pairs, with a lower bound in
+pixels at the distance of the lines.
 
-Pairs that prefer each other are joined, fitted again, and compared again.
+Pairs of mutually best candidates are merged and fitted, and the comparison is repeated.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.two_point_line import across_basis, line_residuals
+from groma.gates import gate
+from groma.mapping.lines.gates import AGREEMENT
+from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.tracks import Tracks
 
-#: Squared Mahalanobis distance up to which two lines agree: 99.7 % for four degrees of freedom.
-GATE = 16.3
-#: Bounds of the deviation of the poses, pixels.
-POSE_PX = (0.3, 2.5)
+
+@dataclass(frozen=True)
+class MergeGates:
+    """When two lines are one."""
+
+    pose_px: tuple[float, float] = gate(
+        (0.3, 2.5),
+        "px",
+        "bounds of the deviation that poses add",
+        "chosen on fountain, herz: the upper one says nothing there",
+    )
+    max_distance: float = gate(8.0, "px", "between lines that are compared", "chosen on fountain, herz")
+    max_angle: float = gate(0.2, "rad", "between lines that are compared", "chosen on fountain, herz")
+
+
 #: Median of the mean of four squared normal numbers, half of them independent.
-MEDIAN_SQUARE = 0.6
-#: Lines further apart are never one, pixels.
-MAX_PX = 8.0
-#: Largest angle between two lines, radians.
-MAX_ANGLE = 0.2
-#: Share of the shorter line that must overlap along the line.
-MIN_OVERLAP = 0.2
-#: Segments of an image nearer than that to each other show one edge twice, pixels.
-SAME_PX = 1.0
-ROUNDS = 6
+_MEDIAN_SQUARE = 0.6
 
 
 # -------------------------------------------------------------------------------------------------------------- Loops
@@ -117,7 +123,7 @@ def _near_pairs(pointers, members, first_bin, low, X, reach, max_angle, min_over
 
 
 @kernel
-def _side_by_side(ends, line, other):
+def _side_by_side(ends, line, other, min_overlap, same_edge):
     """Whether two segments of an image overlap along the first one and are apart across it."""
     ux, uy = ends[2] - ends[0], ends[3] - ends[1]
     length2 = ux * ux + uy * uy
@@ -126,11 +132,11 @@ def _side_by_side(ends, line, other):
     low, high = min(t0, t1), max(t0, t1)
     away0 = abs(line[0] * other[0] + line[1] * other[1] + line[2])
     away1 = abs(line[0] * other[2] + line[1] * other[3] + line[2])
-    return min(high, 1.0) - max(low, 0.0) > 0.3 * min(1.0, high - low) and max(away0, away1) > SAME_PX
+    return min(high, 1.0) - max(low, 0.0) > min_overlap * min(1.0, high - low) and max(away0, away1) > same_edge
 
 
 @loop
-def _apart(pairs, pointers, rows, image, ends, line, apart):
+def _apart(pairs, pointers, rows, image, ends, line, min_overlap, same_edge, apart):
     """Whether some image shows both lines of a pair side by side; the observations of a line come by image."""
     for n in range(len(pairs)):
         a, b = pairs[n, 0], pairs[n, 1]
@@ -141,46 +147,65 @@ def _apart(pairs, pointers, rows, image, ends, line, apart):
                 begin += 1
             j = begin
             while j < pointers[b + 1] and image[rows[j]] == image[s] and not apart[n]:
-                apart[n] = _side_by_side(ends[s], line[s], ends[rows[j]])
+                apart[n] = _side_by_side(ends[s], line[s], ends[rows[j]], min_overlap, same_edge)
                 j += 1
             i += 1
 
 
 # ------------------------------------------------------------------------------------------------------------- Public
-def merge_agreeing(tracks: Tracks) -> int:
-    """Join lines that agree within their uncertainty and that of the poses; return how many were joined to others.
+def merge_agreeing(tracks: Tracks, gates: MergeGates = MergeGates()) -> Tracks:
+    """Return the tracks with lines joined that agree within their uncertainty and that of the poses.
 
     The segments of joined lines get the deviation of the poses added to their own, so that the fit keeps them.
     """
-    merged, pose_px = 0, 0.0
-    for _ in range(ROUNDS):
-        pairs, offset, covariance, unit = _compare(tracks)
-        apart = seen_apart(tracks, pairs)
-        pairs, offset, covariance, unit = pairs[~apart], offset[~apart], covariance[~apart], unit[~apart]
-        if len(pairs) == 0:
+    pose_px = None
+    while True:  # every round leaves fewer lines
+        pairs = _compare(tracks, gates)
+        pairs = pairs.take(~seen_apart(tracks, pairs.lines))
+        if len(pairs.lines) == 0:
             break
-        if pose_px == 0.0:
-            pose_px = _pose_deviation(pairs, offset, covariance, unit, len(tracks.X))
-        distance = _distance(offset, covariance, pose_px * unit)
-        good = _preferred(pairs, distance, len(tracks.X)) & (distance < GATE)
+        if pose_px is None:
+            pose_px = _pose_deviation(pairs, tracks.num_lines, gates)
+        distance = pairs.squared_distance(pose_px)
+        good = _preferred(pairs.lines, distance, tracks.num_lines) & (distance < AGREEMENT.max_squared(4))
         if not good.any():
             break
-        excess = np.sqrt((offset[good] ** 2).mean(1)) / unit[good]
-        _join(tracks, pairs[good], np.where(excess > POSE_PX[0], pose_px, 0.0))
-        merged += int(good.sum())
-    return merged
+        tracks = _joined(tracks, pairs.take(good), pose_px, gates)
+    return tracks.keep(tracks.num_images() >= 2, Outcome.FEW_IMAGES)
 
 
-def _compare(tracks: Tracks) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Pairs (M, 2) of lines that may be one, offsets (M, 4), covariances of these, and the size of a pixel there."""
-    views, count = tracks.views, len(tracks.X)
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Pairs of lines that may be one."""
+
+    #: (M, 2) the lines.
+    lines: IntArray
+    #: (M, 4) offsets of the second from the first, across it, at both ends of their overlap.
+    offset: FloatArray
+    #: (M, 4, 4) their covariances.
+    covariance: FloatArray
+    #: (M,) size of a pixel there, scene units.
+    unit: FloatArray
+
+    def take(self, rows: BoolArray) -> _Pairs:
+        """Return some of the pairs."""
+        return _Pairs(self.lines[rows], self.offset[rows], self.covariance[rows], self.unit[rows])
+
+    def squared_distance(self, pose_px: float) -> FloatArray:
+        """Squared Mahalanobis distances (M,), with the deviation of the poses in pixels."""
+        total = self.covariance + ((pose_px * self.unit) ** 2)[:, None, None] * np.eye(4)
+        return np.einsum("mi,mi->m", self.offset, np.linalg.solve(total, self.offset[..., None])[..., 0])
+
+
+def _compare(tracks: Tracks, gates: MergeGates) -> _Pairs:
+    """Pairs of lines that are near each other."""
+    views, count, X = tracks.views, tracks.num_lines, tracks.lines
     rows, pointers = tracks.table()
     H, U = np.zeros((count, 4, 4)), np.zeros((count, 2, 3))
-    own = np.column_stack([views.ends[rows], views.sigma[rows]])
-    _information(views.camera, views.image_idx[rows], own, pointers, tracks.X, H, U)
+    own = np.column_stack([views.ends[rows], tracks.sigma[rows]])
+    _information(views.camera, views.image_idx[rows], own, pointers, X, H, U)
     unit = _pixel_size(tracks)
-    X = tracks.X
-    pairs, span = _candidates(X, MAX_PX * unit)
+    pairs, span = _candidates(X, gates.max_distance * unit, gates)
     a, b = pairs.T
     covariance = np.linalg.inv(H + 1e-9 * np.einsum("nii->n", H)[:, None, None] * np.eye(4))
     along = X[b, 1] - X[b, 0]
@@ -194,10 +219,10 @@ def _compare(tracks: Tracks) -> tuple[IntArray, FloatArray, FloatArray, FloatArr
         weight = np.stack([1.0 - at, at], axis=-1)  # of both points, at both places
         gain = np.einsum("mkp,mij->mkipj", weight, basis).reshape(-1, 4, 4)
         spread += gain @ covariance[n] @ np.swapaxes(gain, 1, 2)
-    return pairs, offset, spread, np.minimum(unit[a], unit[b])
+    return _Pairs(pairs, offset, spread, np.minimum(unit[a], unit[b]))
 
 
-def _candidates(X: FloatArray, reach: FloatArray) -> tuple[IntArray, FloatArray]:
+def _candidates(X: FloatArray, reach: FloatArray, gates: MergeGates = MergeGates()) -> tuple[IntArray, FloatArray]:
     """Pairs (M, 2) of near, nearly parallel lines and their overlap (M, 2): a sweep along one axis in bins of another.
 
     Work grows with the number of lines where their density stays the same.
@@ -219,7 +244,9 @@ def _candidates(X: FloatArray, reach: FloatArray) -> tuple[IntArray, FloatArray]
     _bin_lines(order, first_bin, last_bin, pointers, members)
     pairs, span = np.empty((4096, 2), np.int64), np.empty((4096, 2))
     while True:
-        needed = _near_pairs(pointers, members, first_bin, low, X, reach, MAX_ANGLE, MIN_OVERLAP, pairs, span)
+        needed = _near_pairs(
+            pointers, members, first_bin, low, X, reach, gates.max_angle, AGREEMENT.min_overlap, pairs, span
+        )
         if needed <= len(pairs):
             break
         pairs, span = np.empty((2 * needed, 2), np.int64), np.empty((2 * needed, 2))
@@ -236,7 +263,7 @@ def _pixel_size(tracks: Tracks) -> FloatArray:
     rows, pointers = tracks.table()
     line = tracks.line_of[rows]
     P = views.camera[views.image_idx[rows]]
-    depth = np.einsum("mc,mc->m", P[:, 2, :3], tracks.X[line].mean(1)) + P[:, 2, 3]
+    depth = np.einsum("mc,mc->m", P[:, 2, :3], tracks.lines[line].mean(1)) + P[:, 2, 3]
     size = np.abs(depth) / np.linalg.norm(P[:, 0, :3], axis=1)
     order = np.lexsort([size, line])
     middle = (pointers[:-1] + pointers[1:]) // 2
@@ -248,13 +275,9 @@ def seen_apart(tracks: Tracks, pairs: IntArray) -> BoolArray:
     views = tracks.views
     rows, pointers = tracks.table()
     apart = np.zeros(len(pairs), np.bool_)
-    _apart(pairs, pointers, rows, views.image_idx, views.ends, views.line, apart)
+    limits = AGREEMENT.min_overlap, AGREEMENT.same_edge
+    _apart(pairs, pointers, rows, views.image_idx, views.ends, views.line, *limits, apart)
     return apart
-
-
-def _distance(offset: FloatArray, covariance: FloatArray, deviation: FloatArray) -> FloatArray:
-    total = covariance + (deviation**2)[:, None, None] * np.eye(4)
-    return np.einsum("mi,mi->m", offset, np.linalg.solve(total, offset[..., None])[..., 0])
 
 
 def _preferred(pairs: IntArray, distance: FloatArray, count: int) -> BoolArray:
@@ -265,25 +288,26 @@ def _preferred(pairs: IntArray, distance: FloatArray, count: int) -> BoolArray:
     return (distance <= best[pairs[:, 0]]) & (distance <= best[pairs[:, 1]])
 
 
-def _pose_deviation(pairs: IntArray, offset: FloatArray, covariance: FloatArray, unit: FloatArray, count: int) -> float:
+def _pose_deviation(pairs: _Pairs, count: int, gates: MergeGates) -> float:
     """Deviation of the poses in pixels: what pairs that prefer each other disagree by beyond their own noise."""
-    floor = POSE_PX[0] * unit
-    good = _preferred(pairs, _distance(offset, covariance, floor), count)
-    excess = (offset[good] ** 2).mean(1) - np.einsum("mii->m", covariance[good]) / 4.0
-    if len(excess) < 5:
-        return POSE_PX[0]
-    return float(np.clip(np.sqrt(max(np.median(excess / unit[good] ** 2), 0.0) / MEDIAN_SQUARE), *POSE_PX))
+    floor = gates.pose_px[0]
+    good = pairs.take(_preferred(pairs.lines, pairs.squared_distance(floor), count))
+    excess = (good.offset**2).mean(1) - np.einsum("mii->m", good.covariance) / 4.0
+    if len(excess) == 0:
+        return floor
+    return float(np.clip(np.sqrt(max(np.median(excess / good.unit**2), 0.0) / _MEDIAN_SQUARE), *gates.pose_px))
 
 
-def _join(tracks: Tracks, pairs: IntArray, pose_px: FloatArray) -> None:
+def _joined(tracks: Tracks, pairs: _Pairs, pose_px: float, gates: MergeGates) -> Tracks:
     """Join disjoint pairs, the line seen in fewer images to the other, and fit them anew."""
-    images = tracks.num_images()
-    turned = images[pairs[:, 0]] < images[pairs[:, 1]]
-    pairs = np.where(turned[:, None], pairs[:, ::-1], pairs)
-    alias, deviation = np.arange(len(tracks.X)), np.zeros(len(tracks.X) + 1)
-    alias[pairs[:, 1]] = pairs[:, 0]
-    deviation[pairs] = pose_px[:, None]
-    tracks.join(alias, deviation)
+    excess = np.sqrt((pairs.offset**2).mean(1)) / pairs.unit
+    images, lines = tracks.num_images(), pairs.lines
+    turned = images[lines[:, 0]] < images[lines[:, 1]]
+    lines = np.where(turned[:, None], lines[:, ::-1], lines)
+    alias, deviation = np.arange(tracks.num_lines), np.zeros(tracks.num_lines)
+    alias[lines[:, 1]] = lines[:, 0]
+    deviation[lines] = np.where(excess > gates.pose_px[0], pose_px, 0.0)[:, None]
+    return tracks.joined(alias, deviation)
 
 
-__all__ = ["merge_agreeing", "seen_apart"]
+__all__ = ["MergeGates", "merge_agreeing", "seen_apart"]

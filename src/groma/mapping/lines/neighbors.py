@@ -1,33 +1,53 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Which images look at the same part of the scene from usefully different places.
+r"""Neighbours: images that see the same part of the scene from sufficiently different positions.
 
 Images are compared through the points they share. Pair (i, j) scores
 
 .. math:: n_{ij}\,\min(1,\ \alpha_{ij}/\alpha_0)\,\min(1,\ \alpha_1/\alpha_{ij})
 
 with :math:`n_{ij}` the number of shared points and :math:`\alpha_{ij}` the median angle under which their rays meet:
-too small an angle says nothing about depth, too large an angle changes what is seen. Where a scene has no points, the
-angle between viewing directions and the distance of the cameras take their place.
+small angles do not determine depth, and large angles change the appearance. Scenes without points use the angle between
+viewing directions and the distance of the cameras instead.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 
 from groma._typing import FloatArray, IntArray
+from groma.gates import gate
 from groma.geometry import quaternion
+from groma.mapping.work import map_work
 from groma.scene import Scene
 
-#: Rays of shared points that meet under less than this count less; radians.
-MIN_ANGLE = np.deg2rad(4.0)
-#: Rays of shared points that meet under more than this count less; radians.
-MAX_ANGLE = np.deg2rad(25.0)
-#: Points looked at per pair of images for the angle.
-_SAMPLE = 64
+
+@dataclass(frozen=True)
+class NeighborGates:
+    """Which images are good neighbours."""
+
+    min_angle_deg: float = gate(
+        4.0, "deg", "between rays of shared points, below which they count less", "chosen on ETH3D facades"
+    )
+    max_angle_deg: float = gate(
+        25.0, "deg", "between rays of shared points, above which they count less", "chosen on ETH3D facades"
+    )
+    sample: int = gate(
+        64, "points", "looked at per pair of images for the angle", "cost: the median of so many is enough"
+    )
+    max_turn_deg: float = gate(
+        60.0, "deg", "between viewing directions, where there are no points", "chosen on wireframes"
+    )
+    turn_scale_deg: float = gate(
+        20.0, "deg", "of turn that counts like the usual distance, where there are no points", "chosen on wireframes"
+    )
 
 
-def covisible_neighbors(scene: Scene, num_neighbors: int, min_shared: int = 8) -> list[IntArray]:
+def covisible_neighbors(
+    scene: Scene, num_neighbors: int, min_shared: int = 8, gates: NeighborGates = NeighborGates()
+) -> list[IntArray]:
     """Choose for every image its neighbours, best first.
 
     Parameters
@@ -38,6 +58,8 @@ def covisible_neighbors(scene: Scene, num_neighbors: int, min_shared: int = 8) -
         At most this many per image.
     min_shared : int
         Shared points below which two images are no neighbours.
+    gates : NeighborGates, optional
+        Which angles are good.
 
     Returns
     -------
@@ -49,34 +71,44 @@ def covisible_neighbors(scene: Scene, num_neighbors: int, min_shared: int = 8) -
     Work and memory grow with the number of pairs of images that share points, not with the square of images.
     """
     if len(scene.point_observations) == 0:
-        return _by_geometry(scene, num_neighbors)
-    observations, centers = scene.point_observations, scene.cam_centers_in_world
+        return _by_geometry(scene, num_neighbors, gates)
+    centers, sees = scene.cam_centers_in_world, _sees(scene)
+    shared = (sees @ sees.T).tocsr()
+
+    def seen_by(image: int) -> IntArray:
+        return sees.indices[sees.indptr[image] : sees.indptr[image + 1]]
+
+    def of_image(i: int) -> IntArray:
+        row = slice(shared.indptr[i], shared.indptr[i + 1])
+        others, counts = shared.indices[row], shared.data[row]
+        keep = (others != i) & (counts >= min_shared)
+        others, counts = others[keep], counts[keep]
+        # Angles are looked at for four times as many as are wanted.
+        order = np.argsort(-counts, kind="stable")[: 4 * num_neighbors]
+        others, counts = others[order], counts[order]
+        angles = np.zeros(len(others))
+        for k, j in enumerate(others):
+            common = np.intersect1d(seen_by(i), seen_by(j), assume_unique=True)
+            xyz = scene.points.xyz[common[:: max(1, len(common) // gates.sample)]]
+            angles[k] = np.median(_angles(xyz - centers[i], xyz - centers[j]))
+        safe = np.maximum(angles, 1e-6)
+        low, high = np.deg2rad(gates.min_angle_deg), np.deg2rad(gates.max_angle_deg)
+        score = counts * np.minimum(1.0, safe / low) * np.minimum(1.0, high / safe)
+        return others[np.argsort(-score, kind="stable")[:num_neighbors]].astype(np.int64)
+
+    return map_work(of_image, range(scene.num_images))
+
+
+def _sees(scene: Scene) -> sparse.csr_array:
+    """(C, P) one where an image sees a point."""
+    observations = scene.point_observations
     ones = np.ones(len(observations), np.int32)
     shape = (scene.num_images, scene.num_points)
     sees = sparse.csr_array((ones, (observations.image_idx, observations.point_idx)), shape=shape)
     sees.sum_duplicates()
     sees.sort_indices()
     sees.data[:] = 1
-    shared = (sees @ sees.T).tocsr()
-    neighbors = []
-    for i in range(scene.num_images):
-        row = slice(shared.indptr[i], shared.indptr[i + 1])
-        others, counts = shared.indices[row], shared.data[row]
-        keep = (others != i) & (counts >= min_shared)
-        others, counts = others[keep], counts[keep]
-        order = np.argsort(-counts, kind="stable")[: 4 * num_neighbors]
-        others, counts = others[order], counts[order]
-        points_i = sees.indices[sees.indptr[i] : sees.indptr[i + 1]]
-        angles = np.zeros(len(others))
-        for k, j in enumerate(others):
-            common = np.intersect1d(points_i, sees.indices[sees.indptr[j] : sees.indptr[j + 1]], assume_unique=True)
-            xyz = scene.points.xyz[common[:: max(1, len(common) // _SAMPLE)]]
-            angles[k] = np.median(_angles(xyz - centers[i], xyz - centers[j]))
-        safe = np.maximum(angles, 1e-6)
-        score = counts * np.minimum(1.0, safe / MIN_ANGLE) * np.minimum(1.0, MAX_ANGLE / safe)
-        chosen = np.argsort(-score, kind="stable")[:num_neighbors]
-        neighbors.append(others[chosen].astype(np.int64))
-    return neighbors
+    return sees
 
 
 def _angles(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -84,19 +116,23 @@ def _angles(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.arctan2(cross, np.einsum("...i,...i->...", first, second))
 
 
-def _by_geometry(scene: Scene, num_neighbors: int) -> list[IntArray]:
+def _by_geometry(scene: Scene, num_neighbors: int, gates: NeighborGates) -> list[IntArray]:
     """Neighbours without points: similar viewing direction, near by, not at the same place."""
     poses, centers = scene.cam_from_world, scene.cam_centers_in_world
     axis = quaternion.rotate(quaternion.conjugate(poses[:, :4]), np.broadcast_to([0.0, 0.0, 1.0], (len(poses), 3)))
     extent = np.linalg.norm(centers - centers.mean(0), axis=1).max(initial=0.0) if len(centers) else 0.0
-    neighbors = []
-    for i in range(len(poses)):
+
+    def of_image(i: int) -> IntArray:
         distance = np.linalg.norm(centers - centers[i], axis=1)
         turn = _angles(axis, np.broadcast_to(axis[i], axis.shape))
-        usable = (distance > 1e-6 * extent) & (turn < np.deg2rad(60.0))
+        usable = (distance > 1e-6 * extent) & (turn < np.deg2rad(gates.max_turn_deg))
         usable[i] = False
         others = np.flatnonzero(usable)
         spread = np.median(np.sort(distance[others])[:num_neighbors]) if len(others) else 1.0
-        cost = turn[others] / np.deg2rad(20.0) + distance[others] / spread
-        neighbors.append(others[np.argsort(cost, kind="stable")[:num_neighbors]])
-    return neighbors
+        cost = turn[others] / np.deg2rad(gates.turn_scale_deg) + distance[others] / spread
+        return others[np.argsort(cost, kind="stable")[:num_neighbors]]
+
+    return map_work(of_image, range(len(poses)))
+
+
+__all__ = ["NeighborGates", "covisible_neighbors"]

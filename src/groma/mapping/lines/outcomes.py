@@ -42,8 +42,6 @@ class Outcome(IntEnum):
     REPEATED = 14
 
 
-#: Not a outcome: what a segment has before its stage.
-UNKNOWN = -1
 #: What is said of so many segments.
 WORDS = {
     Outcome.TOO_SHORT: "fell short of the least length, or lay where the lens model does not hold",
@@ -80,4 +78,4 @@ REMEDIES = {
 }
 
 
-__all__ = ["REMEDIES", "UNKNOWN", "WORDS", "Outcome"]
+__all__ = ["REMEDIES", "WORDS", "Outcome"]

@@ -8,77 +8,116 @@ points and vanishing directions, then the choice among them (:mod:`groma.mapping
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
-from groma.mapping.lines.consensus import Choice, choose
+from groma.mapping.groups import grouped
+from groma.mapping.lines.consensus import choose
 from groma.mapping.lines.matches import MatchProvider
 from groma.mapping.lines.options import MapLinesOptions
-from groma.mapping.lines.outcomes import UNKNOWN, Outcome
+from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.proposals import WEAK, Proposer
 from groma.mapping.lines.views import LineViews
+from groma.mapping.work import map_work
 from groma.scene import Scene
 
 if TYPE_CHECKING:
     from groma.features.matching.wide_baseline import LineMatches
 
 
-def choose_places(
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where the segments (S,) of all images, or of some, lie in space."""
+
+    #: (S,) whether enough neighbours agree on a place.
+    found: BoolArray
+    #: (S, 2) inverse depths of the end points.
+    q: FloatArray
+    #: (S, 3) their variances and covariance, c11 c12 c22.
+    covariance: FloatArray
+    #: (S,) summed support; zero where there is no place.
+    score: FloatArray
+    #: (S, n) rows of the supporting segments, -1 for none.
+    supporters: IntArray
+    #: (S,) the :class:`Outcome` of each segment, should it not become part of a line.
+    rejection: IntArray
+
+    @staticmethod
+    def none(count: int, width: int, rejection: Outcome) -> Places:
+        """No places, for this reason, of so many segments with room for so many supporters."""
+        return Places(
+            found=np.zeros(count, bool),
+            q=np.zeros((count, 2)),
+            covariance=np.zeros((count, 3)),
+            score=np.zeros(count),
+            supporters=np.full((count, width), -1),
+            rejection=np.full(count, rejection, np.int64),
+        )
+
+    def ends_in_space(self, views: LineViews) -> FloatArray:
+        """(S, 2, 3) end points in the world; meaningless without a place."""
+        center = views.center[views.image_idx]
+        return center[:, None] + views.ray / np.where(self.found[:, None], self.q, 1.0)[:, :, None]
+
+
+def find_places(
     scene: Scene,
     views: LineViews,
     ratios: FloatArray,
     neighbors: list[IntArray],
     matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
     options: MapLinesOptions,
-    outcome: IntArray,
-    report: Callable[[str, int, int], None],
-) -> Choice:
-    """The place of every segment of every image; writes the outcomes of those without one."""
-    count = len(views.image_idx)
-    places = Choice(
-        np.zeros(count, bool),
-        np.zeros((count, 2)),
-        np.zeros((count, 3)),
-        np.zeros(count),
-        np.zeros(count),
-        np.full((count, max(1, options.num_neighbors)), -1, np.int64),
-        np.zeros((count, 2), bool),
-    )
-    proposer = Proposer(views, ratios, options.directed, options.min_overlap, options.max_relative_sigma)
-    near_points = _points_by_image(scene, views) if options.use_points else [None] * scene.num_images
-    for i, others in enumerate(neighbors):
-        report("proposals", i, len(neighbors))
-        rows = views.rows(i)
+    progress: Callable[[int, int], None],
+) -> Places:
+    """Return the place of every segment of every image.
+
+    Parameters
+    ----------
+    scene, views
+        Points with their observations, and the segments.
+    ratios : (S, 2) float64
+        Change of depth along each segment and its standard deviation; zero where nothing tells it.
+    neighbors : list of C arrays
+        Neighbours of each image.
+    matches
+        As for :func:`groma.mapping.lines.build.map_lines`.
+    options, progress
+        Gates; called with the number of images done and in all.
+    """
+    proposer = Proposer(views, ratios, options)
+    points = _points_by_image(scene, views) if options.use_points else [None] * scene.num_images
+    width = max(1, options.num_neighbors)
+
+    def of_image(i: int) -> Places:
+        rows, others = views.rows(i), neighbors[i]
+        count = rows.stop - rows.start
         if len(others) == 0:
-            outcome[rows] = Outcome.NO_NEIGHBOR
-            continue
+            return Places.none(count, width, Outcome.NO_NEIGHBOR)
         given = [_given(matches, i, int(j)) for j in others]
         for j, pairs in zip(others, given, strict=True):
             _check_pairs(pairs, i, int(j), views)
-        proposals = proposer.propose(i, others, given, near_points[i])
+        proposals = proposer.propose(i, others, given, points[i])
         # A line of min_images images is this segment and min_images - 1 neighbours; two of them must agree.
-        chosen = choose(proposals, rows.stop - rows.start, len(others), max(1, min(2, options.min_images - 1)))
+        chosen = choose(proposals, count, len(others), max(1, min(2, options.min_images - 1)))
         ambiguous = chosen.found & (chosen.rival > options.max_rival * chosen.score)
         found = chosen.found & ~ambiguous
-        places.found[rows], places.q[rows], places.covariance[rows] = found, chosen.q, chosen.covariance
-        places.score[rows], places.rival[rows] = np.where(found, chosen.score, 0.0), chosen.rival
-        places.assisted[rows] = found[:, None] & chosen.assisted
-        places.supporters[rows, : len(others)] = np.where(found[:, None], chosen.supporters, -1)
-        outcome[rows] = np.select(
-            [found, ambiguous, proposals.reached > WEAK, proposals.reached == WEAK, proposals.reached < WEAK],
-            [
-                Outcome.NOT_LINKED,
-                Outcome.AMBIGUOUS,
-                Outcome.NO_SUPPORT,
-                Outcome.DEGENERATE,
-                Outcome.NO_MATCH,
-            ],
-            UNKNOWN,
+        supporters = np.full((count, width), -1)
+        supporters[found, : len(others)] = chosen.supporters[found]
+        rejection = np.select(
+            [found, ambiguous, proposals.reached > WEAK, proposals.reached == WEAK],
+            [Outcome.NOT_LINKED, Outcome.AMBIGUOUS, Outcome.NO_SUPPORT, Outcome.DEGENERATE],
+            Outcome.NO_MATCH,
         )
-    return places
+        return Places(found, chosen.q, chosen.covariance, np.where(found, chosen.score, 0.0), supporters, rejection)
+
+    found = [Places.none(0, width, Outcome.NO_MATCH), *map_work(of_image, range(len(neighbors)), progress)]
+    columns = {item.name: np.concatenate([getattr(one, item.name) for one in found]) for item in fields(Places)}
+    columns["rejection"][~views.usable] = Outcome.TOO_SHORT
+    return Places(**columns)
 
 
 def _given(
@@ -112,8 +151,7 @@ def _check_pairs(given: tuple[IntArray, FloatArray] | None, i: int, j: int, view
 def _points_by_image(scene: Scene, views: LineViews) -> list[tuple[FloatArray, FloatArray]]:
     """Pixels and inverse depths of the points seen in each image."""
     observations = scene.point_observations
-    order = np.argsort(observations.image_idx, kind="stable")
-    bounds = np.searchsorted(observations.image_idx[order], np.arange(scene.num_images + 1))
+    order, bounds = grouped(observations.image_idx, scene.num_images)
     near = []
     for i in range(scene.num_images):
         xyz = scene.points.xyz[observations.point_idx[order[bounds[i] : bounds[i + 1]]]]
@@ -121,3 +159,6 @@ def _points_by_image(scene: Scene, views: LineViews) -> list[tuple[FloatArray, F
         x = x[x[:, 2] > 0.0]
         near.append((x[:, :2] / x[:, 2:], 1.0 / x[:, 2]))
     return near
+
+
+__all__ = ["Places", "find_places"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Where each segment may lie in space.
+r"""Hypotheses for the place of each segment in space, from one other image at a time.
 
 A 3D segment behind a segment of image i is two numbers: the inverse depths :math:`q = (q_1, q_2)` of its end points on
 their rays :math:`f_1, f_2`. A segment of image j with line :math:`l` proposes the q at which the reference segment's
@@ -7,14 +7,14 @@ plane meets the plane of :math:`l`. With the epipole :math:`a = P_j [c_i; 1]` an
 
 .. math:: l^\top (q_k a + b_k) = 0 \quad\Rightarrow\quad q_k = -\frac{l^\top b_k}{l^\top a},
 
-linear, without an intersection to solve. Its covariance follows from the distance of the projected end point to l,
+which is linear in the image line. Its covariance follows from the distance of the projected end point to l,
 :math:`\partial \mathrm{dist}_k / \partial q_k = l^\top a / x_{k,3}`, and from the noise of both segments' end points.
-Where the line runs along the epipolar line, :math:`l^\top a \to 0`: the covariance explodes, and the proposal is left
-out of the decision; the track picks such segments up again when others have fixed the line. Where only the change of
-depth along the segment is uncertain, because the other image sees a small part of it, its vanishing point supplies it.
+Where the line is parallel to the epipolar line, :math:`l^\top a \to 0` and the covariance grows without bound. Such
+proposals are discarded; the segment can still join a line that other segments determine. Where only the change of depth
+along the segment is uncertain, because the other image sees a small part of it, the vanishing point of the segment
+supplies it (:mod:`groma.mapping.lines.directions`).
 
-The image itself proposes, too: the line through known points that lie on the segment, and the line through one of them
-in the direction of the segment's vanishing point (:mod:`groma.mapping.lines.directions`).
+Known points on a segment give further proposals, without another segment (:mod:`groma.mapping.lines.known_points`).
 
 References
 ----------
@@ -24,20 +24,41 @@ Plücker notes, eq. (33) for the two planes. The parametrisation by inverse dept
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
+from groma.gates import gate
+from groma.mapping.lines.gates import AGREEMENT
+from groma.mapping.lines.known_points import lines_through_points
+from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.views import LineViews
 
-#: The depth range holds for the middle of a segment; its ends may leave it by this factor.
-END_MARGIN = 2.0
-#: Bins of the angle about the baseline.
-NUM_BINS = 2048
-# Why a candidate was refused; the furthest any candidate of a segment got is reported.
+#: Bins of the angle about the baseline: only how long it takes depends on them.
+_NUM_BINS = 2048
+# How far a candidate got; the best of all candidates of a segment is reported.
 NOTHING, OUT_OF_BEAM, WEAK, PROPOSED = 0, 1, 2, 3
+#: Proposals of a pair of images for which there is room at first.
+_ROOM = 1 << 14
+
+
+@dataclass(frozen=True)
+class ProposalGates:
+    """Which pairs of segments propose a place."""
+
+    end_margin: float = gate(
+        2.0,
+        "1",
+        "factor by which the ends of a segment may leave the range of depths of its middle",
+        "chosen on wireframes",
+    )
+
+    def limits(self) -> tuple[float, float, float]:
+        """Least change over the range of depths, margin of the ends, squared disagreement with a direction."""
+        largest = AGREEMENT.max_squared(1)
+        return math.sqrt(largest), self.end_margin, largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,18 +73,18 @@ class Proposals:
     other: IntArray
     #: (M, 6) q1, q2, their variances and covariance (c11, c12, c22), and the score of the match.
     values: FloatArray
-    #: (n_segments,) the furthest that any candidate got.
+    #: (n,) the furthest that any candidate got.
     reached: IntArray
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
-def _use_direction(ratio, out):
+def _use_direction(ratio, max_squared, out):
     """Fuse out = q1 q2 c11 c12 c22 with q2 = r q1, r of mean and deviation ratio; False where they disagree."""
     r = ratio[0]
     away = out[1] - r * out[0]
     variance = out[4] - 2.0 * r * out[3] + r * r * out[2] + (ratio[1] * out[0]) ** 2
-    if not away * away < 9.0 * variance:
+    if not away * away < max_squared * variance:
         return False
     k1, k2 = (out[3] - r * out[2]) / variance, (out[4] - r * out[3]) / variance
     out[0], out[1] = out[0] - k1 * away, out[1] - k2 * away
@@ -73,11 +94,30 @@ def _use_direction(ratio, out):
 
 @kernel
 def _propose(
-    ray, across, sigma, q_low, q_high, ratio, line, ends, sigma_j, M, a, directed, min_overlap, max_relative, out
+    ray,
+    across,
+    sigma,
+    q_low,
+    q_high,
+    ratio,
+    line,
+    ends,
+    sigma_j,
+    M,
+    a,
+    directed,
+    min_overlap,
+    max_relative,
+    limits,
+    out,
 ):
-    """One pair of segments: fill out = q1 q2 c11 c12 c22; return how far it got."""
+    """One pair of segments: fill out = q1 q2 c11 c12 c22; return how far it got.
+
+    ``limits`` are the least change over the range of depths in sigma, the margin of the ends, and the largest squared
+    disagreement with the direction.
+    """
     gain = line[0] * a[0] + line[1] * a[1] + line[2] * a[2]
-    if not abs(gain) * (q_high - q_low) > 3.0 * sigma_j:
+    if not abs(gain) * (q_high - q_low) > limits[0] * sigma_j:
         return WEAK  # the whole range of depths lies within the noise
     ux, uy = ends[2] - ends[0], ends[3] - ends[1]
     length2 = ux * ux + uy * uy
@@ -91,7 +131,7 @@ def _propose(
         b1 = M[1, 0] * ray[k, 0] + M[1, 1] * ray[k, 1] + M[1, 2] * ray[k, 2]
         b2 = M[2, 0] * ray[k, 0] + M[2, 1] * ray[k, 1] + M[2, 2] * ray[k, 2]
         q = -(line[0] * b0 + line[1] * b1 + line[2] * b2) / gain
-        if not (q >= q_low / END_MARGIN and q <= q_high * END_MARGIN):
+        if not (q >= q_low / limits[1] and q <= q_high * limits[1]):
             return OUT_OF_BEAM
         z = q * a[2] + b2
         if z <= 0.05:
@@ -119,7 +159,7 @@ def _propose(
     for attempt in range(2):
         if out[2] <= (max_relative * out[0]) ** 2 and out[4] <= (max_relative * out[1]) ** 2:
             return PROPOSED
-        if attempt == 1 or ratio[0] <= 0.0 or not _use_direction(ratio, out):
+        if attempt == 1 or ratio[0] <= 0.0 or not _use_direction(ratio, limits[2], out):
             return WEAK
     return WEAK
 
@@ -127,22 +167,23 @@ def _propose(
 @loop
 def _propose_beam(
     rows_i, rows_j, ray, across, sigma, search, ratio, line, ends, beam_i, beam_j, bin_pointers, bin_members, M, a,
-    directed, min_overlap, max_relative, first, neighbor, out_index, out, reached,
+    directed, min_overlap, max_relative, limits, neighbor, out_index, out, reached,
 ):  # fmt: skip
     """All pairs whose angles about the baseline overlap; return the number written, or needed if out is too short."""
-    count = first
+    count = 0
     work = np.empty(5)
-    size = 2.0 * math.pi / NUM_BINS
+    num_bins = len(bin_pointers) - 1
+    size = 2.0 * math.pi / num_bins
     for i in range(len(rows_i)):
         s = rows_i[i]
         low, high = beam_i[i, 0], beam_i[i, 1]
         bin_low, bin_high = int(np.floor(low / size)), int(np.floor(high / size))
-        for k in range(bin_low, min(bin_high, bin_low + NUM_BINS - 1) + 1):
-            b = k % NUM_BINS
+        for k in range(bin_low, min(bin_high, bin_low + num_bins - 1) + 1):
+            b = k % num_bins
             for e in range(bin_pointers[b], bin_pointers[b + 1]):
                 j = bin_members[e]
                 # A pair that shares several bins counts in the first of them.
-                if k != bin_low and int(np.floor(beam_j[j, 0] / size)) % NUM_BINS != b:
+                if k != bin_low and int(np.floor(beam_j[j, 0] / size)) % num_bins != b:
                     continue
                 away = 0.5 * (low + high) - 0.5 * (beam_j[j, 0] + beam_j[j, 1])
                 away -= 2.0 * math.pi * math.floor(away / (2.0 * math.pi) + 0.5)
@@ -151,7 +192,7 @@ def _propose_beam(
                 r = rows_j[j]
                 got = _propose(
                     ray[s], across[s], sigma[s], search[s, 0], search[s, 1], ratio[s], line[r], ends[r], sigma[r], M, a,
-                    directed, min_overlap, max_relative, work,
+                    directed, min_overlap, max_relative, limits, work,
                 )  # fmt: skip
                 reached[i] = max(reached[i], got)
                 if got == PROPOSED:
@@ -167,10 +208,10 @@ def _propose_beam(
 @loop
 def _propose_pairs(
     pairs, score, start_i, start_j, ray, across, sigma, search, ratio, line, ends, usable, M, a, min_overlap,
-    max_relative, first, neighbor, out_index, out, reached,
+    max_relative, limits, neighbor, out_index, out, reached,
 ):  # fmt: skip
-    """Given pairs of segments; return the number written, or needed if out is too short."""
-    count = first
+    """Given pairs of segments; return how many proposals there are."""
+    count = 0
     work = np.empty(5)
     for k in range(len(pairs)):
         i, s, r = pairs[k, 0], start_i + pairs[k, 0], start_j + pairs[k, 1]
@@ -178,15 +219,14 @@ def _propose_pairs(
             continue
         got = _propose(
             ray[s], across[s], sigma[s], search[0], search[1], ratio[s], line[r], ends[r], sigma[r], M, a,
-            False, min_overlap, max_relative, work,
+            False, min_overlap, max_relative, limits, work,
         )  # fmt: skip
         reached[i] = max(reached[i], got)
         if got == PROPOSED:
-            if count < len(out):
-                out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor, r
-                out[count, 5] = score[k]
-                for c in range(5):
-                    out[count, c] = work[c]
+            out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor, r
+            out[count, 5] = score[k]
+            for c in range(5):
+                out[count, c] = work[c]
             count += 1
     return count
 
@@ -194,95 +234,19 @@ def _propose_pairs(
 @loop
 def _bin_beams(beams, pointers, members):
     """Members of every bin of the angle about the baseline; members is None-sized on the first call (counts only)."""
-    size = 2.0 * math.pi / NUM_BINS
-    fill = np.zeros(NUM_BINS, np.int64)
+    num_bins = len(pointers) - 1
+    size = 2.0 * math.pi / num_bins
+    fill = np.zeros(num_bins, np.int64)
     for j in range(len(beams)):
         low, high = int(np.floor(beams[j, 0] / size)), int(np.floor(beams[j, 1] / size))
-        for k in range(low, min(high, low + NUM_BINS - 1) + 1):
-            b = k % NUM_BINS
+        for k in range(low, min(high, low + num_bins - 1) + 1):
+            b = k % num_bins
             if len(members):
                 members[pointers[b] + fill[b]] = j
             fill[b] += 1
     if not len(members):
-        for b in range(NUM_BINS):
+        for b in range(num_bins):
             pointers[b + 1] = pointers[b] + fill[b]
-
-
-@loop
-def _point_lines(ends, line, near, search, ratio, pixel, inverse, tolerance, neighbor, out_index, out):
-    """Lines through known points that lie on a segment in the image: inverse depth affine along the segment.
-
-    Through several, with slot ``neighbor``; through one, in the segment's own direction, with slot ``neighbor + 1``.
-    """
-    count = 0
-    t, q = np.empty(16), np.empty(16)
-    for i in range(len(ends)):
-        if near[i] == 0:
-            continue
-        ux, uy = ends[i, 2] - ends[i, 0], ends[i, 3] - ends[i, 1]
-        length2 = ux * ux + uy * uy
-        reach = 4.0 / math.sqrt(length2)
-        number = 0
-        for p in range(len(pixel)):
-            if abs(line[i, 0] * pixel[p, 0] + line[i, 1] * pixel[p, 1] + line[i, 2]) > 2.0:
-                continue
-            at = ((pixel[p, 0] - ends[i, 0]) * ux + (pixel[p, 1] - ends[i, 1]) * uy) / length2
-            if -reach <= at <= 1.0 + reach and number < 16:
-                t[number], q[number] = at, inverse[p]
-                number += 1
-        if ratio[i, 0] > 0.0 and number > 0:
-            # Scale q1 by the point that most others agree with.
-            change, most, middle = ratio[i, 0] - 1.0, 0, 0.0
-            for m in range(number):
-                scale = q[m] / (1.0 + change * t[m])
-                agree = 0
-                for p in range(number):
-                    if abs(scale * (1.0 + change * t[p]) - q[p]) < tolerance * q[p]:
-                        agree += 1
-                if agree > most:
-                    most, middle = agree, scale
-            q1, q2 = middle, ratio[i, 0] * middle
-            if min(q1, q2) >= search[i, 0] and max(q1, q2) <= search[i, 1]:
-                variance = (0.5 * tolerance * q1) ** 2
-                out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor + 1, -1
-                out[count, 0], out[count, 1], out[count, 5] = q1, q2, 0.5
-                out[count, 2], out[count, 3] = variance, ratio[i, 0] * variance
-                out[count, 4] = ratio[i, 0] ** 2 * variance + (ratio[i, 1] * q1) ** 2 + 0.01 * variance
-                count += 1
-        best, first, second = 2, -1, -1
-        for m in range(number):
-            for n in range(m):
-                if abs(t[m] - t[n]) < 0.3:
-                    continue
-                slope = (q[m] - q[n]) / (t[m] - t[n])
-                agree = 0
-                for p in range(number):
-                    if abs(q[n] + slope * (t[p] - t[n]) - q[p]) < tolerance * q[p]:
-                        agree += 1
-                if agree > best:
-                    best, first, second = agree, m, n
-        if first < 0:
-            continue
-        slope = (q[first] - q[second]) / (t[first] - t[second])
-        s0 = s1 = s2 = y0 = y1 = 0.0
-        for p in range(number):
-            if abs(q[second] + slope * (t[p] - t[second]) - q[p]) < tolerance * q[p]:
-                u, v = 1.0 - t[p], t[p]
-                s0, s1, s2 = s0 + u * u, s1 + u * v, s2 + v * v
-                y0, y1 = y0 + u * q[p], y1 + v * q[p]
-        determinant = s0 * s2 - s1 * s1
-        if not determinant > 1e-6:
-            continue
-        q1, q2 = (s2 * y0 - s1 * y1) / determinant, (s0 * y1 - s1 * y0) / determinant
-        if min(q1, q2) < search[i, 0] or max(q1, q2) > search[i, 1]:
-            continue
-        variance = (0.5 * tolerance * max(q1, q2)) ** 2
-        out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor, -1
-        out[count, 0], out[count, 1], out[count, 5] = q1, q2, 0.5
-        out[count, 2], out[count, 3] = variance * s2 / determinant, -variance * s1 / determinant
-        out[count, 4] = variance * s0 / determinant
-        count += 1
-    return count
 
 
 # ------------------------------------------------------------------------------------------------------------- Public
@@ -302,17 +266,19 @@ def angles_about_baseline(ray: FloatArray, baseline: FloatArray) -> FloatArray:
     return np.column_stack([low, low + np.abs(turn)])
 
 
+@dataclass(frozen=True, eq=False)
 class Proposer:
-    """Makes the proposals of one image at a time; keeps the room for them between images."""
+    """What makes the proposals of an image, and what it demands of them."""
 
-    def __init__(
-        self, views: LineViews, ratios: FloatArray, directed: bool, min_overlap: float, max_relative_sigma: float
-    ) -> None:
-        self.views, self.ratios, self.directed = views, ratios, directed
-        self.min_overlap, self.max_relative = min_overlap, max_relative_sigma
-        self._index, self._values = np.empty((1 << 14, 3), np.int64), np.empty((1 << 14, 6))
+    views: LineViews
+    #: (S, 2) change of depth along each segment and its standard deviation.
+    ratios: FloatArray
+    options: MapLinesOptions
+    gates: ProposalGates = field(default_factory=ProposalGates)
 
-    def propose(self, image: int, neighbors: IntArray, matches: list, near_points: tuple | None) -> Proposals:
+    def propose(
+        self, image: int, neighbors: IntArray, matches: list, near_points: tuple[FloatArray, FloatArray] | None
+    ) -> Proposals:
         """Proposals for the segments of an image.
 
         Parameters
@@ -327,61 +293,73 @@ class Proposer:
             Known points seen in the image.
         """
         views, rows = self.views, self.views.rows(image)
-        usable = np.flatnonzero(views.usable[rows])
         reached = np.zeros(rows.stop - rows.start, np.int64)
-        count = 0
+        parts: list[tuple[IntArray, FloatArray]] = [(np.empty((0, 3), np.int64), np.empty((0, 6)))]
         if near_points is not None and len(near_points[0]):
-            self._reserve(0, 2 * reached.size)
-            count = _point_lines(
-                views.ends[rows], views.line[rows], views.usable[rows], views.range[rows], self.ratios[rows],
-                *near_points, 0.01, len(neighbors), self._index, self._values,
-            )  # fmt: skip
+            parts.append(lines_through_points(views, rows, self.ratios[rows], near_points, len(neighbors)))
         for n, (j, given) in enumerate(zip(neighbors, matches, strict=True)):
-            M, a = views.camera[j, :, :3].copy(), views.camera[j] @ np.append(views.center[image], 1.0)
-            while True:
-                if given is None:
-                    needed = self._beam(image, int(j), n, count, rows, usable, reached, M, a)
-                else:
-                    search = views.inverse_depth[image]
-                    needed = _propose_pairs(
-                        given[0], given[1], rows.start, views.rows(j).start, views.ray, views.across, views.sigma,
-                        search, self.ratios, views.line, views.ends, views.usable, M, a, self.min_overlap,
-                        self.max_relative, count, n, self._index, self._values, reached,
-                    )  # fmt: skip
-                if needed <= len(self._values):
-                    break
-                self._reserve(count, needed)
-            count = needed
-        index = self._index[:count].copy()
-        return Proposals(index[:, 0], index[:, 1], index[:, 2], self._values[:count].copy(), reached)
+            if given is None:
+                parts.append(self._beam(image, int(j), n, reached))
+            else:
+                parts.append(self._pairs(image, int(j), n, given, reached))
+        index, values = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return Proposals(index[:, 0], index[:, 1], index[:, 2], values, reached)
 
-    def _reserve(self, keep: int, needed: int) -> None:
-        if needed > len(self._values):
-            index, values = np.empty((2 * needed, 3), np.int64), np.empty((2 * needed, 6))
-            index[:keep], values[:keep] = self._index[:keep], self._values[:keep]
-            self._index, self._values = index, values
+    def _pairs(
+        self, image: int, j: int, n: int, given: tuple[IntArray, FloatArray], reached: IntArray
+    ) -> tuple[IntArray, FloatArray]:
+        """Index (m, 3) and values (m, 6) of the proposals of matched segments of image j, which is neighbour n."""
+        views, (pairs, score) = self.views, given
+        index, values = np.empty((len(pairs), 3), np.int64), np.empty((len(pairs), 6))
+        count = _propose_pairs(
+            pairs, score, views.rows(image).start, views.rows(j).start, views.ray, views.across, views.sigma,
+            views.inverse_depth[image], self.ratios, views.line, views.ends, views.usable, *self._camera(image, j),
+            self.options.min_overlap, self.options.max_relative_sigma, self.gates.limits(), n, index, values, reached,
+        )  # fmt: skip
+        return index[:count], values[:count]
 
-    def _beam(self, image, j, n, count, rows, usable, reached, M, a) -> int:
+    def _beam(self, image: int, j: int, n: int, reached: IntArray) -> tuple[IntArray, FloatArray]:
+        """The same of all segments of image j in the epipolar beam of each segment."""
         views = self.views
         baseline = views.center[j] - views.center[image]
         if not np.linalg.norm(baseline) > 0.0:
-            return count
-        rows_i, rows_j = rows.start + usable, views.rows(j).start + np.flatnonzero(views.usable[views.rows(j)])
+            return np.empty((0, 3), np.int64), np.empty((0, 6))
+        usable = np.flatnonzero(views.usable[views.rows(image)])
+        rows_i, rows_j = views.usable_rows(image), views.usable_rows(j)
         beam_i = angles_about_baseline(views.ray[rows_i], baseline)
         beam_j = angles_about_baseline(views.ray[rows_j], baseline)
-        pointers = np.zeros(NUM_BINS + 1, np.int64)
-        _bin_beams(beam_j, pointers, np.empty(0, np.int64))
-        members = np.empty(pointers[-1], np.int64)
-        if len(members):
-            _bin_beams(beam_j, pointers, members)
-        local = np.zeros(len(rows_i), np.int64)
-        needed = _propose_beam(
-            rows_i, rows_j, views.ray, views.across, views.sigma, views.range, self.ratios, views.line, views.ends,
-            beam_i, beam_j, pointers, members, M, a, self.directed, self.min_overlap, self.max_relative, count, n,
-            self._index, self._values, local,
-        )  # fmt: skip
-        self._index[count : min(needed, len(self._index)), 0] = usable[
-            self._index[count : min(needed, len(self._index)), 0]
-        ]
-        reached[usable] = np.maximum(reached[usable], local)
-        return needed
+        bins = _bins_of(beam_j)
+        furthest = np.zeros(len(rows_i), np.int64)
+        room = _ROOM
+        while True:
+            index, values = np.empty((room, 3), np.int64), np.empty((room, 6))
+            needed = _propose_beam(
+                rows_i, rows_j, views.ray, views.across, views.sigma, views.range, self.ratios, views.line, views.ends,
+                beam_i, beam_j, *bins, *self._camera(image, j), self.options.directed, self.options.min_overlap,
+                self.options.max_relative_sigma, self.gates.limits(), n, index, values, furthest,
+            )  # fmt: skip
+            if needed <= room:
+                break
+            room = needed
+        index = index[:needed]
+        index[:, 0] = usable[index[:, 0]]
+        reached[usable] = np.maximum(reached[usable], furthest)
+        return index, values[:needed]
+
+    def _camera(self, image: int, j: int) -> tuple[FloatArray, FloatArray]:
+        """Image j's camera: for directions, and the epipole of an image."""
+        camera = self.views.camera[j]
+        return camera[:, :3].copy(), camera @ np.append(self.views.center[image], 1.0)
+
+
+def _bins_of(beams: FloatArray) -> tuple[IntArray, IntArray]:
+    """Pointers and members of the bins of the angle about the baseline."""
+    pointers = np.zeros(_NUM_BINS + 1, np.int64)
+    _bin_beams(beams, pointers, np.empty(0, np.int64))
+    members = np.empty(pointers[-1], np.int64)
+    if len(members):
+        _bin_beams(beams, pointers, members)
+    return pointers, members
+
+
+__all__ = ["OUT_OF_BEAM", "PROPOSED", "WEAK", "ProposalGates", "Proposals", "Proposer", "angles_about_baseline"]

@@ -1,40 +1,58 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Edges and texture told apart by how many of the images that should show a line do show it.
+r"""Edges and texture are distinguished by the fraction of images that show a line among those that should.
 
-An edge is in most images that look at it, until something stands before it. Where the border of a blotch or a blade of
-grass gives a segment, another view gives another one, and what agrees in three images agrees in few others. A line
-that is seen in k images of the m that should show it (in view, and as long there as segments are) is therefore taken
-for a draw from one of two urns,
+An edge is detected in most images that see it, except where it is occluded. A segment of texture is detected in few:
+what agrees in three images by chance agrees in few others. Let a line be observed in k of the m images that should show
+it (where it is in view, and longer than the shortest segments). It is drawn from one of two populations,
 
 .. math:: P(k \mid m, c) \propto \binom{m-1}{k-1}
           \frac{B(k - 1 + r_c s_c,\; m - k + (1 - r_c)\, s_c)}{B(r_c s_c,\; (1 - r_c)\, s_c)},
 
-with the mean rates :math:`r_c` and concentrations :math:`s_c` of :data:`EDGE` and :data:`TEXTURE`, given that k is at
-least what a line needs. Which urn a line is from depends on its segments, long and strong ones being edges,
+with the mean rates :math:`r_c` and concentrations :math:`s_c` of :class:`TextureGates`, given that k is at
+least what a line needs. The population of a line depends on its segments, long and strong ones being edges,
 
 .. math:: P(\text{edge}) = \frac{1}{1 + \exp(-w_0 - w_1 \log l - w_2 \log s - w_3 \log \sigma)},
 
-and few of the segments that texture gives become part of a line at all: a share :math:`\pi_c` does. Weights and shares
-are those that make lines and leftover segments of these images most likely (maximum posterior with wide priors). Where
-nothing looks like texture, as on plain boxes, the shares leave no room for it, and lines seen in few images stay.
+and a fraction :math:`\pi_c` of the segments becomes part of a line, which is small for texture. Weights and fractions
+are the maximum a posteriori estimate, with wide priors, from the lines and the remaining segments of these images.
+Scenes without texture, such as plain boxes, keep their lines that are seen in few images.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import betaln, expit, gammaln, log_expit
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.gates import gate
 from groma.mapping.lines.kinds import features_of
-from groma.mapping.lines.tracks import Tracks, images_near_lines
+from groma.mapping.lines.tracks import Tracks
 
-#: Mean and concentration of the rate at which images that should show an edge, or a line of texture, show it.
-EDGE, TEXTURE = (0.6, 6.0), (0.22, 15.0)
-#: Priors of the log odds that what gives segments becomes a line: of texture and of edges; and their deviation.
-_SHARE_ODDS, _SHARE_SIGMA = np.log([0.06 / 0.94, 0.35 / 0.65]), 0.5
-#: Deviations of the priors of the weights.
-_WEIGHT_SIGMA = (10.0, 1.5)
+
+@dataclass(frozen=True)
+class TextureGates:
+    """The two populations, and the priors."""
+
+    edge: tuple[float, float] = gate(
+        (0.6, 6.0), "1", "mean and concentration of the rate at which images show an edge", "chosen on ETH3D facades"
+    )
+    texture: tuple[float, float] = gate((0.22, 15.0), "1", "the same of a line of texture", "chosen on ETH3D facades")
+    line_shares: tuple[float, float] = gate(
+        (0.06, 0.35),
+        "share",
+        "of what texture, and edges, give that becomes a line: middle of the prior",
+        "chosen on ETH3D facades",
+    )
+    share_sigma: float = gate(0.5, "log odds", "deviation of the prior of the shares", "chosen on ETH3D facades")
+    weight_sigma: tuple[float, float] = gate(
+        (10.0, 1.5),
+        "log odds",
+        "deviations of the priors of the first weight and of the others",
+        "convention: wide priors",
+    )
 
 
 def num_expected(tracks: Tracks, neighbors: list[IntArray], size: IntArray, min_length: float) -> IntArray:
@@ -43,11 +61,11 @@ def num_expected(tracks: Tracks, neighbors: list[IntArray], size: IntArray, min_
     ``size`` (C, 2) is the width and height of the images, pixels; 0 where it is not known.
     """
     views = tracks.views
-    reach = images_near_lines(tracks.line_of, views.image_idx, neighbors)
+    reach = tracks.lines_near_images(neighbors)
     bound = np.where(size > 0, size, np.inf)
-    count = np.zeros(len(tracks.X), np.int64)
+    count = np.zeros(tracks.num_lines, np.int64)
     for P, lines, limit in zip(views.camera, reach, bound, strict=True):
-        x = tracks.X[lines] @ P[:, :3].T + P[:, 3]
+        x = tracks.lines[lines] @ P[:, :3].T + P[:, 3]
         ahead = (x[..., 2] > 1e-6).all(1)
         pixel = x[ahead, :, :2] / x[ahead, :, 2:]
         along = pixel[:, 1] - pixel[:, 0]
@@ -65,6 +83,7 @@ def edge_odds(
     seen: IntArray,
     expected: IntArray,
     min_images: int,
+    gates: TextureGates = TextureGates(),
 ) -> FloatArray:
     """Log odds (L,) that a line is an edge, not texture.
 
@@ -80,6 +99,8 @@ def edge_odds(
         Number of images that show each line, and that should.
     min_images : int
         Lines of fewer images were dropped.
+    gates : TextureGates, optional
+        The two populations, and the priors.
     """
     member = line_of >= 0
     features = features_of(eligible | member, *kinds)
@@ -87,13 +108,15 @@ def edge_odds(
     number = np.maximum(np.bincount(line_of[member], minlength=len(seen)), 1)
     sums = [np.bincount(line_of[member], column, minlength=len(seen)) for column in features[member].T]
     lines = np.column_stack(sums) / number[:, None]
-    ratio = _log_chance(seen, expected, min_images, EDGE) - _log_chance(seen, expected, min_images, TEXTURE)
+    ratio = _log_chance(seen, expected, min_images, gates.edge)
+    ratio -= _log_chance(seen, expected, min_images, gates.texture)
 
-    spread = np.array([_WEIGHT_SIGMA[0]] + [_WEIGHT_SIGMA[1]] * len(kinds))
+    prior_odds, odds_sigma = np.log([share / (1.0 - share) for share in gates.line_shares]), gates.share_sigma
+    spread = np.array([gates.weight_sigma[0]] + [gates.weight_sigma[1]] * len(kinds))
 
     def cost(p: FloatArray) -> tuple[float, FloatArray]:
         weights, odds = p[:-2], p[-2:]
-        value, slope = 0.0, np.concatenate([weights / spread**2, (odds - _SHARE_ODDS) / _SHARE_SIGMA**2])
+        value, slope = 0.0, np.concatenate([weights / spread**2, (odds - prior_odds) / odds_sigma**2])
         for features, gain, sign in ((lines, ratio, 1.0), (leftover, 0.0, -1.0)):
             z = features @ weights
             texture, edge = log_expit(-z) + log_expit(sign * odds[0]), log_expit(z) + log_expit(sign * odds[1]) + gain
@@ -101,10 +124,10 @@ def edge_odds(
             is_edge, share = expit(edge - texture), sign * expit(-sign * odds)
             slope[:-2] -= features.T @ (is_edge - expit(z))
             slope[-2:] -= share * [(1.0 - is_edge).sum(), is_edge.sum()]
-        prior = (weights**2 / spread**2).sum() + ((odds - _SHARE_ODDS) ** 2).sum() / _SHARE_SIGMA**2
+        prior = (weights**2 / spread**2).sum() + ((odds - prior_odds) ** 2).sum() / odds_sigma**2
         return value + 0.5 * prior, slope
 
-    p = minimize(cost, np.concatenate([1.0 / spread, _SHARE_ODDS]), jac=True, method="L-BFGS-B").x
+    p = minimize(cost, np.concatenate([1.0 / spread, prior_odds]), jac=True, method="L-BFGS-B").x
     return lines @ p[:-2] + ratio + log_expit(p[-1]) - log_expit(p[-2])
 
 
@@ -126,4 +149,4 @@ def _beta_binomial(hits: FloatArray, tries: FloatArray, kind: tuple[float, float
     return number + betaln(hits + a, tries - hits + b) - betaln(a, b)
 
 
-__all__ = ["edge_odds", "num_expected"]
+__all__ = ["TextureGates", "edge_odds", "num_expected"]

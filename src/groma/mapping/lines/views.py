@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Segments of all images as one table, with the rays, lines and depths that mapping needs.
+r"""The segments of all images as one table, with their rays, image lines and depth ranges.
 
-Pixels are undistorted once, here: an image is then a pinhole camera :math:`P = K [R\,|\,t]`, and a segment has two rays
+Pixels are undistorted here, once. An image is then a pinhole camera :math:`P = K [R\,|\,t]`, and a segment has two rays
 :math:`f = R^\top K^{-1} [u, v, 1]^\top`, so that :math:`X = c + z f = c + f/q` lies at depth z, inverse depth q.
-Along a segment of a straight line q is affine in the pixel, which is why everything is done in inverse depths.
+Along the image of a straight line q is an affine function of the pixel; mapping therefore works with inverse depths.
 """
 
 from __future__ import annotations
@@ -17,14 +17,32 @@ from scipy.spatial import KDTree
 
 from groma import cameras as camera_models
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.gates import gate
 from groma.geometry import quaternion, segment2
+from groma.mapping.groups import grouped
+from groma.mapping.work import map_work
 from groma.scene import Scene
 
 if TYPE_CHECKING:
     from groma.features.segments import Segments
 
-#: Points asked for around each end and the middle of a segment.
-_NUM_NEAR = 6
+
+@dataclass(frozen=True)
+class ViewGates:
+    """Where segments are looked for in depth."""
+
+    num_near: int = gate(
+        6, "points", "around each end and the middle of a segment that tell its depth", "chosen on wireframes"
+    )
+    depth_quantile: float = gate(
+        0.01, "quantile", "of the inverse depths in an image, at either end of its range", "chosen on wireframes"
+    )
+    num_baselines: int = gate(
+        5, "images", "nearest cameras that tell the scale where there are no points", "chosen on wireframes"
+    )
+    inverse_depth_range: tuple[float, float] = gate(
+        (1e-3, 2.0), "1/baseline", "inverse depths searched where there are no points", "chosen on wireframes"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +80,19 @@ class LineViews:
         """Rows of an image."""
         return slice(int(self.pointers[image]), int(self.pointers[image + 1]))
 
+    def usable_rows(self, image: int) -> IntArray:
+        """Rows of the usable segments of an image."""
+        rows = self.rows(image)
+        return rows.start + np.flatnonzero(self.usable[rows])
+
 
 def build_views(
-    scene: Scene, segments: Sequence[Segments], min_length: float, noise: float, depth_margin: float
+    scene: Scene,
+    segments: Sequence[Segments],
+    min_length: float,
+    noise: float,
+    depth_margin: float,
+    gates: ViewGates = ViewGates(),
 ) -> LineViews:
     """Undistort the segments of all images and find where to look for them in depth.
 
@@ -80,64 +108,96 @@ def build_views(
         Added in quadrature to the segments' own sigma; pixels.
     depth_margin : float
         Factor by which the depth range of the points near a segment is widened at both sides.
+    gates : ViewGates, optional
+        Which points tell the depth.
     """
     count = scene.num_images
-    poses = scene.cam_from_world
-    rotation, centers = quaternion.to_matrix(poses[:, :4]), scene.cam_centers_in_world
+    camera = _cameras(scene)
+    by_image, starts = grouped(scene.point_observations.image_idx, count)
+
+    def of_image(i: int) -> dict[str, np.ndarray]:
+        columns = _undistorted(scene, i, segments[i], min_length)
+        points = scene.points.xyz[scene.point_observations.point_idx[by_image[starts[i] : starts[i + 1]]]]
+        depths, search = _depth_range(scene, i, camera[i], points, columns["ends"], depth_margin, gates)
+        return columns | {"sigma": np.hypot(segments[i].sigma, noise), "range": search, "inverse_depth": depths[None]}
+
+    none = {
+        "ends": np.zeros((0, 4)), "ray": np.zeros((0, 2, 3)), "across": np.zeros((0, 3)), "length": np.zeros(0),
+        "usable": np.zeros(0, bool), "sigma": np.zeros(0), "range": np.zeros((0, 2)), "inverse_depth": np.zeros((0, 2)),
+    }  # fmt: skip
+    parts = [none, *map_work(of_image, range(count))]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in none}
     sizes = [len(item.ends) for item in segments]
-    pointers = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    total = int(pointers[-1])
-    camera, depths = np.zeros((count, 3, 4)), np.full((count, 2), np.nan)
-    ends, ray, across = np.zeros((total, 4)), np.zeros((total, 2, 3)), np.zeros((total, 3))
-    sigma, search = np.ones(total), np.zeros((total, 2))
-    usable, lengths = np.zeros(total, bool), np.zeros(total)
-    by_image = np.argsort(scene.point_observations.image_idx, kind="stable")
-    starts = np.searchsorted(scene.point_observations.image_idx[by_image], np.arange(count + 1))
-    for i in range(count):
-        rows = slice(pointers[i], pointers[i + 1])
-        which = scene.images.camera_idx[i]
-        model, params = camera_models.model(scene.cameras.models[which]), scene.cameras.params_of(which)
-        K = model.camera_matrix(params)
-        camera[i] = K @ np.column_stack([rotation[i], poses[i, 4:]])
-        straight = model.undistort_pixels(params, segments[i].ends.reshape(-1, 2)).reshape(-1, 4)
-        length = np.where(np.isfinite(straight).all(1), segment2.length(straight), 0.0)
-        good = length >= min_length
-        straight[~good] = 0.0
-        to_ray = rotation[i].T @ np.linalg.inv(K)
-        pixel = np.ones((len(straight), 2, 3))
-        pixel[:, :, :2] = straight.reshape(-1, 2, 2)
-        normal = np.zeros((len(straight), 3))
-        normal[:, :2] = segment2.to_line(straight)[:, :2]
-        ends[rows], usable[rows], lengths[rows] = straight, good, length
-        ray[rows], across[rows] = pixel @ to_ray.T, normal @ to_ray.T
-        sigma[rows] = np.hypot(segments[i].sigma, noise)
-        seen = by_image[starts[i] : starts[i + 1]]
-        xyz = scene.points.xyz[scene.point_observations.point_idx[seen]]
-        depth = xyz @ rotation[i, 2] + poses[i, 6]
-        xyz, depth = xyz[depth > 0], depth[depth > 0]
-        if len(depth):
-            pixel = (xyz @ camera[i, :2, :3].T + camera[i, :2, 3]) / depth[:, None]
-            inverse = 1.0 / depth
-            low, high = np.quantile(inverse, [0.01, 0.99])
-            depths[i] = low / depth_margin, high * depth_margin
-            search[rows] = _range_near(straight, pixel, inverse, depth_margin)
-        elif count > 1:
-            nearest = np.sort(np.linalg.norm(centers - centers[i], axis=1))[1 : 1 + min(5, count - 1)].mean()
-            depths[i] = search[rows] = 1e-3 / max(nearest, 1e-12), 2.0 / max(nearest, 1e-12)
-    image_idx = np.repeat(np.arange(count), sizes)
-    line = segment2.to_line(ends)
     return LineViews(
-        camera, centers, depths, pointers, image_idx, ends, sigma, line, ray, across, search, lengths, usable
+        camera=camera,
+        center=scene.cam_centers_in_world,
+        pointers=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+        image_idx=np.repeat(np.arange(count), sizes),
+        line=segment2.to_line(columns["ends"]),
+        **columns,
     )
 
 
-def _range_near(ends: FloatArray, pixel: FloatArray, inverse: FloatArray, margin: float) -> FloatArray:
+def _cameras(scene: Scene) -> FloatArray:
+    """(C, 3, 4) pinhole cameras, pixels without distortion from world."""
+    poses = scene.cam_from_world
+    rotation = quaternion.to_matrix(poses[:, :4])
+    camera = np.zeros((scene.num_images, 3, 4))
+    for i, which in enumerate(scene.images.camera_idx):
+        K = camera_models.model(scene.cameras.models[which]).camera_matrix(scene.cameras.params_of(which))
+        camera[i] = K @ np.column_stack([rotation[i], poses[i, 4:]])
+    return camera
+
+
+def _undistorted(scene: Scene, image: int, segments: Segments, min_length: float) -> dict[str, np.ndarray]:
+    """Columns of the segments of an image that follow from their end points."""
+    which = scene.images.camera_idx[image]
+    model, params = camera_models.model(scene.cameras.models[which]), scene.cameras.params_of(which)
+    ends = model.undistort_pixels(params, segments.ends.reshape(-1, 2)).reshape(-1, 4)
+    length = np.where(np.isfinite(ends).all(1), segment2.length(ends), 0.0)
+    usable = length >= min_length
+    ends[~usable] = 0.0
+    to_ray = quaternion.to_matrix(scene.cam_from_world[image, :4]).T @ np.linalg.inv(model.camera_matrix(params))
+    pixel = np.ones((len(ends), 2, 3))
+    pixel[:, :, :2] = ends.reshape(-1, 2, 2)
+    normal = np.zeros((len(ends), 3))
+    normal[:, :2] = segment2.to_line(ends)[:, :2]
+    return {
+        "ends": ends, "ray": pixel @ to_ray.T, "across": normal @ to_ray.T, "length": length, "usable": usable,
+    }  # fmt: skip
+
+
+def _depth_range(
+    scene: Scene, image: int, camera: FloatArray, points: FloatArray, ends: FloatArray, margin: float, gates: ViewGates
+) -> tuple[FloatArray, FloatArray]:
+    """Range (2,) of the inverse depths in an image, and where to look for each segment (n, 2)."""
+    pose = scene.cam_from_world[image]
+    depth = points @ quaternion.to_matrix(pose[:4])[2] + pose[6]
+    points, depth = points[depth > 0], depth[depth > 0]
+    if len(depth):
+        pixel = (points @ camera[:2, :3].T + camera[:2, 3]) / depth[:, None]
+        inverse = 1.0 / depth
+        low, high = np.quantile(inverse, [gates.depth_quantile, 1.0 - gates.depth_quantile])
+        near = _range_near(ends, pixel, inverse, margin, gates.num_near)
+        return np.array([low / margin, high * margin]), near
+    if scene.num_images == 1:
+        return np.full(2, np.nan), np.zeros((len(ends), 2))
+    centers = scene.cam_centers_in_world
+    away = np.sort(np.linalg.norm(centers - centers[image], axis=1))[1 : 1 + gates.num_baselines]
+    everywhere = np.array(gates.inverse_depth_range) / max(away.mean(), 1e-12)
+    return everywhere, np.tile(everywhere, (len(ends), 1))
+
+
+def _range_near(ends: FloatArray, pixel: FloatArray, inverse: FloatArray, margin: float, num_near: int) -> FloatArray:
     """Range of the inverse depths of the points around each segment, widened by the margin."""
     if len(ends) == 0:
         return np.zeros((0, 2))
     first, second = ends[:, :2], ends[:, 2:]
     places = np.stack([first, 0.5 * (first + second), second], axis=1)
-    near = min(_NUM_NEAR, len(pixel))
+    near = min(num_near, len(pixel))
     found = KDTree(pixel).query(places.reshape(-1, 2), k=near)[1].reshape(len(ends), -1)
     values = inverse[found]
     return np.column_stack([values.min(1) / margin, values.max(1) * margin])
+
+
+__all__ = ["LineViews", "ViewGates", "build_views"]

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""Covariances of points and lines from the noise of their observations, poses and intrinsics held.
 
-Each landmark is on its own then: the inverse of its information matrix :math:`\sum J^\top J/\sigma^2`. Lines are
-described by where their segment's two ends move across the line, four numbers :math:`(a_1, b_1, a_2, b_2)` along two
-unit vectors; a point at the share :math:`\lambda` of the segment moves by
-:math:`(1-\lambda)\delta_1 + \lambda\delta_2`.
-The image of a measured end point is that of the line's point closest to its ray, and only its displacement across the
-image line is measured. Any camera model will do.
+With cameras held, landmarks are independent, and the covariance of each is the inverse of its information matrix
+:math:`\sum J^\top J/\sigma^2`. A line has four parameters :math:`(a_1, b_1, a_2, b_2)`: the displacements of the two
+ends of its segment across it, along two unit vectors. The point at the fraction :math:`\lambda` of the segment moves by
+:math:`(1-\lambda)\delta_1 + \lambda\delta_2`. A measured end point corresponds to the point of the line that is closest
+to its ray; only its displacement across the image line is measured. Any camera model can be used.
 """
 
 from __future__ import annotations
@@ -18,12 +17,25 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.cameras import model as camera_model
+from groma.gates import gate
 from groma.geometry import quaternion
 from groma.geometry.algebra import apply, dot, norm, perpendicular, ratio, unit
 from groma.scene import Scene
 
-#: Least standard deviation of a measured coordinate, pixels: synthetic scenes may have none.
-_MIN_SIGMA = 0.02
+
+@dataclass(frozen=True)
+class LandmarkNoiseGates:
+    """What is believed of the noise of a landmark."""
+
+    min_sigma_px: float = gate(
+        0.02, "px", "deviation of a coordinate at least", "convention: synthetic scenes may have none"
+    )
+    max_share: float = gate(
+        3.0, "1", "lengths of a line from its middle, where a ray still tells where it ends", "chosen on wireframes"
+    )
+
+
+GATES = LandmarkNoiseGates()
 
 
 @dataclass(frozen=True)
@@ -153,7 +165,7 @@ def _share_on_line(scene: Scene, image_idx: IntArray, measured: FloatArray, ends
     slope = dot(normal, along)
     share = ratio(dot(normal, center - ends[:, 0]), slope, np.abs(slope) > 1e-12 * dot(along, along))
     # Rays nearly along the line say nothing; far points would only disturb.
-    return np.where(np.abs(share - 0.5) < 3.0, share, np.nan)
+    return np.where(np.abs(share - 0.5) < GATES.max_share, share, np.nan)
 
 
 def _by_model(scene: Scene, image_idx: IntArray):
@@ -170,7 +182,7 @@ def _misfit(squares: FloatArray, freedom: IntArray, sigma_px: float | None) -> t
     """Noise of a coordinate, robustly over the landmarks, and each landmark's misfit in units of it."""
     known = freedom > 0
     variance = ratio(squares, freedom.astype(np.float64), known, 0.0)
-    sigma = _MIN_SIGMA
+    sigma = GATES.min_sigma_px
     if sigma_px is not None:
         sigma = sigma_px
     elif known.any():
@@ -179,7 +191,7 @@ def _misfit(squares: FloatArray, freedom: IntArray, sigma_px: float | None) -> t
         cumulated = np.cumsum(freedom[known][order])
         middle = order[np.searchsorted(cumulated, 0.5 * cumulated[-1])]
         sigma = float(np.sqrt(variance[known][middle]))
-    sigma = max(sigma, _MIN_SIGMA)
+    sigma = max(sigma, GATES.min_sigma_px)
     return sigma, np.sqrt(variance) / sigma
 
 

@@ -1,24 +1,28 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""The noise of the observations of a scene, from their residuals.
 
-Some points are seen sharply in all their images, others in none: fine corners and large blobs, the rims of shadows,
-what is not quite one place. Squared residuals differ far more between points than within one. So each point :math:`i`
-is given a variance of its own, :math:`v_i`, around the usual :math:`s^2`, and Student's distribution for the sake of
-mistakes. With :math:`q_{ij}` the squared norm of a residual of two coordinates,
+Some points, such as fine corners, are localised well in every image; others, such as large blobs and the rims of
+shadows, in none. Squared residuals therefore differ far more between points than within a point. Each point :math:`i`
+has its own variance :math:`v_i`, scattered around a common :math:`s^2`, and residuals follow Student's distribution,
+which allows for outliers. With :math:`q_{ij}` the squared norm of a residual of two coordinates,
 
 .. math:: \frac{\nu_b s^2}{v_i} \sim \chi^2_{\nu_b}, \qquad \frac{q_{ij}}{2 v_i} \sim F_{2, \nu_w}.
 
-Logarithms tell the two apart: :math:`\log q` varies by :math:`\psi_1(1) + \psi_1(\nu_w / 2)` within the points, and
-their levels by :math:`\psi_1(\nu_b / 2)`, where :math:`\psi_1` is the trigamma function. The variances follow by
-expectation maximisation. Noise of one size gives an infinite :math:`\nu_b`, and all points the same variance.
+The logarithms separate the two: :math:`\log q` has the variance :math:`\psi_1(1) + \psi_1(\nu_w / 2)` within a
+point, and the point means have :math:`\psi_1(\nu_b / 2)`, where :math:`\psi_1` is the trigamma function. The
+variances follow by expectation maximisation. Homogeneous noise gives an infinite :math:`\nu_b`, and all points the
+same variance.
 
-The two ends of a segment are not independent. A line fitted to the many pixels of an edge knows its middle better than
-its ends, whose errors then have a correlation of -1/2; an edge that is not quite where it is seen from elsewhere, as
-on a rounded corner, is off as a whole. Which of the two prevails is told by the residuals.
+The errors of the two ends of a segment are correlated. A line fitted to the pixels of an edge is more certain in its
+middle than at its ends, whose errors then have a correlation of -1/2; an edge that appears displaced from view to view,
+as on a rounded corner, is displaced as a whole, with a correlation of 1. The residuals show which of the two
+prevails.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -27,44 +31,63 @@ from scipy.special import polygamma
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.pixel_residuals import squared_residuals_px
+from groma.gates import gate
+from groma.mapping.noise.landmarks import GATES as LANDMARK_GATES
 from groma.mapping.noise.landmarks import project_points
 from groma.problem.residuals import residuals_of
 from groma.scene import Scene
 
-#: Residuals smaller than this are not believed, pixels: synthetic scenes may have none.
-MIN_SIGMA_PX = 0.02
-#: Fewer observations tell nothing; this is assumed then, pixels.
-_FEWEST, _UNKNOWN_PX = 10, 1.0
-#: The median of the squared norm of two Gaussian coordinates, in variances.
-_MEDIAN = 1.386
-#: Observations of a point that tell its noise from chance, and how many such points tell the noise of all.
-_MANY_VIEWS, _MANY_POINTS = 4, 100
-#: Smallest squared residual, relative to the usual one: its logarithm is taken.
-_MIN_SQUARE = 1e-4
-#: Half the degrees of freedom lie between these.
-_SHAPES = (0.5, 1e4)
+
+@dataclass(frozen=True)
+class ObservationNoiseGates:
+    """From how many residuals noise is estimated, and what is believed of it."""
+
+    min_observations: int = gate(
+        10, "observations", "fewer tell nothing", "derived from a third of the noise as its error"
+    )
+    unknown_px: float = gate(1.0, "px", "noise where nothing tells it", "convention: a pixel")
+    max_fitted: float = gate(
+        0.8, "share", "of the residuals that landmarks take at most", "derived from five tracks of two"
+    )
+    min_views: int = gate(
+        4, "observations", "of a landmark that tells its noise from chance", "derived from one degree of freedom in two"
+    )
+    min_landmarks: int = gate(
+        100, "landmarks", "of so many views, that tell the noise of all", "derived from 10 % of its error"
+    )
+    min_square: float = gate(
+        1e-4, "1", "smallest squared residual, over the usual one", "convention: a logarithm is taken"
+    )
+    shapes: tuple[float, float] = gate(
+        (0.5, 1e4), "1", "bounds of half the degrees of freedom", "convention: heavy tails to normal"
+    )
+    max_correlation: float = gate(0.8, "1", "of the two ends of segments", "chosen on ETH3D facades")
+
+
+GATES = ObservationNoiseGates()
+#: The median of the squared norm of two normal coordinates, in variances.
+_MEDIAN = 2.0 * math.log(2.0)
+#: Rounds of expectation maximisation.
 _STEPS = 20
-#: Beyond this, a correlation of the two ends of segments is not believed.
-_MAX_CORRELATED = 0.8
 
 
 def noise_px(scene: Scene, kind: Literal["points", "lines"], end_correlation: float = 0.0) -> float:
-    """Return the standard deviation of the usual coordinate of one kind of landmark, robustly, pixels.
+    r"""Return the standard deviation of the usual coordinate of one kind of landmark, robustly, pixels.
 
-    The median of the squared norm of two Gaussian coordinates is 1.386 variances; fitted landmarks take their share.
-    The observations' own standard deviations are relative to what is returned. For lines it is that of an end point,
-    given how the errors of the two ends are correlated.
+    The squared norm of two normal coordinates has the median :math:`2 \log 2` variances. The residuals that are left
+    after the fit are scaled by their degrees of freedom. Observations carry standard deviations relative to the
+    returned one. For lines the result is that of an end point, given the correlation of the errors of the two ends.
     """
     options = AssemblyOptions(
         points=kind == "points", lines=kind == "lines", planes=False, line_end_correlation=end_correlation
     )
     assembly = assemble(scene, options)
     squares = squared_residuals_px(assembly, weighted=True).get(kind)
-    if squares is None or len(squares) < _FEWEST:
-        return _UNKNOWN_PX
+    if squares is None or len(squares) < GATES.min_observations:
+        return GATES.unknown_px
     unknowns = 3 * scene.num_points if kind == "points" else 4 * scene.num_lines
-    share = 1.0 - min(unknowns / (2 * len(squares)), 0.8)
-    return max(float(np.sqrt(np.median(squares) / _MEDIAN / share)), MIN_SIGMA_PX)
+    share = 1.0 - min(unknowns / (2 * len(squares)), GATES.max_fitted)
+    return max(float(np.sqrt(np.median(squares) / _MEDIAN / share)), LANDMARK_GATES.min_sigma_px)
 
 
 def line_end_correlation(scene: Scene) -> float:
@@ -76,13 +99,13 @@ def line_end_correlation(scene: Scene) -> float:
     images = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
     ends = [np.zeros((0, 2))]
     for factor in problem.factors:
-        told = images[factor.line.index] >= _MANY_VIEWS  # type: ignore[attr-defined]
+        told = images[factor.line.index] >= GATES.min_views  # type: ignore[attr-defined]
         ends.append((residuals_of(factor, problem.variables) * np.asarray(factor.sqrt_information)[:, None])[told])
     first, second = np.concatenate(ends).T
-    if len(first) < _MANY_POINTS:
+    if len(first) < GATES.min_landmarks:
         return 0.0
     shift, turn = np.median(np.abs(first + second)) ** 2, np.median(np.abs(first - second)) ** 2
-    return float(np.clip((shift - turn) / max(shift + turn, 1e-300), -_MAX_CORRELATED, _MAX_CORRELATED))
+    return float(np.clip((shift - turn) / max(shift + turn, 1e-300), -GATES.max_correlation, GATES.max_correlation))
 
 
 def moved_px(before: Scene, after: Scene, share: float) -> float:
@@ -111,15 +134,15 @@ def with_point_noise(scene: Scene) -> Scene:
     seen = np.isfinite(residual).all(axis=1)
     squares, owner = (residual[seen] ** 2).sum(axis=1), table.point_idx[seen]
     number = np.bincount(owner, minlength=count)
-    if np.count_nonzero(number >= _MANY_VIEWS) < _MANY_POINTS:
+    if np.count_nonzero(number >= GATES.min_views) < GATES.min_landmarks:
         return scene
     # Fitting a point takes three of the two coordinates per observation; what is left is as if they all were smaller.
     freedom = np.maximum(2 * number - 3, 1)
     share = (freedom / np.maximum(2 * number, 1))[owner]
     usual = float(np.median(squares / share)) / _MEDIAN
-    if usual < MIN_SIGMA_PX**2:
+    if usual < LANDMARK_GATES.min_sigma_px**2:
         return scene
-    squares = np.maximum(squares, _MIN_SQUARE * usual * share)
+    squares = np.maximum(squares, GATES.min_square * usual * share)
     between, within = _degrees_of_freedom(np.log(squares / share), owner, number)
     variance = np.full(count, usual)
     for _ in range(_STEPS):
@@ -135,9 +158,9 @@ def _degrees_of_freedom(levels: FloatArray, owner: IntArray, number: IntArray) -
 
     Few make them rather infinite than small: each is what is left of a variance that chance explains.
     """
-    chosen = number[owner] >= _MANY_VIEWS
+    chosen = number[owner] >= GATES.min_views
     levels, owner = levels[chosen], owner[chosen]
-    points = np.flatnonzero(number >= _MANY_VIEWS)
+    points = np.flatnonzero(number >= GATES.min_views)
     mean = np.bincount(owner, levels, len(number)) / np.maximum(number, 1)
     within = float(((levels - mean[owner]) ** 2).sum() / (number[points] - 1).sum())
     between = float(np.var(mean[points]) - within * np.mean(1.0 / number[points]))
@@ -146,7 +169,7 @@ def _degrees_of_freedom(levels: FloatArray, owner: IntArray, number: IntArray) -
 
 def _inverse_trigamma(value: float) -> float:
     """Where the trigamma function, which falls, has a value; the nearer end where that is out of bounds."""
-    shapes = np.geomspace(*_SHAPES, 1000)[::-1]
+    shapes = np.geomspace(*GATES.shapes, 1000)[::-1]
     return float(np.interp(value, polygamma(1, shapes), shapes))
 
 

@@ -1,44 +1,59 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""Errors that neighbours in an image share, and what they leave of the weight of many.
 
-What a calibration leaves of the bending of a lens, or air, or a rolling shutter moves all that is seen in one part of
-an image alike, points and lines. A thousand observations there then do not tell a thousand times as much as one. Let
-the shared error of two observations at the distance :math:`d` have the covariance :math:`\tau^2(d)` beside the noise of
-their own. Where the information of all, :math:`J = \sum 1/\sigma^2`, lies within the reach of the shared error,
-least squares with the whole covariance :math:`\mathrm{diag}(\sigma^2) + \tau^2 1 1^T` weighs each by
+Residual lens distortion, refraction and a rolling shutter displace everything in one part of an image alike, points and
+lines. A thousand observations there do not hold a thousand times the information of one. Let the shared errors of two
+observations at the distance :math:`d` have the covariance :math:`\tau^2(d)`, in addition to their own noise. Where all
+observations, with the information :math:`J = \sum 1/\sigma^2`, lie within the range of the shared error, least squares
+with the full covariance :math:`\mathrm{diag}(\sigma^2) + \tau^2 1 1^T` weights each by
 
 .. math:: \frac{1}{\sigma_i^2 f^2}, \qquad f^2 = 1 + \tau^2 J,
 
-and with a covariance that falls slowly by :math:`f_i^2 = 1 + \sum_j \tau^2(d_{ij}) / \sigma_j^2`. The covariance is
-that of the residuals of points, ring by ring of distances, over all pairs of all images; sums over pairs are
-correlations of images of a few pixels, done by Fourier transforms.
+and, for a covariance that decreases slowly with distance, by :math:`f_i^2 = 1 + \sum_j \tau^2(d_{ij}) / \sigma_j^2`.
+The covariance is estimated from the residuals of points, over all pairs of all images, for one ring of distances after
+another. Sums over pairs are correlations of coarse grids, computed by Fourier transforms.
 
-Some points are found at one and the same pixel, as where a detector gives a spot two orientations: one measurement,
-counted twice. They share its weight.
+Points at the same pixel, as where a detector gives a keypoint two orientations, are one measurement counted twice. They
+share its weight.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.gates import gate
 from groma.mapping.noise.landmarks import project_points
 from groma.scene import Scene
 
-#: Cells along the longer side of an image, and the distances in cells at which rings of pairs end.
-_CELLS, _RINGS = 64, (1.0, 2.0, 4.0, 8.0, 16.0)
-#: Fewer observations tell nothing of what they share.
-_FEWEST = 1000
-#: Part of the variance of errors that is left in residuals at least; where there is less, there is no noise.
-_MIN_SHARE = 0.25
-#: A covariance must be so many times its own standard deviation.
-_SIGNIFICANT = 3.0
-#: Residuals beyond so many standard deviations are mistakes.
-_MISTAKE = 4.0
+
+@dataclass(frozen=True)
+class SharedNoiseGates:
+    """Which errors are shared."""
+
+    num_cells: int = gate(64, "cells", "along the longer side of an image", "cost: how finely distances are told apart")
+    rings: tuple[float, ...] = gate(
+        (1.0, 2.0, 4.0, 8.0, 16.0), "cells", "distances at which rings of pairs end", "convention: doubling"
+    )
+    min_observations: int = gate(
+        1000, "observations", "fewer tell nothing of what they share", "chosen on ETH3D facades"
+    )
+    min_share: float = gate(
+        0.25, "share", "of the variance of errors that residuals have at least", "derived from points of two views"
+    )
+    min_significance: float = gate(3.0, "sigma", "of a covariance that is believed", "convention: three sigma")
+    max_residual: float = gate(
+        4.0, "sigma", "residuals beyond are mistakes", "derived from normal noise: exceeded once in 3 000"
+    )
+
+
+GATES = SharedNoiseGates()
 
 
 def with_shared_noise(scene: Scene, point_sigma_px: float, line_sigma_px: float) -> Scene:
-    """Return the scene with observations that share errors with many others made less sure than those alone.
+    """Return the scene with larger standard deviations where observations share errors with many others.
 
     Parameters
     ----------
@@ -53,7 +68,7 @@ def with_shared_noise(scene: Scene, point_sigma_px: float, line_sigma_px: float)
         Standard deviations multiplied by :math:`f_i`, relative to that of the usual point.
     """
     points, lines = scene.point_observations, scene.line_observations
-    if len(points) < _FEWEST or not scene.cameras.width.any():
+    if len(points) < GATES.min_observations or not scene.cameras.width.any():
         return scene
     grid = _Grid(scene)
     times = _times_measured(points.image_idx, points.pixel)
@@ -63,7 +78,7 @@ def with_shared_noise(scene: Scene, point_sigma_px: float, line_sigma_px: float)
     sigma, line_sigma = point_sigma_px * points.sigma, line_sigma_px * lines.sigma
     pixels, _ = project_points(scene, points.image_idx, scene.points.xyz[points.point_idx])
     residual = (pixels - points.pixel) / sigma[:, None]
-    told = (times == 1) & (np.einsum("ni,ni->n", residual, residual) < _MISTAKE**2)
+    told = (times == 1) & (np.einsum("ni,ni->n", residual, residual) < GATES.max_residual**2)
     covariance = _covariance(grid, cells[told], residual[told], sigma[told])
     information = grid.sums(cells, 1.0 / sigma**2) + grid.sums(middles, 1.0 / line_sigma**2)
     around = grid.smoothed(information, covariance).reshape(-1)
@@ -95,8 +110,8 @@ class _Grid:
     def __init__(self, scene: Scene) -> None:
         camera = scene.images.camera_idx
         width, height = scene.cameras.width[camera], scene.cameras.height[camera]
-        self.size = float(max(width.max(), height.max())) / _CELLS
-        room = int(_RINGS[-1])
+        self.size = float(max(width.max(), height.max())) / GATES.num_cells
+        room = int(GATES.rings[-1])
         self.shape = (
             len(scene.images),
             int(np.ceil(height.max() / self.size)) + room,
@@ -109,7 +124,7 @@ class _Grid:
     def cells(self, image_idx: IntArray, pixel: FloatArray) -> IntArray:
         """Number of the cell of each pixel (N,)."""
         _, height, width = self.shape
-        room = int(_RINGS[-1])
+        room = int(GATES.rings[-1])
         at = np.clip((pixel / self.size).astype(np.int64), 0, [width - room - 1, height - room - 1])
         return (image_idx * height + at[:, 1]) * width + at[:, 0]
 
@@ -130,19 +145,19 @@ class _Grid:
 def _covariance(grid: _Grid, cells: IntArray, residual: FloatArray, sigma: FloatArray) -> FloatArray:
     """The shared variance by how far cells lie apart, pixels squared, of the shape of a grid; zero where it is none."""
     # Landmarks follow their observations: residuals are smaller than errors.
-    residual = residual / np.sqrt(max(np.sum(residual**2) / max(residual.size, 1), _MIN_SHARE))
+    residual = residual / np.sqrt(max(np.sum(residual**2) / max(residual.size, 1), GATES.min_share))
     products = np.sum([grid.pairs(grid.sums(cells, along / sigma)) for along in residual.T], axis=0)
     weights = grid.pairs(grid.sums(cells, 1.0 / sigma**2))
     # Without pairs of an observation with itself.
     products[0, 0] -= np.sum(residual**2 / sigma[:, None] ** 2)
     weights[0, 0] -= np.sum(1.0 / sigma**4)
     covariance, least, inner = np.zeros_like(weights), np.inf, 0.0
-    for outer in _RINGS:
+    for outer in GATES.rings:
         ring = (grid.distance >= inner) & (grid.distance < outer)
         total = max(weights[ring].sum(), 1e-300)
         # Every pair is there twice, in two coordinates: the deviation of their mean is one over the root of the sum.
         least = min(least, 0.5 * products[ring].sum() / total)
-        if least < _SIGNIFICANT / np.sqrt(total):
+        if least < GATES.min_significance / np.sqrt(total):
             break
         covariance[ring], inner = least, outer
     return covariance

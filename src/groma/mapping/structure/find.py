@@ -8,14 +8,16 @@ From a scene with poses, points and perhaps lines:
    (:mod:`groma.estimators.directions`), with covariances;
 3. relations, each a statistical test: point on plane, line on plane, line along direction, point on line.
 
-Nothing has a tolerance in pixels or in scene units: how near is near follows from the noise. What is too uncertain to
-tell is left alone, for a missing relation costs little and a wrong one bends the scene.
+There are no tolerances in pixels or scene units; all tests use the covariances. Uncertain pairs are left out: a missing
+relation costs little, a wrong one bends the scene.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -26,9 +28,9 @@ from groma.errors import InputError
 from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines, orthogonal_pairs
 from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
 from groma.geometry.algebra import norm
-from groma.mapping.distinct import num_distinct
+from groma.mapping.groups import num_distinct
 from groma.mapping.noise.landmarks import line_noise, point_noise
-from groma.mapping.structure import relations as _relations
+from groma.mapping.structure.relations import Landmarks, Pairs, along_directions, on_lines, on_planes, spacings
 from groma.scene import Directions, Planes, Relations, Scene
 
 #: Related lines below which a direction is not one that lines share.
@@ -49,16 +51,16 @@ class StructureOptions:
     level: float = 0.95
     #: Least probability that a related landmark is no clutter.
     min_probability: float = 0.7
-    #: The same for lines on planes and along directions. A wrong relation bends a whole line, and these probabilities
-    #: are too high: errors that the images share, such as those of an edge that is a groove, are in no covariance.
+    #: The same for lines on planes and along directions. It is higher, as a wrong relation bends a whole line, and as
+    #: covariances do not contain errors that images share, such as those of an edge that is a groove.
     min_line_probability: float = 0.9
     #: Landmarks seen in fewer images take no part: nothing checks their matches.
     min_views: int = 3
     #: Landmarks whose reprojection error is so many times the usual one take no part.
     max_misfit: float = 3.0
-    #: How well points and lines keep to what they lie on at worst, as a length in the images, pixels: walls are not
-    #: flat, and what was measured very well would show it. Added to the noise of points and lines. How well they really
-    #: do, which an adjustment has to know, is told by what was found: :mod:`groma.mapping.structure.flatness`.
+    #: Largest deviation of landmarks from the surfaces they lie on, as a length in the images, pixels: walls are not
+    #: flat. Added to the noise of points and lines while relations are tested; the actual deviation is then estimated
+    #: for the adjustment (:mod:`groma.mapping.structure.flatness`).
     surface_sigma_px: float = SURFACE_SIGMA_PX
     #: Standard deviations of points and of segment end points, pixels; None: from the residuals.
     point_sigma_px: float | None = None
@@ -124,7 +126,7 @@ def find_structure(
 
     Notes
     -----
-    The poses are taken as right. Adjust the scene before: a bent reconstruction has bent walls, which are no planes.
+    Poses are held. Adjust the scene first: in a distorted reconstruction walls are not planar.
     """
     return detect_structure(scene, options, candidates, progress).scene
 
@@ -137,85 +139,93 @@ def detect_structure(
 ) -> Structure:
     """Find planes, directions and relations, and return them with covariances and probabilities.
 
-    Parameters and errors as for :func:`find_structure`.
+    Parameters and exceptions are those of :func:`find_structure`.
     """
     options = options or StructureOptions()
+    _check(options)
+    report = progress or (lambda stage, done, total: None)
+    level, least, least_line = options.level, options.min_probability, options.min_line_probability
+    report("finding planes", 0, 1)
+    marks = _landmarks(scene, options)
+    on_line = on_lines(marks, level, least)
+    planes = _planes_in(marks, on_line, options, partial(report, "finding planes"))
+    report("finding directions", 0, 1)
+    directions = _directions_in(scene, marks, options, candidates)
+    report("finding what lies on what", 0, 1)
+    point_on_plane, line_on_plane = on_planes(marks, planes, level, (least, least_line))
+    support = point_on_plane.counts(len(planes)) + 2 * line_on_plane.counts(len(planes))
+    planes, new = _only(planes, support >= (options.planes.min_support + 1) // 2)
+    found = {"point_on_plane": point_on_plane.renumbered(new), "line_on_plane": line_on_plane.renumbered(new)}
+    along = along_directions(marks, directions, options.directions.parallel_sigma, level, least_line)
+    directions, new = _only_directions(directions, along.counts(len(directions)) >= _MIN_PARALLEL)
+    found["line_along_direction"] = along.renumbered(new)
+    found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()
+    orthogonal, parallel = _orthogonal(planes, directions)
+    pairs: dict[str, Any] = {name: relation.pairs for name, relation in found.items()}
+    return Structure(
+        scene=scene.replace(
+            planes=Planes(np.arange(len(planes)) + 1, planes.planes),
+            directions=Directions(np.arange(len(directions)) + 1, directions.vectors),
+            relations=Relations(**pairs),
+        ),
+        planes=planes,
+        directions=directions,
+        orthogonal_planes=orthogonal,
+        directions_in_planes=parallel,
+        probability={name: relation.probability for name, relation in found.items()},
+        point_sigma_px=marks.point_noise.sigma_px if scene.num_points else 0.0,
+        line_sigma_px=marks.line_noise.sigma_px if scene.num_lines else 0.0,
+    )
+
+
+def _check(options: StructureOptions) -> None:
     level, least, least_line = options.level, options.min_probability, options.min_line_probability
     if not (0.0 < level < 1.0 and 0.0 <= least < 1.0 and 0.0 <= least_line < 1.0):
         raise InputError(
             "level must lie between 0 and 1, min_probability and min_line_probability from 0 to below 1; got "
             f"{level}, {least} and {least_line}. Usual values are 0.95, 0.7 and 0.9."
         )
-    report = progress or (lambda stage, done, total: None)
-    report("finding planes", 0, 1)
-    marks = _landmarks(scene, options)
-    good_points, good_lines = np.flatnonzero(marks.point_usable), np.flatnonzero(marks.line_usable)
-    segments = marks.segments[good_lines]
-    on_line, p_on = _relations.on_lines(marks, level, least)
+
+
+def _planes_in(
+    marks: Landmarks, on_line: Pairs, options: StructureOptions, progress: Callable[[int, int], None]
+) -> PlaneSet:
+    """Planes in the usable points and segments."""
+    points, lines = np.flatnonzero(marks.point_usable), np.flatnonzero(marks.line_usable)
     line_of_point, position = np.full(len(marks.points), -1), np.full(len(marks.segments) + 1, -1)
-    line_of_point[on_line[:, 0]] = on_line[:, 1]
-    position[good_lines] = np.arange(len(good_lines))
-    carriers = position[line_of_point[good_points]]
-    planes = find_planes(
-        marks.points[good_points],
-        marks.point_noise.covariance[good_points],
-        segments,
-        marks.line_noise.ends()[good_lines],
+    line_of_point[on_line.pairs[:, 0]] = on_line.pairs[:, 1]
+    position[lines] = np.arange(len(lines))
+    return find_planes(
+        marks.points[points],
+        marks.point_noise.covariance[points],
+        marks.segments[lines],
+        marks.line_noise.ends()[lines],
         options.planes,
-        carriers,
-        lambda done, total: report("finding planes", done, total),
+        position[line_of_point[points]],
+        progress,
     )
-    report("finding directions", 0, 1)
+
+
+def _directions_in(
+    scene: Scene, marks: Landmarks, options: StructureOptions, candidates: FloatArray | None
+) -> DirectionSet:
+    """Directions that usable lines share."""
+    lines = np.flatnonzero(marks.line_usable)
     turning = marks.line_noise.directions(norm(marks.segments[:, 1] - marks.segments[:, 0]))
-    directions = directions_from_lines(
-        _unit_directions(scene)[good_lines], turning[good_lines], options.directions, candidates
-    )
-    report("finding what lies on what", 0, 1)
-    point_plane, line_plane, p_point, p_line = _relations.on_planes(marks, planes, level, (least, least_line))
-    kept = np.bincount(point_plane[:, 1], minlength=len(planes)) + 2 * np.bincount(
-        line_plane[:, 1], minlength=len(planes)
-    )
-    planes, new = _only(planes, kept >= (options.planes.min_support + 1) // 2)
-    stays_point, stays_line = new[point_plane[:, 1]] >= 0, new[line_plane[:, 1]] >= 0
-    point_plane, line_plane = _renumbered(point_plane, new), _renumbered(line_plane, new)
-    along, p_along = _relations.along_directions(
-        marks, directions, options.directions.parallel_sigma, level, least_line
-    )
-    shared = np.bincount(along[:, 1], minlength=len(directions)) >= _MIN_PARALLEL
-    directions, new = _only_directions(directions, shared)
-    stays_along, along = new[along[:, 1]] >= 0, _renumbered(along, new)
-    if not options.points_on_lines:
-        on_line, p_on = on_line[:0], p_on[:0]
-    relations = Relations(
-        point_on_plane=point_plane, line_on_plane=line_plane, line_along_direction=along, point_on_line=on_line
-    )
-    normals = planes.covariance[:, :3, :3]
-    both = orthogonal_pairs(
-        np.concatenate([planes.planes[:, :3], directions.vectors]), np.concatenate([normals, directions.covariance])
-    )
-    mixed = both[(both[:, 0] < len(planes)) & (both[:, 1] >= len(planes))] - np.array([0, len(planes)])
-    return Structure(
-        scene=scene.replace(
-            planes=Planes(np.arange(len(planes)) + 1, planes.planes),
-            directions=Directions(np.arange(len(directions)) + 1, directions.vectors),
-            relations=relations,
-        ),
-        planes=planes,
-        directions=directions,
-        orthogonal_planes=both[both[:, 1] < len(planes)],
-        directions_in_planes=mixed,
-        probability={
-            "point_on_plane": p_point[stays_point],
-            "line_on_plane": p_line[stays_line],
-            "line_along_direction": p_along[stays_along],
-            "point_on_line": p_on,
-        },
-        point_sigma_px=marks.point_noise.sigma_px if scene.num_points else 0.0,
-        line_sigma_px=marks.line_noise.sigma_px if scene.num_lines else 0.0,
-    )
+    return directions_from_lines(scene.lines.plucker[lines, 3:], turning[lines], options.directions, candidates)
 
 
-def _landmarks(scene: Scene, options: StructureOptions) -> _relations.Landmarks:
+def _orthogonal(planes: PlaneSet, directions: DirectionSet) -> tuple[IntArray, IntArray]:
+    """Pairs of planes that are orthogonal, and pairs (plane, direction) that are parallel."""
+    pairs = orthogonal_pairs(
+        np.concatenate([planes.planes[:, :3], directions.vectors]),
+        np.concatenate([planes.covariance[:, :3, :3], directions.covariance]),
+    )
+    mixed = (pairs[:, 0] < len(planes)) & (pairs[:, 1] >= len(planes))
+    return pairs[pairs[:, 1] < len(planes)], pairs[mixed] - np.array([0, len(planes)])
+
+
+def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
     """Points and lines with their noise, and which of them may take part."""
     points = point_noise(scene, options.point_sigma_px).widened(
         options.surface_sigma_px * lengths_per_pixel(scene, "point")
@@ -228,14 +238,8 @@ def _landmarks(scene: Scene, options: StructureOptions) -> _relations.Landmarks:
     point_usable = (seen >= options.min_views) & (points.misfit < options.max_misfit)
     line_usable = (lines_seen >= options.min_views) & (lines.misfit < options.max_misfit)
     line_usable &= norm(scene.lines.segments[:, 1] - scene.lines.segments[:, 0]) > 0.0
-    spacing = _relations.spacings(scene.points.xyz, scene.lines.segments)
-    return _relations.Landmarks(
-        scene.points.xyz, points, point_usable, scene.lines.segments, lines, line_usable, *spacing
-    )
-
-
-def _unit_directions(scene: Scene) -> FloatArray:
-    return scene.lines.plucker[:, 3:]
+    spacing = spacings(scene.points.xyz, scene.lines.segments)
+    return Landmarks(scene.points.xyz, points, point_usable, scene.lines.segments, lines, line_usable, *spacing)
 
 
 def _only(planes: PlaneSet, kept: np.ndarray) -> tuple[PlaneSet, IntArray]:
@@ -271,11 +275,6 @@ def _only_directions(directions: DirectionSet, kept: np.ndarray) -> tuple[Direct
         right[(right >= 0).all(axis=1)],
     )
     return chosen, new
-
-
-def _renumbered(pairs: IntArray, new: IntArray) -> IntArray:
-    renumbered = np.column_stack([pairs[:, 0], new[pairs[:, 1]]])
-    return renumbered[renumbered[:, 1] >= 0]
 
 
 __all__ = ["Structure", "StructureOptions", "detect_structure", "find_structure"]

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""How flat the planes of a scene are: the distances that points and lines keep from them beyond their own noise.
 
-The height h of a landmark over its plane varies by the landmark's own variance :math:`s^2`, which its observations
-tell, and by that of the surface: plaster, joints, frames, and what belongs to it only nearly. The surface has one
-standard deviation t for the scene, as a length in the images; with :math:`\ell` the length of a pixel at the landmark,
+The height h of a landmark over its plane has two sources of variance: the landmark's own, :math:`s^2`, known from its
+observations, and that of the surface: plaster, joints, frames. The scene has one standard deviation t of its surfaces,
+expressed in pixels; with :math:`\ell` the length of a pixel at the landmark,
 
 .. math:: -2\log L(t) = \sum_i \log(s_i^2 + t^2\ell_i^2) + \frac{h_i^2}{s_i^2 + t^2\ell_i^2} + \text{const}.
 
-A plane was fitted to its n landmarks, with three unknowns: their heights were larger by :math:`\sqrt{n/(n-3)}`, and
-three tell nothing. Too small a deviation bends landmarks to a plane, too large a one leaves untold what the plane knows
-of them. Taken is the upper end of the confidence interval, one standard deviation above the likeliest: where landmarks
-are few or noisy it stays large.
+Fitting a plane to n landmarks uses three degrees of freedom, so heights are scaled by :math:`\sqrt{n/(n-3)}`, and
+planes with three landmarks are left out. Too small a deviation forces landmarks onto a plane; too large a one gives the
+plane no influence. The result is the upper end of the one-sigma confidence interval of t, which stays large where
+landmarks are few or noisy.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.terms.relations import lengths_per_pixel
+from groma.mapping.noise.landmarks import GATES as LANDMARK_GATES
 from groma.mapping.noise.landmarks import line_noise, point_noise
 from groma.mapping.structure.find import StructureOptions
 from groma.scene import Scene
 
-#: Least deviation, pixels. Tighter ties change little any more, and slow an adjustment down.
-_LEAST = 0.02
-#: Deviations that are tried from the least to the most.
+#: Deviations that are tried, each five per cent larger than the one before.
 _TRIED = 100
 #: Unknowns of a plane.
 _UNKNOWNS = 3
@@ -52,7 +51,7 @@ def surface_noise_px(scene: Scene, options: StructureOptions) -> float:
     variance, length = variance[told], length[told]
     squared = height[told] ** 2 * count[told] / (count[told] - _UNKNOWNS)
     most = options.surface_sigma_px
-    tried = np.geomspace(min(_LEAST, most), most, _TRIED)
+    tried = np.geomspace(min(LANDMARK_GATES.min_sigma_px, most), most, _TRIED)
     surprise = np.empty(_TRIED)
     for k, sigma in enumerate(tried):
         total = variance + (sigma * length) ** 2

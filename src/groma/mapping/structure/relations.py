@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Which points and lines lie on planes, along directions, on lines: chi-square tests with the landmarks' covariances.
 
-A pair is related if it passes three tests: the distance is within the noise of both (chi-square); it is *probably* not
-clutter that happens to be there (:mod:`groma.estimators.association`), so that landmarks too uncertain to tell are left
-alone; and the landmark lies where the structure has been seen, not on its continuation.
+A pair is related if it passes three tests: the distance is within the noise of both (chi-square test); the landmark is
+probably not clutter near the structure (:mod:`groma.estimators.association`), which leaves out landmarks that are too
+uncertain to decide; and it lies where the structure was observed, not on its extension.
 """
 
 from __future__ import annotations
@@ -11,25 +11,39 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import inlier_probability
 from groma.estimators.directions import DirectionSet
 from groma.estimators.plane_search import BAND, PlaneSet, connected_to
+from groma.gates import chi_square_gate, gate
 from groma.geometry.algebra import dot, norm, perpendicular, unit
-from groma.mapping.distinct import distinct_pairs
+from groma.mapping.groups import distinct_pairs
 from groma.mapping.noise.landmarks import LineNoise, PointNoise
 
-#: Planes whose normals differ less compete for a landmark, radians. 15 degrees.
-_COMPETING = 0.26
-#: Least half width of the band around a direction, radians. 2 degrees.
-_MIN_CAP = 0.035
-#: Nearest samples of segments that a point is compared with; least number of samples over all segments, and per
-#: segment on average.
-_NEAREST, _SAMPLES, _PER_SEGMENT = 12, 50_000, 12
-_NEIGHBOURS = 9
+
+@dataclass(frozen=True)
+class RelationGates:
+    """What competes for a landmark, and where landmarks are looked for."""
+
+    competing: float = gate(
+        0.26, "rad", "between the normals of planes that compete for a landmark", "chosen on ETH3D facades"
+    )
+    min_cap: float = gate(0.035, "rad", "half width of the band around a direction at least", "chosen on ETH3D facades")
+    line_margin: float = gate(
+        0.02, "1", "of the length of a line, that points on it may be beyond", "chosen on ETH3D facades"
+    )
+    pooled: float = gate(
+        4.0, "features", "that the share of all lines counts in that of each", "chosen on walls full of points"
+    )
+    neighbor: int = gate(
+        8, "neighbours", "at whose distance a landmark has its surroundings", "chosen on ETH3D facades"
+    )
+    num_nearest: int = gate(12, "samples", "of segments that a point is compared with", "cost: time of a search")
+    num_samples: tuple[int, int] = gate(
+        (50_000, 12), "samples", "of all segments, and per segment on average", "cost: memory"
+    )
 
 
 @dataclass(frozen=True)
@@ -47,88 +61,121 @@ class Landmarks:
     end_spacing: FloatArray
 
 
-def spacings(points: FloatArray, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distances (P,), (L, 2) from points and segment ends to their eighth neighbours among both."""
+@dataclass(frozen=True)
+class Pairs:
+    """Landmarks and the structures they belong to."""
+
+    #: (M, 2) number of the landmark, number of the structure.
+    pairs: IntArray
+    #: (M,) probability that the landmark is no clutter.
+    probability: FloatArray
+
+    @staticmethod
+    def none() -> Pairs:
+        """No pairs."""
+        return Pairs(np.zeros((0, 2), np.int64), np.zeros(0))
+
+    def take(self, rows: IntArray | BoolArray) -> Pairs:
+        """Return some of the pairs."""
+        return Pairs(self.pairs[rows], self.probability[rows])
+
+    def counts(self, num: int) -> IntArray:
+        """(num,) landmarks of each structure."""
+        return np.bincount(self.pairs[:, 1], minlength=num)
+
+    def renumbered(self, new: IntArray) -> Pairs:
+        """Return the pairs with other numbers of structures, without those whose new number is -1."""
+        structure = new[self.pairs[:, 1]]
+        return Pairs(np.column_stack([self.pairs[:, 0], structure]), self.probability).take(structure >= 0)
+
+
+def spacings(
+    points: FloatArray, segments: FloatArray, gates: RelationGates = RelationGates()
+) -> tuple[FloatArray, FloatArray]:
+    """Distances (P,), (L, 2) from points and segment ends to their neighbours among both."""
     places = np.concatenate([points, segments.reshape(-1, 3)])
     if len(places) < 2:
         return np.ones(len(points)), np.ones((len(segments), 2))
-    distance, _ = KDTree(places).query(places, k=min(_NEIGHBOURS, len(places)))
+    distance, _ = KDTree(places).query(places, k=min(gates.neighbor + 1, len(places)))
     return distance[: len(points), -1], distance[len(points) :, -1].reshape(-1, 2)
 
 
 def on_planes(
-    marks: Landmarks, found: PlaneSet, level: float, least: tuple[float, float]
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Pairs (point, plane) and (line, plane), and their probabilities, which have to exceed the least of their kind."""
+    marks: Landmarks,
+    found: PlaneSet,
+    level: float,
+    least: tuple[float, float],
+    gates: RelationGates = RelationGates(),
+) -> tuple[Pairs, Pairs]:
+    """Points on planes and lines on planes; their probabilities have to exceed the least of their kind."""
     num = len(found)
     points, lines = [_nothing()], [_nothing()]
-    gates = stats.chi2.ppf(level, [1, 2])
+    point_gate, line_gate = chi_square_gate(1.0 - level, 1), chi_square_gate(1.0 - level, 2)
     usable_points, usable_lines = np.flatnonzero(marks.point_usable), np.flatnonzero(marks.line_usable)
     for k, (plane, covariance) in enumerate(zip(found.planes, found.covariance, strict=True)):
         height = np.abs(marks.points[usable_points] @ plane[:3] + plane[3])
         rows = usable_points[height < found.band[k]]
         rows = rows[connected_to(found.places[k], marks.points[rows], marks.point_spacing[rows], plane)]
-        points.append(_with_plane(rows, k, *_point_heights(marks, rows, plane, covariance), gates[0]))
+        points.append(_with_plane(rows, k, *_point_heights(marks, rows, plane, covariance), point_gate))
         ends = marks.segments[usable_lines]
         rows = usable_lines[(np.abs(ends @ plane[:3] + plane[3]) < found.band[k]).all(axis=1)]
         near = connected_to(
             found.places[k], marks.segments[rows].reshape(-1, 3), marks.end_spacing[rows].ravel(), plane
         )
         rows = rows[near.reshape(-1, 2).all(axis=1)]
-        lines.append(_with_plane(rows, k, *_line_heights(marks, rows, plane, covariance), gates[1]))
-    competing = np.arccos(np.clip(np.abs(found.planes[:, :3] @ found.planes[:, :3].T), 0.0, 1.0)) < _COMPETING
+        lines.append(_with_plane(rows, k, *_line_heights(marks, rows, plane, covariance), line_gate))
+    competing = np.arccos(np.clip(np.abs(found.planes[:, :3] @ found.planes[:, :3].T), 0.0, 1.0)) < gates.competing
     results = []
     for table, enough in zip((np.concatenate(points), np.concatenate(lines)), least, strict=True):
         probability, _ = inlier_probability(table[:, 2], table[:, 3], table[:, 1].astype(np.int64), found.band)
-        passed = (table[:, 4] < table[:, 5]) & (probability > enough)
-        pairs, probability = table[passed, :2].astype(np.int64), probability[passed]
-        kept = _best_of_competing(pairs, probability, competing, num)
-        results.append((pairs[kept], probability[kept]))
-    return results[0][0], results[1][0], results[0][1], results[1][1]
+        results.append(_best_of_competing(_passing(table, probability, enough), competing, num))
+    return results[0], results[1]
 
 
 def along_directions(
-    marks: Landmarks, found: DirectionSet, sigma: float, level: float, least: float
-) -> tuple[IntArray, FloatArray]:
-    """Pairs (line, direction), at most one for each line, and their probabilities."""
+    marks: Landmarks,
+    found: DirectionSet,
+    sigma: float,
+    level: float,
+    least: float,
+    gates: RelationGates = RelationGates(),
+) -> Pairs:
+    """Lines along directions, at most one direction for each line."""
     rows = np.flatnonzero(marks.line_usable)
     if len(rows) == 0 or len(found) == 0:
-        return np.zeros((0, 2), np.int64), np.zeros(0)
+        return Pairs.none()
     extent = marks.segments[rows, 1] - marks.segments[rows, 0]
     own = marks.line_noise.directions(norm(marks.segments[:, 1] - marks.segments[:, 0]))[rows]
     basis = np.stack(perpendicular(unit(extent)), axis=1)
     tables, bands = [_nothing()], np.zeros(len(found))
-    gate = float(stats.chi2.ppf(level, 2))
+    largest = chi_square_gate(1.0 - level, 2)
     for k, vector in enumerate(found.vectors):
         across = basis @ vector
         noise = basis @ (own + found.covariance[k]) @ np.swapaxes(basis, 1, 2) + sigma**2 * np.eye(2)
         squared = np.einsum("na,na->n", across, np.linalg.solve(noise, across[..., None])[..., 0])
         spread = np.sqrt(np.linalg.eigvalsh(noise)[:, 1])
         angle = norm(across)
-        passing = squared < gate
-        bands[k] = max(_MIN_CAP, BAND * float(np.median(spread[passing])) if passing.any() else 0.0)
+        passing = squared < largest
+        bands[k] = max(gates.min_cap, BAND * float(np.median(spread[passing])) if passing.any() else 0.0)
         near = angle < bands[k]
-        tables.append(_with_plane(rows[near], k, angle[near], spread[near], squared[near], gate))
+        tables.append(_with_plane(rows[near], k, angle[near], spread[near], squared[near], largest))
     table = np.concatenate(tables)
     probability, _ = inlier_probability(table[:, 2], table[:, 3], table[:, 1].astype(np.int64), bands)
-    passed = (table[:, 4] < table[:, 5]) & (probability > least)
-    pairs, probability = table[passed, :2].astype(np.int64), probability[passed]
-    kept = _best_of_competing(pairs, probability, np.ones((len(found), len(found)), bool), len(found))
-    return pairs[kept], probability[kept]
+    return _best_of_competing(_passing(table, probability, least), np.ones((len(found), len(found)), bool), len(found))
 
 
-def on_lines(marks: Landmarks, level: float, least: float) -> tuple[IntArray, FloatArray]:
-    """Pairs (point, line) and their probabilities: points on the segments, not on their continuations."""
+def on_lines(marks: Landmarks, level: float, least: float, gates: RelationGates = RelationGates()) -> Pairs:
+    """Points on lines: on the segments, not on their continuations."""
     rows = np.flatnonzero(marks.line_usable)
     tested = np.flatnonzero(marks.point_usable)
     if len(rows) == 0 or len(tested) == 0:
-        return np.zeros((0, 2), np.int64), np.zeros(0)
-    pairs = _near_segments(marks.points[tested], marks.segments[rows])
+        return Pairs.none()
+    pairs = _near_segments(marks.points[tested], marks.segments[rows], gates)
     point, line = tested[pairs[:, 0]], rows[pairs[:, 1]]
     start, along = marks.segments[line, 0], marks.segments[line, 1] - marks.segments[line, 0]
     share = dot(marks.points[point] - start, along) / dot(along, along)
     offset = marks.points[point] - start - share[:, None] * along
-    inside = (share > -0.02) & (share < 1.02)
+    inside = (share > -gates.line_margin) & (share < 1.0 + gates.line_margin)
     point, line, share, offset = point[inside], line[inside], share[inside], offset[inside]
     across = marks.line_noise.across[line]
     components = np.einsum("nai,ni->na", across, offset)
@@ -138,7 +185,7 @@ def on_lines(marks: Landmarks, level: float, least: float) -> tuple[IntArray, Fl
     spread = np.sqrt(np.linalg.eigvalsh(noise)[:, 1])
     distance = norm(components)
     num = len(marks.segments)
-    gate = float(stats.chi2.ppf(level, 2))
+    largest = chi_square_gate(1.0 - level, 2)
     near = squared < BAND**2
     # The band of a line is set by the noise of what is near it.
     count = np.maximum(np.bincount(line[near], minlength=num), 1)
@@ -147,9 +194,9 @@ def on_lines(marks: Landmarks, level: float, least: float) -> tuple[IntArray, Fl
     near = distance < band[line]
     point, line, squared = point[near], line[near], squared[near]
     # On a wall full of points the clutter beside a line is spread over one dimension, not two.
-    probability, _ = inlier_probability(distance[near], spread[near], line, band, pooled=4.0)
-    passed = (squared < gate) & (probability > least)
-    return np.column_stack([point, line])[passed], probability[passed]
+    probability, _ = inlier_probability(distance[near], spread[near], line, band, gates.pooled)
+    passed = (squared < largest) & (probability > least)
+    return Pairs(np.column_stack([point, line]), probability).take(passed)
 
 
 # --------------------------------------------------------------------------------------------------------- Distances
@@ -158,11 +205,11 @@ def _nothing() -> FloatArray:
 
 
 def _with_plane(
-    rows: IntArray, k: int, distance: FloatArray, spread: FloatArray, squared: FloatArray, gate: float
+    rows: IntArray, k: int, distance: FloatArray, spread: FloatArray, squared: FloatArray, largest: float
 ) -> FloatArray:
     """Table of landmark, structure, distance, standard deviation, squared whitened distance, gate."""
     constant = np.ones(len(rows))
-    columns = rows.astype(np.float64), k * constant, distance, spread, squared, gate * constant
+    columns = rows.astype(np.float64), k * constant, distance, spread, squared, largest * constant
     return np.column_stack(columns)
 
 
@@ -199,25 +246,32 @@ def _line_heights(
     return np.abs((weight * height).sum(axis=1)) / information, 1.0 / np.sqrt(information), squared
 
 
-def _near_segments(points: FloatArray, segments: FloatArray) -> IntArray:
+def _near_segments(points: FloatArray, segments: FloatArray, gates: RelationGates) -> IntArray:
     """Pairs (point, segment) of segments near points, found by samples along the segments."""
     length = norm(segments[:, 1] - segments[:, 0])
-    number = max(_SAMPLES, _PER_SEGMENT * len(segments))
+    number = max(gates.num_samples[0], gates.num_samples[1] * len(segments))
     count = np.clip(np.ceil(number * length / max(length.sum(), 1e-300)), 3, 512).astype(np.int64)
     owner = np.repeat(np.arange(len(segments)), count)
     first = np.repeat(np.cumsum(count) - count, count)
     share = (np.arange(len(owner)) - first) / (count[owner] - 1)
     samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
-    nearest = min(_NEAREST, len(samples))
+    nearest = min(gates.num_nearest, len(samples))
     _, index = KDTree(samples).query(points, k=nearest)
     return distinct_pairs(np.repeat(np.arange(len(points)), nearest), owner[index.reshape(len(points), -1)].ravel())[0]
 
 
-def _best_of_competing(pairs: IntArray, probability: FloatArray, competing: BoolArray, num: int) -> IntArray:
-    """Rows to keep where a landmark is claimed by structures of which only one can be right."""
+def _passing(table: FloatArray, probability: FloatArray, least: float) -> Pairs:
+    """Pairs of a table that pass the chi-square test and are probable enough."""
+    passed = (table[:, 4] < table[:, 5]) & (probability > least)
+    return Pairs(table[:, :2].astype(np.int64), probability).take(passed)
+
+
+def _best_of_competing(found: Pairs, competing: BoolArray, num: int) -> Pairs:
+    """The likeliest pairs where a landmark is claimed by structures of which only one can be right."""
+    pairs = found.pairs
     if len(pairs) == 0:
-        return np.zeros(0, np.int64)
-    order = np.lexsort((-probability, pairs[:, 0]))
+        return found
+    order = np.lexsort((-found.probability, pairs[:, 0]))
     kept = np.zeros(len(pairs), dtype=bool)
     # Claims of one landmark follow each other, the likeliest first: compare rank by rank with those kept before.
     landmark = pairs[order, 0]
@@ -230,4 +284,7 @@ def _best_of_competing(pairs: IntArray, probability: FloatArray, competing: Bool
         free = ~(taken[owner] & competing[structure]).any(axis=1)
         kept[rows[free]] = True
         taken[owner[free], structure[free]] = True
-    return np.flatnonzero(kept)
+    return found.take(kept)
+
+
+__all__ = ["Landmarks", "Pairs", "RelationGates", "along_directions", "on_lines", "on_planes", "spacings"]

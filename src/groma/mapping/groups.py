@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Distinct pairs of numbers, and how often they come: sorting one key is many times faster than sorting rows."""
+"""Rows grouped by their owner, and distinct pairs: sorting one key is many times faster than sorting rows."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from groma._typing import IntArray
+
+
+def grouped(owner: IntArray, count: int) -> tuple[IntArray, IntArray]:
+    """Rows (N,) sorted by their owner, stably, and pointers (count + 1,) to those of each owner."""
+    order = np.argsort(owner, kind="stable")
+    return order, np.searchsorted(owner[order], np.arange(count + 1))
 
 
 def distinct_pairs(first: IntArray, second: IntArray) -> tuple[IntArray, IntArray]:

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""When places, segments and lines belong together: numbers that are the same at every step of mapping lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from groma.gates import chi_square_gate, gate
+
+
+@dataclass(frozen=True)
+class AgreementGates:
+    """When two measurements are of one line."""
+
+    outlier_probability: float = gate(
+        0.0027, "probability", "of noise alone making one line look like two", "convention: three standard deviations"
+    )
+    min_overlap: float = gate(
+        0.3, "share", "of the shorter of two, that overlaps along the line", "chosen on wireframes"
+    )
+    min_common: float = gate(
+        0.6, "share", "of the images of a line, in which another explains it", "chosen on fountain"
+    )
+    same_edge: float = gate(
+        1.0, "px", "apart, two segments of an image are one edge", "derived from the width of an edge"
+    )
+
+    def max_squared(self, dof: int) -> float:
+        """Largest squared Mahalanobis distance of two that agree."""
+        return chi_square_gate(self.outlier_probability, dof)
+
+
+AGREEMENT = AgreementGates()
+
+__all__ = ["AGREEMENT", "AgreementGates"]
