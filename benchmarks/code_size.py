@@ -15,12 +15,8 @@ many arguments              ten or more arguments, ``self`` and ``cls`` not coun
 private imports             imports of an underscored name or module by another package than the one that holds it
 optimiser loops             functions with a loop in which a name that contains ``damp`` or ``lambda`` is assigned to:
                             every damped least-squares loop raises and lowers its damping
-named numbers               module-level names in capitals whose value is a number or a tuple of numbers
-option defaults             fields of classes ``...Options`` whose default is a number
-gates with origin           fields of classes ``...Gates`` that call ``gate`` or ``chi_square_gate``
-inline numbers              floats inside functions other than 0, 1, -1, 2, 0.5 and powers of ten, defaults of
-                            arguments included; kernels too
-... in decisions            those of them inside a comparison
+numbers                     named, defaults, floats in functions, integers in comparisons, gates with origin: by the
+                            rules of ``tuned_numbers.py``
 public names                ``groma.__all__``; and functions and classes without underscore in modules without one
 ==========================  ==========================================================================================
 """
@@ -29,11 +25,13 @@ from __future__ import annotations
 
 import argparse
 import ast
-import math
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
+
+import tuned_numbers
 
 Found: TypeAlias = list[str]
 Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
@@ -94,15 +92,6 @@ def functions(module: Module) -> Iterator[tuple[str, Function]]:
             yield from inside(child, name)
 
     return inside(module.tree, module.name)
-
-
-def classes(module: Module, ending: str) -> Iterator[tuple[str, ast.AnnAssign]]:
-    """Yield the fields with a default of the classes whose name has an ending."""
-    for node in ast.walk(module.tree):
-        if isinstance(node, ast.ClassDef) and node.name.endswith(ending):
-            for field in node.body:
-                if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and field.value is not None:
-                    yield f"{module.name}.{node.name}.{field.target.id}", field
 
 
 def long_functions(modules: list[Module]) -> Found:
@@ -178,66 +167,6 @@ def optimiser_loops(modules: list[Module]) -> Found:
     ]
 
 
-def is_number(node: ast.AST | None) -> bool:
-    """Whether an expression is a number, or a tuple or arithmetic of numbers."""
-    if isinstance(node, ast.Constant):
-        return isinstance(node.value, (int, float)) and not isinstance(node.value, bool)
-    if isinstance(node, ast.UnaryOp):
-        return is_number(node.operand)
-    if isinstance(node, ast.BinOp):
-        return is_number(node.left) and is_number(node.right)
-    return isinstance(node, (ast.Tuple, ast.List)) and bool(node.elts) and all(is_number(item) for item in node.elts)
-
-
-def named_numbers(modules: list[Module]) -> Found:
-    """Module-level names in capitals that are numbers."""
-    found = []
-    for module in modules:
-        for node in module.tree.body:
-            if not isinstance(node, (ast.Assign, ast.AnnAssign)) or not is_number(node.value):
-                continue
-            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
-                names = target.elts if isinstance(target, ast.Tuple) else [target]
-                found += [f"{module.name}.{n.id}" for n in names if isinstance(n, ast.Name) and n.id.isupper()]
-    return found
-
-
-def option_defaults(modules: list[Module]) -> Found:
-    """Fields of options that are numbers by default."""
-    return [name for module in modules for name, field in classes(module, "Options") if is_number(field.value)]
-
-
-def gates(modules: list[Module]) -> Found:
-    """Fields of gates that say where their number is from."""
-    return [
-        name
-        for module in modules
-        for name, field in classes(module, "Gates")
-        if isinstance(field.value, ast.Call) and getattr(field.value.func, "id", "") in ("gate", "chi_square_gate")
-    ]
-
-
-def is_usual(value: float) -> bool:
-    """Whether a number needs no origin: 0, 1, 2, 0.5 and powers of ten."""
-    return value in (0.0, 1.0, 2.0, 0.5) or (value > 0 and math.log10(value) == round(math.log10(value)))
-
-
-def inline_numbers(modules: list[Module], decisions: bool = False) -> Found:
-    """Floats inside functions that need an origin; only those inside comparisons if ``decisions``."""
-    found = set()
-
-    def collect(node: ast.AST, module: str, inside: bool) -> None:
-        if isinstance(node, ast.Constant) and isinstance(node.value, float) and inside and not is_usual(node.value):
-            found.add((f"{module}:{node.lineno}:{node.col_offset}", node.value))
-        opens = (ast.Compare,) if decisions else (ast.FunctionDef, ast.AsyncFunctionDef)
-        for child in ast.iter_child_nodes(node):
-            collect(child, module, inside or isinstance(child, opens))
-
-    for module in modules:
-        collect(module.tree, module.name, False)
-    return [f"{place}: {value}" for place, value in sorted(found)]
-
-
 def top_level_names(modules: list[Module]) -> Found:
     """Names in ``groma.__all__``."""
     root = next(module for module in modules if module.name == "groma")
@@ -268,11 +197,6 @@ ROWS: dict[str, Callable[[list[Module]], Found]] = {
     "many arguments, command line": lambda modules: many_arguments(modules, "cli"),
     "private imports": private_imports,
     "optimiser loops": optimiser_loops,
-    "named numbers": named_numbers,
-    "option defaults": option_defaults,
-    "gates with origin": gates,
-    "inline numbers": inline_numbers,
-    "inline numbers in decisions": lambda modules: inline_numbers(modules, decisions=True),
     "public names, groma.__all__": top_level_names,
     "public names, all modules": public_names,
 }
@@ -285,7 +209,11 @@ def counts(root: Path) -> dict[str, int]:
     table["source lines"] = sum(map(source_lines, modules))
     in_cli = [module for module in modules if module.name.startswith("groma.cli")]
     table["source lines, cli"] = sum(map(source_lines, in_cli))
-    return table | {row: len(listed(modules)) for row, listed in ROWS.items()}
+    table |= {row: len(listed(modules)) for row, listed in ROWS.items()}
+    numbers = sum(tuned_numbers.count(root / "src" / "groma").values(), Counter())
+    table |= {f"numbers, {kind}": numbers[kind] for kind in tuned_numbers.KINDS}
+    gates = sum(number for kind, number in numbers.items() if kind.startswith("gates"))
+    return table | {"gates with origin": gates - numbers["gates without"]}
 
 
 def main() -> None:

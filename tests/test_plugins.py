@@ -5,6 +5,7 @@ Everything runs in processes of its own, which know the package by its installat
 """
 
 import importlib.util
+import json
 import os
 import shutil
 import subprocess
@@ -152,10 +153,12 @@ def test_camera_loss_and_factor_take_part_in_adjustments(python):
     python("-c", ADJUST)
 
 
-def test_loss_chart_and_format_by_name_on_the_command_line(python, tmp_path):
+def test_loss_chart_solver_and_format_by_name_on_the_command_line(python, tmp_path):
     write_scene(holistic(8, seed=0).start, tmp_path / "start.npz")
     options = ["--loss", "welsch", "--loss-scale", "6", "--line-chart", "centimetres", "--no-diagnosis"]
+    options += ["--linear-solver", "eigenvalues", "--json", "report.json"]
     python("-m", "groma.cli.main", "adjust", "start.npz", "-o", "end.npz", *options)
+    assert json.loads((tmp_path / "report.json").read_text())["linear_solver"] == "eigenvalues"
     python("-m", "groma.cli.main", "convert", "end.npz", "end.segments")
     python("-m", "groma.cli.main", "convert", "end.segments", "lines.npz")
     whole, lines = read_scene(tmp_path / "end.npz"), read_scene(tmp_path / "lines.npz")

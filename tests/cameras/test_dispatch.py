@@ -11,8 +11,8 @@ import pytest
 
 from groma import cameras
 from groma._numba import kernel, loop
-from groma.cameras import contract as _camera
 from groma.cameras import dispatch as _dispatch
+from groma.cameras import registry as _camera
 from groma.cameras.check import check_camera
 from groma.errors import InputError
 

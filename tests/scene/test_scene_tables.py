@@ -166,6 +166,9 @@ def test_observations_are_numbered_within_their_image():
     made = PointObservations.numbered([1, 0, 1, 1, 0], [0, 1, 2, 3, 4], np.zeros((5, 2)))
     np.testing.assert_array_equal(made.keypoint_idx, [0, 0, 1, 2, 1])
     assert len(PointObservations.numbered([], [], [])) == 0
+    np.testing.assert_array_equal(made.sigma, 1.0)
+    unlike = PointObservations.numbered([1, 0], [0, 1], np.zeros((2, 2)), [2.0, 3.0])
+    np.testing.assert_array_equal(unlike.sigma, [2.0, 3.0])
 
 
 def test_lines_carry_their_end_points_along():

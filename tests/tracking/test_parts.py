@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Parts of the tracker on their own: poses from a fixed map, planes and segments with depth, assignment, stereo."""
 
+import dataclasses
+
 import _room
 import numpy as np
 import pytest
@@ -73,6 +75,19 @@ def test_pose_from_points_with_outliers():
     assert not found.points[:40].any()
     assert found.points[40:].mean() > 0.95
     assert found.weak == ()
+
+
+def test_points_weigh_by_their_own_noise():
+    """The information of the points of a noisy frame is less by the square of their standard deviation."""
+    table, measured = _points(np.random.default_rng(0), 100, noise=0.2)
+    view, empty = MapView(table, LineTable(), PlaneTable()), Measurements.empty()
+    noisy = dataclasses.replace(measured, sigma=3 * measured.sigma)
+    first, second = (
+        estimate_pose(CAMERA, view, Measurements(table, empty.lines, empty.planes), IDENTITY, WIDE).information
+        for table in (measured, noisy)
+    )
+    # Weights fall with residuals, which are a third in units of the larger noise: by a few per cent.
+    assert np.trace(first) / np.trace(second) == pytest.approx(9.0, rel=0.25)
 
 
 def test_pose_from_lines_alone():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""What a camera model is, and the registry of models.
+r"""What a camera model is.
 
 A camera model maps a point in the camera frame (x right, y down, z forward) to a pixel, in COLMAP's pixel convention
 (the centre of the first pixel is (0.5, 0.5)), and a pixel back to a unit bearing. It depends on ``k`` parameters.
@@ -10,9 +10,7 @@ are repeated here.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,12 +18,10 @@ from groma._numba import loop
 from groma._typing import FloatArray
 from groma.cameras.dispatch import (
     has_pinhole_kernels,
-    kernel_module,
     pinhole_parameters,
     pinhole_parameters_jacobian,
     project,
     project_jacobian,
-    set_kernels,
     unproject,
 )
 from groma.errors import InputError, ShapeError
@@ -200,6 +196,8 @@ class CameraModel:
     def require_pinhole(self) -> None:
         """Raise :class:`~groma.errors.InputError` unless the model is free of distortion by its form."""
         if not self.has_pinhole_parameters:
+            from groma.cameras.registry import models  # it knows this class
+
             free = ", ".join(other.name for other in models() if other.has_pinhole_parameters)
             raise InputError(
                 f"Straight image lines need a camera model without distortion ({free}); got {self.name}. "
@@ -323,68 +321,6 @@ class CameraModel:
         return params
 
 
-_MODELS: dict[str, CameraModel] = {}
-#: One for every registration of this process.
-_NUMBERS = itertools.count()
-
-
-def register_camera(
-    camera: CameraModel,
-    project: Callable[..., bool],
-    project_jacobian: Callable[..., bool],
-    unproject: Callable[..., bool],
-    pinhole_parameters: Callable[..., None] | None = None,
-    pinhole_parameters_jacobian: Callable[..., None] | None = None,
-) -> CameraModel:
-    """Make a camera model known by name, and its kernels to compiled loops.
-
-    Parameters
-    ----------
-    camera : CameraModel
-        The model.
-    project, project_jacobian, unproject : callable
-        Kernels (decorated with :func:`groma.compiled.kernel`) as described in :mod:`groma.cameras.dispatch`, without
-        the tag.
-    pinhole_parameters, pinhole_parameters_jacobian : callable, optional
-        For models without distortion only.
-
-    Returns
-    -------
-    CameraModel
-        The model with the number that selects its kernels.
-
-    Raises
-    ------
-    InputError
-        If the name belongs to a model of another module.
-    """
-    known = _MODELS.get(camera.name)
-    if known is not None and kernel_module(known.number + 1) != project.__module__:
-        raise InputError(
-            f"A camera model named {camera.name!r} is registered already, by {kernel_module(known.number + 1)}. "
-            "Choose another name."
-        )
-    camera = _MODELS[camera.name] = replace(camera, number=next(_NUMBERS))
-    kernels = project, project_jacobian, unproject, pinhole_parameters, pinhole_parameters_jacobian
-    set_kernels(camera.number + 1, *kernels)
-    return camera
-
-
-def model(name: str) -> CameraModel:
-    """Return the camera model of the given name, for example ``"PINHOLE"``; InputError lists the names if unknown."""
-    if name not in _MODELS:
-        raise InputError(
-            f"Camera model must be one of {', '.join(other.name for other in models())}; got {name!r}. "
-            f"Convert the images to one of these models first, or register it with groma.cameras.register_camera."
-        )
-    return _MODELS[name]
-
-
-def models() -> tuple[CameraModel, ...]:
-    """All registered camera models, in the order of their registration."""
-    return tuple(_MODELS.values())
-
-
 def _rows(array: FloatArray, columns: int, name: str) -> FloatArray:
     rows = np.ascontiguousarray(array, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != columns:
@@ -395,12 +331,9 @@ def _rows(array: FloatArray, columns: int, name: str) -> FloatArray:
 
 __all__ = [
     "CameraModel",
-    "model",
-    "models",
     "pinhole_parameters",
     "pinhole_parameters_jacobian",
     "project",
     "project_jacobian",
-    "register_camera",
     "unproject",
 ]

@@ -27,8 +27,9 @@ from __future__ import annotations
 import math
 
 from groma._numba import kernel
-from groma.cameras.contract import CameraModel, register_camera
+from groma.cameras.contract import CameraModel
 from groma.cameras.pinhole import MAX_NORM, MIN_NORM, clear
+from groma.cameras.registry import register_camera
 
 # --------------------------------------------------------------------------------------------------------- Kernels
 

@@ -26,9 +26,10 @@ import math
 import numpy as np
 
 from groma._numba import kernel
-from groma.cameras.contract import CameraModel, register_camera
+from groma.cameras.contract import CameraModel
 from groma.cameras.pinhole import bearing_from_normalized, clear, has_depth
 from groma.cameras.radial import write_point_jacobian
+from groma.cameras.registry import register_camera
 
 # --------------------------------------------------------------------------------------------------------- Kernels
 

@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 
 from groma._numba import kernel
-from groma.cameras.contract import CameraModel, register_camera
+from groma.cameras.contract import CameraModel
+from groma.cameras.registry import register_camera
 
 # --------------------------------------------------------------------------------------------------------- Kernels
 

@@ -19,8 +19,9 @@ from __future__ import annotations
 import math
 
 from groma._numba import kernel
-from groma.cameras.contract import CameraModel, register_camera
+from groma.cameras.contract import CameraModel
 from groma.cameras.pinhole import bearing_from_normalized, clear, has_depth
+from groma.cameras.registry import register_camera
 
 # --------------------------------------------------------------------------------------------------------- Kernels
 

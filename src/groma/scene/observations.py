@@ -54,7 +54,7 @@ class PointObservations(Table):
         order = np.argsort(image, kind="stable")
         number = np.empty(len(order), np.int64)
         number[order] = np.arange(len(order)) - np.searchsorted(image[order], image[order])
-        return cls(image, point_idx, pixel, number)  # type: ignore[arg-type]  # columns are converted
+        return cls(image, point_idx, pixel, number, sigma)  # type: ignore[arg-type]  # columns are converted
 
 
 @dataclass(frozen=True, eq=False)

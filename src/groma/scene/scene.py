@@ -314,8 +314,7 @@ class Scene:
     def transformed(self, new_from_old: Similarity | FloatArray) -> Self:
         """Return the scene seen from another world frame; what the cameras see stays the same.
 
-        Lengths in the camera and rig frames are scaled too, so that reprojections do not change. A similarity may be
-        given as an array (8,) of :mod:`groma.geometry.sim3`, too.
+        Lengths in camera and rig frames are scaled too. An array (8,) of :mod:`groma.geometry.sim3` will do as well.
         """
         if not isinstance(new_from_old, Similarity):
             new_from_old = Similarity.from_array(new_from_old)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -144,10 +144,17 @@ def track(
         folders = ", ".join(f"part_{number}" for number in range(2, len(result.parts) + 2))
         warnings.append(f"Only the longest part is in trajectory.txt and the report; see also {folders}.")
     scores, not_compared = _compared(result, sequence)
+    tracked: dict[str, Any] = {item.name: getattr(result, item.name) for item in fields(result)}
+    tracked["warnings"] = tuple(warnings)
     return SequenceResult(
-        result.trajectory, result.scene, result.keyframes, result.statistics, tuple(warnings), result.parts,
-        tuple(frames), name, sequence.kind, not completed, scores, not_compared,
-    )  # fmt: skip
+        **tracked,
+        frames=tuple(frames),
+        name=name,
+        kind=sequence.kind,
+        interrupted=not completed,
+        scores=scores,
+        not_compared=not_compared,
+    )
 
 
 def _follow(

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -53,6 +53,18 @@ from groma.tracking.pose.relocalise import Found, promote
 from groma.tracking.pose.verification import PoseVerification
 from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """What following a frame gave: a pose, or one that is in doubt."""
+
+    predicted: FloatArray
+    prior_sigma: FloatArray
+    estimate: PoseEstimate | None = None
+    doubtful: PoseEstimate | None = None
+    trusted: bool = False
+    followed: Followed = field(default_factory=Followed.nothing)
 
 
 class Tracker:
@@ -118,42 +130,12 @@ class Tracker:
         mapper.advance(present, watch)
         if not self.map.keyframes:
             return self._start(data, began, watch)
-        predicted, prior_sigma = self._motion.predict(present.pose, frame.timestamp)
-        estimate, doubtful, found, trusted = None, None, None, False
-        followed = Followed.nothing()
-        assert present.data is not None
-        if self._lost_for <= self._gates.near_frames:
-            with watch("turn"):
-                predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
-            estimate, followed = follow_frame(
-                self.map, self.camera, self.options, present.data, data, present.followed, present.pose, predicted,
-                prior_sigma, watch,
-            )  # fmt: skip
-            if estimate is not None:
-                trusted = self._verification.trusts(self.map, data, estimate)
-                if not trusted or self._verification.is_surprised(estimate, predicted, prior_sigma):
-                    doubtful, estimate = estimate, None
+        attempt, found = self._follow(data, watch), None
+        if attempt.estimate is None:
+            attempt, found = self._search(data, attempt, watch)
+        estimate, followed = attempt.estimate, attempt.followed
         if estimate is None:
-            before = present.pose
-            if self._lost_for == 0 and present.frames_since_keyframe > 0:
-                # The frame before is the nearest there is to look for.
-                if mapper.due is not None:
-                    mapper.make_keyframe(present, watch)
-                mapper.choose(present, present.data)
-                mapper.make_keyframe(present, watch)
-            with watch("find"):
-                found = self._find(data, predicted, prior_sigma, doubtful)
-            if found is not None and not (
-                trusted and doubtful is not None and self._verification.score(doubtful) >= found.score
-            ):
-                estimate, followed = found.estimate, Followed(promote(self.map, found, data), found.lines)
-            elif doubtful is not None and (trusted or self._verification.confirms(self.map, data, doubtful)):
-                # The new keyframe may have moved the map.
-                found = None
-                moved = se3.compose(se3.inverse(before[None]), present.pose[None])
-                estimate = replace(doubtful, pose=se3.compose(doubtful.pose[None], moved)[0])
-            else:
-                return self._lose(data, predicted, began, watch)
+            return self._lose(data, attempt.predicted, began, watch)
         pose, status = estimate.pose, FOUND if self._lost_for else TRACKED
         with watch("again"):
             followed = self._find_again(data, pose, followed)
@@ -177,6 +159,51 @@ class Tracker:
                 # What was found by features alone cannot be followed; the next frame needs this one's landmarks.
                 mapper.make_keyframe(present, watch)
         return self._report(frame, status, estimate, is_keyframe, began, watch)
+
+    def _follow(self, data: FrameFeatures, watch: Stopwatch) -> _Attempt:
+        """Predict the pose and follow the frame before, if that is not long ago."""
+        present = self._present
+        predicted, prior_sigma = self._motion.predict(present.pose, data.frame.timestamp)
+        if self._lost_for > self._gates.lost_frames:
+            return _Attempt(predicted, prior_sigma)
+        assert present.data is not None
+        with watch("turn"):
+            predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
+        estimate, followed = follow_frame(
+            self.map, self.camera, self.options, present.data, data, present.followed, present.pose, predicted,
+            prior_sigma, watch,
+        )  # fmt: skip
+        if estimate is None:
+            return _Attempt(predicted, prior_sigma, followed=followed)
+        trusted = self._verification.trusts(self.map, data, estimate)
+        if not trusted or self._verification.is_surprised(estimate, predicted, prior_sigma):
+            return _Attempt(predicted, prior_sigma, None, estimate, trusted, followed)
+        return _Attempt(predicted, prior_sigma, estimate, None, trusted, followed)
+
+    def _search(self, data: FrameFeatures, attempt: _Attempt, watch: Stopwatch) -> tuple[_Attempt, Found | None]:
+        """Find a frame that could not be followed by described features, or keep the pose that was in doubt."""
+        present, mapper, doubtful = self._present, self._mapper, attempt.doubtful
+        before = present.pose
+        if self._lost_for == 0 and present.frames_since_keyframe > 0:
+            # The frame before is the nearest there is to look for.
+            if mapper.due is not None:
+                mapper.make_keyframe(present, watch)
+            assert present.data is not None
+            mapper.choose(present, present.data)
+            mapper.make_keyframe(present, watch)
+        with watch("find"):
+            found = self._find(data, attempt.predicted, attempt.prior_sigma, doubtful)
+        if found is not None and not (
+            attempt.trusted and doubtful is not None and self._verification.score(doubtful) >= found.score
+        ):
+            followed = Followed(promote(self.map, found, data), found.lines)
+            return replace(attempt, estimate=found.estimate, followed=followed), found
+        if doubtful is not None and (attempt.trusted or self._verification.confirms(self.map, data, doubtful)):
+            # The new keyframe may have moved the map.
+            moved = se3.compose(se3.inverse(before[None]), present.pose[None])
+            pose = se3.compose(doubtful.pose[None], moved)[0]
+            return replace(attempt, estimate=replace(doubtful, pose=pose)), None
+        return attempt, None
 
     def _with_turn(self, data: FrameFeatures, predicted: FloatArray, prior_sigma: FloatArray):
         """Put a turn that the whole image shows in place of a prediction that the image denies.
@@ -209,13 +236,13 @@ class Tracker:
 
     def _find(self, data, predicted, prior_sigma, doubtful: PoseEstimate | None) -> Found | None:
         """Find a pose by described features: near the last keyframes first, then anywhere."""
-        if self._lost_for <= self._gates.near_frames:
+        if self._lost_for <= self._gates.lost_frames:
             guesses = [predicted, self._present.pose] + ([doubtful.pose] if doubtful is not None else [])
             found = self._verification.find_near(self.map, data, guesses, predicted, prior_sigma)
             if found is not None:
                 return found
         found = self._verification.find_anywhere(self.map, data)
-        if found is None or self._lost_for > self._gates.near_frames:
+        if found is None or self._lost_for > self._gates.lost_frames:
             return found
         return found if self._verification.is_near(found.estimate.pose, predicted, prior_sigma) else None
 
@@ -292,7 +319,7 @@ class Tracker:
             self._lost_since = now
         self._lost_for += 1
         self._guess = data.gray, guess
-        if self._lost_for > self._gates.restart_frames and now - self._lost_since > self._gates.restart_seconds:
+        if self._lost_for > self._gates.lost_frames and now - self._lost_since > self._gates.restart_seconds:
             self._mapper.begin_anew(self._present)
             self._present, self._motion = Present(), MotionModel(self.options.gates.motion)
             return self._start(data, began, watch)

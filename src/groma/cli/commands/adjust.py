@@ -14,13 +14,13 @@ PlaneResidual = Literal["normal_offset", "quaternion"]
 CovarianceGauge = Literal["auto", "inner", "held"]
 
 
-def _linear_solver(name: str) -> str:
-    """Return the name of a linear solver that is registered."""
+def _check_linear_solver(name: str) -> None:
+    """Refuse a linear solver that is not registered, also by a plugin: before this, none is loaded."""
     from groma.solver.linear.choice import linear_solver_names
 
     if name not in linear_solver_names():
-        raise typer.BadParameter(f"{name!r} is not one of {', '.join(linear_solver_names())}.")
-    return name
+        known = ", ".join(linear_solver_names())
+        raise typer.BadParameter(f"{name!r} is not one of {known}.", param_hint="'--linear-solver'")
 
 
 def adjust(
@@ -71,15 +71,15 @@ def adjust(
         str,
         typer.Option(
             metavar="NAME",
-            callback=_linear_solver,
-            help="How each step is solved: auto, dense, sparse, pcg, or a solver that was registered.",
+            help="How each step is solved: auto, dense, sparse, pcg, or a solver of an installed package.",
         ),
     ] = "auto",
     line_chart: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help="How lines move: cartesian (default), orthonormal_left, orthonormal_right, free_left or free_right.",
+            help="Line parametrisation: cartesian (default), orthonormal_left, orthonormal_right, free_left, "
+            "free_right, or one of an installed package.",
         ),
     ] = None,
     line_residual: Annotated[
@@ -158,6 +158,8 @@ def adjust(
     from groma.cli.shared.input import check_inputs
     from groma.cli.shared.pose_graph import adjust_graph_and_write, is_pose_graph
 
+    if linear_solver != "auto":
+        _check_linear_solver(linear_solver)
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, page, covariance, json_target=json_target)
     if covariance is not None and covariance.suffix not in (".npz", ".json"):

@@ -58,7 +58,12 @@ class DepthLineGates:
         "added to it from round to round, of the inverse depth",
         "chosen on Kinect images",
     )
-    agree: float = gate(13.8, "sigma squared", "two sides agree in a line", "derived from chi-square, 2: 1 in 1000")
+    agree: float = gate(
+        -2.0 * math.log(1e-3),
+        "sigma squared",
+        "two sides agree in a line",
+        "derived from chi-square, 2 numbers: 1 in 1000",
+    )
     agree_slope: float = gate(9.0, "sigma squared", "they agree in the slope", "derived from normal noise: 1 in 370")
     agree_share: float = gate(0.006, "share", "on top of noise, of the inverse depth", "chosen on Kinect images")
     slope_share: float = gate(0.0015, "share / px", "the same for the slope", "chosen on Kinect images")

@@ -137,7 +137,7 @@ def _spread_error(track_map: TrackMap, gates: LoopGates) -> None:
         begin = max(0, k - gates.held_by)
         earlier = living[begin : max(0, k - 1)]
         if earlier:
-            index = np.flatnonzero(track_map.shared(keyframe, earlier) > gates.held_shared) + begin
+            index = np.flatnonzero(track_map.shared(keyframe, earlier) > 2 * gates.shared) + begin
             first.append(index)
             second.append(np.full(len(index), k))
             relative.append(se3.compose(poses[index], se3.inverse(np.tile(poses[k], (len(index), 1)))))

@@ -16,8 +16,6 @@ class KeyframeGates:
 
     max_frames: int = gate(30, "frames", "frames between keyframes while the camera moves", SEQUENCES)
     moved: float = gate(0.25, "share", "share of the motion of a keyframe that counts as moving", SEQUENCES)
-    few_lines: float = gate(0.5, "share", "a keyframe is due when fewer of the lines are followed", SEQUENCES)
-    few_lines_frames: int = gate(5, "frames", "but not sooner after the last one", SEQUENCES)
     nearby: float = gate(
         0.5, "share", "share of the motion of a keyframe within which an older one stands for it", SEQUENCES
     )
@@ -38,8 +36,6 @@ class PointGates:
         2, "keyframes", "keyframes whose patches are looked for in one frame", "cost: time per frame"
     )
     again_radius: float = gate(6.0, "px", "distance at which a point of the map is found again", SEQUENCES)
-    again_border: float = gate(12.0, "px", "distance from the edge of the image of what is looked for", SEQUENCES)
-    again_min: int = gate(5, "points", "points that a keyframe is looked through for", "cost: time per frame")
     again_room: float = gate(0.2, "share", "share of the wanted points that must be missing", "cost: time per frame")
     min_parallax: float = gate(0.015, "rad", "angle between rays that place a point", SEQUENCES)
     max_error: float = gate(2.5, "px", "distance of a placed point from its pixels", SEQUENCES)
@@ -56,30 +52,22 @@ class LineGates:
     max_sigma: float = gate(
         0.45, "px", "segments with less certain edges are not found", "derived from 0.5 px if unfitted"
     )
-    max_sigma_again: float = gate(0.4, "px", "the same for lines that were not followed", SEQUENCES)
     weaker: float = gate(0.35, "ratio", "an edge may be weaker than it was by this factor", SEQUENCES)
     stronger: float = gate(3.0, "ratio", "and stronger", SEQUENCES)
     min_strength: float = gate(2.0, "grey levels / px", "weakest edge", SEQUENCES)
-    detected_sigma: float = gate(0.3, "px", "a detected segment is not known better", SEQUENCES)
-    measured_sigma: float = gate(0.5, "px", "a segment that a pose is estimated from is not known better", SEQUENCES)
+    min_sigma: float = gate(0.5, "px", "no segment is known better: lenses and edges are not straight", SEQUENCES)
     min_length: float = gate(15.0, "px", "shortest segment that is followed or looked for", SEQUENCES)
     border: float = gate(4.0, "px", "expected segments are cut at this distance from the edge of the image", SEQUENCES)
-    end_distance: float = gate(1.5, "1", "distance of an end across, in terms of the mean of both", SEQUENCES)
     min_overlap: float = gate(0.3, "share", "overlap of a pair, of the shorter segment", SEQUENCES)
-    depth_share: float = gate(0.05, "share", "inverse depths of a pair agree within this share", SEQUENCES)
-    depth_floor: float = gate(0.015, "1 / scene unit", "plus this", SEQUENCES)
-    followed_distance: float = gate(2.5, "px", "a segment is a followed line within this distance", SEQUENCES)
-    followed_angle: float = gate(0.06, "rad", "and angle", SEQUENCES)
-    map_distance: float = gate(5.0, "px", "a segment is another line of the map within this distance", SEQUENCES)
-    map_angle: float = gate(0.1, "rad", "and angle", SEQUENCES)
+    depth_share: float = gate(0.1, "share", "inverse depths of a pair agree within this share", SEQUENCES)
+    distance: float = gate(5.0, "px", "a segment is a line of the map within this distance", SEQUENCES)
+    angle: float = gate(0.1, "rad", "and angle", SEQUENCES)
     again_distance: float = gate(4.0, "px", "a line found again is this near to where the pose says", SEQUENCES)
-    again_room: int = gate(5, "lines", "lines that must be missing before any is looked for", "cost: time per frame")
     again_recent: int = gate(400, "lines", "newest lines that are looked for", "cost: time per frame")
     min_length_share: float = gate(0.04, "share", "a new line is longer than this share of its depth", SEQUENCES)
     max_angle: float = gate(0.15, "rad", "noise of the direction of a new line", SEQUENCES)
     min_sine: float = gate(0.03, "rad", "angle of the planes that place a line by motion", SEQUENCES)
     max_depth_ratio: float = gate(3.0, "ratio", "depths of the ends of a line placed by motion", SEQUENCES)
-    min_motion_length: float = gate(0.01, "share", "length of a line placed by motion, of its depth", SEQUENCES)
     max_extension: float = gate(2.0, "ratio", "a line grows by at most this factor in one keyframe", SEQUENCES)
     few_points: int = gate(
         120, "points", "with fewer points the depth along segments is measured too", "cost: time per frame"
@@ -94,14 +82,8 @@ class PlaneGates:
         math.radians(8.0), "rad", "a plane of a keyframe is one of the map within this angle", SEQUENCES
     )
     distance: float = gate(0.08, "scene units", "and distance of the seen part", SEQUENCES)
-    doubtful_angle: float = gate(
-        math.radians(15.0), "rad", "none is new within this angle of one of the map", SEQUENCES
-    )
-    doubtful_distance: float = gate(0.15, "scene units", "and distance", SEQUENCES)
-    frame_angle: float = gate(
-        math.radians(12.0), "rad", "a plane is followed between frames within this angle", SEQUENCES
-    )
-    frame_distance: float = gate(0.12, "scene units", "and distance", SEQUENCES)
+    wide_angle: float = gate(math.radians(12.0), "rad", "the same between frames; within it none is new", SEQUENCES)
+    wide_distance: float = gate(0.12, "scene units", "and distance", SEQUENCES)
     merge_angle: float = gate(0.06, "rad", "planes of the map are one within this angle", SEQUENCES)
     merge_distance: float = gate(0.03, "scene units", "and distance", SEQUENCES)
     reach: float = gate(0.6, "scene units", "the seen parts of one plane lie within this distance", SEQUENCES)

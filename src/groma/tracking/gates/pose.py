@@ -56,7 +56,6 @@ class FindingGates:
     plane_weight: float = gate(6.0, "points", "what a plane counts", SEQUENCES)
     near: float = gate(6.0, "px", "a feature agrees within this distance; coarse scales are not precise", SEQUENCES)
     search: float = gate(0.07, "share", "where features are looked for around a guess, of the image's width", SEQUENCES)
-    strong: float = gate(70.0, "score", "a pose that needs no further proposals", "cost: time to find a pose")
     max_refined: int = gate(4, "poses", "proposals that are refined", "cost: time to find a pose")
     same_shift: float = gate(
         0.01, "share", "a proposal this near to an earlier one is left out, of the depth", "cost: time"
@@ -65,15 +64,6 @@ class FindingGates:
     min_inliers: int = gate(10, "points", "points that agree on a proposal", SEQUENCES)
     max_error: float = gate(4.0, "px", "distance at which they do", SEQUENCES)
     rounds: tuple[float, ...] = gate((3.0, 1.0), "1", "factors of the distances, round by round", SEQUENCES)
-    line_distance: float = gate(8.0, "px", "a segment is a line of the map within this distance", SEQUENCES)
-    line_angle: tuple[float, float] = gate(
-        (0.08, 0.06), "rad", "and angle: plus the second times the factor", SEQUENCES
-    )
-    plane_angle: tuple[float, float] = gate((0.1, 0.06), "rad", "the same for planes", SEQUENCES)
-    plane_distance: tuple[float, float] = gate((0.06, 0.04), "scene units", "and their distance", SEQUENCES)
-    judged_angle: float = gate(0.15, "rad", "a plane speaks for a proposal within this angle", SEQUENCES)
-    judged_distance: float = gate(0.12, "scene units", "and distance", SEQUENCES)
-    depth_factor: float = gate(1.5, "ratio", "features are less precise than points: noise of depth", SEQUENCES)
 
 
 @dataclass(frozen=True)
@@ -84,27 +74,31 @@ class VerificationGates:
         6, "score", "measurements that a pose is estimated from (line 2, plane 3)", "derived from 6 unknowns"
     )
     nearest: int = gate(3, "keyframes", "keyframes that are tried first", "cost: time to find a pose")
-    most: int = gate(30, "keyframes", "keyframes that are tried at all", "cost: time to find a pose")
-    min_score: float = gate(18.0, "score", "agreeing measurements", SEQUENCES)
+    tried: int = gate(30, "keyframes", "keyframes that are tried at all", "cost: time to find a pose")
+    min_score: float = gate(
+        18.0, "score", "points and lines (planes, if they are all) that agree with a pose", SEQUENCES
+    )
+    looser: float = gate(0.75, "share", "of a score, for a pose found by features or without points", SEQUENCES)
     min_share: float = gate(0.35, "share", "share of what was looked at that agrees", SEQUENCES)
+    most: float = gate(0.65, "share", "of what was looked at agrees, where a pose is in doubt", SEQUENCES)
     min_kept: float = gate(0.12, "share", "share of what the last keyframe measured", SEQUENCES)
-    min_evidence: float = gate(16.0, "score", "agreeing points and lines", SEQUENCES)
-    found_share: float = gate(0.75, "share", "share of it for a pose found by features", SEQUENCES)
     confirmed_evidence: float = gate(6.0, "score", "points and lines where depth confirms a pose", SEQUENCES)
-    confirmed_share: float = gate(0.6, "share", "share of what was looked at that must then agree", SEQUENCES)
-    certain: float = gate(40.0, "score", "a found pose with this score needs no share", SEQUENCES)
     min_agreeing: float = gate(0.03, "share", "share of the features in view that agree with a found pose", SEQUENCES)
-    anywhere: float = gate(36.0, "score", "a pose found without a prediction", SEQUENCES)
-    anywhere_without_points: float = gate(0.75, "share", "share of it where no points are followed", SEQUENCES)
-    enough: float = gate(120.0, "score", "no other keyframe is tried", "cost: time to find a pose")
-    doubtful: float = gate(80.0, "score", "below, half of the planes must agree and depth must confirm", SEQUENCES)
     surprise: float = gate(2.0, "sigma", "a pose farther from the prediction is looked at twice", SEQUENCES)
-    sure_share: float = gate(0.7, "share", "unless this share of what was looked at agrees", SEQUENCES)
     wider: float = gate(3.0, "ratio", "the prior of a pose found by features is wider", SEQUENCES)
     jump: float = gate(6.0, "sigma", "distance of a found pose from the prediction", SEQUENCES)
-    near_frames: int = gate(5, "frames", "lost frames after which the camera can be anywhere", SEQUENCES)
-    restart_frames: int = gate(5, "frames", "lost frames after which a new map is begun", SEQUENCES)
+    lost_frames: int = gate(5, "frames", "lost, after which the camera can be anywhere and a map is begun", SEQUENCES)
     restart_seconds: float = gate(0.5, "s", "and time", SEQUENCES)
+
+    @property
+    def sure(self) -> float:
+        """Score of a pose that was found without a prediction, or that needs no share."""
+        return 2.0 * self.min_score
+
+    @property
+    def strong(self) -> float:
+        """Score below which depth must confirm a pose and half of its planes agree; above, a search ends."""
+        return 4.0 * self.min_score
 
 
 @dataclass(frozen=True)
@@ -124,7 +118,6 @@ class LoopGates:
     held_by: int = gate(
         8, "keyframes", "earlier keyframes that hold each one in the pose graph", "cost: time of a loop"
     )
-    held_shared: int = gate(60, "points", "if they share so much with it", SEQUENCES)
     loss: float = gate(3.0, "sigma", "scale of the Huber loss of the pose graph", "derived from normal noise: 1 in 370")
     max_iterations: int = gate(30, "steps", "steps of the pose graph", "cost: converges in fewer")
     final_iterations: int = gate(15, "steps", "steps of the adjustment at the end, twice", "cost: converges in fewer")

@@ -55,9 +55,8 @@ def wants_keyframe(
         return True
     if frames_since >= 2 and now < options.keyframe_share * before:
         return True
-    few_lines = options.lines and len(followed.lines.index) < gates.few_lines * len(last.measured.lines)
     moved = shift > gates.moved * options.keyframe_motion or turn > gates.moved * options.keyframe_turn
-    return moved and (frames_since >= gates.max_frames or (few_lines and frames_since >= gates.few_lines_frames))
+    return moved and frames_since >= gates.max_frames
 
 
 def keyframe_nearby(track_map: TrackMap, pose: FloatArray, options: TrackOptions) -> Keyframe | None:
@@ -209,7 +208,7 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     segments = detected.segments
     of_segment = np.full(len(segments), -1)
     # Segments of lines that are followed already.
-    rows, hits = assign(followed.ends, segments.ends, gates.followed_distance, gates.followed_angle, gates=gates)
+    rows, hits = assign(followed.ends, segments.ends, gates.distance, gates.angle, gates=gates)
     of_segment[hits] = followed.index[rows]
     # Segments of other lines of the map.
     alive = np.flatnonzero(lines.alive)
@@ -219,9 +218,7 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     free = np.flatnonzero(of_segment < 0)
     middle = 1.0 / np.maximum(into(pose, lines.segment[alive].mean(axis=1))[:, 2], 1e-6)
     inverse = detected.inverse_depth.mean(axis=1)
-    rows, hits = assign(
-        expected, segments.ends[free], gates.map_distance, gates.map_angle, middle, inverse[free], gates
-    )
+    rows, hits = assign(expected, segments.ends[free], gates.distance, gates.angle, middle, inverse[free], gates)
     of_segment[free[hits]] = alive[rows]
     # New lines: with a place where the depth is known along the segment, else followed until motion gives one.
     free = np.flatnonzero(of_segment < 0)[: max(options.num_lines - int((of_segment >= 0).sum()), 0)]
@@ -236,7 +233,7 @@ def _add_lines(track_map, camera, data, pose, followed: FollowedSegments, index:
     lines.found[known] += 1
     lines.strength[known] = segments.strength[rows]
     _extend_lines(track_map, camera, pose, known, segments.ends[rows], gates.max_extension)
-    sigma = np.maximum(segments.sigma[rows], gates.detected_sigma)
+    sigma = np.maximum(segments.sigma[rows], gates.min_sigma)
     table = LineMeasurements(
         known, segments.ends[rows], sigma, detected.inverse_depth[rows], detected.inverse_depth_sigma[rows]
     )
@@ -294,7 +291,7 @@ def _place_pending_lines(track_map, camera, pose, known, ends, detected, rows, i
     depth = into(pose, out)[..., 2]
     length = np.linalg.norm(out[:, 1] - out[:, 0], axis=1)
     good &= depth.max(axis=1) < gates.max_depth_ratio * depth.min(axis=1)
-    good &= length > gates.min_motion_length * depth.mean(axis=1)
+    good &= length > gates.min_length_share * depth.mean(axis=1)
     _place(track_map, row[good], out[good])
 
 
@@ -341,7 +338,7 @@ def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> P
         grow(track_map.planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]), gates)
     rest = np.setdiff1d(np.arange(len(seen)), rows)
     # Nothing new beside a plane that is there already but did not agree well enough.
-    _, doubtful = assign_planes(track_map.planes, seen, pose, gates.doubtful_angle, gates.doubtful_distance, gates)
+    _, doubtful = assign_planes(track_map.planes, seen, pose, gates.wide_angle, gates.wide_distance, gates)
     rest = np.setdiff1d(rest, doubtful)
     index = np.concatenate([index, add_planes(track_map.planes, seen, rest, pose, gates)])
     rows = np.concatenate([rows, rest])

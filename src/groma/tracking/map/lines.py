@@ -156,12 +156,12 @@ def assign(
     overlap = np.minimum(along.max(axis=0), length) - np.maximum(along.min(axis=0), 0.0)
     offset = np.abs(across).max(axis=0)
     score = np.abs(across).mean(axis=0)
-    good = (direction @ other.T > np.cos(max_angle)) & (offset < gates.end_distance * max_distance)
-    good &= (score < max_distance) & (overlap > gates.min_overlap * np.minimum(length, own))
+    good = (direction @ other.T > np.cos(max_angle)) & (offset < max_distance)
+    good &= overlap > gates.min_overlap * np.minimum(length, own)
     if expected_inverse is not None and inverse is not None:
         one, two = expected_inverse[:, None], inverse[None]
         with np.errstate(invalid="ignore"):
-            good &= ~(np.abs(one - two) > gates.depth_share * np.maximum(one, two) + gates.depth_floor)
+            good &= ~(np.abs(one - two) > gates.depth_share * np.maximum(one, two))
     score = np.where(good, score, np.inf)
     best = np.argmin(score, axis=1)
     rows = np.flatnonzero(np.isfinite(score[np.arange(len(expected)), best]))

@@ -97,7 +97,7 @@ def find_again(
         return PointTracks.empty()
     place = into(pose, points.xyz[rows])
     pixel = camera.project(place)
-    view = camera.inside(pixel, gates.again_border)
+    view = camera.inside(pixel, gates.border)
     rows, pixel = rows[view], pixel[view]
     living = np.array([k.alive and k.gray is not None for k in track_map.keyframes])
     rows, pixel = rows[living[points.keyframe[rows]]], pixel[living[points.keyframe[rows]]]
@@ -107,7 +107,7 @@ def find_again(
     found = PointTracks.empty()
     for index in np.argsort(-count, kind="stable")[: gates.patch_keyframes]:
         of = np.flatnonzero(points.keyframe[rows] == index)[:limit]
-        if len(of) < gates.again_min:
+        if not len(of):
             break
         patch = track_map.keyframes[index].gray
         assert patch is not None

@@ -53,7 +53,7 @@ def follow_frame(
     with watch("planes"):
         planes = PlaneMeasurements.empty()
         if data.planes is not None:
-            planes = match_planes(track_map, data, predicted, gates.planes.frame_angle, gates.planes.frame_distance)
+            planes = match_planes(track_map, data, predicted, gates.planes.wide_angle, gates.planes.wide_distance)
     if len(measured) + 2 * len(lines) + 3 * len(planes) < gates.verification.min_followed:
         return None, Followed.nothing()
     with watch("pose"):
@@ -143,7 +143,7 @@ def measure_lines(
     return LineMeasurements(
         segments.index[rows],
         ends,
-        np.maximum(segments.sigma[rows], data.options.gates.lines.measured_sigma),
+        np.maximum(segments.sigma[rows], data.options.gates.lines.min_sigma),
         inverse,
         sigma,
     )
@@ -155,7 +155,7 @@ def _find_lines_again(
     """Look for lines of the map that are in view but not followed, where the pose says they are."""
     lines, gates = track_map.lines, data.options.gates.lines
     room = data.options.num_lines - len(segments.index)
-    if room < gates.again_room:
+    if room <= 0:
         return segments
     wanted = lines.alive.copy()
     wanted[segments.index] = False
@@ -166,7 +166,7 @@ def _find_lines_again(
         return segments
     found, of = measured_edges(data.gray, expected, lines.strength[rows], gates)
     away = np.abs(found.ends - expected[of]).max(axis=1)
-    good = (away < gates.again_distance) & (found.sigma < gates.max_sigma_again)
+    good = away < gates.again_distance
     return segments.joined(FollowedSegments(rows[of[good]], found.ends[good], found.sigma[good], found.strength[good]))
 
 

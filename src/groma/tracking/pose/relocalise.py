@@ -152,7 +152,7 @@ def find_pose(
     if guesses:
         near = [search.proposal_near(guess) for guess in guesses]
         best = search.best_of([*guesses, *(pose for pose in near if pose is not None)])
-        if best is not None and best.score >= data.options.gates.finding.strong:
+        if best is not None and best.score >= data.options.gates.verification.strong:
             return best
     return search.best_of([pose for pose in map(search.proposal, keyframes) if pose is not None])
 
@@ -195,8 +195,11 @@ class _Search:
         planes, seen = self.track_map.planes, self.data.planes
         judged = [len(self.near(start, 3 * self.gates.near)) for start in starts]
         if seen:
-            near = self.gates.judged_angle, self.gates.judged_distance, self.all_gates.planes
-            agreeing = [len(assign_planes(planes, seen, start, *near)[0]) for start in starts]
+            gates = self.all_gates.planes
+            agreeing = [
+                len(assign_planes(planes, seen, start, gates.wide_angle, gates.wide_distance, gates)[0])
+                for start in starts
+            ]
             judged = [one + self.gates.plane_weight * other for one, other in zip(judged, agreeing, strict=True)]
         for k in np.argsort(-np.array(judged), kind="stable")[: self.gates.max_refined]:
             if self._is_known(starts[k]):
@@ -222,17 +225,17 @@ class _Search:
     def _refine(self, start: FloatArray) -> Found | None:
         """Estimate the pose from all that agrees with a start, with narrowing gates."""
         track_map, camera, data, gates = self.track_map, self.camera, self.data, self.gates
+        own = self.all_gates
         pose, estimate, lines = start, None, FollowedSegments.empty()
         pairs = np.zeros((0, 2), np.int64)
         for factor in gates.rounds:
             pairs = self.near(pose, factor * gates.near)
             # Features that are no point of the map yet take part by their place alone.
             temporary, table = _temporary_points(self.known, pairs, data)
-            line_angle, plane_angle, plane_distance = (
-                first + second * factor for first, second in (gates.line_angle, gates.plane_angle, gates.plane_distance)
+            lines, line_table = match_lines(
+                track_map, camera, data, pose, factor * own.lines.distance, factor * own.lines.angle
             )
-            lines, line_table = match_lines(track_map, camera, data, pose, factor * gates.line_distance, line_angle)
-            planes = match_planes(track_map, data, pose, plane_angle, plane_distance)
+            planes = match_planes(track_map, data, pose, own.planes.wide_angle, own.planes.wide_distance)
             if len(pairs) + len(line_table) + len(planes) < 3:
                 return None
             view = replace(track_map.view, points=temporary)
@@ -260,7 +263,7 @@ def _temporary_points(known: KnownFeatures, pairs: IntArray, data: FrameFeatures
     count = len(rows)
     depth = data.features.depth[rows]
     sigma = data.features.scale[rows] * data.options.point_sigma_px
-    depth_sigma = data.options.gates.finding.depth_factor * data.depth_sigma(depth)
+    depth_sigma = data.depth_sigma(depth)
     unknown = np.full(count, np.nan)
     table = PointMeasurements(np.arange(count), data.features.pixel[rows], sigma, depth, depth_sigma, unknown)
     return _Places(known.places[pairs[:, 0]]), table
@@ -305,7 +308,7 @@ def match_lines(
     segments = detected.segments
     own = detected.inverse_depth.mean(axis=1)
     rows, hits = assign(expected, segments.ends, distance, angle, inverse, own, gates)
-    sigma = np.maximum(segments.sigma[hits], gates.measured_sigma)
+    sigma = np.maximum(segments.sigma[hits], gates.min_sigma)
     followed = FollowedSegments(alive[rows], segments.ends[hits], sigma, segments.strength[hits])
     table = LineMeasurements(
         alive[rows], segments.ends[hits], sigma, detected.inverse_depth[hits], detected.inverse_depth_sigma[hits]

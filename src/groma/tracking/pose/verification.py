@@ -26,7 +26,7 @@ class PoseVerification:
 
     def __init__(self, camera: TrackCamera, options: TrackOptions) -> None:
         self.camera, self.options, self.gates = camera, options, options.gates.verification
-        self._least_evidence = self.gates.min_evidence if options.points or options.lines else 0.0
+        self._least_evidence = self.gates.min_score if options.points or options.lines else 0.0
 
     def evidence(self, estimate: PoseEstimate) -> float:
         """Weight of points and lines alone: planes slide along each other, so a pose should not hang on them."""
@@ -51,7 +51,7 @@ class PoseVerification:
         if (
             len(estimate.planes) >= 2
             and 2 * estimate.counts["planes"] <= len(estimate.planes)
-            and score < self.gates.doubtful
+            and score < self.gates.strong
         ):
             return False
         enough = score >= self.gates.min_score and self.evidence(estimate) >= self._least_evidence
@@ -59,12 +59,12 @@ class PoseVerification:
             return False
         if not self._keeps(track_map, estimate):
             return False
-        return score >= self.gates.doubtful or not self._contradicted([track_map.near], data, estimate)
+        return score >= self.gates.strong or not self._contradicted([track_map.near], data, estimate)
 
     def is_surprised(self, estimate: PoseEstimate, predicted: FloatArray, prior_sigma: FloatArray) -> bool:
         """Whether a pose that is trusted is far from the prediction, and much that was followed does not agree."""
         far = not self.is_near(estimate.pose, predicted, prior_sigma, self.gates.surprise)
-        return far and _share(estimate) < self.gates.sure_share
+        return far and _share(estimate) < self.gates.most
 
     def confirms(self, track_map: TrackMap, data: FrameFeatures, estimate: PoseEstimate) -> bool:
         """Whether depth confirms the pose of a frame that was followed with few points and lines."""
@@ -79,7 +79,7 @@ class PoseVerification:
         """Whether depth confirms a pose that few points and lines agree with."""
         if self.evidence(estimate) < self.gates.confirmed_evidence or estimate.weak:
             return False
-        if _share(estimate) < self.gates.confirmed_share:
+        if _share(estimate) < self.gates.most:
             return False
         agree, _ = depth_agreement(self.camera, keyframes, data.depth_grid, estimate.pose, self.options.gates)
         return agree > self.options.gates.depth_check.confirms
@@ -109,9 +109,9 @@ class PoseVerification:
         if found is None or not self.is_near(found.estimate.pose, predicted, prior_sigma) or self._denied(data, found):
             return None
         # Rooms are alike at both ends, in depth too: of the features in view some must agree.
-        if not (found.score >= self.gates.certain or found.share >= self.gates.min_agreeing or not self.options.points):
+        if not (found.score >= self.gates.sure or found.share >= self.gates.min_agreeing or not self.options.points):
             return None
-        enough = self.evidence(found.estimate) >= self.gates.found_share * self._least_evidence
+        enough = self.evidence(found.estimate) >= self.gates.looser * self._least_evidence
         if enough and found.score >= self.gates.min_score and len(found.estimate.weak) <= 2:
             return found
         return found if self._confirmed(nearest, data, found.estimate) else None
@@ -121,20 +121,20 @@ class PoseVerification:
         living = track_map.living()
         wide = np.array([1e3] * 3 + [10.0] * 3)
         best = None
-        for keyframe in living[::-1][:: max(1, len(living) // self.gates.most)][: self.gates.most]:
+        for keyframe in living[::-1][:: max(1, len(living) // self.gates.tried)][: self.gates.tried]:
             found = find_pose(track_map, self.camera, data, [keyframe], [], keyframe.pose, wide)
             if found is not None and (best is None or found.score > best.score):
                 best = found
-            if best is not None and best.score > self.gates.enough:
+            if best is not None and best.score > self.gates.strong:
                 break
-        least = self.gates.anywhere * (1.0 if self.options.points else self.gates.anywhere_without_points)
+        least = self.gates.sure * (1.0 if self.options.points else self.gates.looser)
         if best is None or best.score < least or best.estimate.weak:
             return None
         # Two places may have like features; planes that are seen and are not there tell them apart.
         seen = 0 if data.planes is None else len(data.planes)
-        if seen >= 2 and not best.estimate.planes.any() and best.score < self.gates.doubtful:
+        if seen >= 2 and not best.estimate.planes.any() and best.score < self.gates.strong:
             return None
-        if best.score < self.gates.doubtful and self._contradicted(best.known.keyframes, data, best.estimate):
+        if best.score < self.gates.strong and self._contradicted(best.known.keyframes, data, best.estimate):
             return None
         return None if self._denied(data, best) else best
 

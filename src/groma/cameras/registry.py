@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""All camera models by name."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+
+from groma.cameras.contract import CameraModel
+from groma.cameras.dispatch import kernel_module, set_kernels
+from groma.errors import InputError
+
+_MODELS: dict[str, CameraModel] = {}
+#: One for every registration of this process.
+_NUMBERS = itertools.count()
+
+
+def register_camera(
+    camera: CameraModel,
+    project: Callable[..., bool],
+    project_jacobian: Callable[..., bool],
+    unproject: Callable[..., bool],
+    pinhole_parameters: Callable[..., None] | None = None,
+    pinhole_parameters_jacobian: Callable[..., None] | None = None,
+) -> CameraModel:
+    """Make a camera model known by name, and its kernels to compiled loops.
+
+    Parameters
+    ----------
+    camera : CameraModel
+        The model.
+    project, project_jacobian, unproject : callable
+        Kernels (decorated with :func:`groma.compiled.kernel`) as described in :mod:`groma.cameras.dispatch`, without
+        the tag.
+    pinhole_parameters, pinhole_parameters_jacobian : callable, optional
+        For models without distortion only.
+
+    Returns
+    -------
+    CameraModel
+        The model with the number that selects its kernels.
+
+    Raises
+    ------
+    InputError
+        If the name belongs to a model of another module.
+    """
+    known = _MODELS.get(camera.name)
+    if known is not None and kernel_module(known.number + 1) != project.__module__:
+        raise InputError(
+            f"A camera model named {camera.name!r} is registered already, by {kernel_module(known.number + 1)}. "
+            "Choose another name."
+        )
+    camera = _MODELS[camera.name] = replace(camera, number=next(_NUMBERS))
+    kernels = project, project_jacobian, unproject, pinhole_parameters, pinhole_parameters_jacobian
+    set_kernels(camera.number + 1, *kernels)
+    return camera
+
+
+def model(name: str) -> CameraModel:
+    """Return the camera model of the given name, for example ``"PINHOLE"``; InputError lists the names if unknown."""
+    if name not in _MODELS:
+        raise InputError(
+            f"Camera model must be one of {', '.join(other.name for other in models())}; got {name!r}. "
+            f"Convert the images to one of these models first, or register it with groma.cameras.register_camera."
+        )
+    return _MODELS[name]
+
+
+def models() -> tuple[CameraModel, ...]:
+    """All registered camera models, in the order of their registration."""
+    return tuple(_MODELS.values())
+
+
+__all__ = ["model", "models", "register_camera"]
