@@ -94,7 +94,8 @@ def _use_direction(ratio, max_squared, out):
 
 @kernel
 def _propose(
-    ray, across, sigma, q_low, q_high, ratio, line, ends, sigma_j, M, a, directed, min_overlap, max_relative, limits, out,
+    ray, across, sigma, q_low, q_high, ratio, line, ends, sigma_j, M, a, directed, min_overlap, max_relative, limits,
+    out,
 ):  # fmt: skip
     """One pair of segments: fill out = q1 q2 c11 c12 c22; return how far it got.
 
