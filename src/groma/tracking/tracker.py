@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -46,25 +46,13 @@ from groma.tracking.outcome import (
     TrackResult,
 )
 from groma.tracking.pose.estimate import PoseEstimate
-from groma.tracking.pose.following import follow_frame
+from groma.tracking.pose.following import Attempt, follow_frame
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import Found, promote
 from groma.tracking.pose.verification import PoseVerification
 from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
-
-
-@dataclass(frozen=True)
-class _Attempt:
-    """What following a frame gave: a pose, or one that is in doubt."""
-
-    predicted: FloatArray
-    prior_sigma: FloatArray
-    estimate: PoseEstimate | None = None
-    doubtful: PoseEstimate | None = None
-    trusted: bool = False
-    followed: Followed = field(default_factory=Followed.nothing)
 
 
 class Tracker:
@@ -160,12 +148,12 @@ class Tracker:
                 mapper.make_keyframe(present, watch)
         return self._report(frame, status, estimate, is_keyframe, began, watch)
 
-    def _follow(self, data: FrameFeatures, watch: Stopwatch) -> _Attempt:
+    def _follow(self, data: FrameFeatures, watch: Stopwatch) -> Attempt:
         """Predict the pose and follow the frame before, if that is not long ago."""
         present = self._present
         predicted, prior_sigma = self._motion.predict(present.pose, data.frame.timestamp)
         if self._lost_for > self._gates.lost_frames:
-            return _Attempt(predicted, prior_sigma)
+            return Attempt(predicted, prior_sigma)
         assert present.data is not None
         with watch("turn"):
             predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
@@ -174,13 +162,13 @@ class Tracker:
             prior_sigma, watch,
         )  # fmt: skip
         if estimate is None:
-            return _Attempt(predicted, prior_sigma, followed=followed)
+            return Attempt(predicted, prior_sigma, followed=followed)
         trusted = self._verification.trusts(self.map, data, estimate)
         if not trusted or self._verification.is_surprised(estimate, predicted, prior_sigma):
-            return _Attempt(predicted, prior_sigma, None, estimate, trusted, followed)
-        return _Attempt(predicted, prior_sigma, estimate, None, trusted, followed)
+            return Attempt(predicted, prior_sigma, None, estimate, trusted, followed)
+        return Attempt(predicted, prior_sigma, estimate, None, trusted, followed)
 
-    def _search(self, data: FrameFeatures, attempt: _Attempt, watch: Stopwatch) -> tuple[_Attempt, Found | None]:
+    def _search(self, data: FrameFeatures, attempt: Attempt, watch: Stopwatch) -> tuple[Attempt, Found | None]:
         """Find a frame that could not be followed by described features, or keep the pose that was in doubt."""
         present, mapper, doubtful = self._present, self._mapper, attempt.doubtful
         before = present.pose

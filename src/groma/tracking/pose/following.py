@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from groma._typing import FloatArray
@@ -18,6 +20,19 @@ from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
 from groma.tracking.pose.relocalise import match_planes
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What following a frame gave: a pose, or one that is in doubt."""
+
+    predicted: FloatArray
+    prior_sigma: FloatArray
+    estimate: PoseEstimate | None = None
+    doubtful: PoseEstimate | None = None
+    #: Whether enough agrees with the pose.
+    trusted: bool = False
+    followed: Followed = field(default_factory=Followed.nothing)
 
 
 def follow_frame(
@@ -170,4 +185,4 @@ def _find_lines_again(
     return segments.joined(FollowedSegments(rows[of[good]], found.ends[good], found.sigma[good], found.strength[good]))
 
 
-__all__ = ["carry", "follow_frame", "follow_lines", "measure_lines"]
+__all__ = ["Attempt", "carry", "follow_frame", "follow_lines", "measure_lines"]
