@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Files of covariances: arrays (.npz), or standard deviations as text (.json). ``groma adjust --covariance``.
 
-===============  =============  ======================================================================================
+================ =============  ======================================================================================
 Array            Shape          Content
-===============  =============  ======================================================================================
+================ =============  ======================================================================================
 ``image_names``  (N,)           images, and in ``image_frames`` the row of each one's pose
 ``poses``        (F, 6, 6)      left twist of ``cam_from_world`` or of the rig: shift, then turn
 ``centers``      (F, 3, 3)      centres in the world
@@ -13,7 +13,7 @@ Array            Shape          Content
 ``planes``       (K, 4, 4)      (n, w) with a unit normal; ``plane_ids``
 ``directions``   (D, 3, 3)      unit vectors; ``direction_ids``
 ``gauge``        ()             ``inner`` or ``held``, and in ``sigma0`` the factor that was applied
-===============  =============  ======================================================================================
+================ =============  ======================================================================================
 
 Scene units and radians; NaN for what is not observable.
 """
