@@ -150,7 +150,7 @@ def adjust(
     Reads a scene, minimises the robust reprojection error over everything in it and writes the scene back. The input
     is never changed. LIMAP's structures beside a COLMAP model are read and written too, with what they hold besides.
     What the data do not determine is said in words at the end. A pose graph (.g2o, .g2o.gz) is adjusted, too.
-    Chance plays no part here: --seed is accepted so that scripts can pass it everywhere.
+    The result is deterministic; --seed is accepted so that scripts can pass it to every command.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.adjusting import Wanted, adjust_and_write

@@ -79,9 +79,7 @@ def say_map(console: Console, result: MapResult, numbers: dict[str, Any], explai
     for kind, rmse in result.report.rmse_px.items():
         console.say(f"  {kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms, outliers included)")
     if any(rmse["after"] > rmse["before"] for rmse in result.report.rmse_px.values()):
-        console.say(
-            "  The rms counts wrong matches in full and may grow while the robust cost, which doubts them, falls."
-        )
+        console.say("  The rms includes outliers, so it may grow while the robust cost falls.")
     for line in describe_relations(result.report.relations):
         console.detail(line)
     for line in describe_contributions(numbers.get("contributions", [])):

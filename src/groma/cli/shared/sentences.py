@@ -42,7 +42,7 @@ def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, c
     lines.append(f"  {'cost':<16}{numbers['initial_cost']:>10.5g}     -> {numbers['final_cost']:>9.5g}")
     grew = any((rmse.get("after") or 0) > (rmse.get("before") or 0) for rmse in numbers.get("rmse_px", {}).values())
     if grew and numbers["final_cost"] < numbers["initial_cost"]:
-        lines.append("  The rms counts wrong matches in full and may grow; the robust cost, which doubts them, fell.")
+        lines.append("  The rms includes outliers, so it may grow although the robust cost fell.")
     seconds = numbers["seconds"]
     time = spent(seconds["total"], seconds.get("compilation", 0.0), compiled)
     lines.append(f"  {counted(numbers['iterations'], 'steps')} in {time}. {sentence}")
