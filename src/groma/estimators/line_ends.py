@@ -19,6 +19,8 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
+from groma.execution import map_ranges
 from groma.gates import gate, numbers
 
 
@@ -157,4 +159,9 @@ def trim(
     gates: LineEndGates = LINE_ENDS,
 ) -> None:
     """Move the end points X (L, 2, 3) of lines to where they end; front (M,): observation lies before its camera."""
-    _trim_all(center, image, ray, length, pointers, rows, active, numbers(gates), X, front)
+
+    def trim_some(part: slice) -> None:
+        here = pointers[part.start : part.stop + 1]
+        _trim_all(center, image, ray, length, here, rows, active, numbers(gates), X[part], front)
+
+    map_ranges(trim_some, len(X), PROBLEMS_AT_ONCE)

@@ -17,8 +17,9 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._simd import width
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators.batch_least_squares import Observations, solve_batch, solve_damped
+from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE, Observations, solve_batch, solve_damped
 from groma.estimators.two_point_line import TWO_POINT_LINE, line_residuals
+from groma.execution import map_ranges
 from groma.mapping.lines.views import LineViews
 
 #: Scale of the Cauchy loss, in sigma.
@@ -93,10 +94,14 @@ def fit_lines(
     observations = Observations(views.camera, views.image_idx[rows], own, pointers, active)
     found = solve_batch(TWO_POINT_LINE, observations, start, cauchy_scale=_CAUCHY)
     fit = Fit(found.states, np.zeros(len(rows)), np.zeros(len(start)), np.zeros(len(start)))
-    _examine(
-        observations.shared, observations.shared_idx, own, pointers, active, fit.X, found.frames,
-        fit.squared, fit.uncertainty, fit.unchecked,
-    )  # fmt: skip
+
+    def examine(part: slice) -> None:
+        _examine(
+            observations.shared, observations.shared_idx, own, pointers[part.start : part.stop + 1], active, fit.X[part],
+            found.frames[part], fit.squared, fit.uncertainty[part], fit.unchecked[part],
+        )  # fmt: skip
+
+    map_ranges(examine, len(start), PROBLEMS_AT_ONCE)
     return fit
 
 
