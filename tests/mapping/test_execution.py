@@ -3,6 +3,11 @@
 
 import importlib.util
 import multiprocessing
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
 import threading
 import time
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
@@ -97,9 +102,14 @@ def test_lines_do_not_depend_on_who_maps_them(make):
 
 @pytest.mark.skipif(importlib.util.find_spec("mpi4py") is None, reason="mpi4py is not installed")
 def test_lines_mapped_by_mpi():
-    from mpi4py.futures import MPIPoolExecutor
-
-    same_lines_as_alone(MPIPoolExecutor(2))
+    mpiexec = shutil.which("mpiexec", path=sysconfig.get_path("scripts")) or shutil.which("mpiexec")
+    if mpiexec is None:
+        pytest.skip("there is no mpiexec")
+    command = [mpiexec, "-n", "3", sys.executable, "-m", "mpi4py.futures", __file__]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    said = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
+    assert said.returncode == 0, said.stderr
+    assert said.stdout.split() == ["2", "workers", "agree"]
 
 
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask.distributed is not installed")
@@ -124,3 +134,11 @@ def same_lines_as_alone(workers):
     assert alone.num_lines > 20
     for name in ("lines", "segments", "image_idx", "segment_idx", "line_idx", "residual", "uncertainty"):
         np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+
+
+if __name__ == "__main__":
+    from mpi4py.futures import MPIPoolExecutor
+
+    with MPIPoolExecutor() as ranks:
+        same_lines_as_alone(ranks)
+        print(ranks.num_workers, "workers agree")
