@@ -21,7 +21,7 @@ from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
-from groma.mapping.lines.proposals import Proposals
+from groma.mapping.lines.hypotheses.proposals import Proposals
 
 
 @dataclass(frozen=True)

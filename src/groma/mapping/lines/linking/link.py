@@ -18,7 +18,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.mapping.groups import distinct_pairs
-from groma.mapping.lines.places import Places
+from groma.mapping.lines.hypotheses.places import Places
 from groma.mapping.lines.views import LineViews
 
 

@@ -14,8 +14,8 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_ends import trim
 from groma.gates import gate
 from groma.mapping.groups import grouped, num_distinct
-from groma.mapping.lines.fit import fit_lines
 from groma.mapping.lines.gates import AGREEMENT
+from groma.mapping.lines.linking.fit import fit_lines
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import LineViews
 
