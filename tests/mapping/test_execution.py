@@ -16,10 +16,10 @@ from functools import partial
 
 import numpy as np
 import pytest
+from _wireframe import arc, random_lines, wireframe
 
 from groma.execution import available_cores, map_ranges, map_work, num_workers, work_with
 from groma.mapping.lines.build import MapLinesOptions, map_lines
-from _wireframe import arc, random_lines, wireframe
 
 
 def processes() -> ProcessPoolExecutor:
@@ -140,5 +140,6 @@ if __name__ == "__main__":
     from mpi4py.futures import MPIPoolExecutor
 
     with MPIPoolExecutor() as ranks:
+        number = ranks.num_workers
         same_lines_as_alone(ranks)
-        print(ranks.num_workers, "workers agree")
+        print(number, "workers agree")

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from _wireframe import arc, random_lines, wireframe
 
-from groma.mapping.lines.filters import FILTERS, Evidence, filtered, long_enough, seen_by_enough_images
+from groma.mapping.lines.filtering.filters import FILTERS, Evidence, filtered, long_enough, seen_by_enough_images
+from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
-from groma.mapping.lines.tracks import Tracks
 from groma.mapping.lines.views import build_views
 
 

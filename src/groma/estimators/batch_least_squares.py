@@ -319,4 +319,12 @@ def solve_batch(
     return BatchSolution(found, frames, cost, information, steps, converged)
 
 
-__all__ = ["PROBLEMS_AT_ONCE", "BatchSolution", "Observations", "ProblemKind", "problem_kind", "solve_batch", "solve_damped"]
+__all__ = [
+    "PROBLEMS_AT_ONCE",
+    "BatchSolution",
+    "Observations",
+    "ProblemKind",
+    "problem_kind",
+    "solve_batch",
+    "solve_damped",
+]

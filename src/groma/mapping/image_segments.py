@@ -131,8 +131,9 @@ def detect_segments(
 ) -> list[Segments]:
     """Find the segments of every image of a scene; pixels of the images as they are."""
     cameras, names, camera_of = scene.cameras, scene.images.names, scene.images.camera_idx
-    order = np.argsort(camera_of, kind="stable")  # the resampling of a camera is made once and used for all its images
-    work = [(folder / names[i], cameras.models[(c := camera_of[i])], tuple(cameras.params_of(c).tolist())) for i in order]
+    order = np.argsort(camera_of, kind="stable")  # what resamples a camera's images is made once for all of them
+    of_camera = [(name, tuple(cameras.params_of(c).tolist())) for c, name in enumerate(cameras.models)]
+    work = [(folder / names[i], *of_camera[camera_of[i]]) for i in order]
     try:
         found = map_work(partial(_detect_in, detector), work, partial(say, "finding segments"))
     finally:

@@ -27,6 +27,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import ProblemError
+from groma.execution import available_cores
 from groma.factors.contract import Factor
 from groma.problem.lay_out import lay_out
 from groma.problem.layout import Layout

@@ -12,9 +12,10 @@ which is linear in the image line. Its covariance follows from the distance of t
 Where the line is parallel to the epipolar line, :math:`l^\top a \to 0` and the covariance grows without bound. Such
 proposals are discarded; the segment can still join a line that other segments determine. Where only the change of depth
 along the segment is uncertain, because the other image sees a small part of it, the vanishing point of the segment
-supplies it (:mod:`groma.mapping.lines.directions`).
+supplies it (:mod:`groma.mapping.lines.hypotheses.directions`).
 
-Known points on a segment give further proposals, without another segment (:mod:`groma.mapping.lines.known_points`).
+Known points on a segment give further proposals, without another segment
+(:mod:`groma.mapping.lines.hypotheses.known_points`).
 
 References
 ----------
@@ -32,7 +33,7 @@ from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
-from groma.mapping.lines.known_points import lines_through_points
+from groma.mapping.lines.hypotheses.known_points import lines_through_points
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.views import LineViews
 

@@ -97,8 +97,8 @@ def fit_lines(
 
     def examine(part: slice) -> None:
         _examine(
-            observations.shared, observations.shared_idx, own, pointers[part.start : part.stop + 1], active, fit.X[part],
-            found.frames[part], fit.squared, fit.uncertainty[part], fit.unchecked[part],
+            observations.shared, observations.shared_idx, own, pointers[part.start : part.stop + 1], active,
+            fit.X[part], found.frames[part], fit.squared, fit.uncertainty[part], fit.unchecked[part],
         )  # fmt: skip
 
     map_ranges(examine, len(start), PROBLEMS_AT_ONCE)

@@ -19,9 +19,8 @@ from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_ranges
 from groma.mapping.groups import distinct_pairs
-from groma.mapping.lines.places import Places
+from groma.mapping.lines.hypotheses.places import Places
 from groma.mapping.lines.views import LineViews
-
 
 #: Pairs of segments compared by one piece of work.
 _EDGES_AT_ONCE = 8192

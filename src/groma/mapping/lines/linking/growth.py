@@ -2,15 +2,15 @@
 r"""From the places of single segments to lines that many images see, step by step.
 
 link
-    Segments whose places support each other become lines (:mod:`groma.mapping.lines.link`).
+    Segments whose places support each other become lines (:mod:`groma.mapping.lines.linking.link`).
 scale the noise
     The standard deviations of all segments are scaled to what the residuals of the first lines show.
 recover
     Lines are projected into the images of their neighbourhood. A free segment on a line joins it, also one whose own
     proposals were degenerate; a segment of another line is a vote that both are one.
 
-After each step lines are fitted again (:mod:`groma.mapping.lines.fit`), observations that fail a chi-square test are
-let go, and the ends of a line are cut to the part of it that at least two images see
+After each step lines are fitted again (:mod:`groma.mapping.lines.linking.fit`), observations that fail a chi-square
+test are let go, and the ends of a line are cut to the part of it that at least two images see
 (:mod:`groma.estimators.line_ends`).
 """
 
@@ -26,12 +26,12 @@ from scipy.special import ndtri
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_work
 from groma.mapping.groups import distinct_pairs
-from groma.mapping.lines.fit import find_on_lines
 from groma.mapping.lines.gates import AGREEMENT
-from groma.mapping.lines.link import join_once, link
+from groma.mapping.lines.hypotheses.places import Places
+from groma.mapping.lines.linking.fit import find_on_lines
+from groma.mapping.lines.linking.link import join_once, link
+from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.options import MapLinesOptions
-from groma.mapping.lines.places import Places
-from groma.mapping.lines.tracks import Tracks
 
 
 # ---------------------------------------------------------------------------------------------------------------- steps

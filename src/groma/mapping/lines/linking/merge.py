@@ -28,8 +28,8 @@ from groma.estimators.two_point_line import across_basis, line_residuals
 from groma.execution import map_ranges
 from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
+from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.outcomes import Outcome
-from groma.mapping.lines.tracks import Tracks
 
 
 @dataclass(frozen=True)

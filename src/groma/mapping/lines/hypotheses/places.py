@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The place of every segment in space: what every neighbour proposes, and what most of them agree on.
 
-One image at a time: proposals (:mod:`groma.mapping.lines.proposals`) from the segments of its neighbours, from known
-points and vanishing directions, then the choice among them (:mod:`groma.mapping.lines.consensus`).
+One image at a time: proposals from the segments of its neighbours, from known points and vanishing directions
+(:mod:`groma.mapping.lines.hypotheses.proposals`), then the choice among them
+(:mod:`groma.mapping.lines.hypotheses.consensus`).
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.execution import map_work
 from groma.mapping.groups import grouped
-from groma.mapping.lines.consensus import choose
+from groma.mapping.lines.hypotheses.consensus import choose
+from groma.mapping.lines.hypotheses.proposals import WEAK, Proposer
 from groma.mapping.lines.matches import MatchProvider
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
-from groma.mapping.lines.proposals import WEAK, Proposer
 from groma.mapping.lines.views import LineViews
 from groma.scene import Scene
 

@@ -30,8 +30,8 @@ from scipy.special import betaln, expit, gammaln, log_expit
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_work
 from groma.gates import gate
-from groma.mapping.lines.kinds import features_of
-from groma.mapping.lines.tracks import Tracks
+from groma.mapping.lines.filtering.kinds import features_of
+from groma.mapping.lines.linking.tracks import Tracks
 
 
 @dataclass(frozen=True)
