@@ -44,6 +44,15 @@ def image_files(folder: Path) -> list[Path]:
     return files
 
 
+def image_reader(folder: Path, names: Sequence[str]) -> Callable[[int], GrayImage]:
+    """Return what reads the images of some names by their number."""
+    return partial(_read_by_number, folder, names)
+
+
+def _read_by_number(folder: Path, names: Sequence[str], i: int) -> GrayImage:
+    return read_gray(folder / names[i])
+
+
 def read_gray(path: Path) -> GrayImage:
     """Read an image of any type as grey levels.
 
@@ -193,4 +202,4 @@ def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
     return {name: of_camera[camera] for name, camera in zip(model.images.names, model.images.camera_idx, strict=True)}
 
 
-__all__ = ["check_images", "check_names", "check_number", "image_files", "images_left_out", "read_gray"]
+__all__ = ["check_images", "check_names", "check_number", "image_files", "image_reader", "images_left_out", "read_gray"]
