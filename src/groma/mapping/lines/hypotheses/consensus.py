@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._numba import inline_kernel, kernel, loop
+from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
@@ -83,50 +83,6 @@ def _support(pointers, order, neighbor, values, num_neighbors, gate, total):
             total[p] = best.sum()
 
 
-@inline_kernel
-def _nearest_proposals(order, begin, end, neighbor, values, place, gate, used, nearest, chosen):
-    """Write each neighbour's proposal that is nearest to a place, and mark all that agree with it as used."""
-    q1, q2, c11, c12, c22 = place
-    nearest[:] = gate
-    chosen[:] = -1
-    for k in range(begin, end):
-        r = order[k]
-        d1, d2 = values[r, 0] - q1, values[r, 1] - q2
-        v11, v22 = values[r, 2] + c11, values[r, 4] + c22
-        if d1 * d1 > gate * v11 or d2 * d2 > gate * v22:
-            continue
-        distance = _distance(d1, d2, v11, values[r, 3] + c12, v22)
-        if distance < gate:
-            used[k - begin] = True
-        if distance < nearest[neighbor[r]]:
-            nearest[neighbor[r]], chosen[neighbor[r]] = distance, r
-
-
-@inline_kernel
-def _sum_up(values, chosen, nearest, num_neighbors, gate, half_weight):
-    """Return how many neighbours and whether points agree, their support, and their information on the place."""
-    number, points, value = 0, 0, 0.0
-    i11 = i12 = i22 = y1 = y2 = 0.0
-    for n in range(num_neighbors + 2):
-        r = chosen[n]
-        if r < 0:
-            continue
-        if n >= num_neighbors:
-            points = 1
-        else:
-            number += 1
-        weight = 1.0 / (1.0 + nearest[n] / half_weight)
-        value += values[r, 5] * (1.0 - nearest[n] / gate)
-        determinant = values[r, 2] * values[r, 4] - values[r, 3] * values[r, 3]
-        if not determinant > 0.0:
-            continue
-        w11, w12, w22 = values[r, 4] / determinant, -values[r, 3] / determinant, values[r, 2] / determinant
-        i11, i12, i22 = i11 + weight * w11, i12 + weight * w12, i22 + weight * w22
-        y1 += weight * (w11 * values[r, 0] + w12 * values[r, 1])
-        y2 += weight * (w12 * values[r, 0] + w22 * values[r, 1])
-    return number, points, value, (i11, i12, i22), (y1, y2)
-
-
 @loop
 def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate, half_weight, num_seeds, num_rounds,
             min_support, q, covariance, score, supporters, rival):  # fmt: skip
@@ -147,14 +103,38 @@ def _choose(pointers, order, neighbor, other, values, total, num_neighbors, gate
             q1, q2, c11, c12, c22 = values[p, 0], values[p, 1], values[p, 2], values[p, 3], values[p, 4]
             number, points, value = 0, 0, 0.0
             for _ in range(num_rounds):  # fuse, compare again
-                _nearest_proposals(
-                    order, begin, end, neighbor, values, (q1, q2, c11, c12, c22), gate, used, nearest, chosen
-                )
-                number, points, value, information, y = _sum_up(
-                    values, chosen, nearest, num_neighbors, gate, half_weight
-                )
-                i11, i12, i22 = information
-                y1, y2 = y
+                nearest[:] = gate
+                chosen[:] = -1
+                for k in range(begin, end):
+                    r = order[k]
+                    d1, d2 = values[r, 0] - q1, values[r, 1] - q2
+                    v11, v22 = values[r, 2] + c11, values[r, 4] + c22
+                    if d1 * d1 > gate * v11 or d2 * d2 > gate * v22:
+                        continue
+                    distance = _distance(d1, d2, v11, values[r, 3] + c12, v22)
+                    if distance < gate:
+                        used[k - begin] = True
+                    if distance < nearest[neighbor[r]]:
+                        nearest[neighbor[r]], chosen[neighbor[r]] = distance, r
+                number, points, value = 0, 0, 0.0
+                i11 = i12 = i22 = y1 = y2 = 0.0
+                for n in range(num_neighbors + 2):
+                    r = chosen[n]
+                    if r < 0:
+                        continue
+                    if n >= num_neighbors:
+                        points = 1
+                    else:
+                        number += 1
+                    weight = 1.0 / (1.0 + nearest[n] / half_weight)
+                    value += values[r, 5] * (1.0 - nearest[n] / gate)
+                    determinant = values[r, 2] * values[r, 4] - values[r, 3] * values[r, 3]
+                    if not determinant > 0.0:
+                        continue
+                    w11, w12, w22 = values[r, 4] / determinant, -values[r, 3] / determinant, values[r, 2] / determinant
+                    i11, i12, i22 = i11 + weight * w11, i12 + weight * w12, i22 + weight * w22
+                    y1 += weight * (w11 * values[r, 0] + w12 * values[r, 1])
+                    y2 += weight * (w12 * values[r, 0] + w22 * values[r, 1])
                 determinant = i11 * i22 - i12 * i12
                 if not determinant > 0.0:
                     break
