@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import _comparison as compare
 import numpy as np
 import pytest
 
@@ -21,7 +22,7 @@ from groma.errors import ProblemError
 from groma.factors.losses import Cauchy, GemanMcClure, Huber
 from groma.io import read_scene, write_scene
 from groma.mapping.result import last_loss
-from groma.scene import Relations, compare, synthetic
+from groma.scene import Relations, synthetic
 
 pytestmark = pytest.mark.kernels
 
