@@ -19,6 +19,8 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
+from groma.execution import map_ranges
 from groma.gates import gate, numbers
 
 
@@ -171,8 +173,12 @@ def trim(
     and ``rows`` names their segments.
     """
     found, front = X.copy(), np.empty(len(rows), np.bool_)
-    _trim_all(
-        segments.center, segments.image, segments.ray, segments.length, pointers, rows, active, numbers(gates), found,
-        front,
-    )  # fmt: skip
+
+    def trim_some(part: slice) -> None:
+        _trim_all(
+            segments.center, segments.image, segments.ray, segments.length, pointers[part.start : part.stop + 1], rows,
+            active, numbers(gates), found[part], front,
+        )  # fmt: skip
+
+    map_ranges(trim_some, len(X), PROBLEMS_AT_ONCE)
     return found, front

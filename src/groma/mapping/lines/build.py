@@ -27,6 +27,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
+from groma.execution import work_with
 from groma.mapping.lines.filtering.filters import Evidence, filtered
 from groma.mapping.lines.hypotheses.directions import depth_ratios
 from groma.mapping.lines.hypotheses.places import find_places
@@ -98,19 +99,20 @@ def map_lines(
     choose = neighbors or partial(
         covisible_neighbors, num_neighbors=options.num_neighbors, min_shared=options.min_shared
     )
-    compared = choose(scene)
-    views = build_views(scene, segments, options.min_length, options.noise, options.depth_margin)
-    ratios = depth_ratios(scene, segments, views) if options.use_directions else np.zeros((len(views.image_idx), 2))
-    places = find_places(scene, views, ratios, compared, matches, options, partial(report, "proposals"))
-    unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, partial(report, "tracks"))
-    evidence = Evidence(
-        options=options,
-        neighbors=compared,
-        strength=np.concatenate([np.zeros(0), *(one.strength for one in segments)]),
-        size=np.column_stack([scene.cameras.width, scene.cameras.height])[scene.images.camera_idx],
-        unmerged=unmerged,
-    )
-    return _line_map(filtered(merge_agreeing(unmerged), evidence), compared)
+    with work_with():
+        compared = choose(scene)
+        views = build_views(scene, segments, options.min_length, options.noise, options.depth_margin)
+        ratios = depth_ratios(scene, segments, views) if options.use_directions else np.zeros((len(views.image_idx), 2))
+        places = find_places(scene, views, ratios, compared, matches, options, partial(report, "proposals"))
+        unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, partial(report, "tracks"))
+        evidence = Evidence(
+            options=options,
+            neighbors=compared,
+            strength=np.concatenate([np.zeros(0), *(one.strength for one in segments)]),
+            size=np.column_stack([scene.cameras.width, scene.cameras.height])[scene.images.camera_idx],
+            unmerged=unmerged,
+        )
+        return _line_map(filtered(merge_agreeing(unmerged), evidence), compared)
 
 
 def _line_map(tracks: Tracks, neighbors: list[IntArray]) -> LineMap:
