@@ -115,15 +115,15 @@ def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
     )
 
 
-def check_number(folder: Path, names: Sequence[str], model: Scene | None, fewest: int) -> None:
+def check_number(folder: Path, names: Sequence[str], model: Scene | None, min_images: int) -> None:
     """Check that there are images and points enough for a map, and that the folder has the images of the model."""
     if model is None:
         if len(names) < 3:
             raise InputError(f"{folder} holds {_images(len(names))}; a map needs at least 3 that overlap. Take more.")
         return
-    if model.num_images < max(2, fewest):
+    if model.num_images < max(2, min_images):
         raise InputError(
-            f"The model has {_images(model.num_images)} with a pose; a map needs at least {max(2, fewest)} that "
+            f"The model has {_images(model.num_images)} with a pose; a map needs at least {max(2, min_images)} that "
             "overlap. Pass a model with more, or none to have it made."
         )
     if len(model.point_observations.image_idx) == 0:
