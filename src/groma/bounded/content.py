@@ -24,8 +24,7 @@ class ReadingGates:
         40, "1", "and so many times its size on top", "cost: memory; numbers as text shrink by 3 to 6, arrays by 16"
     )
     pipe: int = gate(1 << 30, "bytes", "largest content of what is no regular file, such as a pipe", "cost: memory")
-    line: int = gate(1 << 20, "characters", "longest line of a text file", "cost: time")
-    word: int = gate(1 << 10, "characters", "longest number in a text file", "cost: time; 17 digits say all")
+    line: int = gate(1 << 20, "characters", "longest line of a text file of numbers", "cost: memory and time")
     pixels: int = gate(1 << 26, "px", "largest image of any file", "cost: memory")
     pixel_ratio: int = gate(
         40, "px", "and so many for each byte of its file on top", "cost: memory; photographs hold 2 to 20 a byte"

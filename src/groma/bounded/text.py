@@ -58,16 +58,22 @@ def finite(words: Iterable[str], place: object, expected: str = "finite numbers"
     FileFormatError
         If one of them is not a number, or not finite.
     """
-    found = []
-    for word in words:
-        try:
-            value = float(word) if len(word) <= READING.word else math.nan
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise FileFormatError(f"{place}: expected {expected}; got {shown(word)}. Correct the file.")
-        found.append(value)
+    words = list(words)
+    try:
+        found = list(map(float, words))
+    except ValueError:
+        found = [math.nan]
+    if not all(map(math.isfinite, found)):
+        wrong = next(word for word in words if not _is_finite(word))
+        raise FileFormatError(f"{place}: expected {expected}; got {shown(wrong)}. Correct the file.")
     return found
+
+
+def _is_finite(word: str) -> bool:
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
 
 
 def whole(word: str, place: object, expected: str = "a whole number") -> int:

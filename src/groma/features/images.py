@@ -42,7 +42,7 @@ def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
     elif image.dtype == np.uint16:
         full = _FULL_12_BITS if image.max() <= _FULL_12_BITS else 65535
         levels = np.round(np.arange(full + 1) * (255.0 / full)).astype(np.uint8)
-        image = levels[image]
+        image = levels[np.asarray(image, np.uint16)]
     elif np.issubdtype(image.dtype, np.floating):
         levels = image.astype(np.float64)
         if not np.isfinite(levels).all():

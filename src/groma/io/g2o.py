@@ -33,7 +33,7 @@ from pathlib import Path
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.bounded.text import finite, read_words, whole
+from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError
 from groma.geometry import quaternion
 from groma.io.atomic import atomic_output
@@ -102,7 +102,7 @@ def _rows_by_tag(path: Path) -> dict[str, array[float]]:
             continue
         place = f"{path}, line {number}"
         if tag == "FIX":
-            rows.setdefault(tag, array("d")).extend(whole(word, place, "the id of a pose") for word in words)
+            rows.setdefault(tag, array("d")).extend(finite(words, place, "ids of poses"))
             continue
         if tag not in _NUMBERS:
             raise FileFormatError(f"{place}: {tag[:40]!r} is not read; a pose graph has {', '.join(_NUMBERS)} and FIX.")
@@ -130,7 +130,7 @@ def _graph(rows: dict[str, array[float]], path: Path) -> PoseGraph:
         missing = int(named[~np.isin(named, known)][0])
         raise FileFormatError(f"{path}: a motion names pose {missing}, which has no {vertex} line. Add one.")
     held = np.zeros(len(ids), dtype=bool)
-    for name in map(int, rows.get("FIX", [])):
+    for name in _integers(np.unique(rows.get("FIX", [])), path).tolist():
         if name not in row_of:
             raise FileFormatError(f"{path}: FIX names pose {name}, which is not there.")
         held[row_of[name]] = True
