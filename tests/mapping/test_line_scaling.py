@@ -9,10 +9,10 @@ import pytest
 
 from groma.cli.commands.map import map_
 from groma.mapping.groups import distinct_pairs, num_distinct
-from groma.mapping.lines import merge as _line_merge
 from groma.mapping.lines.build import LineMap, explain
 from groma.mapping.lines.gates import AGREEMENT
-from groma.mapping.lines.merge import MergeGates
+from groma.mapping.lines.linking import merge as _line_merge
+from groma.mapping.lines.linking.merge import MergeGates
 from groma.mapping.lines.outcomes import REMEDIES, WORDS, Outcome
 from groma.mapping.unused import without_unused
 from groma.scene import Directions, Relations

@@ -27,6 +27,7 @@ from pathlib import Path
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
+from groma.execution import work_with
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches
 from groma.features.matches import LineMatches
@@ -165,7 +166,7 @@ def map_images(
     check_number(folder, names, model, options.lines.min_images)
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
-    with Stages(Path(work), key, options, say) as stages:
+    with work_with(options.threads), Stages(Path(work), key, options, say) as stages:
         start = stages.run(find_start, folder, names, model, stages.place)
         points = stages.run(adjust_points, start)
         if options.refine_points:

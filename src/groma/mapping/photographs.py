@@ -17,9 +17,9 @@ import cv2
 
 from groma.bounded.images import decoded
 from groma.errors import FileFormatError, GromaError, InputError
+from groma.execution import map_work
 from groma.features.images import GrayImage, to_gray
 from groma.io.endings import IMAGES, VIDEOS
-from groma.mapping.work import map_work
 from groma.scene import Scene
 
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
@@ -161,19 +161,21 @@ def _suggestion(folder: Path, names: Sequence[str], missing: list[str]) -> str:
 def check_images(folder: Path, names: Sequence[str], model: Scene | None, say: Callable[[str, int, int], None]) -> None:
     """Check that every image of the model, or of the folder, can be read, and has the size of its camera."""
     sizes = {} if model is None else _sizes(model)
-    used = list(names) if model is None else list(model.images.names)
+    used = names if model is None else model.images.names
+    work = [(folder / name, sizes.get(name, (0, 0))) for name in used]
+    map_work(_check_image, work, partial(say, "checking images"))
 
-    def check(name: str) -> None:
-        height, width = read_gray(folder / name).shape
-        size = sizes.get(name, (0, 0))
-        if size in ((0, 0), (width, height)):
-            return
-        remedy = "Pass the images the model was made from."
-        if size == (height, width):
-            remedy = "It is turned by 90 degrees: pass the images as they were stored when the model was made."
-        raise InputError(f"{folder / name} has {width}x{height} pixels, its camera {size[0]}x{size[1]}. {remedy}")
 
-    map_work(check, used, partial(say, "checking images"))
+def _check_image(image: tuple[Path, tuple[int, int]]) -> None:
+    """Check that an image can be read and has the size of its camera, where that is known."""
+    path, size = image
+    height, width = read_gray(path).shape
+    if size in ((0, 0), (width, height)):
+        return
+    remedy = "Pass the images the model was made from."
+    if size == (height, width):
+        remedy = "It is turned by 90 degrees: pass the images as they were stored when the model was made."
+    raise InputError(f"{path} has {width}x{height} pixels, its camera {size[0]}x{size[1]}. {remedy}")
 
 
 def _sizes(model: Scene) -> dict[str, tuple[int, int]]:

@@ -40,9 +40,9 @@ class MapLinesOptions:
     max_unchecked: float = 0.04
     #: A place is ambiguous if another one has more than this share of its support.
     max_rival: float = 0.95
-    #: Smallest repeatability of the segments of a line (:mod:`groma.mapping.lines.kinds`); more is required where the
-    #: scene as a whole is less repeatable. 0 keeps all lines of texture, also those that
-    #: :mod:`groma.mapping.lines.texture` finds.
+    #: Smallest repeatability of the segments of a line (:mod:`groma.mapping.lines.filtering.kinds`); more is required
+    #: where the scene as a whole is less repeatable. 0 keeps all lines of texture, also those that
+    #: :mod:`groma.mapping.lines.filtering.texture` finds.
     min_repeatability: float = 0.4
     #: Use lines through known points as further proposals.
     use_points: bool = True
