@@ -189,7 +189,7 @@ def test_landmark_without_information_stays():
     assert np.isfinite(solution["points"]).all()
     np.testing.assert_array_equal(solution["points"][3], problem.variables["points"].state[3])
     assert solution.report.num_underdetermined_landmarks == 1
-    assert any("leave a direction" in warning for warning in solution.report.warnings)
+    assert any("unobservable direction" in warning for warning in solution.report.warnings)
 
 
 def test_not_finite_start_is_an_outcome():
