@@ -20,6 +20,9 @@ RELATION_SCALES = {"cauchy": 2.0, "geman_mcclure": 4.0}
 #: The loss of scenes with depths, stereo pairs or planes measured in the cameras, and that of their relations: each
 #: measurement has a standard deviation of its own, and what does not belong was left out in tracking.
 METRIC_LOSS, METRIC_RELATION_LOSS = Cauchy(2.0), Cauchy(1.0)
+#: Such a scene stays as it is if the first step promises to lower the cost by no more than this fraction: tracking ends
+#: there, and what is left is far below the noise of the measurements.
+METRIC_START_TOLERANCE = 1e-3
 
 
 def with_loss(factor: Factor, loss: Loss, relation_loss: Loss | None = None) -> Factor:
