@@ -191,8 +191,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
 
         if last and number:
             loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
-        staged = Problem(problem.variables, [with_loss(factor, loss, relation_loss) for factor in problem.factors])
-        solution = solve(staged, solver_options, tell)
+        solution = solve(with_loss(problem, loss, relation_loss), solver_options, tell)
         problem = solution.problem
         reports.append(solution.report)
         if stopped:
