@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -88,7 +89,7 @@ class History:
         relative = se3.compose(pose[None], se3.inverse(keyframe.pose[None]))[0]
         self.entries.append(Entry(timestamp, keyframe.index, relative, part))
 
-    def joined(self, where: dict[int, tuple[int, int]]) -> None:
+    def joined(self, where: Sequence[tuple[int, int]]) -> None:
         """Take note of maps that were put into others."""
         for entry in self.entries:
             entry.part, shift = where[entry.part]
