@@ -126,8 +126,9 @@ def _say(console: "Console", numbers: dict[str, Any]) -> None:
     scores = numbers.get("reference", {})
     if "ate_rmse" in scores:
         drift = scores["drift_percent"]
+        how = scores["alignment"] + (" by positions and orientations" if scores["by_orientations"] else "")
         console.say(
-            f"Against the reference ({scores['alignment']}): position error {scores['ate_rmse']:.4f} (root mean "
+            f"Against the reference ({how}): position error {scores['ate_rmse']:.4f} (root mean "
             f"square, units of the reference) over {scores['path_length']:.2f}"
             + (f"; drift {drift:.2f} %, {scores['drift_deg_per_metre']:.4f} deg per unit" if drift is not None else "")
         )
