@@ -47,6 +47,7 @@ class Ending:
             self.warnings.append(f"Interrupted at the end of the track: {what}. This and what follows was left out.")
         except Exception as error:
             self.warnings.append(_left_out(what, error))
+        mapper.abandon()
         mapper.maps, mapper.current = kept, current
         return otherwise
 

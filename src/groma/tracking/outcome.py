@@ -38,6 +38,8 @@ class TrackedFrame:
     #: Why a frame was skipped.
     reason: str = ""
     keyframe: bool = False
+    #: Its name in the sequence.
+    name: str = ""
     #: The map that the pose refers to: 0, or more after the track was lost for long and a new map was begun.
     part: int = 0
 

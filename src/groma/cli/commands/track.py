@@ -108,7 +108,8 @@ def track(
     if result.interrupted:
         console.warn("interrupted; what was tracked so far is written.")
     _output.check_output(output, force)
-    result.write(output, f"Track of {sequence.absolute().name}", force)
+    for sentence in result.write(output, f"Track of {sequence.absolute().name}", force):
+        console.warn(sentence)
     shutil.rmtree(work, ignore_errors=True)
     numbers = result.summary()
     _say(console, numbers)

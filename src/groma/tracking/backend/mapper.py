@@ -242,10 +242,13 @@ class Mapper:
                 report = job.report
         return report
 
-    def close(self) -> None:
-        """End the threads; what they were working on and was not taken up is left."""
-        pools, self._pool, self._workers = (self._pool, self._workers), None, None
+    def abandon(self) -> None:
+        """Leave what was begun and not taken up."""
         self.due = self._pending = self._search = None
+
+    def close(self) -> None:
+        """End the threads."""
+        pools, self._pool, self._workers = (self._pool, self._workers), None, None
         for pool in pools:
             if pool is not None:
                 pool.shutdown(wait=True, cancel_futures=True)
