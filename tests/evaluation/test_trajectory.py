@@ -265,7 +265,7 @@ def test_alignment_by_both_is_at_the_minimum_of_what_it_minimises():
 
     def cost(rotation):
         away = y - y.mean(0) - (x - x.mean(0)) @ rotation.T
-        return np.sum(away**2) / noise2 + np.sum((votes - rotation) ** 2) / (2 * scatter2)
+        return np.sum(away**2) / noise2 + np.mean(np.sum((votes - rotation) ** 2, axis=(1, 2))) / (2 * scatter2)
 
     best = cost(found.similarity.rotation)
     for axis in np.vstack([np.eye(3), -np.eye(3)]):

@@ -102,15 +102,18 @@ def pose_alignment(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: boo
 
     The camera centres alone (:func:`align_points`) know the rotation to
 
-    .. math:: \sigma_p / \sqrt{\lambda_{\min}}, \qquad
-        \Lambda = \sum_i (\lVert x_i \rVert^2 I - x_i x_i^\top),
+    .. math:: \sigma_p / \sqrt{\lambda_{\min}(\Lambda)}, \qquad
+        \Lambda = s^2 \sum_i (\lVert x_i \rVert^2 I - x_i x_i^\top),
 
     with the centred :math:`x_i` and the noise :math:`\sigma_p` that the alignment leaves on a coordinate. On a straight
     road, or of a camera that turns on the spot, that is little. Where it is worse than a degree, and worse than the
     scatter :math:`\sigma_r` of single orientations about their mean, both take part, weighted by their noise:
 
     .. math:: \min_{s, R, t} \sum_i \frac{\| y_i - (s R x_i + t) \|^2}{\sigma_p^2}
-        + \frac{\| V_i - R \|_F^2}{2 \sigma_r^2}, \qquad V_i = R_{y,i}^\top R_{x,i}.
+        + \frac{1}{N} \sum_i \frac{\| V_i - R \|_F^2}{2 \sigma_r^2}, \qquad V_i = R_{y,i}^\top R_{x,i}.
+
+    All orientations together count as one: what a camera and its reference differ by is mostly common to them. So they
+    decide about the directions in which the centres say nothing, and about little else.
 
     With fewer than three centres, or all on one line, the orientations alone give the rotation. Parameters and errors
     are those of :func:`align_poses`.
@@ -137,7 +140,7 @@ def pose_alignment(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: boo
     if noise <= lever * max(scatter, ALIGNMENT.known_rotation):
         return PoseAlignment(by_centers, False)
     # Orientations that agree to rounding are as good as those that agree to a part in a million.
-    weight = by_centers.scale * max(scatter, 1e-6) ** 2 / noise**2
+    weight = 2 * len(x) * by_centers.scale * max(scatter, 1e-6) ** 2 / noise**2
     rotation = _nearest_rotation(weight * (y0.T @ x0) + votes.sum(0))
     return PoseAlignment(_with_rotation(x, y, rotation, with_scale), True)
 

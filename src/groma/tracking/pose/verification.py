@@ -75,7 +75,7 @@ class PoseVerification:
         index = before.index[track_map.points.alive[before.index]]
         expected = self.camera.project(into(estimate.pose, track_map.points.xyz[index]))
         in_view = self.camera.inside(expected, self.options.gates.points.border).sum()
-        return estimate.counts["points"] < self.gates.min_seen * in_view
+        return bool(estimate.counts["points"] < self.gates.min_seen * in_view)
 
     def confirms(self, track_map: TrackMap, data: FrameFeatures, estimate: PoseEstimate) -> bool:
         """Whether depth confirms the pose of a frame that was followed with few points and lines."""
