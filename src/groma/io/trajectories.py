@@ -158,6 +158,13 @@ def write_tum(trajectory: Trajectory, path: str | os.PathLike[str], force: bool 
     write_trajectory(trajectory, path, "tum", force)
 
 
+def read_times(path: str | os.PathLike[str]) -> FloatArray:
+    """Read times (N,), seconds, one a line, as they lie beside the poses of KITTI."""
+    place = existing(path)
+    with reading(place, "times"):
+        return _numbers(place, _rows(place), 1)[:, 0]
+
+
 def read_text(path: Path) -> str:
     """Return the text of a file that may be compressed by gzip."""
     content = path.read_bytes()
@@ -266,6 +273,7 @@ for _format in (
 __all__ = [
     "Trajectory",
     "TrajectoryFormat",
+    "read_times",
     "read_trajectory",
     "read_tum",
     "register_trajectory_format",

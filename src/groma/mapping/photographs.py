@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 
 from groma.errors import GromaError, InputError
+from groma.execution import map_work
 from groma.features.images import GrayImage, to_gray
 from groma.io.endings import IMAGES, VIDEOS
-from groma.mapping.work import map_work
 from groma.scene import Scene
 
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
@@ -42,6 +42,15 @@ def image_files(folder: Path) -> list[Path]:
     if not files:
         raise InputError(f"{folder} holds no images ({', '.join(IMAGES)}). Check the path.")
     return files
+
+
+def image_reader(folder: Path, names: Sequence[str]) -> Callable[[int], GrayImage]:
+    """Return what reads the images of some names by their number."""
+    return partial(_read_by_number, folder, names)
+
+
+def _read_by_number(folder: Path, names: Sequence[str], i: int) -> GrayImage:
+    return read_gray(folder / names[i])
 
 
 def read_gray(path: Path) -> GrayImage:
@@ -106,15 +115,15 @@ def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
     )
 
 
-def check_number(folder: Path, names: Sequence[str], model: Scene | None, fewest: int) -> None:
+def check_number(folder: Path, names: Sequence[str], model: Scene | None, min_images: int) -> None:
     """Check that there are images and points enough for a map, and that the folder has the images of the model."""
     if model is None:
         if len(names) < 3:
             raise InputError(f"{folder} holds {_images(len(names))}; a map needs at least 3 that overlap. Take more.")
         return
-    if model.num_images < max(2, fewest):
+    if model.num_images < max(2, min_images):
         raise InputError(
-            f"The model has {_images(model.num_images)} with a pose; a map needs at least {max(2, fewest)} that "
+            f"The model has {_images(model.num_images)} with a pose; a map needs at least {max(2, min_images)} that "
             "overlap. Pass a model with more, or none to have it made."
         )
     if len(model.point_observations.image_idx) == 0:
@@ -169,19 +178,21 @@ def _suggestion(folder: Path, names: Sequence[str], missing: list[str]) -> str:
 def check_images(folder: Path, names: Sequence[str], model: Scene | None, say: Callable[[str, int, int], None]) -> None:
     """Check that every image of the model, or of the folder, can be read, and has the size of its camera."""
     sizes = {} if model is None else _sizes(model)
-    used = list(names) if model is None else list(model.images.names)
+    used = names if model is None else model.images.names
+    work = [(folder / name, sizes.get(name, (0, 0))) for name in used]
+    map_work(_check_image, work, partial(say, "checking images"))
 
-    def check(name: str) -> None:
-        height, width = read_gray(folder / name).shape
-        size = sizes.get(name, (0, 0))
-        if size in ((0, 0), (width, height)):
-            return
-        remedy = "Pass the images the model was made from."
-        if size == (height, width):
-            remedy = "It is turned by 90 degrees: pass the images as they were stored when the model was made."
-        raise InputError(f"{folder / name} has {width}x{height} pixels, its camera {size[0]}x{size[1]}. {remedy}")
 
-    map_work(check, used, partial(say, "checking images"))
+def _check_image(image: tuple[Path, tuple[int, int]]) -> None:
+    """Check that an image can be read and has the size of its camera, where that is known."""
+    path, size = image
+    height, width = read_gray(path).shape
+    if size in ((0, 0), (width, height)):
+        return
+    remedy = "Pass the images the model was made from."
+    if size == (height, width):
+        remedy = "It is turned by 90 degrees: pass the images as they were stored when the model was made."
+    raise InputError(f"{path} has {width}x{height} pixels, its camera {size[0]}x{size[1]}. {remedy}")
 
 
 def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
@@ -191,4 +202,4 @@ def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
     return {name: of_camera[camera] for name, camera in zip(model.images.names, model.images.camera_idx, strict=True)}
 
 
-__all__ = ["check_images", "check_names", "check_number", "image_files", "images_left_out", "read_gray"]
+__all__ = ["check_images", "check_names", "check_number", "image_files", "image_reader", "images_left_out", "read_gray"]
