@@ -38,7 +38,7 @@ from groma.tracking.gates import StartGates
 from groma.tracking.map.map_scene import TRACKING
 
 _ASSEMBLY = replace(TRACKING, gauge="first_camera", loss=Cauchy(1.5))
-_SOLVER = SolverOptions(max_iterations=20, function_tolerance=1e-4, threads=1)
+_SOLVER = SolverOptions(max_iterations=50, function_tolerance=1e-5, threads=1)
 #: Depth, in units of the usual one, beyond which a point tells little of a position.
 FAR = 50.0
 #: Cost of a point that no measurement undercuts: a hundredth of the standard deviation.
