@@ -59,6 +59,14 @@ def turn_kernel(q, omega, left, step, out):
         out[j] *= k
 
 
+@kernel
+def minus_skew_kernel(x, y, z, row, B):
+    """Write -[v]x, the derivative of a turned vector, to three rows of B from ``row`` on."""
+    B[row, 0], B[row, 1], B[row, 2] = 0.0, z, -y
+    B[row + 1, 0], B[row + 1, 1], B[row + 1, 2] = -z, 0.0, x
+    B[row + 2, 0], B[row + 2, 1], B[row + 2, 2] = y, -x, 0.0
+
+
 @loop
 def turn_and_add_all(state, delta, left, out):
     """Turn the quaternions ``state[:, :4]`` by ``delta[:, :3]``, from the left or the right; add the last numbers."""
@@ -138,8 +146,13 @@ class Chart(Manifold):
         self.ambient_size, self.dof = self._SIZES[self.kind]
         self.factor_columns = self.ambient_size
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    def ambient(self, state: FloatArray) -> FloatArray:
+        """Return the state itself, which is what factors read."""
+        return self._checked_state(state)
+
+    def random(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Lines or planes 0.5 to 2 units from the origin."""
+        return self.from_ambient((random_lines if self.kind == "line" else random_planes)(rng, count))
 
     def _checked_state(self, state: FloatArray, name: str = "state") -> FloatArray:
         return as_rows(state, self.state_size, name)

@@ -104,9 +104,6 @@ class _PoseChart(Manifold):
     kind: ClassVar[str] = "pose"
     state_size, ambient_size, factor_columns, dof = 7, 12, 6, 6
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
-
     def ambient(self, state: FloatArray) -> FloatArray:
         """Row-major 3x4 matrices [R | t], (N, 12)."""
         state = as_rows(state, 7, "state")

@@ -99,9 +99,6 @@ class Unit3(Manifold):
     kind: ClassVar[str] = "direction"
     state_size, ambient_size, factor_columns, dof = 3, 3, 3, 2
 
-    def __repr__(self) -> str:
-        return "Unit3()"
-
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move unit vectors (N, 3) by angles (N, 2), radians, along the tangent basis."""
         state, delta = as_steps(state, delta, 3, 2)
