@@ -22,7 +22,7 @@ from groma.solver.damped_problem import Trial
 from groma.solver.linear.schur import MIN_DIAGONAL, invert_blocks
 from groma.solver.options import SolverOptions, first_damping
 from groma.solver.report import SolveReport, Stopwatch, note_costs
-from groma.solver.steps import States, size_of
+from groma.solver.steps import States, landmark_slopes
 from groma.solver.termination import Termination
 
 #: A variable whose damping exceeds this has reached its minimum to machine precision.
@@ -103,8 +103,8 @@ class IndependentBlocks:
         self._begun = True
 
     def largest_gradient(self) -> float:
-        """Return the largest component of the gradient."""
-        return max((float(np.abs(g).max(initial=0.0)) for g in self.equations.g_landmarks), default=0.0)
+        """Return the largest component of the gradient, each over the root of its curvature."""
+        return max(landmark_slopes(self.equations), default=0.0)
 
     def advance(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
         """Take the step of every variable from where they were linearised, if it lowers the variable's cost."""
@@ -236,7 +236,7 @@ class IndependentProblem:
         self._at_start = self._blocks.equations.costs
         cost = float(sum(self._at_start))
         self._outside = cost - _total(costs)
-        self._here = replace(self._here, cost=cost, costs=costs)
+        self._here = replace(self._here, cost=cost, costs=costs, num_hidden=self._blocks.equations.num_hidden)
         return self._here
 
     def linearize(self) -> None:  # noqa: D102
@@ -246,8 +246,8 @@ class IndependentProblem:
     def largest_gradient(self) -> float:  # noqa: D102
         return self._blocks.largest_gradient()
 
-    def size(self) -> float:  # noqa: D102
-        return size_of(self.states)
+    def is_curved(self) -> bool:  # noqa: D102
+        return any(bool(V.any()) for V in self._blocks.equations.V)
 
     def try_step(self) -> IndependentTrial:  # noqa: D102
         with self._watch("linearize"):

@@ -30,7 +30,7 @@ class Iteration:
     gain_ratio: float
     #: Euclidean length of the step in increments.
     step_norm: float
-    #: Largest component of the gradient at the start of the step.
+    #: Largest component of the gradient at the start of the step, over the root of its curvature.
     gradient_max: float
     #: Iterations of the linear solver; 0 for direct solvers.
     linear_iterations: int
