@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -306,29 +306,13 @@ def _is_coupled(problem: Problem) -> bool:
 
 
 def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss, relation_loss: Loss | None) -> AssemblyOptions:
+    """Return the options of the assembly: those of the same name, and what follows from the scene and the stage."""
     is_bal = _is_bal(scene)
-    refine = is_bal if options.refine_intrinsics is None else options.refine_intrinsics
-    return AssemblyOptions(
-        points=options.points,
-        lines=options.lines,
-        planes=options.planes,
-        refine_poses=options.refine_poses,
-        refine_intrinsics=refine,
-        refine_principal_point=options.refine_principal_point,
-        refine_rigs=options.refine_rigs,
-        line_chart=options.line_chart,
-        gauge=options.gauge,
-        point_sigma_px=options.point_sigma_px,
-        line_sigma_px=options.line_sigma_px,
-        line_end_correlation=options.line_end_correlation,
-        line_residual=options.line_residual,
-        plane_residual=options.plane_residual,
-        structure_form=options.structure_form,
-        structure_sigma_px=options.structure_sigma_px,
-        loss=loss,
-        relation_loss=relation_loss,
-        drop_behind=not is_bal,
-    )
+    shared = {item.name for item in fields(AssemblyOptions)} & {item.name for item in fields(options)}
+    chosen: dict[str, Any] = {name: getattr(options, name) for name in shared}
+    if options.refine_intrinsics is None:
+        chosen["refine_intrinsics"] = is_bal
+    return AssemblyOptions(**chosen | {"loss": loss, "relation_loss": relation_loss, "drop_behind": not is_bal})
 
 
 def _rmse_px(assembly: Assembly) -> dict[str, float]:

@@ -72,7 +72,7 @@ class PoseGraphResult:
     chi_square_before: FloatArray
     chi_square: FloatArray
     #: Motions beyond the scale of the loss after the adjustment; none for plain least squares.
-    doubtful: IntArray
+    outliers: IntArray
 
     @property
     def num_parts(self) -> int:
@@ -104,8 +104,8 @@ class PoseGraphResult:
             "linear_solver": report.linear_solver,
             "seconds": dict(report.seconds),
             "chi_square": {"before": float(self.chi_square_before.sum()), "after": float(self.chi_square.sum())},
-            "doubtful_motions": [
-                [int(ids[motions.first_idx[row]]), int(ids[motions.second_idx[row]])] for row in self.doubtful
+            "outlier_motions": [
+                [int(ids[motions.first_idx[row]]), int(ids[motions.second_idx[row]])] for row in self.outliers
             ],
             "warnings": list(self.warnings),
         }
@@ -158,7 +158,7 @@ def adjust_pose_graph(
         report=solution.report,
         chi_square_before=before,
         chi_square=after,
-        doubtful=np.flatnonzero(beyond),
+        outliers=np.flatnonzero(beyond),
     )
 
 

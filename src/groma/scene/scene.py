@@ -346,10 +346,8 @@ class Scene:
         """
         chosen = rows_of("image_idx", image_idx, self.num_images, "images")
         kept_frames, frame_idx = np.unique(self.images.frame_idx[chosen], return_inverse=True)
-        tables = {
-            "frames": self.frames.take(kept_frames),
-            "images": self.images.take(chosen).replace(frame_idx=frame_idx),
-        }
+        images = self.images.take(chosen).replace(frame_idx=frame_idx)
+        tables = {"frames": self.frames.take(kept_frames), "images": images}
         new_index = {
             "frames": new_index_of(kept_frames, self.num_frames),
             "images": new_index_of(chosen, self.num_images),
