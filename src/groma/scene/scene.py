@@ -85,12 +85,9 @@ class Scene:
 
     def __post_init__(self) -> None:
         for name, column, side, target in references(Scene):
-            index = getattr(getattr(self, name), column)
-            if not len(index):
-                continue
-            where = f"{name}.{column}" if side is None else f"{name}.{column}[:, {side}]"
-            index = index if side is None else index[:, side]
-            check_index(where, index, len(getattr(self, target)), target.replace("_", " "))
+            if len(index := getattr(getattr(self, name), column)):
+                where, index = (column, index) if side is None else (f"{column}[:, {side}]", index[:, side])
+                check_index(f"{name}.{where}", index, len(getattr(self, target)), target.replace("_", " "))
         is_camera = self.sensors.kind == CAMERA
         check_index("sensors.camera_idx", self.sensors.camera_idx[is_camera], len(self.cameras), "cameras")
         check_quaternions("frames.rig_from_world", self.frames.rig_from_world)

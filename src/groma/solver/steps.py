@@ -89,12 +89,19 @@ def share_of_states(step: FloatArray, states: FloatArray) -> float:
     return float(np.sqrt(np.max(step[moved] / np.maximum(states[moved], np.finfo(float).tiny))))
 
 
-def relative_length(layout: Layout, states: States, step: Step) -> float:
-    """Return :func:`share_of_states` of a step of all free variables."""
-    squares, sizes = np.zeros(3), np.zeros(3)
-    for manifold, name, delta in parts_of(layout, step):
+def sizes_of(layout: Layout, states: States) -> FloatArray:
+    """Return :func:`squares_of_states` of all free variables together."""
+    members = [member.group for kept in layout.kept for member in kept.members]
+    names = [*members, *(group.group for group in layout.eliminated)]
+    variables = layout.problem.variables
+    return sum((squares_of_states(variables[name].manifold, states[name]) for name in names), np.zeros(3))
+
+
+def relative_length(layout: Layout, sizes: FloatArray, step: Step) -> float:
+    """Return :func:`share_of_states` of a step of all free variables, for states of these :func:`sizes_of`."""
+    squares = np.zeros(3)
+    for manifold, _, delta in parts_of(layout, step):
         squares += squares_of_step(manifold, delta)
-        sizes += squares_of_states(manifold, states[name])
     return share_of_states(squares, sizes)
 
 
