@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 
 import cv2
-import numpy as np
 
-from groma.errors import GromaError, InputError
+from groma.bounded.images import decoded
+from groma.errors import FileFormatError, GromaError, InputError
 from groma.execution import map_work
 from groma.features.images import GrayImage, to_gray
 from groma.io.endings import IMAGES, VIDEOS
@@ -69,9 +69,12 @@ def read_gray(path: Path) -> GrayImage:
         # Decoders fill what is missing with grey. A preview inside the file has both marks, so the last ones count.
         raise InputError(f"{path} ends in the middle of the picture (JPEG without its end). Copy it again.")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = _decoded(content, flags)
-    if image is None:  # kinds that are not turned into grey while they are read: floating point TIFF
-        image = _decoded(content, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        image = decoded(content, flags)
+        if image is None:  # kinds that are not turned into grey while they are read: floating point TIFF
+            image = decoded(content, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    except FileFormatError as error:
+        raise InputError(f"{path}: {error}") from error
     try:
         if image is not None:
             return to_gray(image)
@@ -81,17 +84,6 @@ def read_gray(path: Path) -> GrayImage:
         f"{path} cannot be read as an image: it is damaged or of an unknown kind. Replace it, or leave it out of the "
         "folder and the model."
     )
-
-
-def _decoded(content: bytes, flags: int) -> np.ndarray | None:
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        return cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
-    except cv2.error:
-        return None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
 
 
 def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
