@@ -15,6 +15,7 @@ from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.pose.estimate import PoseEstimate
 from groma.tracking.pose.verification import PoseVerification
+from groma.tracking.stopwatch import Stopwatch
 
 OPTIONS = TrackOptions(num_points=250, num_features=500)
 
@@ -59,25 +60,14 @@ def test_what_is_worked_out_is_taken_up_before_a_frame_is_searched():
     for frame in _room.frames("rgbd", _room.poses(14)):
         tracker.process(frame)
     mapper, present = tracker._mapper, tracker._present
-    mapper.keep_present(present, _NoWatch())
+    mapper.keep_present(present, Stopwatch())
     made = len(tracker.map.keyframes)
-    assert tracker.map.last.timestamp == present.data.frame.timestamp
+    assert present.data is not None and tracker.map.last.timestamp == present.data.frame.timestamp
     assert mapper.busy
-    mapper.keep_present(present, _NoWatch())
+    mapper.keep_present(present, Stopwatch())
     assert len(tracker.map.keyframes) == made
     assert not mapper.busy
     tracker.finish()
-
-
-class _NoWatch:
-    def __call__(self, _stage):
-        return self
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_error):
-        return None
 
 
 def test_features_are_described_in_all_parts_of_an_image():
