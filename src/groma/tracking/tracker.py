@@ -31,7 +31,7 @@ from groma.tracking.frame.checks import FrameChecks
 from groma.tracking.frame.coarse_alignment import turned, turned_prediction
 from groma.tracking.frame.features import FrameFeatures, grid_pixels
 from groma.tracking.map.keyframes import Followed, keyframe_nearby, wants_keyframe
-from groma.tracking.map.points import agreeing, find_again
+from groma.tracking.map.points import find_again
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.outcome import (
@@ -46,7 +46,7 @@ from groma.tracking.outcome import (
     TrackedFrame,
     TrackResult,
 )
-from groma.tracking.pose.estimate import GATE, PoseEstimate
+from groma.tracking.pose.estimate import PoseEstimate
 from groma.tracking.pose.following import Attempt, follow_frame
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
@@ -181,11 +181,7 @@ class Tracker:
         if found is not None and not (
             attempt.trusted and unconfirmed is not None and self._verification.score(unconfirmed) >= found.score
         ):
-            pose, most = found.estimate.pose, GATE * self.options.point_sigma_px
-            points = agreeing(self.map, self.camera, attempt.followed.points, pose, most)
-            more = promote(self.map, found, data)
-            points = points.joined(more.take(~np.isin(more.index, points.index)))
-            followed = Followed(points, found.lines)
+            followed = Followed(promote(self.map, found, data), found.lines)
             return replace(attempt, estimate=found.estimate, followed=followed), found
         if unconfirmed is not None and (attempt.trusted or self._verification.confirms(self.map, data, unconfirmed)):
             # The new keyframe may have moved the map.
