@@ -96,7 +96,7 @@ def contributions(
     InputError
         If the scene has no points to begin with, or no image of the reference.
     """
-    options = options or AdjustOptions()
+    options = replace(options or AdjustOptions(), check_lens=False)
     if not (options.points and scene.num_point_observations):
         raise InputError(
             "Contributions are measured against an adjustment by points alone, and there are no points. "
