@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -222,14 +223,28 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
     adjusted, relations = drop_failed_relations(disassemble(scene, problem), problem)
     if any(map(len, moved)):
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
+    outcome = _outcome(scene, assembly, problem, report, relations, stage_entries(stages, reports))
+    if options.check_lens and (lens := unmodelled_distortion(problem, options.threads)):
+        outcome = replace(outcome, warnings=(*outcome.warnings, lens))
+    return AdjustResult(adjusted, outcome, problem)
+
+
+def _outcome(
+    scene: Scene,
+    assembly: Assembly,
+    problem: Problem,
+    report: SolveReport,
+    relations: dict[str, dict[str, int]],
+    stages: tuple[dict[str, Any], ...],
+) -> AdjustReport:
+    """Say in numbers what an adjustment did: from the problem of the assembly to the one that was solved."""
     before, after = (squared_residuals_px(replace(assembly, problem=p)) for p in (assembly.problem, problem))
-    counts = assembly.num_measurements
-    lens = [said] if options.check_lens and (said := unmodelled_distortion(problem, options.threads)) else []
-    outcome = AdjustReport(
+    counts, start = assembly.num_measurements, assembly.problem.variables
+    return AdjustReport(
         num_images=scene.num_images,
-        num_points=scene.num_points if "points" in assembly.problem.variables else 0,
-        num_lines=scene.num_lines if "lines" in assembly.problem.variables else 0,
-        num_planes=scene.num_planes if "planes" in assembly.problem.variables else 0,
+        num_points=scene.num_points if "points" in start else 0,
+        num_lines=scene.num_lines if "lines" in start else 0,
+        num_planes=scene.num_planes if "planes" in start else 0,
         num_observations=sum(len(group.factor) for group in assembly.groups if group.observes),
         num_measurements={name: count for name, count in counts.items() if name not in _COUNTED_OTHERWISE},
         rmse_px={kind: {"before": _rms(before[kind]), "after": _rms(after[kind])} for kind in before},
@@ -237,10 +252,9 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         sigma0=_sigma0(replace(assembly, problem=problem)),
         solve=report,
         relations=relations,
-        stages=stage_entries(stages, reports),
-        warnings=(*assembly.notes, *not_converged(report), *report.warnings, *lens),
+        stages=stages,
+        warnings=(*assembly.notes, *not_converged(report), *report.warnings),
     )
-    return AdjustResult(adjusted, outcome, problem)
 
 
 def _is_bal(scene: Scene) -> bool:

@@ -22,7 +22,7 @@ from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.solver.observability.diagnosis import Diagnosis
 from groma.viz.pictures import ImageFiles
-from groma.viz.report.page import write_report
+from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.tables import contributions_card
 
 
@@ -122,11 +122,13 @@ class MapResult:
                 self.report,
                 images,
                 title,
-                outcomes=self.outcomes,
-                explanation=self.explanation,
-                warnings=self.warnings,
-                diagnosis=numbers.get("diagnosis"),
-                cards=contributions_card(numbers.get("contributions")),
+                PageContents(
+                    self.outcomes,
+                    self.explanation,
+                    self.warnings,
+                    numbers.get("diagnosis"),
+                    contributions_card(numbers.get("contributions")),
+                ),
             )
             (draft / "summary.json").write_text(json_text(numbers), encoding="utf-8")
 

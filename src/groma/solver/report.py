@@ -155,8 +155,8 @@ def warn_of_oddities(report: SolveReport) -> None:
         )
     if report.num_underdetermined_landmarks:
         report.warnings.append(
-            "The observations leave a direction of "
-            f"{counted(report.num_underdetermined_landmarks, 'landmarks')} open; there nothing was moved."
+            f"{counted(report.num_underdetermined_landmarks, 'landmarks')} with an unobservable direction; along it "
+            "nothing was moved."
         )
     if report.num_residuals < report.num_unknowns:
         report.warnings.append(

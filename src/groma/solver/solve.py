@@ -23,10 +23,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.execution import available_cores
 from groma.problem.lay_out import lay_out
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
-from groma.problem.parallel import FACTORS_FOR_THREADS, Workers, available_cores
+from groma.problem.parallel import FACTORS_FOR_THREADS, Workers
 from groma.problem.problem import Problem
 from groma.solver.damped_problem import DampedProblem, T
 from groma.solver.independent import STRETCH_GAIN_RATIO, IndependentProblem, stretch_factor

@@ -158,9 +158,8 @@ class Tracker:
         with watch("turn"):
             predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
         estimate, followed = follow_frame(
-            self.map, self.camera, self.options, present.data, data, present.followed, present.pose, predicted,
-            prior_sigma, watch,
-        )  # fmt: skip
+            self.map, present.data, data, present.followed, present.pose, predicted, prior_sigma, watch
+        )
         if estimate is None:
             return Attempt(predicted, prior_sigma, followed=followed)
         trusted = self._verification.trusts(self.map, data, estimate)

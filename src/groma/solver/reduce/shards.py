@@ -27,11 +27,12 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import ProblemError
+from groma.execution import available_cores
 from groma.factors.contract import Factor
 from groma.problem.lay_out import lay_out
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
-from groma.problem.parallel import Workers, available_cores
+from groma.problem.parallel import Workers
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.damped_problem import Trial
