@@ -144,8 +144,7 @@ def _problem_of(scene: Scene, told: AdjustOptions) -> Problem:
         refine_intrinsics=bool(told.refine_intrinsics),
     )
     problem, ended_with = assemble(scene, assembly).problem, last_loss(told)
-    factors = [with_loss(factor, ended_with) for factor in problem.factors]
-    return Problem(problem.variables, factors)
+    return with_loss(problem, ended_with)
 
 
 def last_loss(told: AdjustOptions) -> Loss:
