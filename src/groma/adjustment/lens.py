@@ -52,7 +52,7 @@ class LensGates:
         0.1,
         "share",
         "of the residuals' variance that distortion explains and that is told",
-        "chosen on rectified scenes",
+        "convention: a tenth",
     )
     rings: int = gate(16, "rings", "of equal area around the principal point", "convention: as many as a histogram has")
     steps: int = gate(4, "steps", "with free distortion", "cost: the first brings most")
