@@ -78,6 +78,16 @@ def test_the_unit_of_length_does_not_matter(start, exponent):
 
 
 @pytest.mark.parametrize("exponent", [-12, 12])
+def test_what_is_known_does_not_depend_on_the_unit_of_length(start, near, exponent):
+    unit = 10.0**exponent
+    there = adjust(start.transformed(Similarity(scale=unit)), OPTIONS)
+    here, far = near.pose_uncertainty(), there.pose_uncertainty()
+    assert far["center"]["median"] == pytest.approx(unit * here["center"]["median"], rel=1e-6)
+    assert far["rotation_deg"]["median"] == pytest.approx(here["rotation_deg"]["median"], rel=1e-6)
+    assert [f.sentence for f in there.diagnose().findings] == [f.sentence for f in near.diagnose().findings]
+
+
+@pytest.mark.parametrize("exponent", [-12, 12])
 def test_the_unit_of_length_ends_no_solve_early(exponent):
     """Two poses and the motion between them, turns held: what is small in numbers is not small for the scene."""
     unit = 10.0**exponent
