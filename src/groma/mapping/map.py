@@ -49,7 +49,7 @@ from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.unused import without_unused
 from groma.scene import Scene
-from groma.scene.local_frame import local_frame
+from groma.scene.local_frame import usual_frame
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def map_images(
     if model is not None and options.camera_model is not None:
         model = model.replace(cameras=model.cameras.with_model(options.camera_model))
         options = dataclasses.replace(options, refine_intrinsics=options.refine_intrinsics is not False)
-    near = None if model is None else local_frame(model)
+    near = None if model is None else usual_frame(model)
     if model is not None and near is not None:
         model = model.transformed(near)
     check_number(folder, names, model, options.lines.min_images)
