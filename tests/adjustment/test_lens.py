@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Lens distortion that cameras lack: noticed and named where it is, and only there; cameras in another model."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import groma
-from groma.adjustment.lens import radial_field, unmodelled_distortion
+from groma.adjustment.lens import LensGates, radial_field, unmodelled_distortion
 from groma.cameras import in_model, model
 from groma.cli.app import app
 from groma.errors import InputError
@@ -71,6 +73,14 @@ def test_a_calibration_that_is_held_wrongly_is_to_be_refined(scene):
     assert any("--refine-intrinsics" in text for text in groma.adjust(held).report.warnings)
     freed = groma.adjust(held, groma.AdjustOptions(refine_intrinsics=True))
     assert not any("lens" in text for text in freed.report.warnings)
+
+
+def test_a_part_of_the_points_tells_a_lens_as_well(scene):
+    some = LensGates(most=2_000)
+    assert scene.num_point_observations > 3 * some.most
+    bent, plain = (groma.adjust(s, POINTS).problem for s in (through_lens(scene, -0.05), scene))
+    assert "--camera-model OPENCV" in unmodelled_distortion(bent, gates=some)
+    assert unmodelled_distortion(plain, gates=replace(some, false_alarm=0.999)) is None
 
 
 def test_lines_do_not_hide_a_lens():

@@ -55,6 +55,7 @@ class LensGates:
         "convention: a tenth",
     )
     rings: int = gate(16, "rings", "of equal area around the principal point", "convention: as many as a histogram has")
+    most: int = gate(200_000, "observations", "that a lens is estimated from", "cost: more tell no more")
     steps: int = gate(4, "steps", "with free distortion", "cost: the first brings most")
 
 
@@ -79,8 +80,8 @@ def unmodelled_distortion(problem: Problem, threads: int | None = None, gates: L
     if not any(radial_field(f, problem, gates) for f in seen):
         return None
     options = SolverOptions(max_iterations=gates.steps, threads=threads)
-    begun = _of_points(problem)
-    if len(begun.factors) < len(problem.factors):  # without lines and planes, points alone find another minimum
+    begun = _of_points(problem, gates.most)
+    if begun.num_residuals < problem.num_residuals:  # a part of the measurements finds another minimum
         begun = solve(begun, options).problem
     freed = solve(_with_free_lens(begun, groups), options).problem
     before, after = (_median_px([f for f in p.factors if isinstance(f, PointReprojection)], p) for p in (begun, freed))
@@ -126,10 +127,19 @@ def _may_lack(group: Variables, model: CameraModel) -> bool:
     return wider is not None and (wider != model.name or (free is not None and not free.any()))
 
 
-def _of_points(problem: Problem) -> Problem:
-    """Return the problem without what refers to lines, planes and directions, which have no say in a lens."""
-    flat = {name for name, group in problem.variables.items() if group.manifold.kind in ("line", "plane", "direction")}
-    kept = [f for f in problem.factors if not any(ref.group in flat for _, ref in f.references())]
+def _of_points(problem: Problem, most: int) -> Problem:
+    """Return the problem without what refers to lines, planes and directions, and with as many points as are enough."""
+    kinds = {name: group.manifold.kind for name, group in problem.variables.items()}
+    kept = [
+        factor for factor in problem.factors
+        if not any(kinds[ref.group] in ("line", "plane", "direction") for _, ref in factor.references())
+    ]  # fmt: skip
+    stride = -(-sum(map(len, kept)) // most)
+    if stride > 1:
+        for number, factor in enumerate(kept):
+            for _, ref in factor.references():
+                if kinds[ref.group] == "point":
+                    kept[number] = factor.take(np.flatnonzero(ref.index % stride == 0))
     return Problem(problem.variables, kept)
 
 
