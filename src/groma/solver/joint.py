@@ -38,9 +38,9 @@ class JointProblem:
         self._layout, self._watch = layout, watch
         self._reduction = Reduction(self.equations, self._system, self.linear, watch)
         self._damping = damping_from(first_damping(layout.problem.variables, options))
-        self._sizes = sizes_of(layout, states)
         inputs = self.equations.prepare(states)
         self._at_start: list[float] = []
+        self._sizes = sizes_of(layout, states)
         self._here = JointTrial(cost=np.nan, states=states, inputs=inputs, costs=[], hidden=[])
 
     @property

@@ -89,19 +89,20 @@ def share_of_states(step: FloatArray, states: FloatArray) -> float:
     return float(np.sqrt(np.max(step[moved] / np.maximum(states[moved], np.finfo(float).tiny))))
 
 
+def sizes_of(layout: Layout, states: States) -> FloatArray:
+    """Return :func:`squares_of_states` of all free variables together."""
+    members = [member.group for kept in layout.kept for member in kept.members]
+    names = [*members, *(group.group for group in layout.eliminated)]
+    variables = layout.problem.variables
+    return sum((squares_of_states(variables[name].manifold, states[name]) for name in names), np.zeros(3))
+
+
 def relative_length(layout: Layout, sizes: FloatArray, step: Step) -> float:
-    """Return :func:`share_of_states` of a step of all free variables, which have :func:`sizes_of`."""
+    """Return :func:`share_of_states` of a step of all free variables, for states of these :func:`sizes_of`."""
     squares = np.zeros(3)
     for manifold, _, delta in parts_of(layout, step):
         squares += squares_of_step(manifold, delta)
     return share_of_states(squares, sizes)
-
-
-def sizes_of(layout: Layout, states: States) -> FloatArray:
-    """Return :func:`squares_of_states` of all free variables (3,). Once in a solve is enough: they hardly change."""
-    names = [member.group for kept in layout.kept for member in kept.members] + [e.group for e in layout.eliminated]
-    variables = layout.problem.variables
-    return np.sum([squares_of_states(variables[name].manifold, states[name]) for name in names], axis=0)
 
 
 def parts_of(layout: Layout, step: Step) -> Iterator[tuple[Manifold, str, FloatArray]]:
