@@ -121,6 +121,14 @@ def test_odometry_keeps_its_weight_unless_told(rng):
     assert 4 not in adjust_pose_graph(graph, PoseGraphOptions(loss="geman_mcclure")).outliers
 
 
+def test_a_graph_that_did_not_converge_says_so(rng):
+    start = disturbed(rng, ring(rng, noise=0.02)[1], 0.3)
+    short = adjust_pose_graph(start, PoseGraphOptions(max_iterations=1))
+    assert not short.report.converged and short.warnings[0].startswith("Not converged after 1 step.")
+    assert short.summary()["warnings"] == list(short.warnings)
+    assert adjust_pose_graph(start, PoseGraphOptions(max_iterations=200)).warnings == ()
+
+
 def test_a_graph_without_motions_is_refused():
     poses = GraphPoses(np.arange(2), np.tile([0.0, 0, 0, 1, 0, 0, 0], (2, 1)))
     with pytest.raises(InputError, match="no motions"):

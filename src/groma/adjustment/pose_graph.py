@@ -20,7 +20,7 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.adjustment.report import Progress
+from groma.adjustment.report import Progress, not_converged
 from groma.errors import InputError
 from groma.factors.contract import Ref
 from groma.factors.losses import Loss, Trivial
@@ -82,10 +82,10 @@ class PoseGraphResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences for the user."""
+        said = (*not_converged(self.report), *self.report.warnings)
         if self.num_parts == 1:
-            return tuple(self.report.warnings)
-        parts = f"The graph falls into {self.num_parts} parts; each keeps the frame of its held or first pose."
-        return (*self.report.warnings, parts)
+            return said
+        return (*said, f"The graph falls into {self.num_parts} parts; each keeps the frame of its held or first pose.")
 
     def summary(self) -> dict[str, Any]:
         """Return all numbers as plain values, as ``groma adjust --json`` writes them."""

@@ -130,8 +130,8 @@ def largest_slope(gradient: FloatArray, curvature: FloatArray) -> float:
 
 def landmark_slopes(equations: NormalEquations) -> list[float]:
     """Return :func:`largest_slope` of each group of landmarks."""
-    groups = equations.layout.eliminated
-    curvatures = [
-        np.einsum("nii->ni", V.reshape(e.count, e.dof, e.dof)) for e, V in zip(groups, equations.V, strict=True)
-    ]
-    return [largest_slope(g, c.reshape(-1)) for g, c in zip(equations.g_landmarks, curvatures, strict=True)]
+    slopes = []
+    for group, V, gradient in zip(equations.layout.eliminated, equations.V, equations.g_landmarks, strict=True):
+        curvature = V.reshape(group.count, group.dof**2)[:, :: group.dof + 1]
+        slopes.append(largest_slope(gradient.reshape(group.count, group.dof), curvature))
+    return slopes
