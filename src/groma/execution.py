@@ -99,6 +99,12 @@ def num_workers() -> int:
     return 1 if crew is None else crew.workers
 
 
+def num_threads() -> int:
+    """Return how many of them are threads of this process, one if they are not."""
+    crew = _CREW.get()
+    return crew.workers if crew is not None and crew.shares_memory else 1
+
+
 def map_work(
     function: Callable[[_Item], _Result],
     items: Sequence[_Item],
@@ -145,19 +151,20 @@ def map_work(
     return results
 
 
-def map_ranges(function: Callable[[slice], Any], count: int, size: int) -> None:
-    """Call a function that writes into arrays with slices of ``size`` rows that cover ``count``.
+def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
+    """Do what :func:`map_work` does in threads, if that is what :func:`work_with` has given, else in this thread.
 
-    The rows of a slice must depend on no other row. Only threads share the arrays, so that other executors leave the
-    work to this thread.
+    It is for pieces that share more memory than they are worth: they are not sent to other processes.
     """
-    parts = [slice(first, min(first + size, count)) for first in range(0, count, size)]
-    crew = _CREW.get()
-    if crew is not None and crew.shares_memory:
-        map_work(function, parts)
-    else:
-        for part in parts:
-            function(part)
+    return map_work(function, items) if num_threads() > 1 else [function(item) for item in items]
+
+
+def map_ranges(function: Callable[[slice], Any], count: int, size: int) -> None:
+    """Call a function that writes into arrays with slices of ``size`` rows that cover ``count``, in threads.
+
+    The rows of a slice must depend on no other row.
+    """
+    map_in_threads(function, [slice(first, min(first + size, count)) for first in range(0, count, size)])
 
 
 def _each(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
@@ -184,4 +191,12 @@ def _num_workers(executor: Any) -> int:
     return max(1, sum(client.nthreads().values())) if client is not None else available_cores()
 
 
-__all__ = ["available_cores", "map_ranges", "map_work", "num_workers", "work_with"]
+__all__ = [
+    "available_cores",
+    "map_in_threads",
+    "map_ranges",
+    "map_work",
+    "num_threads",
+    "num_workers",
+    "work_with",
+]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _measured import with_measurements
 
 import groma
 from groma.adjustment.assemble import TERMS, AssemblyOptions, assemble
@@ -18,7 +19,6 @@ from groma.factors.priors.position_prior import PositionPrior
 from groma.io.archive import read_archive
 from groma.problem.residuals import residuals_of
 from groma.scene import Cameras, Relations, Similarity
-from groma.scene.synthetic.measured import with_measurements
 from groma.scene.synthetic.scenes import holistic
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve

@@ -186,6 +186,54 @@ EVO_RPE = [  # rmse of the translation, then of the rotation in degrees
 ]
 
 
+def test_without_times_lines_belong_together():
+    """KITTI has no times: the numbers of its lines must not be taken for seconds."""
+    truth = wander(40)
+    numbered = truth.replace(timestamps=np.arange(40.0))
+    for ours, theirs in ((truth, numbered), (numbered, truth), (numbered, numbered)):
+        scores = score_trajectory(ours, theirs, "none")
+        assert scores.num_poses == 40 and scores.association == "line" and scores.warnings == ()
+        assert scores.ate.max < 1e-12
+    assert score_trajectory(truth, truth).association == "time"
+    # 36 of 40 poses: nobody knows which lines they are
+    few = score_trajectory(truth.take(np.arange(36)), numbered)
+    assert few.num_poses == 4 and few.association == "time"
+    assert "Only 4 of 36 and 40" in few.warnings[0] and "REF has no times" in few.warnings[0]
+    assert few.to_dict()["warnings"] == list(few.warnings)
+    shifted = truth.replace(timestamps=truth.timestamps + 3.0)
+    assert "units of time" in score_trajectory(truth, shifted).warnings[0]
+    assert score_trajectory(truth.take(np.arange(0, 40, 3)), truth).warnings == ()  # the shorter one counts
+
+
+def test_unrelated_trajectories_are_noticed():
+    """Others agree in nothing; one that is noisy, or badly scaled, is not taken for another."""
+    truth = wander(60, seed=1)
+    rng = np.random.default_rng(0)
+    turned = truth.world_from_cam.copy()
+    turned[:, :4] = quaternion.normalize(rng.normal(size=(60, 4)))
+    turned[:, 4:] = rng.normal(size=(60, 3))
+    assert "unrelated" in score_trajectory(truth.replace(world_from_cam=turned), truth, "sim3").warnings[0]
+    noisy = truth.world_from_cam.copy()
+    noisy[:, 4:] += rng.normal(0, 2.0, (60, 3))
+    assert score_trajectory(truth.replace(world_from_cam=noisy), truth).warnings == ()
+    small = truth.replace(world_from_cam=apply_similarity(Similarity(0.1), truth.world_from_cam))
+    assert score_trajectory(small, truth, "se3").warnings == ()
+
+
+def test_the_command_warns_and_finds_times_beside_the_reference(tmp_path):
+    truth = wander(40)
+    write_trajectory(truth.take(np.arange(36)), tmp_path / "est.txt")
+    write_trajectory(truth, tmp_path / "poses.txt", "kitti")
+    words = ["evaluate", "trajectory", str(tmp_path / "est.txt"), str(tmp_path / "poses.txt")]
+    alone = CliRunner().invoke(app, words)
+    assert alone.exit_code == 0 and "Only 4 of 36" in alone.stderr and "--times" in alone.stderr
+    for name, more in (("clock.txt", ["--times", str(tmp_path / "clock.txt")]), ("times.txt", [])):
+        (tmp_path / name).write_text("".join(f"{time!r}\n" for time in truth.timestamps.tolist()))
+        found = CliRunner().invoke(app, words + more)
+        assert found.exit_code == 0 and "36 poses associated by time of 36 and 40" in found.stdout
+        assert "warning" not in found.stderr
+
+
 @pytest.fixture(scope="module")
 def published(shared_data):
     folder = shared_data / "trajectories"

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _comparison import equal, near
 from _models import rig_scene
 
 from groma.errors import FileFormatError, GromaError, InputError, OutputError
@@ -34,7 +35,6 @@ from groma.io import (
     write_tum,
 )
 from groma.scene import Cameras, Scene
-from groma.scene.compare import equal, near
 from groma.scene.synthetic.scenes import holistic
 
 BAL = Path(__file__).parents[1] / "data" / "bal"

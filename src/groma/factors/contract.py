@@ -101,18 +101,22 @@ class Factor(ABC):
     type_name: ClassVar[str] = ""
     #: The variables touched, in order.
     slots: ClassVar[tuple[Slot, ...]]
+    #: Rows m of one residual; where they are not the same for all factors of a type, it overrides ``residual_size``.
+    rows: ClassVar[int]
+    #: How many of them are independent; 0: all.
+    independent_rows: ClassVar[int] = 0
     #: Which motions of the world it does not notice; None: not declared, and not checked.
     invariance: ClassVar[Invariance | None] = Invariance()
 
     @property
-    @abstractmethod
     def residual_size(self) -> int:
         """Rows m of one residual."""
+        return self.rows
 
     @property
     def residual_rank(self) -> int:
         """Independent rows of one residual: less than ``residual_size`` where rows depend on each other."""
-        return self.residual_size
+        return self.independent_rows or self.residual_size
 
     def references(self) -> tuple[tuple[Slot, Ref], ...]:
         """The slots that are present, each with the variables it refers to, in order."""

@@ -32,10 +32,10 @@ from groma.features.segments import Segments
 class ExternalMatches:
     """Segments and matches by image name."""
 
+    #: End points (N, 4) by image name; empty where the file has matches only.
     segments: Mapping[str, npt.NDArray[np.float64]]
-    """End points (N, 4) by image name; empty where the file has matches only."""
+    #: Matches by pair of image names.
     matches: Mapping[tuple[str, str], LineMatches]
-    """Matches by pair of image names."""
 
     def match(self, first: str, second: str) -> LineMatches:
         """Matches of a pair in the order asked for; none where the file has none."""

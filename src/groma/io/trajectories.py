@@ -162,6 +162,13 @@ def write_tum(trajectory: Trajectory, path: str | os.PathLike[str], force: bool 
     write_trajectory(trajectory, path, "tum", force)
 
 
+def read_times(path: str | os.PathLike[str]) -> FloatArray:
+    """Read times (N,), seconds, one a line, as they lie beside the poses of KITTI."""
+    place = existing(path)
+    with reading(place, "times"):
+        return _numbers(place, read_lines(place), 1)[0][:, 0]
+
+
 # ---------------------------------------------------------------------------------------------------------- Formats
 
 
@@ -259,6 +266,7 @@ for _format in (
 __all__ = [
     "Trajectory",
     "TrajectoryFormat",
+    "read_times",
     "read_trajectory",
     "read_tum",
     "register_trajectory_format",

@@ -44,6 +44,15 @@ def image_files(folder: Path) -> list[Path]:
     return files
 
 
+def image_reader(folder: Path, names: Sequence[str]) -> Callable[[int], GrayImage]:
+    """Return what reads the images of some names by their number."""
+    return partial(_read_by_number, folder, names)
+
+
+def _read_by_number(folder: Path, names: Sequence[str], i: int) -> GrayImage:
+    return read_gray(folder / names[i])
+
+
 def read_gray(path: Path) -> GrayImage:
     """Read an image of any type as grey levels.
 
@@ -98,15 +107,15 @@ def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
     )
 
 
-def check_number(folder: Path, names: Sequence[str], model: Scene | None, fewest: int) -> None:
+def check_number(folder: Path, names: Sequence[str], model: Scene | None, min_images: int) -> None:
     """Check that there are images and points enough for a map, and that the folder has the images of the model."""
     if model is None:
         if len(names) < 3:
             raise InputError(f"{folder} holds {_images(len(names))}; a map needs at least 3 that overlap. Take more.")
         return
-    if model.num_images < max(2, fewest):
+    if model.num_images < max(2, min_images):
         raise InputError(
-            f"The model has {_images(model.num_images)} with a pose; a map needs at least {max(2, fewest)} that "
+            f"The model has {_images(model.num_images)} with a pose; a map needs at least {max(2, min_images)} that "
             "overlap. Pass a model with more, or none to have it made."
         )
     if len(model.point_observations.image_idx) == 0:
@@ -185,4 +194,4 @@ def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
     return {name: of_camera[camera] for name, camera in zip(model.images.names, model.images.camera_idx, strict=True)}
 
 
-__all__ = ["check_images", "check_names", "check_number", "image_files", "images_left_out", "read_gray"]
+__all__ = ["check_images", "check_names", "check_number", "image_files", "image_reader", "images_left_out", "read_gray"]

@@ -15,6 +15,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import ProblemError
 from groma.factors.contract import Factor
+from groma.problem._numbers import refuse_unusable_numbers
 from groma.problem.variables import Variables
 
 #: Kinds of variables that are plain numbers; a slot of kind ``vector`` takes any of them.
@@ -33,6 +34,7 @@ class Problem:
         object.__setattr__(self, "factors", tuple(factors))
         for factor in self.factors:
             self._check(factor)
+            refuse_unusable_numbers(factor, self.variables)
 
     def _check(self, factor: Factor) -> None:
         """Check that every reference of a factor meets an existing variable of the right kind."""

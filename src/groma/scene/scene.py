@@ -44,7 +44,7 @@ _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
-    """Everything known about a scene; see the module. Compare scenes with :mod:`groma.scene.compare`."""
+    """Everything known about a scene; see the module."""
 
     #: Calibrations.
     cameras: Cameras = field(default_factory=Cameras)

@@ -73,7 +73,7 @@ def text_column() -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Equally long columns; see the module. Compare tables with :func:`groma.scene.compare.equal`."""
+    """Equally long columns; see the module."""
 
     #: What one row is called in messages.
     noun: ClassVar[str] = "row"

@@ -21,9 +21,9 @@ class SolverOptions:
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in an accepted step.
     function_tolerance: float = 1e-6
-    #: Stop when no component of the gradient exceeds this.
+    #: Stop when no component of the gradient, over the root of its diagonal in the normal equations, exceeds this.
     gradient_tolerance: float = 1e-10
-    #: Stop when a step is shorter than this fraction of the state.
+    #: Stop when the lengths in a step, its turns and all else are below this fraction of those of the states.
     step_tolerance: float = 1e-10
     #: ``levenberg_marquardt``, or ``gauss_newton`` for steps without damping: for problems that are well determined and
     #: start near their minimum. Where the system is singular, or a step does not lower the cost, it stops.

@@ -52,18 +52,18 @@ FEATURES = 6  # descriptor distance; points for, against, near one only; overlap
 class WideBaselineOptions:
     """What counts as a match."""
 
+    #: Candidates further apart are not looked at.
     max_descriptor_distance: float = 0.9
-    """Candidates further apart are not looked at."""
+    #: Smallest epipolar overlap, as a share of the smaller extent; only with a fundamental matrix.
     min_overlap: float = 0.3
-    """Smallest epipolar overlap, as a share of the smaller extent; only with a fundamental matrix."""
+    #: How far outside the epipolar beam an end point may lie, pixels.
     beam_tolerance: float = 2.0
-    """How far outside the epipolar beam an end point may lie, pixels."""
+    #: Points within this distance of a segment support it, pixels.
     reach: float = 40.0
-    """Points within this distance of a segment support it, pixels."""
+    #: Smallest score of a match.
     min_score: float = 0.5
-    """Smallest score of a match."""
+    #: By how much a match must beat any rival, logarithm of odds: 0.7 is twice as likely.
     margin: float = 0.7
-    """By how much a match must beat any rival, logarithm of odds: 0.7 is twice as likely."""
 
 
 @dataclass(frozen=True)

@@ -95,13 +95,13 @@ class _Shared:
     def best_of(self, i: int, num: int, min_shared: int) -> IntArray:
         """The best neighbours of an image."""
         gates, row = self.gates, slice(self.number.indptr[i], self.number.indptr[i + 1])
-        others, counts = self.number.indices[row], self.number.data[row]
+        others, counts = np.asarray(self.number.indices[row]), np.asarray(self.number.data[row], np.int64)
         keep = (others != i) & (counts >= min_shared)
         others, counts = others[keep], counts[keep]
         # Angles are looked at for four times as many as are wanted.
         order = np.argsort(-counts, kind="stable")[: 4 * num]
         others, counts = others[order], counts[order]
-        safe = np.maximum([self._angle(i, j) for j in others], 1e-6)
+        safe = np.maximum(np.array([self._angle(i, int(j)) for j in others]), 1e-6)
         low, high = np.deg2rad(gates.min_angle_deg), np.deg2rad(gates.max_angle_deg)
         score = counts * np.minimum(1.0, safe / low) * np.minimum(1.0, high / safe)
         return others[np.argsort(-score, kind="stable")[:num]].astype(np.int64)

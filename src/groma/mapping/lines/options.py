@@ -16,9 +16,9 @@ class MapLinesOptions:
     min_longest: float = 0.0
     #: Neighbours per image.
     num_neighbors: int = 10
-    #: Fewest shared points of neighbours.
+    #: Smallest number of shared points of neighbours.
     min_shared: int = 8
-    #: Fewest images of a line.
+    #: Smallest number of images of a line.
     min_images: int = 3
     #: Error of poses and cameras in the image, added in quadrature to the segments' sigma; pixels.
     noise: float = 0.15

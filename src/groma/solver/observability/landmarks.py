@@ -25,7 +25,7 @@ class _Landmarks:
     seen: Observers
     #: (count,) as given to :func:`landmark_findings`.
     weakness: FloatArray
-    num_open: IntArray
+    num_unobservable: IntArray
     #: (count,) not determined and seen by one camera, by several, by none.
     alone: BoolArray
     rest: BoolArray
@@ -52,7 +52,7 @@ class _Landmarks:
 
 
 def landmark_findings(
-    inspection: Inspection, name: str, seen: Observers, weakness: FloatArray, num_open: IntArray
+    inspection: Inspection, name: str, seen: Observers, weakness: FloatArray, num_unobservable: IntArray
 ) -> list[Finding]:
     """Explain the points or lines of a group whose weakest direction is not determined, or weak.
 
@@ -66,21 +66,21 @@ def landmark_findings(
         Who sees it.
     weakness : (count,) float
         Standard deviation of the weakest direction, as a share of the viewing distance.
-    num_open : (count,) int
+    num_unobservable : (count,) int
         Directions that are not determined.
     """
     kind = inspection.problem.variables[name].manifold.kind
-    is_open = ~(weakness <= DIAGNOSIS.undetermined)
-    poses = np.bincount(seen.of(is_open)[0], minlength=len(is_open))
-    alone, rest, unseen = is_open & (poses == 1), is_open & (poses > 1), is_open & (poses == 0)
-    shaky = ~is_open & (weakness > DIAGNOSIS.weak)
+    unobservable = ~(weakness <= DIAGNOSIS.undetermined)
+    poses = np.bincount(seen.of(unobservable)[0], minlength=len(unobservable))
+    alone, rest, unseen = unobservable & (poses == 1), unobservable & (poses > 1), unobservable & (poses == 0)
+    shaky = ~unobservable & (weakness > DIAGNOSIS.weak)
     findings: list[Finding] = []
     turning = _only_turning(kind, seen, rest, shaky)
     if turning is not None:
         bad = tuple(int(i) for i in np.flatnonzero(rest | shaky))
         findings.append(Finding("pure_rotation", "problem", turning[0], name, bad, {"spread": turning[1]}))
         rest, shaky = np.zeros_like(rest), np.zeros_like(shaky)
-    landmarks = _Landmarks(inspection, name, kind, seen, weakness, num_open, alone, rest, unseen, shaky)
+    landmarks = _Landmarks(inspection, name, kind, seen, weakness, num_unobservable, alone, rest, unseen, shaky)
     special, explained = _point_findings(landmarks) if kind == "point" else _line_findings(landmarks)
     return [*findings, *special, *_general_findings(landmarks, rest & ~explained)]
 
@@ -94,7 +94,8 @@ def _point_findings(landmarks: _Landmarks) -> tuple[list[Finding], BoolArray]:
         apart |= (angle > DIAGNOSIS.small_parallax) & (inspection.worst_residuals(name, rest) > DIAGNOSIS.discounted)
     findings = landmarks.finding(
         "point_seen_once", "problem", landmarks.alone,
-        "is seen by one camera only: its depth is open", "are seen by one camera only: their depth is open",
+        "is seen by one camera only: its depth is not determined",
+        "are seen by one camera only: their depth is not determined",
         "Drop them or add views.",
     )  # fmt: skip
     findings += landmarks.finding(
@@ -110,7 +111,7 @@ def _line_findings(landmarks: _Landmarks) -> tuple[list[Finding], BoolArray]:
     """Explain lines by where their cameras are; also return which of those seen by several cameras that explains."""
     end_on, same_plane, along = _line_geometry(landmarks.inspection, landmarks.name, landmarks.seen)
     alone, rest = landmarks.alone & ~end_on, landmarks.rest & ~end_on
-    several = landmarks.num_open[landmarks.rest & same_plane] > 1
+    several = landmarks.num_unobservable[landmarks.rest & same_plane] > 1
     can = f"can slide {'and' if several.all() else 'or'} turn in it"
     findings = landmarks.finding(
         "line_end_on", "problem", (landmarks.alone | landmarks.rest) & end_on,
@@ -141,7 +142,7 @@ def _line_findings(landmarks: _Landmarks) -> tuple[list[Finding], BoolArray]:
 def _general_findings(landmarks: _Landmarks, rest: BoolArray) -> list[Finding]:
     """Name the landmarks that nothing else explains, those that nobody sees, and weak ones."""
     findings = landmarks.finding(
-        f"{landmarks.kind}_open", "problem", rest,
+        f"{landmarks.kind}_unobservable", "problem", rest,
         "is not determined: some of its observations contradict the others, and hardly count under a robust loss",
         "are not determined: some of their observations contradict the others, and hardly count under a robust loss",
         "These may be wrong matches.",
@@ -189,7 +190,7 @@ def _only_turning(kind: str, seen: Observers, rest: BoolArray, shaky: BoolArray)
     elif spread < DIAGNOSIS.near_one_place and affected > 0.5 * len(rest):
         text = (
             f"The cameras hardly move: their centres are within {spread:.1%} of the viewing distance, and the depth of "
-            f"{_so_many(kind, affected, len(rest))} is open or uncertain by more than {DIAGNOSIS.weak:.0%}."
+            f"{_so_many(kind, affected, len(rest))} is not determined or uncertain by more than {DIAGNOSIS.weak:.0%}."
         )
     else:
         return None
