@@ -54,9 +54,7 @@ def start_server(host: str, port: int, say: Say | None = None) -> viser.ViserSer
         server = viser.ViserServer(host=host, port=port, label="groma", verbose=False)
     if not applied:
         stop_server(server)
-        raise GromaError(
-            f"viser {viser.__version__} cannot be made safe. Install an earlier one."
-        )
+        raise GromaError(f"viser {viser.__version__} cannot be made safe. Install an earlier one.")
     return server
 
 
