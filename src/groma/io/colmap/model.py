@@ -12,7 +12,6 @@ to images and points by identifier, so they survive changes made to the model by
 from __future__ import annotations
 
 import os
-import zlib  # noqa: F401 - must be loaded before pycolmap, whose wheel (4.2) otherwise breaks it: heap corruption
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -24,6 +23,7 @@ from groma._typing import FloatArray
 from groma.errors import FileFormatError, InputError
 from groma.io.atomic import atomic_output
 from groma.io.colmap.files import check_binary_model, damage_in_text, find_model, is_model
+from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.quiet import quiet
 from groma.io.colmap.to_pycolmap import colmap_camera, to_pycolmap
 from groma.io.limap.structures import Structures, read_beside, write_beside
@@ -58,9 +58,8 @@ def read_colmap(path: str | os.PathLike[str]) -> Scene:
     InputError
         If a camera model is not one of groma's.
     """
-    import pycolmap
-
     folder, form = find_model(path)
+    pycolmap = load_pycolmap()
     with reading(folder, _KIND), quiet(pycolmap):
         reconstruction = pycolmap.Reconstruction()
         if form == "binary":
