@@ -34,8 +34,9 @@ def image_file(images: ImageFiles | None, name: str) -> Path | None:
 
 def warn_of_names_outside(images: ImageFiles | None, names: Iterable[str]) -> None:
     """Warn of images that are not shown because their names lead out of the folder of photographs."""
-    wrong = [] if images is None or isinstance(images, Mapping) else outside(names)
-    if wrong:
+    if images is None or isinstance(images, Mapping):
+        return
+    if wrong := outside(names):
         shown = ", ".join(repr(name[:200]) for name in wrong[:3]) + (", ..." if len(wrong) > 3 else "")
         warnings.warn(
             f"{len(wrong)} images of the scene are not shown: their names lead out of {os.fspath(images)} ({shown}). "

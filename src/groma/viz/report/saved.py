@@ -94,7 +94,7 @@ def saved_report(folder: Path) -> SavedReport | None:
         numbers = None
     if isinstance(numbers, dict) and any(numbers.get(name) is None for name in _NEEDED):
         return None  # of a track, or of another program
-    if not _has_form(numbers, _FORM) or "total" not in numbers["seconds"]:
+    if not isinstance(numbers, dict) or not _has_form(numbers, _FORM) or "total" not in numbers["seconds"]:
         warnings.warn(f"{path} is damaged; the page is made without it.", stacklevel=2)
         return None
     return SavedReport(numbers)
