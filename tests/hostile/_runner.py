@@ -35,8 +35,10 @@ ADJUST_EVERY = 25
 
 def run(first: int, last: int, seed: int, keep: Path | None = None) -> tuple[collections.Counter, list[str]]:
     """Run the cases ``first`` to ``last - 1``; return the counts of outcomes and a line for each that is bad."""
+    import cv2
     from _targets import targets
 
+    cv2.setNumThreads(1)
     base = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     home = Path(tempfile.mkdtemp(prefix="groma-hostile-", dir=base))
     counts: collections.Counter = collections.Counter()
