@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,7 @@ import typer
 
 from groma._counted import counted
 from groma.cli.shared import output as _output
-from groma.cli.shared.interrupt import INTERRUPTED
+from groma.cli.shared.interrupt import PROCESS
 from groma.errors import OutputError
 
 if TYPE_CHECKING:
@@ -43,12 +42,8 @@ def run_map(
         with interruptible() as interruption, console.stages() as stages:
             return map_images(images, work, model, options, interruption.checking(stages), line_matches)
     except KeyboardInterrupt:
-        print(
-            f"groma: interrupted; finished stages are kept in {work}: the same command goes on from there.",
-            file=sys.stderr,
-            flush=True,
-        )
-        raise typer.Exit(INTERRUPTED) from None
+        words = f"finished stages are kept in {work}: the same command goes on from there."
+        raise typer.Exit(PROCESS.tell(words)) from None
 
 
 def write_map(result: MapResult, output: Path, work: Path, force: bool, **how: Any) -> None:
