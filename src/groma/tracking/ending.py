@@ -16,7 +16,7 @@ import numpy as np
 from groma.io.trajectories import Trajectory
 from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
-from groma.tracking.backend.submaps import Joint, Places, Submap, best_joint
+from groma.tracking.backend.submaps import Joint, Part, Places, best_joint
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.outcome import History
 from groma.tracking.result import map_to_scene
@@ -99,7 +99,7 @@ class Ending:
             )
         return report, offset
 
-    def submap(self, root: int) -> Submap:
+    def submap(self, root: int) -> Part:
         """Return the trajectory and the scene of a map."""
         mapper = self._mapper
         track_map, relations = mapper.maps[root], mapper.options.relations
@@ -107,7 +107,7 @@ class Ending:
         trajectory = self._built("the trajectory", lambda: self._history.trajectory(track_map, root), Trajectory())
         nothing = map_to_scene(TrackMap(), mapper.camera)
         scene = self._built("the scene", lambda: map_to_scene(track_map, mapper.camera, relations), nothing)
-        return Submap(trajectory, scene, stamps[: scene.num_images])
+        return Part(trajectory, scene, stamps[: scene.num_images])
 
     def _built(self, what: str, step: Callable[[], T], otherwise: T) -> T:
         """Return what a step gives that is needed after an interruption too."""
