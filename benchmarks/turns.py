@@ -95,8 +95,8 @@ def row(name: str, camera: SequenceCamera, frames: Iterable[Frame], truth) -> st
     stamps = np.array([one.timestamp for one in tracked])
     exact = truth(stamps)
     worst = np.zeros(2)
-    for part in {one.part for one in tracked if one.pose is not None}:
-        rows = [k for k, one in enumerate(tracked) if one.pose is not None and one.part == part]
+    for part in {one.submap for one in tracked if one.pose is not None}:
+        rows = [k for k, one in enumerate(tracked) if one.pose is not None and one.submap == part]
         poses = np.array([tracked[k].pose for k in rows])
         # The world of a map is its first frame.
         expected = se3.compose(se3.inverse(exact[rows]), np.tile(exact[rows[0]], (len(rows), 1)))
