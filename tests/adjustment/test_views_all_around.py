@@ -41,6 +41,8 @@ def room(name, seed=0, num_images=6, num_points=80, num_lines=30):
         pixels = model.project(params, in_cam.reshape(-1, 3)).reshape(*in_cam.shape[:2], 2)
         return pixels, (angle < HALF_ANGLE) | (not model.is_planar), in_cam[..., 2]
 
+    xyz = xyz[seen(xyz)[1].sum(axis=0) >= 3]
+    segments = segments[(seen(segments[:, 0])[1] & seen(segments[:, 1])[1]).sum(axis=0) >= 3]
     pixels, visible, depth = seen(xyz)
     image, point = np.nonzero(visible)
     ends = [seen(segments[:, k]) for k in (0, 1)]
@@ -86,17 +88,31 @@ def test_everything_around_is_adjusted_down_to_its_noise(name, residual):
     result = groma.adjust(start, groma.AdjustOptions(loss="none", line_residual=residual))
     report = result.report
     assert report.solve.converged
-    assert report.solve.num_degenerate == 0
+    assert report.solve.num_degenerate == {}
     assert report.num_observations == len(depth) + len(truth.line_observations)
     # Of the points two numbers for each observation remain, less three for a point and six for a camera.
-    share = np.sqrt(1.0 - (3.0 * 80 + 6.0 * 6 - 7.0) / (2.0 * len(depth)))
+    share = np.sqrt(1.0 - (3.0 * truth.num_points + 6.0 * 6 - 7.0) / (2.0 * len(depth)))
     assert report.rmse_px["points"]["after"] == pytest.approx(NOISE * np.sqrt(2) * share, rel=0.1)
     assert report.rmse_px["points"]["before"] > 5.0
     # Both ends across, less four for a line.
-    share = np.sqrt(1.0 - 4.0 * 30 / (2.0 * len(truth.line_observations)))
+    share = np.sqrt(1.0 - 4.0 * truth.num_lines / (2.0 * len(truth.line_observations)))
     assert report.rmse_px["lines"]["after"] == pytest.approx(NOISE * np.sqrt(2) * share, rel=0.15)
     # A pixel is three milliradians at most, four units away, and each camera has a hundred measurements.
     assert center_error(result.scene, truth) < 5e-3
+
+
+def test_calibration_is_estimated_where_it_is_not_known():
+    """Of a fisheye the focal length comes back, from points; the size of a panorama is no unknown."""
+    truth, start, _ = room("RADIAL_FISHEYE", num_points=200)
+    right = truth.cameras.params
+    options = groma.AdjustOptions(loss="none", refine_intrinsics=True, lines=False)
+    found = groma.adjust(start.with_params(right * [1.01, 1, 1, 1, 1]), options).scene.cameras.params
+    assert abs(found[0, 0] / right[0, 0] - 1) < 2e-3
+    np.testing.assert_array_equal(found[0, 1:3], right[0, 1:3])
+    truth, start, _ = room("EQUIRECTANGULAR", num_images=4)
+    result = groma.adjust(start, options)
+    np.testing.assert_array_equal(result.scene.cameras.params, truth.cameras.params)
+    assert result.report.rmse_px["points"]["after"] < 2 * NOISE
 
 
 @pytest.mark.parametrize("name", ["EQUIRECTANGULAR", "RADIAL_FISHEYE"])

@@ -277,7 +277,9 @@ def test_a_panorama_is_the_same_at_its_left_and_right_border():
     assert abs(pixels[1, 0] - pixels[0, 0]) > 639
     difference = model.pixel_difference(params, pixels[:1], pixels[1:])
     np.testing.assert_allclose(difference, [[0.64, 0.0]], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(model.unproject(params, pixels + [640, 0]), model.unproject(params, pixels), atol=1e-12)
+    np.testing.assert_allclose(
+        model.unproject(params, pixels + np.array([640, 0])), model.unproject(params, pixels), atol=1e-12
+    )
     np.testing.assert_array_equal(
         cameras.PINHOLE.pixel_difference(np.ones(4), np.array([[900.0, 1.0]]), np.array([[1.0, 3.0]])), [[899.0, -2.0]]
     )

@@ -133,8 +133,8 @@ def check_cameras(models: Sequence[str]) -> None:
         if not camera_model(name).is_planar:
             raise InputError(
                 f"groma map finds lines in images that are flat, and {name} images are panoramas. Cut each into "
-                "perspective views that are held in a rig (as COLMAP's panorama_sfm.py does) and map those; groma adjust "
-                "takes panoramas as they are, with lines."
+                "perspective views that are held in a rig (as COLMAP's panorama_sfm.py does) and map those; groma "
+                "adjust takes panoramas as they are, with lines."
             )
 
 

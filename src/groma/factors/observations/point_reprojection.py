@@ -36,7 +36,7 @@ from groma.factors.contract import Example, Ref, Slot, register
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
 def _difference(model_tag, params, uv, pixels, i):
-    """Subtract the measured pixel from ``uv``, the short way in a panorama; False if the result is not a number, or infinite."""
+    """Subtract the measured pixel from ``uv``, the short way in a panorama; False if the result is not finite."""
     uv[0] -= pixels[i, 0]
     uv[1] -= pixels[i, 1]
     wrap(model_tag, params, uv)

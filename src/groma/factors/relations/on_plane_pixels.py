@@ -69,7 +69,7 @@ def _into_camera(poses, p, c, P):
 
 @kernel
 def _difference(model_tag, params, uv, other):
-    """Subtract a pixel from ``uv``, the short way in a panorama; False if the result is not a number, or infinite."""
+    """Subtract a pixel from ``uv``, the short way in a panorama; False if the result is not finite."""
     uv[0] -= other[0]
     uv[1] -= other[1]
     wrap(model_tag, params, uv)
