@@ -8,6 +8,7 @@ import groma
 from groma import cameras
 from groma.evaluation.alignment import align_poses
 from groma.geometry import quaternion
+from groma.io.sequences.frame import SequenceCamera
 from groma.scene import Cameras, LineObservations, Lines, PointObservations, Points, Scene
 from groma.viz.drawable import drawable
 
@@ -141,6 +142,17 @@ def test_points_at_the_border_of_a_panorama():
     assert 0.1 < result.report.rmse_px["points"]["before"] < 1.0
     residual = drawable(scene).residuals
     assert 0.1 < np.abs(residual).max() < 1.0
+
+
+def test_a_panorama_without_size_is_refused():
+    _, start, _ = room("EQUIRECTANGULAR")
+    with pytest.raises(groma.ProblemError, match=r"positive width and height.*EQUIRECTANGULAR.*\[0.0, 1000.0\]"):
+        groma.adjust(start.with_params(np.array([[0.0, 1000.0]])))
+
+
+def test_a_panorama_is_not_followed():
+    with pytest.raises(groma.InputError, match=r"EQUIRECTANGULAR images are panoramas"):
+        SequenceCamera("EQUIRECTANGULAR", np.array([2000.0, 1000.0]), 2000, 1000)
 
 
 def test_a_view_without_a_plane_is_not_mapped(tmp_path):
