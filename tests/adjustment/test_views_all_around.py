@@ -11,6 +11,7 @@ from groma.geometry import quaternion
 from groma.io.sequences.frame import SequenceCamera
 from groma.scene import Cameras, LineObservations, Lines, PointObservations, Points, Scene
 from groma.viz.drawable import drawable
+from groma.viz.report.overlays import projected_segments
 
 pytestmark = pytest.mark.kernels
 
@@ -142,6 +143,20 @@ def test_points_at_the_border_of_a_panorama():
     assert 0.1 < result.report.rmse_px["points"]["before"] < 1.0
     residual = drawable(scene).residuals
     assert 0.1 < np.abs(residual).max() < 1.0
+
+
+def test_lines_are_drawn_all_around_a_panorama():
+    """As curves in one piece, also behind the camera and across the border, through the measured ends."""
+    truth, _, _ = room("EQUIRECTANGULAR")
+    curves = projected_segments(truth, 2, np.arange(truth.num_lines))
+    seen = truth.line_observations
+    of_image = np.flatnonzero(seen.image_idx == 2)
+    assert len(curves) == truth.num_lines == len(of_image)
+    for row in of_image:
+        curve, segment = curves[seen.line_idx[row]], seen.segment[row].reshape(2, 2)
+        assert np.abs(np.diff(curve[:, 0])).max() < 1000
+        np.testing.assert_allclose(curve[[0, -1]], segment, rtol=0, atol=6 * NOISE)
+    assert any((curve[:, 0] < 500).any() or (curve[:, 0] > 1500).any() for curve in curves)
 
 
 def test_a_panorama_without_size_is_refused():
