@@ -190,9 +190,9 @@ def test_maps_are_joined_at_the_end_where_they_saw_the_same_place(monkeypatch):
     poses = np.array(poses + [_turned(180 - 6 * k, 0.3) for k in range(1, 30)])
     tracker = Tracker(_room.camera(), OPTIONS)
     rows = [tracker.process(frame) for frame in _room.frames("rgbd", poses)]
-    assert {row.part for row in rows} == {0, 1}
+    assert {row.submap for row in rows} == {0, 1}
     result = tracker.finish()
-    assert result.parts == ()
+    assert result.submaps == ()
     assert len(result.trajectory) == sum(row.pose is not None for row in rows)
     truth = Trajectory(np.arange(len(poses)) / 30.0, se3.inverse(poses))
     assert score_trajectory(result.trajectory, truth, max_time_difference=0.001).ate.rmse < 0.02

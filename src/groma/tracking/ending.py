@@ -99,7 +99,7 @@ class Ending:
             )
         return report, offset
 
-    def part(self, root: int) -> Part:
+    def submap(self, root: int) -> Part:
         """Return the trajectory and the scene of a map."""
         mapper = self._mapper
         track_map, relations = mapper.maps[root], mapper.options.relations

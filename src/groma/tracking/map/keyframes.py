@@ -340,8 +340,8 @@ def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> P
         grow(track_map.planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]), gates)
     rest = np.setdiff1d(np.arange(len(seen)), rows)
     # Nothing new beside a plane that is there already but did not agree well enough.
-    _, doubtful = assign_planes(track_map.planes, seen, pose, gates.wide_angle, gates.wide_distance, gates)
-    rest = np.setdiff1d(rest, doubtful)
+    _, ambiguous = assign_planes(track_map.planes, seen, pose, gates.wide_angle, gates.wide_distance, gates)
+    rest = np.setdiff1d(rest, ambiguous)
     index = np.concatenate([index, add_planes(track_map.planes, seen, rest, pose, gates)])
     rows = np.concatenate([rows, rest])
     return PlaneMeasurements(index, seen.plane[rows], seen.sqrt_information[rows])

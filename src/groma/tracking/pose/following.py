@@ -28,7 +28,7 @@ class Attempt:
     predicted: FloatArray
     prior_sigma: FloatArray
     estimate: PoseEstimate | None = None
-    doubtful: PoseEstimate | None = None
+    unconfirmed: PoseEstimate | None = None
     #: Whether enough agrees with the pose.
     trusted: bool = False
     followed: Followed = field(default_factory=Followed.nothing)
