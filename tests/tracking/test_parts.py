@@ -43,7 +43,7 @@ def _points(rng, count, noise=0.5):
     seen = CAMERA.project(in_cam) + noise * rng.normal(size=(count, 2))
     nothing = np.full(count, np.nan)
     measured = PointMeasurements(
-        np.arange(count), seen, np.full(count, max(noise, 0.1)), nothing, nothing.copy(), nothing.copy()
+        np.arange(count), seen, np.full(count, max(noise, 0.1)), nothing, nothing.copy(), np.full((count, 2), np.nan)
     )
     return table, measured
 

@@ -29,6 +29,7 @@ from groma.tracking.frame.camera import TrackCamera, back
 from groma.tracking.frame.checks import FrameChecks
 from groma.tracking.frame.coarse_alignment import turned, turned_prediction
 from groma.tracking.frame.features import FrameFeatures, grid_pixels
+from groma.tracking.frame.rectification import RightTurn
 from groma.tracking.map.keyframes import Followed, keyframe_nearby, wants_keyframe
 from groma.tracking.map.points import find_again
 from groma.tracking.map.track_map import TrackMap
@@ -113,8 +114,8 @@ class Tracker:
         reason = self._checks.reason_to_skip(frame)
         if reason:
             return self._skip(frame, reason, began)
-        data = FrameFeatures(frame, self.camera, self.options)
         present, mapper = self._present, self._mapper
+        data = FrameFeatures(frame, self.camera, self.options, mapper.right)
         mapper.advance(present, watch)
         if not self.map.keyframes:
             return self._start(data, began, watch)
@@ -367,7 +368,7 @@ class Tracker:
             stamps,
         )
 
-    def statistics(self, report: SolveReport | None = None, right_offset_px: float = 0.0) -> dict:
+    def statistics(self, report: SolveReport | None = None, right_turn: RightTurn | None = None) -> dict:
         """Return counts and times so far as plain numbers."""
         out: dict = {
             "frames": dict(self._history.statuses),
@@ -381,8 +382,8 @@ class Tracker:
             "metric": self._mapper.metric,
             "milliseconds": self._history.milliseconds(),
         }
-        if right_offset_px:
-            out["right_offset_px"] = right_offset_px
+        if self.camera.baseline > 0:
+            out["right_camera"] = (right_turn or self._mapper.right.turn).numbers(self.camera)
         if report is not None:
             out["final_adjustment"] = {"iterations": report.iterations, "seconds": dict(report.seconds)}
         return out

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -13,10 +14,11 @@ from groma.geometry import se3
 from groma.solver.report import SolveReport
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
 from groma.tracking.backend.loop_closure import LoopSearch, close_loop, search_for_loop
-from groma.tracking.backend.stereo_calibration import correct_offset, estimate_offset
+from groma.tracking.backend.stereo_calibration import correct_map, estimate_turn, matters
 from groma.tracking.backend.submaps import Joint, find_joint, join_maps, search_older_maps
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
+from groma.tracking.frame.rectification import RightCamera, RightTurn
 from groma.tracking.map.culling import drop_repeating_keyframes, drop_unseen
 from groma.tracking.map.keyframes import Followed, add_keyframe
 from groma.tracking.map.planes import merge_planes
@@ -72,6 +74,9 @@ class Mapper:
         #: How maps join older ones, by the number of the newer.
         self.joints: dict[int, Joint] = {}
         self.camera, self.options = camera, options
+        #: The right camera of stereo pairs, and the number of keyframes that tell next how it is turned.
+        self.right = RightCamera(camera, options.gates.rectification, options.gates.features)
+        self._next_look = options.gates.rectification.min_keyframes
         self.metric = True
         self.loops = 0
         #: A frame that is to become a keyframe; its features are being found meanwhile.
@@ -124,6 +129,7 @@ class Mapper:
 
     def choose(self, present: Present, data: FrameFeatures) -> None:
         """Choose the present frame as a keyframe; its features are found in other threads meanwhile."""
+        data.keep_up()
         if self._workers is not None:
             data.prepare(self._workers)
         near = self.map.near
@@ -151,6 +157,8 @@ class Mapper:
             if self.options.relations:
                 find_lines_on_planes(self.map)
         present.frames_since_keyframe = 0
+        with watch("right camera"):
+            self._look_at_right_camera(present)
         with watch("adjust"):
             job = window_job(self.map, self.camera, self.options.window, self.options.relations, self.metric)
             if job is not None:
@@ -214,6 +222,24 @@ class Mapper:
         """Take up the result of an adjustment."""
         _follow_world(present, job.apply(self.map))
 
+    def _look_at_right_camera(self, present: Present) -> None:
+        """Find now and then how the right camera is turned; correct the maps if that is not as it was taken to be."""
+        gates, living = self.options.gates.rectification, self.map.living()
+        if not self.camera.baseline > 0 or len(living) < self._next_look:
+            return
+        self._next_look = math.ceil(gates.growth * len(living))
+        turn, job = estimate_turn(self.map, self.camera, self.right.turn, gates)
+        if matters(self.camera, self.right.turn, turn, gates):
+            last = self.map.last
+            before = last.pose.copy()
+            for track_map in self.maps:
+                correct_map(
+                    track_map, self.camera, self.right.turn, turn, self.options, job if track_map is self.map else None
+                )
+            self.right.turn = turn
+            self._adjust_all()
+            _follow_world(present, se3.compose(se3.inverse(last.pose[None]), before[None])[0])
+
     def _adjust_all(self) -> SolveReport | None:
         """Adjust all keyframes of the map together, twice: outliers are left out in between."""
         report, living = None, self.map.living()
@@ -243,17 +269,19 @@ class Mapper:
         self._pool = self._workers = None
         return join_maps(self.maps, self.joints)
 
-    def adjust_at_end(self, part: int) -> tuple[SolveReport | None, float]:
-        """Adjust all keyframes of a map together; return the report and the offset of the right images, pixels."""
+    def adjust_at_end(self, part: int) -> tuple[SolveReport | None, RightTurn]:
+        """Adjust all keyframes of a map together; return the report and how the right camera is turned."""
         self.current = part
+        turn = self.right.turn
         if not self.options.adjust_at_end or len(self.map.living()) < 2:
-            return None, 0.0
+            return None, turn
         report = self._adjust_all()
-        offset = estimate_offset(self.map, self.camera)
-        if offset:
-            correct_offset(self.map, self.camera, offset)
-            report = self._adjust_all()
-        return report, offset
+        if self.camera.baseline > 0:
+            turn, job = estimate_turn(self.map, self.camera, self.right.turn, self.options.gates.rectification)
+            if matters(self.camera, self.right.turn, turn, self.options.gates.rectification):
+                correct_map(self.map, self.camera, self.right.turn, turn, self.options, job)
+                report = self._adjust_all()
+        return report, turn
 
 
 def _follow_world(present: Present, new_from_old: FloatArray) -> None:
