@@ -31,6 +31,10 @@ test *arguments:
 test-plain:
     NUMBA_DISABLE_JIT=1 .venv/bin/pytest -n auto -m "kernels and not slow"
 
+# damaged files of every format, 100 000 by default; arguments go to the harness
+hostile *arguments="--cases 100000":
+    {{python}} tests/hostile/_runner.py {{arguments}}
+
 # documentation, warnings are errors
 docs:
     .venv/bin/sphinx-build -W --keep-going -b html docs docs/_build/html

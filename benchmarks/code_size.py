@@ -11,7 +11,7 @@ Row                         Rule
 lines, source lines         all lines of ``src/groma/**/*.py``; those that are neither blank, comment nor docstring
 long functions              more than 60 lines from ``def`` to the end, without the docstring
 many arguments              ten or more arguments, ``self`` and ``cls`` not counted; in rows of their own kernels
-                            (``@kernel``, ``@loop``) and the command line, whose arguments are its options
+                            (``@kernel``, ``@loop``, ...) and the command line, whose arguments are its options
 private imports             imports of an underscored name or module by another package than the one that holds it
 optimiser loops             functions with a loop in which a name that contains ``damp`` or ``lambda`` is assigned to:
                             every damped least-squares loop raises and lowers its damping
@@ -36,6 +36,8 @@ import tuned_numbers
 Found: TypeAlias = list[str]
 Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 LONG, MANY = 60, 10
+#: Decorators of compiled code.
+KERNELS = {"exact_kernel", "inline_kernel", "intrinsic", "kernel", "loop"}
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ def many_arguments(modules: list[Module], kind: str = "") -> Found:
                 for part in ast.walk(decorator)
                 if isinstance(part, ast.Name)
             }
-            here = "cli" if module.name.startswith("groma.cli.") else "kernels" if words & {"kernel", "loop"} else ""
+            here = "cli" if module.name.startswith("groma.cli.") else "kernels" if words & KERNELS else ""
             if count >= MANY and here == kind:
                 found.append(f"{name} ({count})")
     return found

@@ -107,7 +107,7 @@ ROOMS: Rooms = (
     (
         "Pages and viewer",
         {
-            "groma.viz.report.page": ("write_report",),
+            "groma.viz.report.page": ("PageContents", "write_report"),
             "groma.viz.report.trajectory": ("write_track_report",),
             "groma.viz.viewer.scene": ("open_viewer",),
         },

@@ -35,6 +35,8 @@ def _compiled(**options: Any) -> Callable[[Callable], Any]:
 kernel = _compiled(forceinline=True)
 #: A kernel whose operations are done as written: its result is the same whatever loop it is inlined into.
 exact_kernel = _compiled(forceinline=True, fastmath=False)
+#: A step of a long loop, pasted into it before anything is optimised: compiled as if it were written there.
+inline_kernel = _compiled(inline="always")
 loop = _compiled()
 
 

@@ -147,7 +147,8 @@ def _add_matvec(typing, y, y0, A, a0, x, x0, rows, lanes):
     return signature, codegen
 
 
-def _blocks(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes):
+def _blocks(C, c0, *factors):
+    A, a0, a_stride, B, b0, b_stride, depth, rows, lanes = factors
     m, p, q = len(depth), len(rows), len(lanes)
     first = [A[a0 + k * a_stride : a0 + k * a_stride + p] for k in range(m)]
     second = [B[b0 + k * b_stride : b0 + k * b_stride + q] for k in range(m)]
@@ -155,13 +156,13 @@ def _blocks(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes):
     return C[c0 : c0 + p * q], product.reshape(-1)
 
 
-def _add_product_plain(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes):
-    target, product = _blocks(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)
+def _add_product_plain(*arguments):
+    target, product = _blocks(*arguments)
     target += product
 
 
-def _set_product_plain(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes):
-    target, product = _blocks(C, c0, A, a0, a_stride, B, b0, b_stride, depth, rows, lanes)
+def _set_product_plain(*arguments):
+    target, product = _blocks(*arguments)
     target[:] = product
 
 

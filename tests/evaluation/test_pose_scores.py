@@ -135,6 +135,21 @@ def test_images_are_matched_by_name():
         evaluate_poses(twins, truth)
 
 
+def test_scenes_that_hardly_share_images_or_share_names_alone_are_warned_of():
+    scene = holistic(12, seed=3).start
+    names = [f"{k}.png" for k in range(12)]
+    renamed = scene.replace(images=scene.images.replace(names=tuple(names[:3] + [f"other/{n}" for n in names[3:]])))
+    scene = scene.replace(images=scene.images.replace(names=tuple(names)))
+    scores = evaluate_poses(renamed, scene)
+    assert scores.num_images == 3 and "Only 3 of 12 and 12 images" in scores.warnings[0]
+    assert scores.to_dict()["warnings"] == list(scores.warnings)
+    assert evaluate_poses(scene, scene).warnings == ()
+    assert evaluate_poses(scene.subset([0, 1, 2, 3]), scene).warnings == ()
+    other = holistic(12, seed=4).start
+    other = other.replace(images=other.images.replace(names=tuple(names)))
+    assert "unrelated" in evaluate_poses(other, scene).warnings[0]
+
+
 def test_report_has_the_promised_keys():
     made = holistic(10, seed=1)
     report = evaluate_poses(made.start, made.truth).to_dict()

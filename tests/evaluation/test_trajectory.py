@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from groma.cli.app import app
 from groma.errors import InputError
+from groma.evaluation.alignment import align_points, pose_alignment
 from groma.evaluation.trajectory import apply_similarity, associate, score_trajectory
 from groma.geometry import quaternion, se3
 from groma.io import Trajectory, read_trajectory, write_trajectory
@@ -186,6 +187,54 @@ EVO_RPE = [  # rmse of the translation, then of the rotation in degrees
 ]
 
 
+def test_without_times_lines_belong_together():
+    """KITTI has no times: the numbers of its lines must not be taken for seconds."""
+    truth = wander(40)
+    numbered = truth.replace(timestamps=np.arange(40.0))
+    for ours, theirs in ((truth, numbered), (numbered, truth), (numbered, numbered)):
+        scores = score_trajectory(ours, theirs, "none")
+        assert scores.num_poses == 40 and scores.association == "line" and scores.warnings == ()
+        assert scores.ate.max < 1e-12
+    assert score_trajectory(truth, truth).association == "time"
+    # 36 of 40 poses: nobody knows which lines they are
+    few = score_trajectory(truth.take(np.arange(36)), numbered)
+    assert few.num_poses == 4 and few.association == "time"
+    assert "Only 4 of 36 and 40" in few.warnings[0] and "REF has no times" in few.warnings[0]
+    assert few.to_dict()["warnings"] == list(few.warnings)
+    shifted = truth.replace(timestamps=truth.timestamps + 3.0)
+    assert "units of time" in score_trajectory(truth, shifted).warnings[0]
+    assert score_trajectory(truth.take(np.arange(0, 40, 3)), truth).warnings == ()  # the shorter one counts
+
+
+def test_unrelated_trajectories_are_noticed():
+    """Others agree in nothing; one that is noisy, or badly scaled, is not taken for another."""
+    truth = wander(60, seed=1)
+    rng = np.random.default_rng(0)
+    turned = truth.world_from_cam.copy()
+    turned[:, :4] = quaternion.normalize(rng.normal(size=(60, 4)))
+    turned[:, 4:] = rng.normal(size=(60, 3))
+    assert "unrelated" in score_trajectory(truth.replace(world_from_cam=turned), truth, "sim3").warnings[0]
+    noisy = truth.world_from_cam.copy()
+    noisy[:, 4:] += rng.normal(0, 2.0, (60, 3))
+    assert score_trajectory(truth.replace(world_from_cam=noisy), truth).warnings == ()
+    small = truth.replace(world_from_cam=apply_similarity(Similarity(0.1), truth.world_from_cam))
+    assert score_trajectory(small, truth, "se3").warnings == ()
+
+
+def test_the_command_warns_and_finds_times_beside_the_reference(tmp_path):
+    truth = wander(40)
+    write_trajectory(truth.take(np.arange(36)), tmp_path / "est.txt")
+    write_trajectory(truth, tmp_path / "poses.txt", "kitti")
+    words = ["evaluate", "trajectory", str(tmp_path / "est.txt"), str(tmp_path / "poses.txt")]
+    alone = CliRunner().invoke(app, words)
+    assert alone.exit_code == 0 and "Only 4 of 36" in alone.stderr and "--times" in alone.stderr
+    for name, more in (("clock.txt", ["--times", str(tmp_path / "clock.txt")]), ("times.txt", [])):
+        (tmp_path / name).write_text("".join(f"{time!r}\n" for time in truth.timestamps.tolist()))
+        found = CliRunner().invoke(app, words + more)
+        assert found.exit_code == 0 and "36 poses associated by time of 36 and 40" in found.stdout
+        assert "warning" not in found.stderr
+
+
 @pytest.fixture(scope="module")
 def published(shared_data):
     folder = shared_data / "trajectories"
@@ -213,3 +262,60 @@ def test_relative_errors_are_those_of_evo(published, name, align, delta, unit, t
     np.testing.assert_allclose(
         [scores.rpe_translation.rmse, scores.rpe_rotation_deg.rmse], [translation, rotation], rtol=0, atol=1e-6
     )
+
+
+def _turning(spread, noise, turn_noise, seed=3):
+    """A camera that turns on the spot, within a spread of positions, and an estimate of it in another world."""
+    rng, count = np.random.default_rng(seed), 80
+    angle = np.linspace(0.0, 1.5, count)
+    turns = quaternion.exp(np.stack([0.2 * np.sin(3 * angle), angle, 0.1 * np.cos(2 * angle)], axis=1))
+    truth = Trajectory(np.arange(count) * 0.1, np.hstack([turns, spread * rng.standard_normal((count, 3))]))
+    noisy = truth.world_from_cam.copy()
+    noisy[:, 4:] += noise * rng.standard_normal((count, 3))
+    noisy[:, :4] = quaternion.multiply(quaternion.exp(turn_noise * rng.standard_normal((count, 3))), noisy[:, :4])
+    there = Similarity(1.0, SOME.rotation, SOME.translation)
+    return truth.replace(world_from_cam=apply_similarity(there, noisy)), truth, there
+
+
+def test_a_camera_that_turns_on_the_spot_is_aligned_by_its_orientations_too():
+    estimate, truth, there = _turning(spread=0.002, noise=0.01, turn_noise=np.radians(0.3))
+    scores = score_trajectory(estimate, truth, "se3")
+    assert scores.by_orientations and scores.to_dict()["by_orientations"]
+    # The mean of 80 orientations with 0.3 degrees of noise about each axis is good to 0.06 degrees.
+    away = quaternion.log(quaternion.from_matrix((scores.similarity.rotation @ there.rotation)[None]))
+    assert np.degrees(np.linalg.norm(away)) < 0.1
+    assert scores.rotation_deg.rmse < 0.3 * np.sqrt(3) * 1.2
+    # Positions are not worse for it than their noise.
+    assert scores.ate.rmse < 0.01 * np.sqrt(3) * 1.2
+
+
+def test_positions_that_determine_the_rotation_align_alone():
+    estimate, truth, _ = _turning(spread=1.0, noise=0.01, turn_noise=np.radians(3.0))
+    scores = score_trajectory(estimate, truth, "se3")
+    assert not scores.by_orientations
+    alone = align_points(estimate.world_from_cam[:, 4:], truth.world_from_cam[:, 4:], with_scale=False)
+    np.testing.assert_allclose(scores.similarity.rotation, alone.rotation, atol=1e-12)
+
+
+def test_alignment_by_both_is_at_the_minimum_of_what_it_minimises():
+    estimate, truth, _ = _turning(spread=0.004, noise=0.01, turn_noise=np.radians(2.0))
+    poses, others = se3.inverse(estimate.world_from_cam), se3.inverse(truth.world_from_cam)
+    found = pose_alignment(poses, others, with_scale=False)
+    assert found.by_orientations
+    x, y = estimate.world_from_cam[:, 4:], truth.world_from_cam[:, 4:]
+    alone = align_points(x, y, with_scale=False)
+    votes = quaternion.to_matrix(truth.world_from_cam[:, :4]) @ quaternion.to_matrix(
+        estimate.world_from_cam[:, :4]
+    ).transpose(0, 2, 1)
+    u, _, vt = np.linalg.svd(votes.sum(0))
+    noise2 = np.sum((y - alone.points(x)) ** 2) / (3 * len(x) - 6)
+    scatter2 = np.sum((votes - u @ vt) ** 2) / 2 / (3 * len(x) - 3)
+
+    def cost(rotation):
+        away = y - y.mean(0) - (x - x.mean(0)) @ rotation.T
+        return np.sum(away**2) / noise2 + np.mean(np.sum((votes - rotation) ** 2, axis=(1, 2))) / (2 * scatter2)
+
+    best = cost(found.similarity.rotation)
+    for axis in np.vstack([np.eye(3), -np.eye(3)]):
+        turn = quaternion.to_matrix(quaternion.exp(1e-3 * axis))
+        assert cost(turn @ found.similarity.rotation) > best

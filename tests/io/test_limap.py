@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _comparison import equal, near
 from _limap import LIMAP_PYTHON, through_limap
 from _models import rig_scene
 
@@ -25,7 +26,6 @@ from groma.io.limap.structures import (
     write_limap,
 )
 from groma.scene import Directions, LineObservations, Lines, Planes, Relations, Scene
-from groma.scene.compare import equal, near
 from groma.scene.synthetic.scenes import holistic
 
 DATA = Path(__file__).parents[1] / "data" / "limap"

@@ -78,6 +78,7 @@ NUMBERS += [struct.pack("<Q", value) for value in (2**64 - 1, 2**63, 2**40, 2**3
 WORDS = [b" nan ", b" inf ", b" -1 ", b" 1e400 ", b" 99999999999999999999999 ", b"\n", b"\0", b"#", b"\xff", b" x "]
 
 
+@pytest.mark.filterwarnings("ignore:.*were left out")
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("form", ["binary", "text"])
 def test_damaged_files_give_a_scene_or_an_error(tmp_path, form):

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _comparison import near
 from _limap import LIMAP_PYTHON, through_limap
 from _models import rig_scene
 
 from groma.io import read_scene, write_colmap
 from groma.io.limap.structures import read_limap, write_limap
 from groma.scene import Scene
-from groma.scene.compare import near
 from groma.scene.synthetic.scenes import holistic
 
 DATA = Path(__file__).parents[1] / "data" / "limap"

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from _comparison import equal
 
 from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble
 from groma.errors import InputError
@@ -12,7 +13,6 @@ from groma.io import read_scene
 from groma.mapping.noise.landmarks import line_noise, point_noise
 from groma.mapping.structure.find import StructureOptions, detect_structure, find_structure
 from groma.scene import Directions, Planes, Relations, Scene
-from groma.scene.compare import equal
 from groma.scene.synthetic.scenes import corridor, holistic
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -74,7 +74,7 @@ def test_corridor_has_its_walls_and_directions():
         assert (height < 0.05).all()
         assert len(np.unique(landmark)) > 0.75 * len(places)
     assert structure.scene.num_directions == 3
-    assert structure.orthogonal_directions.tolist() == [[0, 1], [0, 2], [1, 2]]
+    assert structure.directions.orthogonal.tolist() == [[0, 1], [0, 2], [1, 2]]
     line, direction = relations.line_along_direction.T
     angle = np.cross(truth.lines.plucker[line, 3:], structure.scene.directions.vectors[direction])
     assert np.linalg.norm(angle, axis=1).max() < 5e-3

@@ -8,9 +8,9 @@ import pytest
 from _wireframe import arc, random_lines, wireframe
 from scipy.special import logit
 
-from groma.mapping.lines.filters import FilterGates
-from groma.mapping.lines.texture import TextureGates, edge_odds, num_expected
-from groma.mapping.lines.tracks import Tracks
+from groma.mapping.lines.filtering.filters import FilterGates
+from groma.mapping.lines.filtering.texture import TextureGates, edge_odds, num_expected
+from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.views import build_views
 
 EDGE, TEXTURE = TextureGates().edge, TextureGates().texture

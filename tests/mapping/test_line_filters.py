@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from _wireframe import arc, random_lines, wireframe
 
-from groma.mapping.lines.filters import FILTERS, Evidence, filtered, long_enough, seen_by_enough_images
+from groma.mapping.lines.filtering.filters import FILTERS, Evidence, filtered, long_enough, seen_by_enough_images
+from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
-from groma.mapping.lines.tracks import Tracks
 from groma.mapping.lines.views import build_views
-from groma.mapping.work import map_work
 
 
 @pytest.fixture(scope="module")
@@ -73,23 +72,3 @@ def test_nothing_changes_tracks(tracks):
     filtered(tracks, evidence(tracks))
     for name, array in arrays(tracks).items():
         np.testing.assert_array_equal(array, before[name], err_msg=name)
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_work_keeps_its_order_and_ends_with_an_error(threads):
-    said = []
-    found = map_work(lambda i: i * i, range(7), lambda done, total: said.append((done, total)), threads)
-    assert found == [i * i for i in range(7)]
-    assert said == [(done, 7) for done in range(8)]
-    assert map_work(str, [], None, threads) == []
-    done = []
-
-    def interrupted(number, _):
-        if number == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        map_work(done.append, range(10_000), interrupted, threads)
-    assert len(done) < 10_000
-    with pytest.raises(ZeroDivisionError):
-        map_work(lambda i: 1 // i, [1, 0, 1], None, threads)

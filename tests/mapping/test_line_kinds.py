@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from groma.mapping.lines.kinds import found_again, repeatability
+from groma.mapping.lines.filtering.kinds import found_again, repeatability
 
 
 def population(rng, count, length, strength, share, per_line=5):

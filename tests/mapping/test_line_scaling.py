@@ -6,17 +6,17 @@ import re
 
 import numpy as np
 import pytest
+from _comparison import equal
 
 from groma.cli.commands.map import map_
 from groma.mapping.groups import distinct_pairs, num_distinct
-from groma.mapping.lines import merge as _line_merge
 from groma.mapping.lines.build import LineMap, explain
 from groma.mapping.lines.gates import AGREEMENT
-from groma.mapping.lines.merge import MergeGates
+from groma.mapping.lines.linking import merge as _line_merge
+from groma.mapping.lines.linking.merge import MergeGates
 from groma.mapping.lines.outcomes import REMEDIES, WORDS, Outcome
 from groma.mapping.unused import without_unused
 from groma.scene import Directions, Relations
-from groma.scene.compare import equal
 from groma.scene.synthetic.scenes import corridor
 
 

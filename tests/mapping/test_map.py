@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import _comparison as compare
 import cv2
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from groma.mapping.checkpoint_files import SCENE
 from groma.mapping.checkpoints import Stages, digest, has_stages, remove_stages, stage
 from groma.mapping.map import MapOptions, map_images
 from groma.mapping.photographs import check_names, image_files, read_gray
-from groma.scene import Planes, PointObservations, Points, compare
+from groma.scene import Planes, PointObservations, Points
 from groma.scene.synthetic.scenes import holistic
 
 

@@ -22,11 +22,11 @@ from groma.mapping.lines.build import (
     map_lines,
     segment_matches,
 )
-from groma.mapping.lines.directions import depth_ratios
-from groma.mapping.lines.filters import is_certain
+from groma.mapping.lines.filtering.filters import is_certain
+from groma.mapping.lines.hypotheses.directions import depth_ratios
+from groma.mapping.lines.hypotheses.proposals import Proposer, angles_about_baseline
+from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.neighbors import covisible_neighbors
-from groma.mapping.lines.proposals import Proposer, angles_about_baseline
-from groma.mapping.lines.tracks import Tracks
 from groma.mapping.lines.views import build_views
 from groma.scene import Cameras, Scene
 from groma.scene.similarity import Similarity

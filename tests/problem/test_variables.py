@@ -9,8 +9,32 @@ from groma.geometry.charts.plane_charts import PLANE_CHARTS
 from groma.geometry.charts.pose_charts import POSE_CHARTS
 from groma.geometry.charts.unit3 import DIRECTION_CHARTS
 from groma.geometry.manifold import Euclidean
-from groma.problem.gauge import gauge_directions, move_world
+from groma.problem.gauge import gauge_directions
 from groma.problem.variables import Variables
+
+
+def move_world(kind, ambient, translation, rotation, scale):
+    r"""Ambient numbers of objects after the world frame moved by :math:`X' = s R X + a`.
+
+    Poses keep their metric form: :math:`R'_{cw} = R_{cw} R^\top`, :math:`t'_{cw} = s\,t_{cw} - R'_{cw} a`.
+    """
+    R, a, s = rotation, translation, scale
+    if kind == "point":
+        return s * ambient @ R.T + a
+    if kind == "direction":
+        return ambient @ R.T
+    if kind == "line":
+        d = ambient[:, 3:] @ R.T
+        return np.hstack([s * ambient[:, :3] @ R.T + np.cross(a, d), d])
+    if kind == "plane":
+        n = ambient[:, :3] @ R.T
+        return np.hstack([n, s * ambient[:, 3:] - (n @ a)[:, None]])
+    if kind == "pose":
+        T = ambient.reshape(-1, 3, 4)
+        R_cw = T[:, :, :3] @ R.T
+        t_cw = s * T[:, :, 3] - R_cw @ a
+        return np.concatenate([R_cw, t_cw[:, :, None]], axis=2).reshape(-1, 12)
+    return ambient
 
 
 def test_constants_of_every_shape():

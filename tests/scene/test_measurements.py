@@ -5,12 +5,12 @@ import zipfile
 
 import numpy as np
 import pytest
+from _comparison import equal, near
+from _measured import with_measurements
 
 from groma.errors import FileFormatError, InputError, ShapeError
 from groma.io.archive import read_archive, write_archive
 from groma.scene import LineDepths, PlaneObservations, PointDepths, PosePriors, Relations, RightColumns, Similarity
-from groma.scene.compare import equal, near
-from groma.scene.synthetic.measured import with_measurements
 from groma.scene.synthetic.scenes import holistic
 
 TABLES = ("point_depths", "right_columns", "line_depths", "plane_observations", "pose_priors")

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from _comparison import equal, near
 
 from groma.errors import InputError, ShapeError
 from groma.evaluation.trajectory import apply_similarity
@@ -19,7 +20,6 @@ from groma.scene import (
     Scene,
     Similarity,
 )
-from groma.scene.compare import equal, near
 from groma.scene.synthetic.noise import project_pinhole
 from groma.scene.synthetic.scenes import holistic
 

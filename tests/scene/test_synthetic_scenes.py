@@ -3,10 +3,10 @@
 
 import numpy as np
 import pytest
+from _comparison import equal
 
 from groma.errors import InputError
 from groma.evaluation.poses import rotation_angle
-from groma.scene.compare import equal
 from groma.scene.synthetic.noise import project_pinhole
 from groma.scene.synthetic.scenes import corridor, holistic
 

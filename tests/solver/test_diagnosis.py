@@ -201,12 +201,12 @@ CASES = [
     (
         "plane through two points",
         lambda: problem_of(RING, [*CLOUD, *PAIR], planes=[[0, 0, 1, -0.5]], on_plane=[(40, 0), (41, 0)]),
-        "plane_open", ["Plane 0 ", "turn about x", "2 points only"],
+        "plane_unobservable", ["Plane 0 ", "turn about x", "2 points only"],
     ),
     (
         "plane through one point",
         lambda: problem_of(RING, [*CLOUD, [0, 0, 0.5]], planes=[[0, 0, 1, -0.5]], on_plane=[(40, 0)]),
-        "plane_open", ["Plane 0 ", "turn about every axis in it", "1 point only"],
+        "plane_unobservable", ["Plane 0 ", "turn about every axis in it", "1 point only"],
     ),
     (
         "plane seen edge-on",
@@ -214,12 +214,15 @@ CASES = [
         "plane_edge_on", ["Plane 0 ", "turn about x", "edge-on"],
     ),
     (
-        "single plane", lambda: camera_and_planes([0, 0, 1, 0]), "camera_open",
+        "single plane", lambda: camera_and_planes([0, 0, 1, 0]), "camera_unobservable",
         ["Pose 0 ", "move in the plane perpendicular to z", "turn about z"],
     ),
-    ("two planes", lambda: camera_and_planes([0, 0, 1, 0], [1, 0, 0, -2]), "camera_open", ["Pose 0 ", "move along y"]),
+    (
+        "two planes", lambda: camera_and_planes([0, 0, 1, 0], [1, 0, 0, -2]), "camera_unobservable",
+        ["Pose 0 ", "move along y"],
+    ),
     ("planar scene", lambda: problem_of(RING, CLOUD * [1, 1, 0]), "planar_scene", ["one plane", "homography"]),
-    ("camera with two points", few_observations, "camera_open", ["Pose 4 ", "4 measured numbers"]),
+    ("camera with two points", few_observations, "camera_unobservable", ["Pose 4 ", "4 measured numbers"]),
     ("two groups", two_groups, "separate_parts", ["2 groups", "6 and 4"]),
     (
         "camera without observations",
@@ -228,7 +231,7 @@ CASES = [
     ),
     (
         "focal length and depth",
-        lambda: problem_of(PATH, CLOUD * [1, 0, 1], free_intrinsics=True), "parameters_open",
+        lambda: problem_of(PATH, CLOUD * [1, 0, 1], free_intrinsics=True), "parameters_unobservable",
         ["Intrinsic 0", "fx, fy, cx and cy", "makes up for them"],
     ),
 ]  # fmt: skip
@@ -251,7 +254,7 @@ def test_what_is_not_observable_is_named(make, kind, words):
 
 @pytest.mark.parametrize("centers", [[[0, -6, 0], [1, -6, 0]], [[0, -6, 0], [1, -6, 0], [2, -6, 0.5]]])
 def test_few_cameras_are_no_reason_for_alarm(centers):
-    """The frame and the scale of two cameras are those of the scene; no camera is open."""
+    """The frame and the scale of two cameras are those of the scene; no camera is unobservable."""
     diagnosis = diagnose(problem_of(looking(centers), CLOUD))
     assert [finding.kind for finding in diagnosis.findings] == ["determined", "free_motions"], diagnosis.sentences
     assert diagnosis.num_free_motions == 7
@@ -304,7 +307,7 @@ def test_a_point_of_contradicting_matches_is_not_said_to_be_far():
     factor = dataclasses.replace(factor, pixels=pixels, loss=Tukey(5.0))
     diagnosis = diagnose(Problem(problem.variables, [factor]))
     found = [finding for finding in diagnosis.findings if finding.severity == "problem"]
-    assert [(finding.kind, finding.indices) for finding in found] == [("point_open", (7,))], diagnosis.sentences
+    assert [(finding.kind, finding.indices) for finding in found] == [("point_unobservable", (7,))], diagnosis.sentences
     assert "contradict" in found[0].sentence
 
 
@@ -339,7 +342,7 @@ def test_large_systems_are_judged_like_small_ones(name, monkeypatch):
     monkeypatch.setattr("groma.solver.observability.weak_modes.DENSE", 0)
     large = diagnose(CASES_BY_NAME[name]())
     assert [finding.kind for finding in large.findings] == [finding.kind for finding in small.findings]
-    assert large.num_open_directions == small.num_open_directions
+    assert large.num_unobservable_directions == small.num_unobservable_directions
 
 
 def test_a_sound_scene_gives_no_alarm():
@@ -351,7 +354,7 @@ def test_a_sound_scene_gives_no_alarm():
     )
     diagnosis = diagnose(problem)
     assert [finding.kind for finding in diagnosis.findings] == ["determined", "free_motions"]
-    assert diagnosis.num_open_directions == 0
+    assert diagnosis.num_unobservable_directions == 0
     assert (diagnosis.weakness["points"] < 0.01).all()
     held = dataclasses.replace(problem.variables["poses"], constant=np.arange(6) < 2)
     diagnosis = diagnose(Problem({**problem.variables, "poses": held}, problem.factors))
@@ -395,4 +398,6 @@ def test_large_counts_have_separators_and_names_have_none():
 def test_what_helps_one_landmark_is_said_of_one():
     pairs = [(0, 0)] + [(k, c) for k in range(1, 40) for c in range(6)]
     diagnosis = diagnose(problem_of(RING, CLOUD, point_obs=pairs, held=True))
-    assert "Point 0 is seen by one camera only: its depth is open. Drop it or add views." in diagnosis.sentences
+    assert (
+        "Point 0 is seen by one camera only: its depth is not determined. Drop it or add views." in diagnosis.sentences
+    )

@@ -5,6 +5,7 @@ import pytest
 from problems import dense_normal_equations, scene_problem
 
 from groma.factors.losses import Cauchy
+from groma.problem import parallel
 from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import Workers
@@ -13,7 +14,7 @@ from groma.solver.linear.choice import linear_solver
 from groma.solver.linear.schur import LANDMARK_DAMPING, MIN_DIAGONAL, ReducedSystem
 from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport, Stopwatch
-from groma.solver.steps import Step, gradient, retract
+from groma.solver.steps import Step, retract
 
 pytestmark = pytest.mark.kernels
 
@@ -122,12 +123,38 @@ def test_whatever_is_eliminated_the_step_is_the_dense_one(eliminate):
         np.testing.assert_allclose(got[name], expected[name], atol=1e-8 * np.abs(expected[name]).max())
 
 
-def test_threads_do_not_change_the_step():
+def test_threads_do_not_change_the_step(monkeypatch):
+    """To the last digit: how the sums are divided depends on the problem alone."""
+    monkeypatch.setattr(parallel, "FACTORS_FOR_THREADS", 0)
+    monkeypatch.setattr(parallel, "USES_OF_A_BLOCK", 1)
     problem = scene_problem(num_points=80, num_lines=40)
-    _layout, *_, one = eliminated_step(problem, 1e-2)
-    _, *_, two = eliminated_step(problem, 1e-2, threads=2)
-    for first, second in zip(one.parts(), two.parts(), strict=True):
+    _layout, equations, *_, one = eliminated_step(problem, 1e-2)
+    assert len(equations.shares) > 4
+    for threads in (2, 3, 7, 40):
+        _, *_, other = eliminated_step(problem, 1e-2, threads=threads)
+        for first, second in zip(one.parts(), other.parts(), strict=True):
+            np.testing.assert_array_equal(first, second)
+    monkeypatch.setattr(parallel, "FACTORS_FOR_THREADS", 10**9)
+    _, equations, *_, alone = eliminated_step(problem, 1e-2)
+    assert len(equations.shares) == 1
+    for first, second in zip(one.parts(), alone.parts(), strict=True):
         np.testing.assert_allclose(first, second, rtol=1e-9, atol=1e-12)
+
+
+def test_an_error_in_a_thread_is_raised():
+    for threads in (1, 3):
+        workers, done = Workers(threads), []
+
+        def work(task, done=done):
+            if task == 2:
+                raise ValueError("task 2")
+            done.append(task)
+            return task
+
+        with pytest.raises(ValueError, match="task 2"):
+            workers.map(work, 5)
+        assert workers.map(lambda task: task * task, 9) == [task * task for task in range(9)]
+        workers.close()
 
 
 def test_held_coordinates_do_not_move():
@@ -160,7 +187,9 @@ def test_quadratic_model(case):
     problem = scene_problem(**CASES[case])
     layout, equations, system, *_ = eliminated_step(problem, 1e-2)
     H, g, columns = dense_normal_equations(problem)
-    np.testing.assert_allclose(flat(layout, columns, gradient(equations)), g, atol=1e-9 * np.abs(g).max())
+    np.testing.assert_allclose(
+        flat(layout, columns, Step(equations.g_kept, equations.g_landmarks)), g, atol=1e-9 * np.abs(g).max()
+    )
     dofs = [e.dof for e in layout.eliminated]
     landmarks = [V.reshape(-1, n * n)[:, :: n + 1].reshape(-1) for V, n in zip(equations.V, dofs, strict=True)]
     diagonal = Step([system.diagonal(c).reshape(-1) for c in range(len(layout.kept))], landmarks)
@@ -187,7 +216,7 @@ def test_linearisation_predicts_the_cost():
     """A tiny step changes the cost by the gradient's share."""
     problem = scene_problem(num_lines=8, num_planes=1, loss=Cauchy(2.0))
     layout, equations, _system, states, step = eliminated_step(problem, 1e-2)
-    g = gradient(equations)
+    g = Step(equations.g_kept, equations.g_landmarks)
     h = 1e-6
     costs = [equations.cost(equations.prepare(retract(layout, states, step.scaled(sign * h)))) for sign in (1, -1)]
     np.testing.assert_allclose((costs[0] - costs[1]) / (2 * h), g.dot(step), rtol=1e-6)

@@ -51,14 +51,15 @@ class Curve:
     def largest_gradient(self):
         return abs(self.here.x)
 
-    def size(self):
-        return abs(self.here.x)
+    def is_curved(self):
+        return True
 
     def at(self, x):
         cost, promised = self._cost(x), 0.5 * self.here.x**2
         ratio = (self.here.cost - cost) / promised
         length = abs(x - self.here.x)
-        return At(cost=cost, num_hidden=self._hidden(x), gain_ratio=ratio, promised=promised, length=length, x=x)
+        found = {"gain_ratio": ratio, "promised": promised, "length": length, "relative_length": length / abs(x)}
+        return At(cost=cost, num_hidden=self._hidden(x), **found, x=x)
 
     def try_step(self):
         self.calls.append("try")

@@ -8,7 +8,7 @@ from problems import INTRINSICS, dense_normal_equations, pixels_of, scene_proble
 
 import groma.solver.joint as joint_module
 import groma.solver.linear.schur as schur_module
-from groma.errors import ProblemError
+from groma.errors import InputError, ProblemError
 from groma.factors import PointOnLine, PointReprojection, VectorPrior
 from groma.factors.contract import Example, Factor, Ref, Slot
 from groma.factors.losses import Cauchy, Truncated
@@ -87,6 +87,21 @@ def test_start_alone_is_evaluated():
     assert report.termination is Termination.MAX_ITERATIONS
     assert report.initial_cost == report.final_cost == pytest.approx(full.initial_cost, rel=1e-12)
     assert report.final_costs == pytest.approx(full.initial_costs, rel=1e-12)
+
+
+def test_a_start_that_promises_little_is_kept():
+    problem = solve(scene_problem(num_lines=5), SolverOptions(function_tolerance=1e-3)).problem
+    step = solve(problem, SolverOptions(max_iterations=1)).report
+    promised = (step.initial_cost - step.final_cost) / step.history[0].gain_ratio / step.initial_cost
+    assert promised > 0.0
+    kept = solve(problem, SolverOptions(start_tolerance=1.01 * promised))
+    assert (kept.report.termination, kept.report.iterations) == (Termination.COST_CONVERGED, 0)
+    assert kept.report.final_cost == kept.report.initial_cost
+    for name, group in problem.variables.items():
+        np.testing.assert_array_equal(kept.problem.variables[name].state, group.state)
+    moved = solve(problem, SolverOptions(start_tolerance=0.99 * promised)).report
+    assert moved.iterations > 0
+    assert moved.final_cost < moved.initial_cost
 
 
 def test_robust_loss_ignores_an_outlier():
@@ -189,14 +204,66 @@ def test_landmark_without_information_stays():
     assert np.isfinite(solution["points"]).all()
     np.testing.assert_array_equal(solution["points"][3], problem.variables["points"].state[3])
     assert solution.report.num_underdetermined_landmarks == 1
-    assert any("leave a direction" in warning for warning in solution.report.warnings)
+    assert any("unobservable direction" in warning for warning in solution.report.warnings)
 
 
 def test_not_finite_start_is_an_outcome():
     problem = scene_problem(num_points=10)
-    factor = dataclasses.replace(problem.factors[0], sqrt_information=np.inf)
+    factor = dataclasses.replace(problem.factors[0], sqrt_information=1e200)
     report = solve(Problem(problem.variables, [factor])).report
     assert report.termination is Termination.NOT_FINITE
+
+
+def _spoiled(problem: Problem, row: int, value: float) -> PointReprojection:
+    pixels = problem.factors[0].pixels.copy()
+    pixels[row, 1] = value
+    return dataclasses.replace(problem.factors[0], pixels=pixels)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_measurements_that_are_no_numbers_are_refused_by_name(value):
+    problem = scene_problem(num_points=10)
+    with pytest.raises(InputError, match=r"PointReprojection\.pixels must be finite; row 7"):
+        _spoiled(problem, 7, value)
+    prior = VectorPrior(variable=Ref("points", np.arange(8)), measured=np.array(8 * [[1.0, 2.0, 3.0]]))
+    prior.measured[5, 1] = value
+    with pytest.raises(ProblemError, match=r"Factor 5 of 'vector_prior' .* measured is .*\(variable -> points 5\)"):
+        Problem(problem.variables, [prior])
+    for noise in (value, np.where(np.arange(len(problem.factors[0])) == 3, value, 1.0)):
+        with pytest.raises(ProblemError, match="of 'point_reprojection' needs finite numbers; its sqrt_information"):
+            Problem(problem.variables, [dataclasses.replace(problem.factors[0], sqrt_information=noise)])
+    Problem(problem.variables, [_spoiled(problem, 7, 1e308), _spoiled(problem, 8, 1.7e308)])  # large, but numbers
+
+
+@pytest.mark.parametrize("focal", [0.0, -800.0])
+def test_focal_lengths_that_are_not_positive_are_refused_by_name(focal):
+    problem = scene_problem(num_points=10, shared_intrinsics=False)
+    parameters = problem.variables["intrinsics"].state.copy()
+    parameters[2, 1] = focal
+    variables = {**problem.variables, "intrinsics": problem.variables["intrinsics"].with_state(parameters)}
+    with pytest.raises(
+        ProblemError, match=r"Slot 'intrinsics' .* positive focal lengths; those of variable 2 of group"
+    ):
+        Problem(variables, problem.factors)
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_solve_in_which_no_factor_counts_has_not_converged(held):
+    """Behind all cameras, with no weight, or beyond a loss that rejects them: a cost that nothing changes."""
+    problem = scene_problem(num_points=10, constant_poses=held)
+    (factor,) = problem.factors
+    R, t = np.split(problem.variables["poses"].ambient()[0].reshape(3, 4), [3], axis=1)
+    back = R.T @ (np.array([[0.1], [0.2], [-5.0]]) - t)  # behind the first camera, which alone looks
+    one = dataclasses.replace(factor.take(np.flatnonzero(factor.pose.index == 0)), require_in_front=True)
+    behind = Problem(problem.with_states({"points": np.tile(back.T, (10, 1))}).variables, [one])
+    weightless = Problem(problem.variables, [dataclasses.replace(factor, sqrt_information=0.0)])
+    rejected = Problem(
+        problem.variables, [dataclasses.replace(factor, pixels=factor.pixels + 1e6, loss=Truncated(1.0))]
+    )
+    for spoiled in (weightless, rejected, behind):
+        report = solve(spoiled).report
+        assert report.termination is Termination.NO_FACTOR_COUNTS and not report.converged
+    assert solve(behind, SolverOptions(max_iterations=0)).report.termination is Termination.NO_FACTOR_COUNTS
 
 
 def test_unknown_group_and_bad_index_are_refused():

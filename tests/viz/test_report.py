@@ -19,7 +19,7 @@ from groma.scene.synthetic.scenes import holistic
 from groma.viz.pictures import jpeg_address
 from groma.viz.report import data as _page_data
 from groma.viz.report import images as _page_images
-from groma.viz.report.page import write_report
+from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.saved import saved_report
 
 REPORT = SimpleNamespace(
@@ -218,7 +218,7 @@ def test_tables_of_planes_and_directions(tmp_path):
 
 def test_what_became_of_the_segments(tmp_path):
     outcomes = {"mapped": 60, "few_images": 40, "of_a_kind_to_come": 1, "outlier": 0}
-    text = _write(tmp_path, None, exact_scene(), outcomes=outcomes, explanation="4 lines from <60> segments.")
+    text = _write(tmp_path, None, exact_scene(), contents=PageContents(outcomes, "4 lines from <60> segments."))
     assert "4 lines from &lt;60&gt; segments." in text
     for words in ("observes a line", "line in too few images", "of a kind to come", "59 %"):
         assert words in text
@@ -279,7 +279,7 @@ def test_what_the_data_determine(tmp_path):
         ],
         "observability": {"lines": {"determined": 1234, "weak": 5, "undetermined": 1}},
     }
-    text = _write(tmp_path, None, exact_scene(), diagnosis=found)
+    text = _write(tmp_path, None, exact_scene(), contents=PageContents(diagnosis=found))
     for words in ("What the data determine", 'class="is-problem">Line &lt;7&gt; is open.', 'class="is-note">', "1,234"):
         assert words in text
     assert text.index("is-problem") < text.index('class="is-note"')

@@ -50,7 +50,7 @@ class Contribution:
     center_sigma: float | None
     #: Why it is not known; empty if it is.
     center_sigma_missing: str
-    #: How many landmarks the data leave open, by kind, where that is known; they are no harm to the others.
+    #: How many landmarks are unobservable, by kind, where that is known; they are no harm to the others.
     num_undetermined: dict[str, int]
     #: Against a reference, if there is one: rms error of the camera centres, its percentiles over the images, and mean
     #: error of the rotations.
@@ -137,7 +137,7 @@ def _contribution(kind: str, result: AdjustResult, alone: Scene, reference: Scen
     unit = 1.0 if scores is None else scores.alignment.scale
     moved = unit * _distances(scene.cam_from_world, alone.cam_from_world)
     outcomes = report.relations.values()
-    sigma, missing, num_open = _center_sigma(result)
+    sigma, missing, num_undetermined = _center_sigma(result)
     return Contribution(
         added=kind,
         num_landmarks=report.num_points + report.num_lines + report.num_planes,
@@ -148,7 +148,7 @@ def _contribution(kind: str, result: AdjustResult, alone: Scene, reference: Scen
         moved_percentiles=_percentiles(0.0 * moved if scene is alone else moved),
         center_sigma=None if sigma is None else unit * sigma,
         center_sigma_missing=missing,
-        num_undetermined=num_open,
+        num_undetermined=num_undetermined,
         center_error=None if scores is None else scores.center_rmse,
         center_error_percentiles=None if reference is None else _percentiles(_errors(scene, reference)),
         rotation_error_deg=None if scores is None else scores.rotation_deg_mean,
@@ -175,16 +175,16 @@ def _percentiles(values: FloatArray) -> tuple[float, ...]:
 
 
 def _center_sigma(result: AdjustResult) -> tuple[float | None, str, dict[str, int]]:
-    """Return the median standard deviation of the camera centres, why there is none, and how much is open by kind."""
+    """Return the median standard deviation of the camera centres, why there is none, what is unobservable by kind."""
     if result.scene.num_images > MAX_IMAGES:
         return None, f"more than {MAX_IMAGES} images", {}
     try:
         found = uncertainty(result.scene, gauge="held", problem=result.problem)
     except (InputError, ProblemError) as error:
         return None, str(error), {}
-    num_open = {name: len(ids) for name, ids in found.undetermined.items() if len(ids)}
+    num_undetermined = {name: len(ids) for name, ids in found.undetermined.items() if len(ids)}
     sigma = position_sigma(found.centers)
     known = sigma[np.isfinite(sigma) & (sigma > 0)]
     if not len(known):
-        return None, "the poses are held" if (sigma == 0).any() else "no pose is determined", num_open
-    return float(np.median(known)), "", num_open
+        return None, "the poses are held" if (sigma == 0).any() else "no pose is determined", num_undetermined
+    return float(np.median(known)), "", num_undetermined

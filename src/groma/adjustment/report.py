@@ -162,13 +162,13 @@ def why_steps_ran_out(numbers: Mapping[str, Any]) -> list[str]:
     nor a robust loss would make a result that can be relied on.
     """
     diagnosis = numbers.get("diagnosis")
-    if numbers["termination"] != "max_iterations" or diagnosis is None or not diagnosis["num_open_directions"]:
+    if numbers["termination"] != "max_iterations" or diagnosis is None or not diagnosis["num_unobservable_directions"]:
         return []
     costs = [step["cost"] for step in numbers["history"] if step["accepted"]]
     if len(costs) < CREEPING_STEPS or costs[-1] < (1.0 - CREEPING) * costs[-2]:
         return []
     return [
-        "The steps ran out where the data leave cameras or calibrations open: along these the cost falls slowly, and "
+        "The steps ran out where cameras or calibrations are unobservable: along these the cost falls slowly, and "
         "wherever more steps end is one result of many. Hold them, or add data."
     ]
 

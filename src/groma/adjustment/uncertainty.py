@@ -20,7 +20,7 @@ from groma.solver.covariance.marginals import Covariances
 
 @dataclass(frozen=True)
 class SceneUncertainty:
-    """Covariances of a scene. NaN where the data leave something open, zero where it is held."""
+    """Covariances of a scene. NaN for what is unobservable, zero where it is held."""
 
     #: Frame that the covariances refer to: ``inner`` or ``held``.
     gauge: str
@@ -40,7 +40,7 @@ class SceneUncertainty:
     planes: FloatArray
     #: (D, 3, 3) of the directions.
     directions: FloatArray
-    #: Identifiers of what the data leave open, by kind: ``points``, ``lines``, ``planes``, ``directions``, and the rows
+    #: Identifiers of what is unobservable, by kind: ``points``, ``lines``, ``planes``, ``directions``, and the rows
     #: of ``frames``. Their covariances are NaN, and all others are not affected.
     undetermined: dict[str, IntArray]
     #: For joint covariances and derived quantities: groups are ``frames``, ``points``, ``lines``, ``planes``. Of a
@@ -113,7 +113,7 @@ def uncertainty(
         If the gauge is not known.
     ProblemError
         If the poses are not determined; :func:`groma.adjustment.diagnosis.diagnose_scene` says what. Landmarks may be
-        open.
+        unobservable.
     """
     if gauge not in ("auto", "inner", "held"):
         raise InputError(f"gauge must be 'auto', 'inner' or 'held'; got {gauge!r}.")

@@ -43,6 +43,7 @@ from groma._numba_digest import ByLength
 from groma._simd import width
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
+from groma.execution import map_ranges
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 # Kernels by number of the kind. Filled by problem_kind.
@@ -54,6 +55,8 @@ _MOVE: ByLength[Callable[..., None]] = ByLength()
 FIRST_DAMPING, MIN_DAMPING, MAX_ATTEMPTS = 1e-4, 1e-12, 8
 #: A pivot below this fraction of its diagonal entry means a singular system.
 PIVOT_TOLERANCE = 1e-12
+#: Problems, or lines, that one piece of work solves; a problem takes some ten microseconds.
+PROBLEMS_AT_ONCE = 512
 
 
 def _frame(kind, x, B):
@@ -304,11 +307,24 @@ def solve_batch(
     steps, converged = np.zeros(count, np.int64), np.zeros(count, np.bool_)
     rules = (max_steps, tolerance, floor, 1.0 / cauchy_scale**2)
     seen = observations
-    _solve_all(
-        width(kind.number), seen.shared, seen.shared_idx, seen.own, seen.pointers, seen.active, found, frames, rules,
-        cost, information, steps, converged, width(kind.num_parameters), width(kind.num_rows),
-    )  # fmt: skip
+
+    def solve(part: slice) -> None:
+        _solve_all(
+            width(kind.number), seen.shared, seen.shared_idx, seen.own, seen.pointers[part.start : part.stop + 1],
+            seen.active, found[part], frames[part], rules, cost[part], information[part], steps[part], converged[part],
+            width(kind.num_parameters), width(kind.num_rows),
+        )  # fmt: skip
+
+    map_ranges(solve, count, PROBLEMS_AT_ONCE)
     return BatchSolution(found, frames, cost, information, steps, converged)
 
 
-__all__ = ["BatchSolution", "Observations", "ProblemKind", "problem_kind", "solve_batch", "solve_damped"]
+__all__ = [
+    "PROBLEMS_AT_ONCE",
+    "BatchSolution",
+    "Observations",
+    "ProblemKind",
+    "problem_kind",
+    "solve_batch",
+    "solve_damped",
+]

@@ -344,9 +344,7 @@ def _score(pool: Perpendicular | Parallel, candidates: FloatArray, gate: float) 
 def _refine(pool: Perpendicular | Parallel, start: FloatArray, gate: float) -> tuple[FloatArray, FloatArray]:
     """Robust least squares: Gauss-Newton with Geman-McClure weights inside twice the gate's radius."""
     direction = unit(start)
-    information = np.eye(2)
-    basis = np.stack(perpendicular(direction))
-    scale = 1.0
+    information, basis, scale = np.eye(2), np.zeros((2, 3)), 1.0
     for step in range(DIRECTIONS.refine_steps):
         squared = pool.squared(direction[None])[0]
         near = squared < DIRECTIONS.wider * gate

@@ -19,6 +19,8 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
+from groma.execution import map_ranges
 from groma.gates import gate, numbers
 
 
@@ -144,17 +146,39 @@ def _trim_all(center, image, ray, length, pointers, rows, active, gates, X, fron
             X[n, 1, 0], X[n, 1, 1], X[n, 1, 2] = a0 + high_end * d0, a1 + high_end * d1, a2 + high_end * d2
 
 
+@dataclass(frozen=True)
+class SegmentRays:
+    """Segments as the rays of their ends."""
+
+    #: (N, 3) camera centres, and the camera (S,) of each segment.
+    center: FloatArray
+    image: IntArray
+    #: (S, 2, 3) directions of the ends.
+    ray: FloatArray
+    #: (S,) lengths in the image, pixels.
+    length: FloatArray
+
+
 def trim(
-    center: FloatArray,
-    image: IntArray,
-    ray: FloatArray,
-    length: FloatArray,
+    segments: SegmentRays,
     pointers: IntArray,
     rows: IntArray,
     active: BoolArray,
     X: FloatArray,
-    front: BoolArray,
     gates: LineEndGates = LINE_ENDS,
-) -> None:
-    """Move the end points X (L, 2, 3) of lines to where they end; front (M,): observation lies before its camera."""
-    _trim_all(center, image, ray, length, pointers, rows, active, numbers(gates), X, front)
+) -> tuple[FloatArray, BoolArray]:
+    """Return end points (L, 2, 3) of lines X where they end, and (M,) whether observations lie before their cameras.
+
+    Observations of all lines are flat arrays, stored by line: those of line n are ``pointers[n] : pointers[n + 1]``,
+    and ``rows`` names their segments.
+    """
+    found, front = X.copy(), np.empty(len(rows), np.bool_)
+
+    def trim_some(part: slice) -> None:
+        _trim_all(
+            segments.center, segments.image, segments.ray, segments.length, pointers[part.start : part.stop + 1], rows,
+            active, numbers(gates), found[part], front,
+        )  # fmt: skip
+
+    map_ranges(trim_some, len(X), PROBLEMS_AT_ONCE)
+    return found, front

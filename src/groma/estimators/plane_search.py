@@ -21,16 +21,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from heapq import heapify, heappop, heappush
+from heapq import heapify, heappop, heappush, nsmallest
 
 import numpy as np
 from scipy import stats
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.estimators._plane_candidates import Scores, features_of, from_neighbours, from_segments
+from groma.estimators._plane_candidates import Features, Scores, features_of, from_neighbours, from_segments
 from groma.estimators._plane_growth import Grower, Grown, connected_to
 from groma.estimators._plane_options import PLANE_SEARCH, PlaneOptions
+from groma.execution import map_in_threads, num_threads
 from groma.geometry.algebra import vectors
 
 #: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
@@ -169,7 +170,7 @@ def _extract(
     alive = (support >= 0.5 * options.min_support) & (score >= least_score)
     queue = [(-float(score[k]), int(k)) for k in np.flatnonzero(alive)]
     heapify(queue)
-    grower = Grower(features, gate, float(log_tried), options)
+    growth = _Growth(features, gate, float(log_tried), options)
     failures = 0
     patience = max(PLANE_SEARCH.patience, len(candidates) // PLANE_SEARCH.candidates_per_failure)
     at = np.argsort(homes, kind="stable")
@@ -188,8 +189,12 @@ def _extract(
             continue
         alive[best] = False
         failures += 1
-        grown, plane, rows = grower.grow(candidates[best], int(homes[best]), labels)
+        if best not in growth.ready:
+            after = nsmallest(growth.at_once - 1, queue)
+            growth.prepare([best, *(k for _, k in after if alive[k])], candidates, homes, labels)
+        grown, plane, rows = growth.ready[best]
         if grown is not None:
+            growth.ready.clear()
             failures = 0
             labels[grown.taken] = len(found)
             found.append(grown)
@@ -204,6 +209,28 @@ def _extract(
                 PLANE_SEARCH.same * float(np.median(features.spread(plane[:3], rows))),
             )
     return found
+
+
+class _Growth:
+    """Grows the next candidates at the same time, as if one after the other: what was grown before a plane was taken
+    out is grown again after it.
+    """
+
+    def __init__(self, features: Features, gate: float, log_tried: float, options: PlaneOptions) -> None:
+        self.at_once = num_threads()
+        self.ready: dict[int, tuple[Grown | None, FloatArray, IntArray]] = {}
+        self._growers = [Grower(features, gate, log_tried, options) for _ in range(self.at_once)]
+
+    def prepare(self, wanted: list[int], candidates: FloatArray, homes: IntArray, labels: IntArray) -> None:
+        """Grow some candidates."""
+
+        def grow(work: tuple[Grower, int]) -> tuple[Grown | None, FloatArray, IntArray]:
+            grower, k = work
+            return grower.grow(candidates[k], int(homes[k]), labels)
+
+        new = [k for k in wanted if k not in self.ready]
+        found = map_in_threads(grow, list(zip(self._growers, new, strict=False)))
+        self.ready.update(zip(new, found, strict=True))
 
 
 def _ranges(begin: IntArray, end: IntArray) -> IntArray:

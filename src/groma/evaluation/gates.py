@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from groma.gates import gate
@@ -34,13 +35,36 @@ class ScoreGates:
         (1.0, 3.0, 5.0, 10.0), "deg", "thresholds of the area under the curve", "convention: image matching benchmarks"
     )
     time_difference: float = gate(0.01, "s", "times of poses that belong together", "convention: half of TUM's 0.02 s")
+    associated: float = gate(0.5, "share", "less of the shorter side in both is warned of", "convention: half")
+    unrelated: float = gate(
+        0.5,
+        "share",
+        "spread of the centres left by the alignment that is warned of",
+        "convention: half of the variance",
+    )
+    unrelated_deg: float = gate(
+        60.0,
+        "deg",
+        "mean angle left by the alignment that is warned of",
+        "derived from the angle of random rotations: half of it",
+    )
     segment_lengths: tuple[float, ...] = gate(
         (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0), "m", "lengths of the segments of a drift", _KITTI
     )
     segment_step: int = gate(10, "poses", "step between their first poses", _KITTI)
 
 
-#: The numbers in use.
-SCORES = ScoreGates()
+@dataclass(frozen=True)
+class AlignmentGates:
+    """When camera centres determine a rotation."""
 
-__all__ = ["SCORES", "ScoreGates"]
+    known_rotation: float = gate(
+        math.radians(1.0), "rad", "noise of a rotation known from centres; above it orientations may take part",
+        "convention: as for weak directions of a tracked pose",
+    )  # fmt: skip
+
+
+#: The numbers in use.
+SCORES, ALIGNMENT = ScoreGates(), AlignmentGates()
+
+__all__ = ["ALIGNMENT", "SCORES", "AlignmentGates", "ScoreGates"]

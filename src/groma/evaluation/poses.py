@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -37,8 +37,10 @@ class PoseScores:
     num_images: int
     #: Number of images of the reference that the estimate lacks; their pairs count as wrong in ``auc``.
     num_missing: int
+    #: Sentences about what makes the scores doubtful.
+    warnings: tuple[str, ...] = ()
     #: ``reference_from_estimate``: the alignment that was applied.
-    alignment: Similarity = field(repr=False, compare=False)
+    alignment: Similarity = field(default_factory=Similarity, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, object]:
         """Return the scores for a machine-readable report."""
@@ -50,6 +52,7 @@ class PoseScores:
             "auc": {f"{degrees:g}": value for degrees, value in self.auc.items()},
             "num_images": self.num_images,
             "num_missing": self.num_missing,
+            "warnings": list(self.warnings),
         }
 
 
@@ -85,7 +88,15 @@ def evaluate_poses(estimate: Scene, reference: Scene, with_scale: bool = True) -
         )
     estimated = estimate.cam_from_world[[rows[0][name] for name in common]]
     true = reference.cam_from_world[[rows[1][name] for name in common]]
-    return score_poses(estimated, true, with_scale, num_missing=reference.num_images - len(common))
+    scores = score_poses(estimated, true, with_scale, num_missing=reference.num_images - len(common))
+    least = min(scene.num_images for scene in (estimate, reference))
+    if len(common) >= SCORES.associated * least:
+        return scores
+    few = (
+        f"Only {len(common):,} of {estimate.num_images:,} and {reference.num_images:,} images have a name that is in "
+        "both scenes: the scores are of these alone. Are these the same photographs, with the same names?"
+    )
+    return replace(scores, warnings=(few, *scores.warnings))
 
 
 def score_poses(
@@ -114,6 +125,7 @@ def score_poses(
     moved = alignment.poses(estimate)
     distance = np.linalg.norm(camera_centers(moved) - camera_centers(reference), axis=1)
     angle = np.rad2deg(rotation_angle(moved[:, :4], reference[:, :4]))
+    doubt = unrelated(distance, camera_centers(reference), angle)
     return PoseScores(
         center_rmse=float(np.sqrt(np.mean(distance**2))),
         center_max=float(distance.max()),
@@ -122,7 +134,32 @@ def score_poses(
         auc=pairwise_auc(estimate, reference, num_missing),
         num_images=len(estimate),
         num_missing=num_missing,
+        warnings=(doubt,) if doubt else (),
         alignment=alignment,
+    )
+
+
+def unrelated(distance: FloatArray, centers: FloatArray, angle_deg: FloatArray) -> str | None:
+    """Return a sentence where poses agree no better after alignment than those of different scenes would.
+
+    Unrelated scenes agree in nothing: the alignment leaves most of the spread of the centres, and any angle.
+
+    Parameters
+    ----------
+    distance : (N,) float
+        Of the aligned camera centres from the reference.
+    centers : (N, 3) float
+        Camera centres of the reference.
+    angle_deg : (N,) float
+        Between the orientations.
+    """
+    spread = float(np.sum((centers - centers.mean(axis=0)) ** 2))
+    left = float(np.sum(distance**2))
+    if len(distance) < 3 or left <= SCORES.unrelated * spread or float(angle_deg.mean()) <= SCORES.unrelated_deg:
+        return None
+    return (
+        f"The alignment leaves {100 * left / spread if spread else 100:.0f} % of the spread of the centres and "
+        f"{angle_deg.mean():.0f} deg on average: the two seem unrelated (another scene, other frames or another world)."
     )
 
 
@@ -171,4 +208,12 @@ def pairwise_auc(
     return {threshold: total / pairs for threshold, total in sums.items()}
 
 
-__all__ = ["THRESHOLDS_DEG", "PoseScores", "evaluate_poses", "pairwise_auc", "rotation_angle", "score_poses"]
+__all__ = [
+    "THRESHOLDS_DEG",
+    "PoseScores",
+    "evaluate_poses",
+    "pairwise_auc",
+    "rotation_angle",
+    "score_poses",
+    "unrelated",
+]

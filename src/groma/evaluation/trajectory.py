@@ -8,9 +8,12 @@ With poses :math:`P_i` (estimate, after alignment) and :math:`Q_i` (reference), 
   :math:`E = (Q_i^{-1} Q_j)^{-1} (P_i^{-1} P_j)`; the length of its translation and the angle of its rotation;
 * **drift**: the same over segments of given lengths of the reference, divided by the length.
 
-Poses are associated by time: each pose of the shorter trajectory takes the nearest of the longer. Alignment minimises
-the squared absolute errors. Steps in metres are measured along the aligned estimate, and steps do not overlap. Absolute
-and relative error are those of the program *evo* with the same options.
+Poses are associated by time: each pose of the shorter trajectory takes the nearest of the longer. Where one of two
+trajectories of equal length has no times (KITTI), they are associated by their lines instead. Alignment minimises the
+squared absolute errors. Where the positions do not determine the rotation (a straight road, a camera that turns on the
+spot), the orientations take part (:func:`~groma.evaluation.alignment.pose_alignment`). Steps in metres are measured
+along the aligned estimate, and steps do not overlap. Absolute and relative error are those of the program *evo* with
+the same options.
 """
 
 from __future__ import annotations
@@ -23,9 +26,9 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
-from groma.evaluation.alignment import align_poses
+from groma.evaluation.alignment import pose_alignment
 from groma.evaluation.gates import SCORES
-from groma.evaluation.poses import rotation_angle
+from groma.evaluation.poses import rotation_angle, unrelated
 from groma.geometry import quaternion, se3
 from groma.io.trajectories import Trajectory
 from groma.scene import Similarity
@@ -75,12 +78,18 @@ class TrajectoryScores:
     segment_lengths: tuple[float, ...]
     #: How the estimate was aligned: ``se3``, ``sim3`` or ``none``.
     alignment: Alignment
+    #: Whether orientations took part in it, as the positions alone do not determine the rotation.
+    by_orientations: bool
     #: ``reference_from_estimate``: the alignment that was applied; its scale is one unless ``sim3``.
     similarity: Similarity = field(repr=False)
     #: Number of poses that were compared, and of poses in the two trajectories.
     num_poses: int
     num_estimate: int
     num_reference: int
+    #: ``time``, or ``line`` where one side has no times and both have as many lines.
+    association: Literal["time", "line"]
+    #: Sentences about what makes the scores doubtful.
+    warnings: tuple[str, ...]
     #: Length of the path of the reference over the compared poses.
     path_length: float
     #: (N,) times of the compared poses; (N, 7) aligned estimate and reference, world_from_cam; (N,) distances.
@@ -97,9 +106,11 @@ class TrajectoryScores:
             for key in ("rmse", "mean", "median", "max"):
                 result[f"{name}_{key}"] = None if spread is None else getattr(spread, key)
         result["scale"] = self.similarity.scale
-        for name in ("alignment", "num_poses", "num_estimate", "num_reference", "num_pairs", "path_length"):
+        for name in ("alignment", "by_orientations", "num_poses", "num_estimate", "num_reference", "num_pairs"):
             result[name] = getattr(self, name)
+        result["path_length"] = self.path_length
         result["drift_percent"], result["drift_deg_per_metre"] = self.drift_percent, self.drift_deg_per_metre
+        result["association"], result["warnings"] = self.association, list(self.warnings)
         result["segment_lengths"] = list(self.segment_lengths)
         return result
 
@@ -151,13 +162,16 @@ def score_trajectory(
     if not (np.isfinite(rpe_delta) and rpe_delta > 0) or (rpe_unit == "frames" and rpe_delta != int(rpe_delta)):
         raise InputError(f"rpe_delta must be positive, and a whole number of frames; got {rpe_delta} {rpe_unit}.")
     ours, theirs = in_order(estimate), in_order(reference)
-    i, j = associate(ours.timestamps, theirs.timestamps, max_time_difference)
+    by_line = len(ours) == len(theirs) and (counts_lines(ours) or counts_lines(theirs))
+    every = np.arange(len(ours))
+    i, j = (every, every) if by_line else associate(ours.timestamps, theirs.timestamps, max_time_difference)
     if len(i) == 0:
         raise InputError(_no_match(ours, theirs, max_time_difference))
     times, poses, truth = ours.timestamps[i], ours.world_from_cam[i], theirs.world_from_cam[j]
-    similarity = Similarity()
+    similarity, by_orientations = Similarity(), False
     if align != "none":
-        similarity = align_poses(se3.inverse(poses), se3.inverse(truth), align == "sim3")
+        found = pose_alignment(se3.inverse(poses), se3.inverse(truth), align == "sim3")
+        similarity, by_orientations = found.similarity, found.by_orientations
     aligned = apply_similarity(similarity, poses)
 
     errors = np.linalg.norm(aligned[:, 4:] - truth[:, 4:], axis=1)
@@ -165,6 +179,7 @@ def score_trajectory(
     first, second = _steps(times, aligned[:, 4:], float(rpe_delta), rpe_unit)
     translation, rotation = _relative_errors(aligned, truth, first, second)
     drift, turn, lengths, path = _drift(aligned, truth)
+    doubts = (_few_in_common(ours, theirs, len(i)), unrelated(errors, truth[:, 4:], np.degrees(angles)))
     return TrajectoryScores(
         ate=Spread.of(errors),
         rotation_deg=Spread.of(np.degrees(angles)),
@@ -175,10 +190,13 @@ def score_trajectory(
         drift_deg_per_metre=turn,
         segment_lengths=lengths,
         alignment=align,
+        by_orientations=by_orientations,
         similarity=similarity,
         num_poses=len(i),
         num_estimate=len(estimate),
         num_reference=len(reference),
+        association="line" if by_line else "time",
+        warnings=tuple(doubt for doubt in doubts if doubt),
         path_length=path,
         timestamps=times,
         aligned=aligned,
@@ -209,6 +227,11 @@ def associate(
         return _nearest(a, b, max_time_difference)
     j, i = _nearest(b, a, max_time_difference)
     return i, j
+
+
+def counts_lines(trajectory: Trajectory) -> bool:
+    """Whether the times are the numbers of the lines 0, 1, ..., as in a file without times."""
+    return len(trajectory) > 0 and bool((trajectory.timestamps == np.arange(len(trajectory))).all())
 
 
 def in_order(trajectory: Trajectory) -> Trajectory:
@@ -250,6 +273,20 @@ def _no_match(estimate: Trajectory, reference: Trajectory, limit: float) -> str:
     return (
         f"No two poses are within {limit:g} s: the estimate runs from {a[0]:.6f} to {a[-1]:.6f}, the reference from "
         f"{b[0]:.6f} to {b[-1]:.6f}. Check the units of time, or allow a larger difference."
+    )
+
+
+def _few_in_common(estimate: Trajectory, reference: Trajectory, count: int) -> str | None:
+    """Return a sentence where fewer poses are associated than should be."""
+    if count >= SCORES.associated * min(len(estimate), len(reference)):
+        return None
+    numbered = [name for name, side in (("EST", estimate), ("REF", reference)) if counts_lines(side)]
+    hint = "check the units of time, or allow a larger difference"
+    if numbered:
+        hint = f"{' and '.join(numbered)} has no times but the numbers of its lines; give them (--times)"
+    return (
+        f"Only {count:,} of {len(estimate):,} and {len(reference):,} poses are associated, perhaps wrongly: the scores "
+        f"are of these alone. By their times the two hardly overlap; {hint}."
     )
 
 
@@ -316,6 +353,7 @@ __all__ = [
     "TrajectoryScores",
     "apply_similarity",
     "associate",
+    "counts_lines",
     "in_order",
     "score_trajectory",
 ]

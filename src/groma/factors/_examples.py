@@ -49,7 +49,7 @@ def make_example(
     factor : Factor
         The factors.
     rng : numpy.random.Generator
-        Source of chance.
+        Random generator.
     manifolds : mapping, optional
         Charts by group; the default chart of the kind otherwise.
     states : mapping, optional

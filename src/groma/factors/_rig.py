@@ -189,7 +189,7 @@ class CameraFactor(Factor):
             if not finite.all():
                 row = int(np.argmin(finite))
                 raise InputError(
-                    f"{type(self).__name__}.{field} must be finite; row {row} is {getattr(self, field)[row]} "
+                    f"{type(self).__name__}.{field} must be finite; row {row} is {getattr(self, field)[row].tolist()} "
                     f"({np.count_nonzero(~finite)} such rows). Leave these observations out."
                 )
 

@@ -26,6 +26,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -101,22 +102,31 @@ class Factor(ABC):
     type_name: ClassVar[str] = ""
     #: The variables touched, in order.
     slots: ClassVar[tuple[Slot, ...]]
+    #: Rows m of one residual; where they are not the same for all factors of a type, it overrides ``residual_size``.
+    rows: ClassVar[int]
+    #: How many of them are independent; 0: all.
+    independent_rows: ClassVar[int] = 0
     #: Which motions of the world it does not notice; None: not declared, and not checked.
     invariance: ClassVar[Invariance | None] = Invariance()
 
     @property
-    @abstractmethod
     def residual_size(self) -> int:
         """Rows m of one residual."""
+        return self.rows
 
     @property
     def residual_rank(self) -> int:
         """Independent rows of one residual: less than ``residual_size`` where rows depend on each other."""
-        return self.residual_size
+        return self.independent_rows or self.residual_size
 
     def references(self) -> tuple[tuple[Slot, Ref], ...]:
         """The slots that are present, each with the variables it refers to, in order."""
-        return tuple((slot, getattr(self, slot.name)) for slot in self.slots if getattr(self, slot.name) is not None)
+        return self._references
+
+    @cached_property
+    def _references(self) -> tuple[tuple[Slot, Ref], ...]:
+        present = ((slot, getattr(self, slot.name)) for slot in self.slots)
+        return tuple((slot, ref) for slot, ref in present if ref is not None)
 
     def __len__(self) -> int:
         return len(self.references()[0][1].index)

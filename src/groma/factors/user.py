@@ -92,8 +92,6 @@ class UserFactor(Factor):
     data_size: ClassVar[int] = 0
     #: Not declared unless :func:`factor` is told.
     invariance: ClassVar[Invariance | None] = None
-    #: Rows of one residual.
-    rows: ClassVar[int] = 0
     #: The user's function, before compilation.
     function: ClassVar[Callable]
 
@@ -104,10 +102,6 @@ class UserFactor(Factor):
         if self.data is None and self.data_size == 0:
             object.__setattr__(self, "data", np.zeros((len(self), 0)))
         set_rows(self, "data", self.data_size)
-
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return self.rows
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         for slot, ambient, size in zip(self.slots, ambients, self._loops.sizes, strict=True):

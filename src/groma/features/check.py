@@ -120,8 +120,10 @@ def check_matcher(matcher: SegmentMatcher) -> None:
     found.check(len(views[0].segments), len(views[1].segments))
     one, two = views[0].segments.ends[found.pairs[:, 0]], views[1].segments.ends[found.pairs[:, 1]]
     right = np.abs(one - two - [_SHIFT, 0.0, _SHIFT, 0.0]).max(axis=1, initial=0.0) < 3.0
-    fewest = 0.5 * min(len(view.segments) for view in views)
-    _require(len(found) >= fewest, name, f"only {len(found)} segments are matched; expected at least {fewest:.0f}")
+    min_matches = 0.5 * min(len(view.segments) for view in views)
+    _require(
+        len(found) >= min_matches, name, f"only {len(found)} segments are matched; expected at least {min_matches:.0f}"
+    )
     _require(right.mean() >= 0.9, name, f"{(~right).sum()} of {len(found)} matches are wrong")
     bare = _with(views[1], segments=Segments.empty())
     _require(len(matcher.match(first, matcher.describe(bare))) == 0, name, "an image without segments has matches")

@@ -24,7 +24,7 @@ from groma.features.segments import Segments
 
 @runtime_checkable
 class SegmentDetector(Protocol):
-    """Finds line segments in an image."""
+    """Finds line segments in an image; called from several threads."""
 
     def detect(self, image: npt.NDArray[np.generic]) -> Segments:
         """Segments of an image (H, W) or (H, W, 3), 8 bit.
@@ -58,7 +58,7 @@ class ImageView:
 
 @runtime_checkable
 class SegmentMatcher(Protocol):
-    """Finds which segments of two images show the same edge."""
+    """Finds which segments of two images show the same edge. Both methods are called from several threads."""
 
     def describe(self, view: ImageView) -> Any:
         """Return what :meth:`match` needs of one image; called once an image, and kept."""
@@ -71,7 +71,7 @@ class SegmentMatcher(Protocol):
 
 @runtime_checkable
 class ImageRetrieval(Protocol):
-    """Tells which images of a set may show what another image shows."""
+    """Tells which images of a set may show what another image shows; ``describe`` is called from several threads."""
 
     def describe(self, image: npt.NDArray[np.generic]) -> Any:
         """Return what :meth:`similarity` needs of one image (H, W) or (H, W, 3), 8 bit; called once an image."""

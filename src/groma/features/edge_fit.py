@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from groma._numba import kernel, loop
+from groma._numba import inline_kernel, kernel, loop
 from groma._typing import FloatArray
 from groma.features.images import GrayImage
 from groma.gates import gate, numbers
@@ -127,6 +127,59 @@ def _line_fit(s, e, w, n, out):
     return True
 
 
+@inline_kernel
+def _mean_gradient(image, u1, v1, u2, v2, dx, dy, count):
+    """Sum of the gradients along a segment towards its right hand (-dy, dx); the sign gives the direction."""
+    total = 0.0
+    for k in range(count):
+        t = (k + 0.5) / count
+        x, y = u1 + t * (u2 - u1) - 0.5, v1 + t * (v2 - v1) - 0.5
+        total += _bilinear(image, x - dy, y + dx) - _bilinear(image, x + dy, y - dx)
+    return total
+
+
+@inline_kernel
+def _robust_line(s, e, w, spread, n, outlier, line):
+    """Fit offsets e at places s by a line, with weights w that let go of what is far; False where it fails."""
+    # Start from the median offset: half of the samples may belong to a neighbouring edge.
+    line[0], line[1] = np.median(e[:n]), 0.0
+    for _ in range(4):
+        for k in range(n):
+            spread[k] = abs(e[k] - line[0] - line[1] * s[k])
+        cut = outlier * max(1.4826 * np.median(spread[:n]), 0.05)
+        for k in range(n):
+            ratio = spread[k] / cut
+            w[k] = (1.0 - ratio * ratio) ** 2 if ratio < 1.0 else 0.0
+        if not _line_fit(s, e, w, n, line):
+            return False
+    return True
+
+
+@inline_kernel
+def _end_sigma(s, e, w, n, line, numbers):
+    """Standard deviation of the ends across the segment, from residuals, their correlation and their bow."""
+    min_sigma, prior_sigma, prior_count, bow_test = numbers
+    weight, squares, lagged, before = 0.0, 0.0, 0.0, 0.0
+    bow, bows = 0.0, 0.0
+    for k in range(n):
+        residual = e[k] - line[0] - line[1] * s[k]
+        arc = s[k] * s[k] - 1.0 / 12.0
+        bow += w[k] * arc * residual
+        bows += w[k] * arc * arc
+        weight += w[k]
+        squares += w[k] * residual * residual
+        if k > 0:
+            lagged += math.sqrt(w[k] * w[k - 1]) * residual * before
+        before = residual
+    variance = (squares + prior_count * prior_sigma**2) / (weight + prior_count)
+    rho = min(max(lagged / max(squares, 1e-12), 0.0), 0.9)
+    effective = max(weight * (1.0 - rho) / (1.0 + rho), 2.0)
+    bow /= max(bows, 1e-12)
+    if bow * bow * bows < bow_test * variance * (weight / effective):
+        bow = 0.0
+    return math.sqrt(min_sigma**2 + 4.0 * variance / effective + (bow / 6.0) ** 2)
+
+
 @loop
 def _measure_all(image, ends, fit, gates, new_ends, sigma, strength):
     """Direct, fit and rate all segments; `image` is float32, smoothed, `gates` the numbers of :class:`EdgeGates`."""
@@ -138,12 +191,7 @@ def _measure_all(image, ends, fit, gates, new_ends, sigma, strength):
         length = math.hypot(u2 - u1, v2 - v1)
         count = max(int(length), 2)
         dx, dy = (u2 - u1) / max(length, 1e-9), (v2 - v1) / max(length, 1e-9)
-        # Mean gradient towards the right hand (-dy, dx): its sign gives the direction.
-        total = 0.0
-        for k in range(count):
-            t = (k + 0.5) / count
-            x, y = u1 + t * (u2 - u1) - 0.5, v1 + t * (v2 - v1) - 0.5
-            total += _bilinear(image, x - dy, y + dx) - _bilinear(image, x + dy, y - dx)
+        total = _mean_gradient(image, u1, v1, u2, v2, dx, dy, count)
         if total < 0.0:
             u1, v1, u2, v2 = u2, v2, u1, v1
             dx, dy = -dx, -dy
@@ -165,43 +213,13 @@ def _measure_all(image, ends, fit, gates, new_ends, sigma, strength):
                 n += 1
         if n < 5 or n < min_share * count:
             continue
-        # Start from the median offset: half of the samples may belong to a neighbouring edge.
-        line[0], line[1] = np.median(e[:n]), 0.0
-        good = True
-        for _ in range(4):
-            for k in range(n):
-                spread[k] = abs(e[k] - line[0] - line[1] * s[k])
-            cut = outlier * max(1.4826 * np.median(spread[:n]), 0.05)
-            for k in range(n):
-                ratio = spread[k] / cut
-                w[k] = (1.0 - ratio * ratio) ** 2 if ratio < 1.0 else 0.0
-            if not _line_fit(s, e, w, n, line):
-                good = False
-                break
+        good = _robust_line(s, e, w, spread, n, outlier, line)
         first, second = line[0] - 0.5 * line[1], line[0] + 0.5 * line[1]
         if not good or abs(first) > max_shift or abs(second) > max_shift:
             continue
         new_ends[row, 0], new_ends[row, 1] = u1 - dy * first, v1 + dx * first
         new_ends[row, 2], new_ends[row, 3] = u2 - dy * second, v2 + dx * second
-        weight, squares, lagged, before = 0.0, 0.0, 0.0, 0.0
-        bow, bows = 0.0, 0.0
-        for k in range(n):
-            residual = e[k] - line[0] - line[1] * s[k]
-            arc = s[k] * s[k] - 1.0 / 12.0
-            bow += w[k] * arc * residual
-            bows += w[k] * arc * arc
-            weight += w[k]
-            squares += w[k] * residual * residual
-            if k > 0:
-                lagged += math.sqrt(w[k] * w[k - 1]) * residual * before
-            before = residual
-        variance = (squares + prior_count * prior_sigma**2) / (weight + prior_count)
-        rho = min(max(lagged / max(squares, 1e-12), 0.0), 0.9)
-        effective = max(weight * (1.0 - rho) / (1.0 + rho), 2.0)
-        bow /= max(bows, 1e-12)
-        if bow * bow * bows < bow_test * variance * (weight / effective):
-            bow = 0.0
-        sigma[row] = math.sqrt(min_sigma**2 + 4.0 * variance / effective + (bow / 6.0) ** 2)
+        sigma[row] = _end_sigma(s, e, w, n, line, (min_sigma, prior_sigma, prior_count, bow_test))
 
 
 # --------------------------------------------------------------------------------------------------------- Public

@@ -12,8 +12,6 @@ Nothing is unpickled. Either order of the two images will do when asking for a p
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from groma.bounded.arrays import opened_arrays
 from groma.errors import FileFormatError, GromaError
 from groma.features.edge_fit import measure_edges
 from groma.features.images import to_gray
@@ -33,10 +32,10 @@ from groma.features.segments import Segments
 class ExternalMatches:
     """Segments and matches by image name."""
 
+    #: End points (N, 4) by image name; empty where the file has matches only.
     segments: Mapping[str, npt.NDArray[np.float64]]
-    """End points (N, 4) by image name; empty where the file has matches only."""
+    #: Matches by pair of image names.
     matches: Mapping[tuple[str, str], LineMatches]
-    """Matches by pair of image names."""
 
     def match(self, first: str, second: str) -> LineMatches:
         """Matches of a pair in the order asked for; none where the file has none."""
@@ -96,31 +95,20 @@ def read_matches(path: str | Path) -> ExternalMatches:
 
 
 def _arrays(path: Path) -> dict[str, Any]:
-    """Arrays of an archive, and what is wrong with it in our own words: NumPy's would have strangers' code run."""
+    """Arrays of an archive, and what is wrong with it in our own words."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            if (broken := archive.testzip()) is not None:
-                raise FileFormatError(f"{path} is damaged: '{broken}' in it cannot be read. Write the file again.")
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as saved:
-            return {key: _plain(path, saved, key) for key in saved.files}
+        with opened_arrays(path) as members:
+            return {key: members.read(key) for key in members.names}
     except FileNotFoundError:
         raise FileFormatError(f"Expected an .npz file of line matches; {path} does not exist.") from None
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
+    except FileFormatError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    except OSError as error:
+        raise FileFormatError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except Exception as error:  # of zipfile and zlib, which have no common root
         raise FileFormatError(
             f"Expected an .npz file of line matches; {path} is another kind of file, or incomplete. Write it with "
             "numpy.savez, or groma.features.external.write_matches."
-        ) from error
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be read: {error.strerror or error}.") from error
-
-
-def _plain(path: Path, saved: Mapping[str, Any], key: str) -> Any:
-    try:
-        return saved[key]
-    except (ValueError, KeyError, TypeError, AttributeError, SyntaxError) as error:
-        raise FileFormatError(
-            f"{path}: array '{key}' holds Python objects or is damaged; only arrays of numbers are read. Convert it to "
-            "numbers before it is saved."
         ) from error
 
 

@@ -41,7 +41,8 @@ def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
         image = image.astype(np.uint8) * 255
     elif image.dtype == np.uint16:
         full = _FULL_12_BITS if image.max() <= _FULL_12_BITS else 65535
-        image = np.round(image.astype(np.float64) * (255.0 / full)).astype(np.uint8)
+        levels = np.round(np.arange(full + 1) * (255.0 / full)).astype(np.uint8)
+        image = levels[np.asarray(image, np.uint16)]
     elif np.issubdtype(image.dtype, np.floating):
         levels = image.astype(np.float64)
         if not np.isfinite(levels).all():

@@ -27,18 +27,18 @@ MIN_IMAGE = 8  # pixels; LSD needs a few gradients, and no segment fits in less
 class LsdDetector:
     """Line segment detector (Grompone von Gioi et al., 2010) without its refinement, then fitted to the grey levels."""
 
+    #: Shortest segment, pixels.
     min_length: float = 20.0
-    """Shortest segment, pixels."""
+    #: Smallest mean gradient across a segment, grey levels (of 255) per pixel.
     min_strength: float = 3.0
-    """Smallest mean gradient across a segment, grey levels (of 255) per pixel."""
+    #: Reduction of the image before detection.
     scale: float = 0.8
-    """Reduction of the image before detection."""
+    #: Fit the end points to the grey levels across the segment (see :mod:`groma.features.edge_fit`).
     fit: bool = True
-    """Fit the end points to the grey levels across the segment (see :mod:`groma.features.edge_fit`)."""
+    #: Join collinear neighbours (see :mod:`groma.features.merging`).
     merge: bool = True
-    """Join collinear neighbours (see :mod:`groma.features.merging`)."""
+    #: Keep at most so many, the longest; 0 keeps all.
     max_segments: int = 0
-    """Keep at most so many, the longest; 0 keeps all."""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.min_length) and self.min_length > 0.0):

@@ -29,11 +29,11 @@ RIVALS = RivalGates()
 class LineMatches:
     """Pairs of segments that may show the same edge."""
 
+    #: (M, 2) index of the segment in the first and in the second image.
     pairs: IntArray
-    """(M, 2) index of the segment in the first and in the second image."""
 
+    #: (M,) between 0 and 1, higher is better.
     score: FloatArray
-    """(M,) between 0 and 1, higher is better."""
 
     def __post_init__(self) -> None:
         pairs = np.asarray(self.pairs)

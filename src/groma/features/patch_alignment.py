@@ -32,7 +32,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from groma._numba import kernel, loop
+from groma._numba import inline_kernel, kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import ShapeError
 from groma.features.images import GrayImage
@@ -40,7 +40,8 @@ from groma.gates import gate, numbers
 
 RADIUS = 7  # of the template, pixels
 SIZE = 2 * RADIUS + 3  # side of a template: the patch and one pixel more for its gradient
-_COUNT = (2 * RADIUS + 1) ** 2
+_SIDE = 2 * RADIUS + 1
+_COUNT = _SIDE**2
 
 
 @dataclass(frozen=True)
@@ -115,15 +116,153 @@ def _cut_all(image, pixels, templates, fractions):
                 templates[row, v, u] = image[i + v - reach, j + u - reach]
 
 
+@inline_kernel
+def _describe(templates, number, fu, fv, window, S, T, W, H):
+    """Write grey levels about their mean, their rows s(x), weights and H; return the sums of w and of w T^2."""
+    total, mean = 0.0, 0.0
+    for v in range(_SIDE):
+        for u in range(_SIDE):
+            k = v * _SIDE + u
+            W[k] = window[u] * window[v]
+            T[k] = templates[number, v + 1, u + 1]
+            total += W[k]
+            mean += W[k] * T[k]
+    mean /= total
+    squares = 0.0
+    H[:, :] = 0.0
+    for v in range(_SIDE):
+        y = v - RADIUS - fv
+        for u in range(_SIDE):
+            x = u - RADIUS - fu
+            k = v * _SIDE + u
+            gu = 0.5 * (templates[number, v + 1, u + 2] - templates[number, v + 1, u])
+            gv = 0.5 * (templates[number, v + 2, u + 1] - templates[number, v, u + 1])
+            T[k] -= mean
+            squares += W[k] * T[k] * T[k]
+            S[k, 0], S[k, 1], S[k, 2], S[k, 3] = gu * x, gu * y, gv * x, gv * y
+            S[k, 4], S[k, 5], S[k, 6], S[k, 7] = gu, gv, T[k], 1.0
+            for a in range(8):
+                for b in range(a + 1):
+                    H[a, b] += W[k] * S[k, a] * S[k, b]
+    return total, squares
+
+
+@inline_kernel
+def _invert_normal(H, noise, shape_sigma):
+    """Complete H from its lower triangle, hold the shape, and invert it in place; False where it is singular."""
+    for a in range(8):
+        for b in range(a):
+            H[b, a] = H[a, b]
+    for a in range(4):
+        H[a, a] += noise / shape_sigma**2
+    return _solve_in_place(H, 8)
+
+
+@inline_kernel
+def _warp(image, A, c, fu, fv, W, wu, wv, warped):
+    """Write the grey levels of the image under the map; return their weighted sum, NaN where it leaves the image."""
+    height, width = image.shape
+    weighted = 0.0
+    for v in range(_SIDE):
+        y = v - RADIUS - fv
+        for u in range(_SIDE):
+            x = u - RADIUS - fu
+            pu, pv = c[0] + A[0] * x + A[1] * y, c[1] + A[2] * x + A[3] * y
+            if not (pu >= 1.0 and pv >= 1.0 and pu < width - 2.0 and pv < height - 2.0):
+                return math.nan
+            j, i = int(pu), int(pv)
+            _cubic_weights(pu - j, wu)
+            _cubic_weights(pv - i, wv)
+            level = 0.0
+            for b in range(4):
+                line = 0.0
+                for a in range(4):
+                    line += wu[a] * image[i - 1 + b, j - 1 + a]
+                level += wv[b] * line
+            k = v * _SIDE + u
+            warped[k] = level
+            weighted += W[k] * level
+    return weighted
+
+
+@inline_kernel
+def _increment(H, S, T, W, warped, gain, rhs, delta):
+    """Write the increment of the template's shape and place; return the weighted sum of squared differences."""
+    rhs[:] = 0.0
+    residual = 0.0
+    for k in range(_COUNT):
+        e = gain * warped[k] - T[k]
+        residual += W[k] * e * e
+        for a in range(8):
+            rhs[a] += W[k] * S[k, a] * e
+    for a in range(6):
+        delta[a] = 0.0
+        for b in range(8):
+            delta[a] += H[a, b] * rhs[b]
+    return residual
+
+
+@inline_kernel
+def _undo(A, c, delta):
+    """Undo the increment of the template in the image; return the map and its squared step, NaN if it collapses."""
+    D0, D1, D2, D3 = 1.0 + delta[0], delta[1], delta[2], 1.0 + delta[3]
+    determinant = D0 * D3 - D1 * D2
+    if not determinant > 0.2:
+        return A, c, math.nan
+    B0, B1 = (A[0] * D3 - A[1] * D2) / determinant, (A[1] * D0 - A[0] * D1) / determinant
+    B2, B3 = (A[2] * D3 - A[3] * D2) / determinant, (A[3] * D0 - A[2] * D1) / determinant
+    su, sv = B0 * delta[4] + B1 * delta[5], B2 * delta[4] + B3 * delta[5]
+    return (B0, B1, B2, B3), (c[0] - su, c[1] - sv), su * su + sv * sv
+
+
+@inline_kernel
+def _align(image, A, c, fu, fv, total, squares, rules, S, T, W, H, warped, rhs, delta, wu, wv):
+    """Move the map (A, c) until the template fits; return it, the squares left and the correlation, NaN if lost."""
+    max_iterations, smallest_step = rules
+    residual, likeness = 0.0, math.nan
+    for iteration in range(int(max_iterations) + 1):
+        mean = _warp(image, A, c, fu, fv, W, wu, wv, warped) / total
+        if not mean < math.inf:
+            return A, c, residual, math.nan
+        common, energy = 0.0, 0.0
+        for k in range(_COUNT):
+            warped[k] -= mean
+            energy += W[k] * warped[k] * warped[k]
+            common += W[k] * warped[k] * T[k]
+        if not energy > 1e-3 * squares or not common > 0.0:
+            return A, c, residual, math.nan
+        likeness = common / math.sqrt(energy * squares)
+        residual = _increment(H, S, T, W, warped, common / energy, rhs, delta)
+        if iteration == max_iterations:
+            break
+        A, c, step = _undo(A, c, delta)
+        if not step >= smallest_step**2:
+            if not step >= 0.0:
+                return A, c, residual, math.nan
+            break
+    return A, c, residual, likeness
+
+
+@inline_kernel
+def _place_covariance(H, A, variance, covariance):
+    """Carry the covariance of the place in the template to the image."""
+    c00, c01, c11 = H[4, 4], H[4, 5], H[5, 5]
+    left0, left1 = A[0] * c00 + A[1] * c01, A[0] * c01 + A[1] * c11
+    right0, right1 = A[2] * c00 + A[3] * c01, A[2] * c01 + A[3] * c11
+    covariance[0, 0] = variance * (left0 * A[0] + left1 * A[1])
+    covariance[0, 1] = variance * (left0 * A[2] + left1 * A[3])
+    covariance[1, 0] = covariance[0, 1]
+    covariance[1, 1] = variance * (right0 * A[2] + right1 * A[3])
+
+
 @loop
 def _align_all(
     image, templates, fractions, template_index, pixels, shapes, gates, out_pixels, covariance, correlation
 ):  # fmt: skip
     """Align one template per row to the image; correlation NaN where it left the image or has no texture."""
     spread, max_iterations, smallest_step, shape_sigma, unexplained, min_texture, _ = gates
-    height, width = image.shape
-    window = np.empty(2 * RADIUS + 1)
-    for k in range(2 * RADIUS + 1):
+    window = np.empty(_SIDE)
+    for k in range(_SIDE):
         window[k] = math.exp(-0.5 * ((k - RADIUS) / spread) ** 2)
     S, T, W, warped = np.empty((_COUNT, 8)), np.empty(_COUNT), np.empty(_COUNT), np.empty(_COUNT)
     H, rhs, delta, wu, wv = np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(4), np.empty(4)
@@ -134,123 +273,22 @@ def _align_all(
         fu, fv = fractions[number, 0], fractions[number, 1]
         if not abs(fu) + abs(fv) < math.inf:
             continue
-        total, mean = 0.0, 0.0
-        for v in range(2 * RADIUS + 1):
-            for u in range(2 * RADIUS + 1):
-                k = v * (2 * RADIUS + 1) + u
-                W[k] = window[u] * window[v]
-                T[k] = templates[number, v + 1, u + 1]
-                total += W[k]
-                mean += W[k] * T[k]
-        mean /= total
-        squares = 0.0
-        for a in range(8):
-            for b in range(8):
-                H[a, b] = 0.0
-        for v in range(2 * RADIUS + 1):
-            y = v - RADIUS - fv
-            for u in range(2 * RADIUS + 1):
-                x = u - RADIUS - fu
-                k = v * (2 * RADIUS + 1) + u
-                gu = 0.5 * (templates[number, v + 1, u + 2] - templates[number, v + 1, u])
-                gv = 0.5 * (templates[number, v + 2, u + 1] - templates[number, v, u + 1])
-                T[k] -= mean
-                squares += W[k] * T[k] * T[k]
-                S[k, 0], S[k, 1], S[k, 2], S[k, 3] = gu * x, gu * y, gv * x, gv * y
-                S[k, 4], S[k, 5], S[k, 6], S[k, 7] = gu, gv, T[k], 1.0
-                for a in range(8):
-                    for b in range(a + 1):
-                        H[a, b] += W[k] * S[k, a] * S[k, b]
+        total, squares = _describe(templates, number, fu, fv, window, S, T, W, H)
         if not squares > min_texture * total:
             continue
-        noise = unexplained * squares / total
-        for a in range(8):
-            for b in range(a):
-                H[b, a] = H[a, b]
-        for a in range(4):
-            H[a, a] += noise / shape_sigma**2
-        if not _solve_in_place(H, 8):
+        if not _invert_normal(H, unexplained * squares / total, shape_sigma):
             continue
-        A0, A1, A2, A3 = shapes[row, 0, 0], shapes[row, 0, 1], shapes[row, 1, 0], shapes[row, 1, 1]
-        cu, cv = pixels[row, 0] - 0.5, pixels[row, 1] - 0.5
-        inside, residual, likeness = True, 0.0, -1.0
-        for iteration in range(int(max_iterations) + 1):
-            mean = 0.0
-            for v in range(2 * RADIUS + 1):
-                y = v - RADIUS - fv
-                for u in range(2 * RADIUS + 1):
-                    x = u - RADIUS - fu
-                    pu, pv = cu + A0 * x + A1 * y, cv + A2 * x + A3 * y
-                    if not (pu >= 1.0 and pv >= 1.0 and pu < width - 2.0 and pv < height - 2.0):
-                        inside = False
-                        break
-                    j, i = int(pu), int(pv)
-                    _cubic_weights(pu - j, wu)
-                    _cubic_weights(pv - i, wv)
-                    level = 0.0
-                    for b in range(4):
-                        line = 0.0
-                        for a in range(4):
-                            line += wu[a] * image[i - 1 + b, j - 1 + a]
-                        level += wv[b] * line
-                    k = v * (2 * RADIUS + 1) + u
-                    warped[k] = level
-                    mean += W[k] * level
-                if not inside:
-                    break
-            if not inside:
-                break
-            mean /= total
-            common, energy = 0.0, 0.0
-            for k in range(_COUNT):
-                warped[k] -= mean
-                energy += W[k] * warped[k] * warped[k]
-                common += W[k] * warped[k] * T[k]
-            if not energy > 1e-3 * squares or not common > 0.0:
-                inside = False
-                break
-            likeness = common / math.sqrt(energy * squares)
-            gain = common / energy
-            for a in range(8):
-                rhs[a] = 0.0
-            residual = 0.0
-            for k in range(_COUNT):
-                e = gain * warped[k] - T[k]
-                residual += W[k] * e * e
-                for a in range(8):
-                    rhs[a] += W[k] * S[k, a] * e
-            for a in range(6):
-                delta[a] = 0.0
-                for b in range(8):
-                    delta[a] += H[a, b] * rhs[b]
-            if iteration == max_iterations:
-                break
-            # The increment of the template, undone in the image.
-            D0, D1, D2, D3 = 1.0 + delta[0], delta[1], delta[2], 1.0 + delta[3]
-            determinant = D0 * D3 - D1 * D2
-            if not determinant > 0.2:
-                inside = False
-                break
-            B0, B1 = (A0 * D3 - A1 * D2) / determinant, (A1 * D0 - A0 * D1) / determinant
-            B2, B3 = (A2 * D3 - A3 * D2) / determinant, (A3 * D0 - A2 * D1) / determinant
-            A0, A1, A2, A3 = B0, B1, B2, B3
-            su, sv = A0 * delta[4] + A1 * delta[5], A2 * delta[4] + A3 * delta[5]
-            cu -= su
-            cv -= sv
-            if su * su + sv * sv < smallest_step**2:
-                break
-        if not inside:
+        A = shapes[row, 0, 0], shapes[row, 0, 1], shapes[row, 1, 0], shapes[row, 1, 1]
+        c = pixels[row, 0] - 0.5, pixels[row, 1] - 0.5
+        rules = (max_iterations, smallest_step)
+        A, c, residual, likeness = _align(
+            image, A, c, fu, fv, total, squares, rules, S, T, W, H, warped, rhs, delta, wu, wv
+        )
+        if not abs(likeness) < math.inf:
             continue
         correlation[row] = likeness
-        out_pixels[row, 0], out_pixels[row, 1] = cu + 0.5, cv + 0.5
-        variance = residual / total * _COUNT / (_COUNT - 8.0)
-        c00, c01, c11 = H[4, 4], H[4, 5], H[5, 5]
-        left0, left1 = A0 * c00 + A1 * c01, A0 * c01 + A1 * c11
-        right0, right1 = A2 * c00 + A3 * c01, A2 * c01 + A3 * c11
-        covariance[row, 0, 0] = variance * (left0 * A0 + left1 * A1)
-        covariance[row, 0, 1] = variance * (left0 * A2 + left1 * A3)
-        covariance[row, 1, 0] = covariance[row, 0, 1]
-        covariance[row, 1, 1] = variance * (right0 * A2 + right1 * A3)
+        out_pixels[row, 0], out_pixels[row, 1] = c[0] + 0.5, c[1] + 0.5
+        _place_covariance(H, A, residual / total * _COUNT / (_COUNT - 8.0), covariance[row])
 
 
 # --------------------------------------------------------------------------------------------------------- Public

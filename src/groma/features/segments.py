@@ -22,14 +22,14 @@ from groma.geometry import segment2
 class Segments:
     """Line segments of one image, in the order the detector gives them: longest first."""
 
+    #: (N, 4) end points u1 v1 u2 v2, pixels; darker side to the left.
     ends: FloatArray
-    """(N, 4) end points u1 v1 u2 v2, pixels; darker side to the left."""
 
+    #: (N,) standard deviation of each end point across the segment, pixels.
     sigma: FloatArray
-    """(N,) standard deviation of each end point across the segment, pixels."""
 
+    #: (N,) mean gradient across the segment, grey levels (of 255) per pixel.
     strength: FloatArray
-    """(N,) mean gradient across the segment, grey levels (of 255) per pixel."""
 
     def __post_init__(self) -> None:
         ends = np.asarray(self.ends, dtype=np.float64)

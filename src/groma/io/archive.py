@@ -7,21 +7,21 @@ compressed: measurements hardly shrink, and pycolmap's wheel (4.2), when it is i
 zlib's compression for the whole process (it exports functions of the same names). Compressed archives are read too.
 
 A reader must survive files made to harm: each array's header is compared with what the scene's tables declare, and
-with the size of its zip member, before memory is taken for it.
+with the size of its zip member, before memory is taken for it (:mod:`groma.bounded.arrays`).
 """
 
 from __future__ import annotations
 
-import math
 import os
 import zipfile
 from dataclasses import Field, fields
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from groma.bounded.arrays import ArrayMembers, Header, opened_arrays
 from groma.errors import FileFormatError
 from groma.io.atomic import atomic_output
 from groma.io.reading import existing, reading
@@ -30,9 +30,6 @@ from groma.scene import Scene
 
 FORMAT, VERSION = "groma scene", 1
 _KIND = "groma archive"
-#: Members may unpack to this many bytes plus a multiple of the file's size; more is a bomb. Deflate gives at most 1032.
-_FREE_BYTES, _MAX_RATIO = 64 << 20, 300
-_HEADER_LIMIT = 4096
 
 
 def write_archive(scene: Scene, path: str | os.PathLike[str], force: bool = False) -> None:
@@ -61,24 +58,20 @@ def read_archive(path: str | os.PathLike[str]) -> Scene:
         If a member is missing, has another type or shape than a scene's, or the scene is not valid.
     """
     place = existing(path)
-    with reading(place, _KIND), zipfile.ZipFile(place) as file:
-        members = {info.filename: info for info in file.infolist()}
-        limit = _FREE_BYTES + _MAX_RATIO * place.stat().st_size
-        if (total := sum(info.file_size for info in members.values())) > limit:
-            raise FileFormatError(f"{place} would unpack to {total} bytes, far more than an archive of its size holds.")
-        if "format.npy" not in members or str(_read_array(file, members["format.npy"], ())) != FORMAT:
+    with reading(place, _KIND), opened_arrays(place) as members:
+        if "format" not in members or str(_read_array(members, "format", ())) != FORMAT:
             raise FileFormatError(
                 f"{place} is not a groma archive: its format is not '{FORMAT}'. It is an .npz file of another program; "
                 "pass a scene."
             )
-        version = int(_read_array(file, members["version.npy"], ())) if "version.npy" in members else 0
+        version = int(_read_array(members, "version", ())) if "version" in members else 0
         if not 1 <= version <= VERSION:
             raise FileFormatError(f"{place} has version {version}; this groma reads up to {VERSION}. Update groma.")
         tables = {}
         for table in fields(Scene):
             kind: Any = table.default_factory
             columns = {
-                item.name: _read_column(file, members, f"{table.name}.{item.name}", item, _may_lack(kind, item))
+                item.name: _read_column(members, f"{table.name}.{item.name}", item, _may_lack(kind, item))
                 for item in fields(kind)
             }
             tables[table.name] = kind(**columns)
@@ -90,16 +83,13 @@ def _may_lack(kind: Any, item: Field[Any]) -> bool:
     return bool(getattr(kind, "optional", False) or item.metadata.get("optional"))
 
 
-def _read_column(
-    file: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], name: str, item: Field[Any], may_lack: bool
-) -> Any:
-    info = members.get(f"{name}.npy")
-    if info is None and (may_lack or item.metadata.get("fill") is not None):
+def _read_column(members: ArrayMembers, name: str, item: Field[Any], may_lack: bool) -> Any:
+    if name not in members and (may_lack or item.metadata.get("fill") is not None):
         return np.zeros((0, *item.metadata["row"]), item.metadata["dtype"])
-    if info is None:
+    if name not in members:
         raise FileFormatError(f"Array {name} is missing. The file is incomplete or of another program.")
     dtype = item.metadata["dtype"]
-    array = _read_array(file, info, (None, *item.metadata["row"]))
+    array = _read_array(members, name, (None, *item.metadata["row"]))
     if dtype is None:
         if array.dtype.kind != "U":
             raise FileFormatError(f"Array {name} must hold text; got dtype {array.dtype}.")
@@ -119,37 +109,19 @@ def _write_array(file: zipfile.ZipFile, name: str, array: npt.NDArray[Any]) -> N
         np.lib.format.write_array(stream, np.asanyarray(little, order="C"), version=(1, 0), allow_pickle=False)
 
 
-def _read_array(file: zipfile.ZipFile, info: zipfile.ZipInfo, shape: tuple[int | None, ...]) -> npt.NDArray[Any]:
-    """Read one member after its header has been found to be the expected and to fit the member's size."""
-    with file.open(info) as stream:
-        got_shape, fortran, dtype, header_size = _read_header(stream, info.filename)
-        if len(got_shape) != len(shape) or any(
-            size is not None and size != got for size, got in zip(shape, got_shape, strict=True)
-        ):
-            raise FileFormatError(f"Array {info.filename} must have shape {shape} (None: any); got {got_shape}.")
-        if dtype.kind not in "iufU" or (fortran and len(got_shape) > 1):
-            raise FileFormatError(f"Array {info.filename} must hold numbers or text in C order; got dtype {dtype}.")
-        size = math.prod(got_shape) * dtype.itemsize
-        if size != info.file_size - header_size:
-            raise FileFormatError(
-                f"Array {info.filename} needs {size} bytes but {info.file_size - header_size} follow."
-            )
-        content = stream.read(size + 1)  # one more, so that the checksum at the end is verified
-        if len(content) != size:
-            raise FileFormatError(f"Array {info.filename} ends after {len(content)} of {size} bytes.")
-    if dtype.itemsize == 0:
-        return np.zeros(got_shape, dtype)
-    return np.frombuffer(content, dtype).reshape(got_shape).copy()
+def _read_array(members: ArrayMembers, name: str, shape: tuple[int | None, ...]) -> npt.NDArray[Any]:
+    """Read one member after its header has been found to be the expected."""
 
+    def check(header: Header) -> None:
+        fits = len(header.shape) == len(shape) and all(
+            size in (None, got) for size, got in zip(shape, header.shape, strict=True)
+        )
+        if not fits:
+            raise FileFormatError(f"Array {name} must have shape {shape} (None: any); got {header.shape}.")
+        if header.dtype.kind not in "iufU" or (header.fortran and len(shape) > 1):
+            raise FileFormatError(f"Array {name} must hold numbers or text in C order; got dtype {header.dtype}.")
 
-def _read_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-    version = np.lib.format.read_magic(stream)
-    if version != (1, 0):
-        raise FileFormatError(f"Array {name} has npy version {version}; an archive uses (1, 0).")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=_HEADER_LIMIT)
-    if any(size < 0 for size in shape):
-        raise FileFormatError(f"Array {name} has the negative shape {shape}.")
-    return shape, fortran, dtype, stream.tell()
+    return members.read(name, check)
 
 
 def looks_like_archive(head: bytes) -> bool:

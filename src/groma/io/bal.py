@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.bounded.content import read_content
 from groma.errors import FileFormatError, InputError, OutputError
 from groma.geometry import quaternion
 from groma.io.atomic import atomic_output
@@ -34,8 +35,6 @@ from groma.scene import Cameras, PointObservations, Points, Scene
 _FLIP = np.array([1.0, -1.0, -1.0])
 #: The rotation by pi about x, which is ``diag(1, -1, -1)``.
 _FLIP_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
-#: Numeric text shrinks by a factor of three to six; more than this is no text of numbers but a bomb.
-_MAX_RATIO = 200
 _KIND = "BAL file"
 
 
@@ -54,7 +53,7 @@ def read_bal(path: str | os.PathLike[str]) -> Scene:
     """
     place = existing(path)
     with reading(place, _KIND):
-        (num_cameras, num_points, num_observations), body = _split(_load(place), place)
+        (num_cameras, num_points, num_observations), body = _split(read_content(place), place)
         wanted = 4 * num_observations + 9 * num_cameras + 3 * num_points
         # Every number takes a character and a separator: refuse impossible counts before memory is taken for them.
         if 2 * wanted - 1 > len(body):
@@ -179,22 +178,6 @@ def _refuse_broken_zlib() -> None:
             "Cannot write .gz: pycolmap was imported before zlib, which breaks zlib in this process. Import groma.io "
             "(or zlib) before pycolmap, or write .bz2 or plain text."
         )
-
-
-def _load(path: Path) -> bytes:
-    raw = path.read_bytes()
-    limit = _MAX_RATIO * len(raw) + 4096
-    if raw[:3] == b"BZh":
-        with bz2.open(io.BytesIO(raw)) as stream:
-            text = stream.read(limit + 1)
-    elif raw[:2] == b"\x1f\x8b":
-        with gzip.open(io.BytesIO(raw)) as stream:
-            text = stream.read(limit + 1)
-    else:
-        return raw
-    if len(text) > limit:
-        raise FileFormatError(f"{path} grows more than {_MAX_RATIO} times when decompressed, which no BAL file does.")
-    return text
 
 
 def _split(text: bytes, path: Path) -> tuple[list[int], bytes]:

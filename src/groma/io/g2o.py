@@ -26,12 +26,14 @@ from __future__ import annotations
 import gzip
 import io
 import os
+from array import array
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError
 from groma.geometry import quaternion
 from groma.io.atomic import atomic_output
@@ -40,6 +42,8 @@ from groma.scene.pose_graph import GraphPoses, Motions, PoseGraph
 
 #: Numbers after the tag.
 _NUMBERS = {"VERTEX_SE3:QUAT": 8, "EDGE_SE3:QUAT": 30, "VERTEX_SE2": 4, "EDGE_SE2": 11}
+#: Larger numbers are not exact as floating point.
+_ID_LIMIT = 2.0**53
 _HALF_ANGLES = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 #: Coordinates of a planar motion within (rho, omega).
 _PLANAR = np.array([0, 1, 5])
@@ -57,7 +61,7 @@ def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
     """
     place = existing(path)
     with reading(place, "g2o file"):
-        return _graph(_rows_by_tag(_text(place), place), place)
+        return _graph(_rows_by_tag(place), place)
 
 
 def write_g2o(graph: PoseGraph, path: str | os.PathLike[str], force: bool = False) -> None:
@@ -90,36 +94,30 @@ def looks_like_g2o(head: bytes) -> bool:
     return head.lstrip().split(b" ", 1)[0].decode("ascii", "replace") in (*_NUMBERS, "FIX", "PARAMS_SE3OFFSET")
 
 
-def _text(path: Path) -> str:
-    raw = path.read_bytes()
-    return (gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw).decode()
-
-
-def _rows_by_tag(text: str, path: Path) -> dict[str, list[list[str]]]:
-    """Return the words after each tag, by tag."""
-    rows: dict[str, list[list[str]]] = {}
-    for number, line in enumerate(text.splitlines(), 1):
-        tag, *words = line.split() or ["#"]
-        if tag.startswith(("#", "PARAMS_")):
+def _rows_by_tag(path: Path) -> dict[str, array[float]]:
+    """Return the numbers after each tag, one row after the other, by tag."""
+    rows: dict[str, array[float]] = {}
+    for number, (tag, *words) in read_words(path):
+        if tag.startswith("PARAMS_"):
             continue
-        if tag != "FIX" and tag not in _NUMBERS:
-            raise FileFormatError(
-                f"{path}, line {number}: {tag!r} is not read; a pose graph has {', '.join(_NUMBERS)} and FIX."
-            )
-        if tag != "FIX" and len(words) != _NUMBERS[tag]:
-            raise FileFormatError(
-                f"{path}, line {number}: {tag} takes {_NUMBERS[tag]} numbers; got {len(words)}. Is it cut off?"
-            )
-        rows.setdefault(tag, []).append(words)
+        place = f"{path}, line {number}"
+        if tag == "FIX":
+            rows.setdefault(tag, array("d")).extend(finite(words, place, "ids of poses"))
+            continue
+        if tag not in _NUMBERS:
+            raise FileFormatError(f"{place}: {tag[:40]!r} is not read; a pose graph has {', '.join(_NUMBERS)} and FIX.")
+        if len(words) != _NUMBERS[tag]:
+            raise FileFormatError(f"{place}: {tag} takes {_NUMBERS[tag]} numbers; got {len(words)}. Is it cut off?")
+        rows.setdefault(tag, array("d")).extend(finite(words, place, f"{_NUMBERS[tag]} finite numbers after {tag}"))
     return rows
 
 
-def _graph(rows: dict[str, list[list[str]]], path: Path) -> PoseGraph:
+def _graph(rows: dict[str, array[float]], path: Path) -> PoseGraph:
     planar = "VERTEX_SE2" in rows or "EDGE_SE2" in rows
     if planar and ("VERTEX_SE3:QUAT" in rows or "EDGE_SE3:QUAT" in rows):
         raise FileFormatError(f"{path} mixes poses of the plane (SE2) and of space (SE3); write two graphs.")
     vertex, edge = ("VERTEX_SE2", "EDGE_SE2") if planar else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
-    vertices, edges = (_numbers(rows.get(tag, []), _NUMBERS[tag], path) for tag in (vertex, edge))
+    vertices, edges = (np.array(rows.get(tag, array("d"))).reshape(-1, _NUMBERS[tag]) for tag in (vertex, edge))
     if not len(vertices) and not len(edges):
         raise FileFormatError(f"{path} holds no poses and no motions; expected lines such as {vertex} and {edge}.")
     width = 3 if planar else 7
@@ -132,11 +130,10 @@ def _graph(rows: dict[str, list[list[str]]], path: Path) -> PoseGraph:
         missing = int(named[~np.isin(named, known)][0])
         raise FileFormatError(f"{path}: a motion names pose {missing}, which has no {vertex} line. Add one.")
     held = np.zeros(len(ids), dtype=bool)
-    for words in rows.get("FIX", []):
-        for name in words:
-            if int(name) not in row_of:
-                raise FileFormatError(f"{path}: FIX names pose {name}, which is not there.")
-            held[row_of[int(name)]] = True
+    for name in _integers(np.unique(rows.get("FIX", [])), path).tolist():
+        if name not in row_of:
+            raise FileFormatError(f"{path}: FIX names pose {name}, which is not there.")
+        held[row_of[name]] = True
     if chained:
         poses = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(ids), 1))
     else:
@@ -157,18 +154,11 @@ def _graph(rows: dict[str, list[list[str]]], path: Path) -> PoseGraph:
     return graph.chained() if chained else graph
 
 
-def _numbers(rows: list[list[str]], width: int, path: Path) -> FloatArray:
-    values = np.array(rows, dtype=np.float64).reshape(len(rows), width)
-    if not np.isfinite(values).all():
-        raise FileFormatError(f"{path} holds a number that is not finite.")
-    return values
-
-
 def _integers(values: FloatArray, path: Path) -> IntArray:
-    whole = values.astype(np.int64)
-    if (whole != values).any():
-        raise FileFormatError(f"{path}: {values[whole != values][0]:g} is not the id of a pose; ids are whole numbers.")
-    return whole
+    wrong = (values != np.floor(values)) | (np.abs(values) >= _ID_LIMIT)
+    if wrong.any():
+        raise FileFormatError(f"{path}: {values[wrong][0]:g} is not the id of a pose; ids are whole numbers.")
+    return values.astype(np.int64)
 
 
 def _information(upper: FloatArray, planar: bool, path: Path) -> FloatArray:

@@ -16,6 +16,7 @@ A Line3D++ style row is ``X1 Y1 Z1 X2 Y2 Z2 N`` and N times ``image u1 v1 u2 v2`
 from __future__ import annotations
 
 import os
+from array import array
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -25,11 +26,16 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
+from groma.bounded.arrays import opened_arrays, read_array
+from groma.bounded.content import read_content
+from groma.bounded.text import finite, read_words, whole
 from groma.errors import FileFormatError
 from groma.io.geometry import Geometry
 from groma.io.reading import existing, reading
 
 _KIND = "reference"
+#: Pairs of vertices, and triangles.
+_Elements = tuple[Any, Any]
 #: PLY's names of numbers.
 _PLY_TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -86,8 +92,8 @@ def holds_scene(path: str | os.PathLike[str]) -> bool:
     place = existing(path)
     if place.is_dir() or place.suffix.lower() != ".npz":
         return place.is_dir()
-    with reading(place, _KIND), place.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-        return "format" in file.files
+    with reading(place, _KIND), opened_arrays(place) as file:
+        return "format" in file
 
 
 def read_line3dpp(path: str | os.PathLike[str]) -> ReferenceLines:
@@ -95,8 +101,8 @@ def read_line3dpp(path: str | os.PathLike[str]) -> ReferenceLines:
     place = existing(path)
     with reading(place, "file of reference lines"):
         ends, names, lines, images, seen = [], {}, [], [], []
-        for number, words in _rows(place):
-            count = int(words[6]) if len(words) > 6 else -1
+        for number, words in read_words(place):
+            count = whole(words[6], f"Line {number}", "N, how many images see the line") if len(words) > 6 else -1
             if count < 0 or len(words) != 7 + 5 * count:
                 raise FileFormatError(
                     f"Line {number}: expected 6 coordinates, N and 5 N words; got {len(words)} words."
@@ -104,18 +110,12 @@ def read_line3dpp(path: str | os.PathLike[str]) -> ReferenceLines:
             for at in range(7, len(words), 5):
                 lines.append(len(ends))
                 images.append(names.setdefault(words[at], len(names)))
-                seen.append([float(word) for word in words[at + 1 : at + 5]])
-            ends.append([float(word) for word in words[:6]])
+                seen.append(finite(words[at + 1 : at + 5], f"Line {number}", "the ends of a segment"))
+            ends.append(finite(words[:6], f"Line {number}", "six finite coordinates"))
         segments = Geometry(segments=np.array(ends, float).reshape(-1, 2, 3)).segments
     return ReferenceLines(
         segments, tuple(names), np.array(lines, np.int64), np.array(images, np.int64), np.reshape(seen, (-1, 4))
     )
-
-
-def _rows(place: Path) -> list[tuple[int, list[str]]]:
-    text = place.read_text(encoding="utf-8").splitlines()
-    rows = [(number, line.partition("#")[0].split()) for number, line in enumerate(text, 1)]
-    return [(number, words) for number, words in rows if words]
 
 
 def _of_scene(place: Path) -> Geometry:
@@ -125,49 +125,66 @@ def _of_scene(place: Path) -> Geometry:
 
 
 def _read_text(place: Path) -> Geometry:
-    rows = _rows(place)
-    if rows and all(len(words) == 6 for _, words in rows):
-        return Geometry(segments=np.array([[float(w) for w in words] for _, words in rows]).reshape(-1, 2, 3))
-    return Geometry(segments=read_line3dpp(place).segments)
+    if len(next(read_words(place), (0, []))[1]) != 6:
+        return Geometry(segments=read_line3dpp(place).segments)
+    table = array("d")
+    for number, words in read_words(place):
+        if len(words) != 6:
+            raise FileFormatError(f"Line {number}: expected six coordinates, as in the first; got {len(words)} words.")
+        table.extend(finite(words, f"Line {number}", "six finite coordinates"))
+    return Geometry(segments=np.array(table).reshape(-1, 2, 3))
 
 
 def _read_npy(place: Path) -> Geometry:
-    with place.open("rb") as stream:
-        return _of_array(np.load(stream, allow_pickle=False))
+    return _of_array(read_array(place))
 
 
-def _of_array(array: npt.NDArray[Any]) -> Geometry:
-    if array.dtype.kind in "iuf" and array.ndim == 2 and array.shape[1] == 3:
-        return Geometry(points=array)
-    if array.dtype.kind in "iuf" and array.shape[1:] in ((6,), (2, 3)):
-        return Geometry(segments=array.reshape(-1, 2, 3))
-    raise FileFormatError(f"Expected an array (R, 6), (R, 2, 3) or (P, 3); got {array.dtype} {array.shape}.")
+def _of_array(places: npt.NDArray[Any]) -> Geometry:
+    if places.dtype.kind in "iuf" and places.ndim == 2 and places.shape[1] == 3:
+        return Geometry(points=places)
+    if places.dtype.kind in "iuf" and places.shape[1:] in ((6,), (2, 3)):
+        return Geometry(segments=places.reshape(-1, 2, 3))
+    raise FileFormatError(f"Expected an array (R, 6), (R, 2, 3) or (P, 3); got {places.dtype} {places.shape}.")
 
 
 def _read_npz(place: Path) -> Geometry:
-    with place.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-        names = set(file.files)
+    with opened_arrays(place) as file:
+        names = set(file.names)
         if "format" in names:
             return _of_scene(place)
         for name in ("lines", "segments"):
             if name in names:
-                return _of_array(file[name])
+                return _of_array(file.read(name))
         for vertices, elements in (("points", "edges"), ("vertices", "edges"), ("vertices", "faces")):
             if {vertices, elements} <= names:
-                return _of_elements(file[vertices], list(file[elements]))
+                return _of_elements(file.read(vertices), _polygons(file.read(elements)))
         if "points" in names:
-            return _of_array(file["points"])
+            return _of_array(file.read("points"))
     raise FileFormatError(f"Expected lines, segments, points and edges, or vertices and faces; got {sorted(names)}.")
 
 
-def _of_elements(vertices: npt.NDArray[Any], elements: list[Any]) -> Geometry:
-    """Return the segments of pairs of vertices and the triangles of polygons (fans around their first corner)."""
+def _polygons(elements: npt.NDArray[Any]) -> _Elements:
+    """Return polygons of equal size as pairs, or cut into triangles."""
+    if elements.ndim != 2 or elements.dtype.kind not in "iu":
+        raise FileFormatError(f"Edges and faces must be whole numbers (M, n); got {elements.dtype} {elements.shape}.")
+    count = elements.shape[1]
+    if count <= 2:
+        return elements if count == 2 else [], []
+    return [], np.concatenate([elements[:, [0, k, k + 1]] for k in range(1, count - 1)])
+
+
+def _fans(elements: list[Any]) -> _Elements:
+    """Return those of two corners, and the triangles of all others (fans around their first corner)."""
+    three = [e for e in elements if len(e) == 3]
+    fans = [[e[0], e[k], e[k + 1]] for e in elements if len(e) > 3 for k in range(1, len(e) - 1)]
+    return [e for e in elements if len(e) == 2], three + fans
+
+
+def _of_elements(vertices: npt.NDArray[Any], elements: _Elements) -> Geometry:
+    """Return the triangles between vertices, else the segments, else the vertices."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "iuf":
         raise FileFormatError(f"Vertices must have shape (P, 3); got {vertices.dtype} {vertices.shape}.")
-    pairs = np.array([e for e in elements if len(e) == 2], dtype=np.int64).reshape(-1, 2)
-    three = np.array([e for e in elements if len(e) == 3], dtype=np.int64).reshape(-1, 3)
-    fans = [[e[0], e[k], e[k + 1]] for e in elements if len(e) > 3 for k in range(1, len(e) - 1)]
-    corners = np.concatenate([three, np.array(fans, np.int64).reshape(-1, 3)])
+    pairs, corners = (np.reshape(np.asarray(e, np.int64), (-1, n)) for e, n in zip(elements, (2, 3), strict=True))
     for index in (pairs, corners):
         if len(index) and (index.min() < 0 or index.max() >= len(vertices)):
             raise FileFormatError(f"An edge or face refers to vertex {index.max()}; there are {len(vertices)}.")
@@ -179,23 +196,23 @@ def _of_elements(vertices: npt.NDArray[Any], elements: list[Any]) -> Geometry:
 def _read_obj(place: Path) -> Geometry:
     vertices: list[list[float]] = []
     elements: list[list[int]] = []
-    for number, words in _rows(place):
+    for number, words in read_words(place):
         if words[0] == "v":
             if len(words) < 4:
                 raise FileFormatError(f"Line {number}: a vertex has three coordinates.")
-            vertices.append([float(word) for word in words[1:4]])
+            vertices.append(finite(words[1:4], f"Line {number}", "three finite coordinates"))
         elif words[0] in ("f", "l"):
-            index = [int(word.split("/")[0]) for word in words[1:]]
+            index = [whole(word.split("/")[0], f"Line {number}", "the number of a vertex") for word in words[1:]]
             index = [i - 1 if i > 0 else len(vertices) + i for i in index]
             elements += [index] if words[0] == "f" else [list(pair) for pair in pairwise(index)]
-    return _of_elements(np.array(vertices, float).reshape(-1, 3), elements)
+    return _of_elements(np.array(vertices, float).reshape(-1, 3), _fans(elements))
 
 
 # PLY
 
 
 def _read_ply(place: Path) -> Geometry:
-    content = place.read_bytes()
+    content = read_content(place)
     header, found, body = content.partition(b"end_header")
     if not content.startswith(b"ply") or not found:
         raise FileFormatError("it has no PLY header")
@@ -212,7 +229,7 @@ def _read_ply(place: Path) -> Geometry:
         elif name == "face":
             column = "vertex_indices" if "vertex_indices" in table else "vertex_index"
             elements += [list(map(int, row)) for row in table[column]]
-    return _of_elements(vertices, elements)
+    return _of_elements(vertices, _fans(elements))
 
 
 _Properties = list[tuple[str, str, str]]
@@ -248,6 +265,8 @@ class _PlyText:
 
     def element(self, count: int, properties: _Properties) -> dict[str, list[Any]]:
         table: dict[str, list[Any]] = {name: [] for name, _, _ in properties}
+        if not properties or count * len(properties) > len(self.words) - self.at:
+            raise FileFormatError("it ends too early")
         for _ in range(count):
             for name, _, length in properties:
                 if length:
@@ -274,7 +293,7 @@ class _PlyBytes:
             rows = self.array(dtype, count)
             return {name: rows[name] for name, _, _ in properties}
         table: dict[str, Any] = {name: [] for name, _, _ in properties}
-        if count > len(self.body):
+        if count * len(properties) > len(self.body) - self.at:
             raise FileFormatError("it ends too early")
         if len(properties) == 1 and count:  # as in nearly every mesh: triangles and nothing else
             name, kind, length = properties[0]

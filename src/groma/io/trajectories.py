@@ -13,25 +13,27 @@
 
 from __future__ import annotations
 
-import gzip
 import os
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
+from groma.bounded.text import finite, read_lines
 from groma.errors import FileFormatError, InputError, ShapeError
 from groma.geometry import quaternion, se3
 from groma.io.atomic import atomic_output
 from groma.io.reading import existing, reading
 from groma.scene.table import Table, column
 
-#: Lines that hold something, with their numbers.
-Rows = list[tuple[int, str]]
+#: Lines that hold something, with their numbers, one after the other.
+Rows = Iterable[tuple[int, str]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +115,11 @@ def read_trajectory(
         raise InputError(f"Unknown trajectory format {format!r}. Use auto, {', '.join(_FORMATS)}.")
     place = existing(path)
     with reading(place, "trajectory"):
-        rows = _rows(place)
-        chosen = _recognise(place, rows) if format == "auto" else _FORMATS[format]
-        read = chosen.read(place, rows)
+        rows = read_lines(place)
+        if (first := next(rows, None)) is None:
+            raise FileFormatError(f"{place} holds no pose.")
+        chosen = _recognise(place, *first) if format == "auto" else _FORMATS[format]
+        read = chosen.read(place, chain([first], rows))
         if timestamps is None or chosen.has_times:
             return read
         times = np.asarray(timestamps, float)
@@ -158,28 +162,21 @@ def write_tum(trajectory: Trajectory, path: str | os.PathLike[str], force: bool 
     write_trajectory(trajectory, path, "tum", force)
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a file that may be compressed by gzip."""
-    content = path.read_bytes()
-    return (gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content).decode("utf-8")
+def read_times(path: str | os.PathLike[str]) -> FloatArray:
+    """Read times (N,), seconds, one a line, as they lie beside the poses of KITTI."""
+    place = existing(path)
+    with reading(place, "times"):
+        return _numbers(place, read_lines(place), 1)[0][:, 0]
 
 
 # ---------------------------------------------------------------------------------------------------------- Formats
-
-
-def _rows(path: Path) -> Rows:
-    lines = (line.partition("#")[0].strip() for line in read_text(path).splitlines())
-    return [(number, line) for number, line in enumerate(lines, start=1) if line]
 
 
 def _words(line: str) -> list[str]:
     return line.split(",") if "," in line else line.split()
 
 
-def _recognise(path: Path, rows: Rows) -> TrajectoryFormat:
-    if not rows:
-        raise FileFormatError(f"{path} holds no pose.")
-    number, line = rows[0]
+def _recognise(path: Path, number: int, line: str) -> TrajectoryFormat:
     for known in _FORMATS.values():
         if known.fits(line):
             return known
@@ -189,48 +186,51 @@ def _recognise(path: Path, rows: Rows) -> TrajectoryFormat:
     )
 
 
-def _numbers(path: Path, rows: Rows, count: int, more: bool = False) -> FloatArray:
-    """Return the first ``count`` numbers of each row, (N, count)."""
-    table = np.empty((len(rows), count))
-    for row, (number, line) in enumerate(rows):
+def _numbers(path: Path, rows: Rows, count: int, more: bool = False) -> tuple[FloatArray, IntArray]:
+    """Return the first ``count`` numbers of each row, (N, count), and the numbers of the lines."""
+    table, lines = array("d"), array("q")
+    for number, line in rows:
         words = _words(line)
         if len(words) != count and not (more and len(words) > count):
             raise FileFormatError(f"{path}, line {number}: expected {count} numbers, got {len(words)}.")
-        table[row] = [float(word) for word in words[:count]]
-    return table
+        table.extend(finite(words[:count], f"{path}, line {number}", f"{count} finite numbers"))
+        lines.append(number)
+    return np.array(table).reshape(-1, count), np.array(lines)
 
 
-def _unit(path: Path, rows: Rows, quaternions: FloatArray) -> FloatArray:
-    length = np.linalg.norm(quaternions, axis=1)
+def _unit(path: Path, lines: IntArray, quaternions: FloatArray) -> FloatArray:
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(quaternions, axis=1)
     bad = np.flatnonzero(~((length > 0.5) & (length < 2)))
     if len(bad):
         raise FileFormatError(
-            f"{path}, line {rows[bad[0]][0]}: the quaternion {quaternions[bad[0]].tolist()} is far from unit length."
+            f"{path}, line {lines[bad[0]]}: the quaternion {quaternions[bad[0]].tolist()} is far from unit length."
         )
     return quaternions / length[:, None]
 
 
 def _read_tum(path: Path, rows: Rows) -> Trajectory:
-    table = _numbers(path, rows, 8)
-    return Trajectory(table[:, 0], np.hstack([_unit(path, rows, table[:, 4:]), table[:, 1:4]]))
+    table, lines = _numbers(path, rows, 8)
+    return Trajectory(table[:, 0], np.hstack([_unit(path, lines, table[:, 4:]), table[:, 1:4]]))
 
 
 def _read_euroc(path: Path, rows: Rows) -> Trajectory:
-    table = _numbers(path, rows, 8, more=True)
-    turned = _unit(path, rows, table[:, [5, 6, 7, 4]])
+    table, lines = _numbers(path, rows, 8, more=True)
+    turned = _unit(path, lines, table[:, [5, 6, 7, 4]])
     return Trajectory(table[:, 0] * 1e-9, np.hstack([turned, table[:, 1:4]]))
 
 
 def _read_kitti(path: Path, rows: Rows) -> Trajectory:
-    matrices = _numbers(path, rows, 12).reshape(-1, 3, 4)
+    table, lines = _numbers(path, rows, 12)
+    matrices = table.reshape(-1, 3, 4)
     # The nearest rotation: files hold six or seven digits.
     u, singular, vt = np.linalg.svd(matrices[:, :, :3])
     turned = u @ vt
     bad = np.flatnonzero((np.abs(singular - 1.0).max(axis=1, initial=0.0) > 0.01) | (np.linalg.det(turned) < 0))
     if len(bad):
-        raise FileFormatError(f"{path}, line {rows[bad[0]][0]}: the first three columns are not a rotation.")
+        raise FileFormatError(f"{path}, line {lines[bad[0]]}: the first three columns are not a rotation.")
     poses = np.hstack([quaternion.from_matrix(turned), matrices[:, :, 3]])
-    return Trajectory(np.arange(len(rows), dtype=float), poses)
+    return Trajectory(np.arange(len(table), dtype=float), poses)
 
 
 def _lines(table: FloatArray) -> str:
@@ -266,6 +266,7 @@ for _format in (
 __all__ = [
     "Trajectory",
     "TrajectoryFormat",
+    "read_times",
     "read_trajectory",
     "read_tum",
     "register_trajectory_format",

@@ -13,6 +13,7 @@ import numpy as np
 
 from groma._typing import IntArray
 from groma.adjustment.report import AdjustReport, AdjustResult
+from groma.bounded.arrays import opened_arrays
 from groma.features.segments import Segments
 from groma.io import atomic_output, read_archive, write_archive
 from groma.io.reading import reading
@@ -38,8 +39,8 @@ def _write_arrays(path: Path, arrays: dict[str, Any]) -> None:
 
 
 def _read_arrays(path: Path) -> dict[str, Any]:
-    with reading(path, "finished stage"), np.load(path, allow_pickle=False) as saved:
-        return {name: saved[name] for name in saved.files}
+    with reading(path, "finished stage"), opened_arrays(path) as saved:
+        return {name: saved.read(name) for name in saved.names}
 
 
 def _write_segments(segments: list[Segments], path: Path) -> None:

@@ -9,21 +9,23 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from groma._typing import IntArray
 from groma.errors import InputError
+from groma.execution import map_work
 from groma.features.contract import ImageRetrieval
 from groma.features.external import ExternalMatches
 from groma.features.registry import DETECTORS, MATCHERS, RETRIEVAL
 from groma.features.retrieval import most_similar
 from groma.features.segments import Segments
-from groma.mapping.lines.matches import ImageReader, MatchProvider, segment_matches
+from groma.mapping.lines.matches import ImageReader, MatchProvider, given_matches, segment_matches
 from groma.mapping.lines.neighbors import covisible_neighbors
-from groma.mapping.photographs import read_gray
+from groma.mapping.photographs import image_reader
 from groma.scene import Scene
 
 if TYPE_CHECKING:
@@ -62,10 +64,10 @@ def matches_for(
     """
     names = scene.images.names
     if options.matcher is None:
-        return None if given is None else lambda i, j: given.match(names[i], names[j])
+        return None if given is None else given_matches(names, given)
     if given is not None:
         raise InputError("Matches are given, and a matcher is chosen. Leave one of them out.")
-    return segment_matches(scene, segments, _reader(folder, scene), options.matcher)
+    return segment_matches(scene, segments, image_reader(folder, names), options.matcher)
 
 
 def neighbors_for(options: MapOptions, folder: Path) -> NeighborChooser | None:
@@ -76,7 +78,9 @@ def neighbors_for(options: MapOptions, folder: Path) -> NeighborChooser | None:
 
     def choose(scene: Scene) -> list[IntArray]:
         shared = covisible_neighbors(scene, lines.num_neighbors, lines.min_shared) if scene.num_points else []
-        return similar_neighbors(scene, _reader(folder, scene), retrieval, lines.num_neighbors, shared)
+        return similar_neighbors(
+            scene, image_reader(folder, scene.images.names), retrieval, lines.num_neighbors, shared
+        )
 
     return choose
 
@@ -99,7 +103,7 @@ def similar_neighbors(
     shared : list of C arrays, or empty
         Neighbours known from elsewhere; they come first.
     """
-    described = [retrieval.describe(image(i)) for i in range(scene.num_images)]
+    described = map_work(partial(_described, retrieval, image), range(scene.num_images))
     neighbors = []
     for i, query in enumerate(described):
         known = shared[i] if shared else np.zeros(0, np.int64)
@@ -109,8 +113,8 @@ def similar_neighbors(
     return neighbors
 
 
-def _reader(folder: Path, scene: Scene) -> ImageReader:
-    return lambda i: read_gray(folder / scene.images.names[i])
+def _described(retrieval: ImageRetrieval, image: ImageReader, i: int) -> Any:
+    return retrieval.describe(image(i))
 
 
 __all__ = ["NeighborChooser", "matches_for", "neighbors_for", "similar_neighbors", "with_parts"]

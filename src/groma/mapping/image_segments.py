@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -20,6 +20,7 @@ import numpy.typing as npt
 from groma import cameras as camera_models
 from groma._typing import FloatArray
 from groma.errors import InputError
+from groma.execution import map_work
 from groma.features.contract import SegmentDetector
 from groma.features.external import ExternalMatches
 from groma.features.images import GrayImage
@@ -27,7 +28,6 @@ from groma.features.segments import Segments
 from groma.gates import gate
 from groma.geometry import segment2
 from groma.mapping.photographs import read_gray
-from groma.mapping.work import map_work
 from groma.scene import Scene
 
 
@@ -130,19 +130,29 @@ def detect_segments(
     folder: Path, scene: Scene, detector: SegmentDetector, say: Callable[[str, int, int], None]
 ) -> list[Segments]:
     """Find the segments of every image of a scene; pixels of the images as they are."""
-    straighteners: dict[int, Straightener | None] = {}
+    cameras, names, camera_of = scene.cameras, scene.images.names, scene.images.camera_idx
+    order = np.argsort(camera_of, kind="stable")  # what resamples a camera's images is made once for all of them
+    of_camera = [(name, tuple(cameras.params_of(c).tolist())) for c, name in enumerate(cameras.models)]
+    work = [(folder / names[i], *of_camera[camera_of[i]]) for i in order]
+    try:
+        found = map_work(partial(_detect_in, detector), work, partial(say, "finding segments"))
+    finally:
+        _straightener.cache_clear()
+    return [found[place] for place in np.argsort(order)]
 
-    def of_image(i: int) -> Segments:
-        image, camera = read_gray(folder / scene.images.names[i]), int(scene.images.camera_idx[i])
-        if camera not in straighteners:
-            model = camera_models.model(scene.cameras.models[camera])
-            # One is kept: it is larger than the image, and there may be a camera for every image.
-            straighteners.clear()
-            straighteners[camera] = Straightener.of(model, scene.cameras.params_of(camera), *image.shape[::-1])
-        straightener = straighteners[camera]
-        return detector.detect(image) if straightener is None else straightener.detect(detector, image)
 
-    return map_work(of_image, range(scene.num_images), partial(say, "finding segments"))
+def _detect_in(detector: SegmentDetector, work: tuple[Path, str, tuple[float, ...]]) -> Segments:
+    """The segments of an image file, whose camera has a model and parameters."""
+    path, model, params = work
+    image = read_gray(path)
+    straightener = _straightener(model, params, image.shape[1], image.shape[0])
+    return detector.detect(image) if straightener is None else straightener.detect(detector, image)
+
+
+# Few are kept: they are larger than the image, and there may be a camera for every image.
+@lru_cache(maxsize=2)
+def _straightener(model: str, params: tuple[float, ...], width: int, height: int) -> Straightener | None:
+    return Straightener.of(camera_models.model(model), np.array(params), width, height)
 
 
 def given_segments(
@@ -170,10 +180,12 @@ def given_segments(
             f"'segments|{min(used - known)}'."
         )
 
-    def of_image(name: str) -> Segments:
-        return external.segments_of(name, read_gray(folder / name)) if name in known else Segments.empty()
+    return map_work(partial(_given_in, folder, known, external), scene.images.names, partial(say, "reading segments"))
 
-    return map_work(of_image, scene.images.names, partial(say, "reading segments"))
+
+def _given_in(folder: Path, known: set[str], external: ExternalMatches, name: str) -> Segments:
+    """The given segments of an image, none where they are not known."""
+    return external.segments_of(name, read_gray(folder / name)) if name in known else Segments.empty()
 
 
 __all__ = ["Straightener", "detect_segments", "given_segments"]

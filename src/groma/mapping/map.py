@@ -27,6 +27,7 @@ from pathlib import Path
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
+from groma.execution import work_with
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches
 from groma.features.matches import LineMatches
@@ -41,7 +42,7 @@ from groma.mapping.image_segments import detect_segments, given_segments
 from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider, explain, map_lines
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
-from groma.mapping.photographs import check_images, check_number, image_files, images_left_out, read_gray
+from groma.mapping.photographs import check_images, check_number, image_files, image_reader, images_left_out
 from groma.mapping.refine_points import PointRefinementOptions, refine_points
 from groma.mapping.result import MapResult
 from groma.mapping.structure.find import StructureOptions, find_structure
@@ -165,7 +166,7 @@ def map_images(
     check_number(folder, names, model, options.lines.min_images)
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
-    with Stages(Path(work), key, options, say) as stages:
+    with work_with(options.threads), Stages(Path(work), key, options, say) as stages:
         start = stages.run(find_start, folder, names, model, stages.place)
         points = stages.run(adjust_points, start)
         if options.refine_points:
@@ -246,7 +247,7 @@ def measure_points(folder: Path, points: Scene, options: MapOptions, say: StageP
     """Points measured again in the photographs, and adjusted with the noise they have then."""
     found = refine_points(
         points,
-        lambda image: read_gray(folder / points.images.names[image]),
+        image_reader(folder, points.images.names),
         noise_px(points, "points"),
         PointRefinementOptions(threads=options.threads),
         partial(say, "measuring points"),

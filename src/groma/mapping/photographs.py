@@ -14,12 +14,12 @@ from functools import partial
 from pathlib import Path
 
 import cv2
-import numpy as np
 
-from groma.errors import GromaError, InputError
+from groma.bounded.images import decoded
+from groma.errors import FileFormatError, GromaError, InputError
+from groma.execution import map_work
 from groma.features.images import GrayImage, to_gray
 from groma.io.endings import IMAGES, VIDEOS
-from groma.mapping.work import map_work
 from groma.scene import Scene
 
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
@@ -44,6 +44,15 @@ def image_files(folder: Path) -> list[Path]:
     return files
 
 
+def image_reader(folder: Path, names: Sequence[str]) -> Callable[[int], GrayImage]:
+    """Return what reads the images of some names by their number."""
+    return partial(_read_by_number, folder, names)
+
+
+def _read_by_number(folder: Path, names: Sequence[str], i: int) -> GrayImage:
+    return read_gray(folder / names[i])
+
+
 def read_gray(path: Path) -> GrayImage:
     """Read an image of any type as grey levels.
 
@@ -60,9 +69,12 @@ def read_gray(path: Path) -> GrayImage:
         # Decoders fill what is missing with grey. A preview inside the file has both marks, so the last ones count.
         raise InputError(f"{path} ends in the middle of the picture (JPEG without its end). Copy it again.")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = _decoded(content, flags)
-    if image is None:  # kinds that are not turned into grey while they are read: floating point TIFF
-        image = _decoded(content, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        image = decoded(content, flags)
+        if image is None:  # kinds that are not turned into grey while they are read: floating point TIFF
+            image = decoded(content, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    except FileFormatError as error:
+        raise InputError(f"{path}: {error}") from error
     try:
         if image is not None:
             return to_gray(image)
@@ -72,17 +84,6 @@ def read_gray(path: Path) -> GrayImage:
         f"{path} cannot be read as an image: it is damaged or of an unknown kind. Replace it, or leave it out of the "
         "folder and the model."
     )
-
-
-def _decoded(content: bytes, flags: int) -> np.ndarray | None:
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        return cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
-    except cv2.error:
-        return None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
 
 
 def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
@@ -106,15 +107,15 @@ def check_names(folder: Path, names: Sequence[str], scene: Scene) -> None:
     )
 
 
-def check_number(folder: Path, names: Sequence[str], model: Scene | None, fewest: int) -> None:
+def check_number(folder: Path, names: Sequence[str], model: Scene | None, min_images: int) -> None:
     """Check that there are images and points enough for a map, and that the folder has the images of the model."""
     if model is None:
         if len(names) < 3:
             raise InputError(f"{folder} holds {_images(len(names))}; a map needs at least 3 that overlap. Take more.")
         return
-    if model.num_images < max(2, fewest):
+    if model.num_images < max(2, min_images):
         raise InputError(
-            f"The model has {_images(model.num_images)} with a pose; a map needs at least {max(2, fewest)} that "
+            f"The model has {_images(model.num_images)} with a pose; a map needs at least {max(2, min_images)} that "
             "overlap. Pass a model with more, or none to have it made."
         )
     if len(model.point_observations.image_idx) == 0:
@@ -169,19 +170,21 @@ def _suggestion(folder: Path, names: Sequence[str], missing: list[str]) -> str:
 def check_images(folder: Path, names: Sequence[str], model: Scene | None, say: Callable[[str, int, int], None]) -> None:
     """Check that every image of the model, or of the folder, can be read, and has the size of its camera."""
     sizes = {} if model is None else _sizes(model)
-    used = list(names) if model is None else list(model.images.names)
+    used = names if model is None else model.images.names
+    work = [(folder / name, sizes.get(name, (0, 0))) for name in used]
+    map_work(_check_image, work, partial(say, "checking images"))
 
-    def check(name: str) -> None:
-        height, width = read_gray(folder / name).shape
-        size = sizes.get(name, (0, 0))
-        if size in ((0, 0), (width, height)):
-            return
-        remedy = "Pass the images the model was made from."
-        if size == (height, width):
-            remedy = "It is turned by 90 degrees: pass the images as they were stored when the model was made."
-        raise InputError(f"{folder / name} has {width}x{height} pixels, its camera {size[0]}x{size[1]}. {remedy}")
 
-    map_work(check, used, partial(say, "checking images"))
+def _check_image(image: tuple[Path, tuple[int, int]]) -> None:
+    """Check that an image can be read and has the size of its camera, where that is known."""
+    path, size = image
+    height, width = read_gray(path).shape
+    if size in ((0, 0), (width, height)):
+        return
+    remedy = "Pass the images the model was made from."
+    if size == (height, width):
+        remedy = "It is turned by 90 degrees: pass the images as they were stored when the model was made."
+    raise InputError(f"{path} has {width}x{height} pixels, its camera {size[0]}x{size[1]}. {remedy}")
 
 
 def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
@@ -191,4 +194,4 @@ def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
     return {name: of_camera[camera] for name, camera in zip(model.images.names, model.images.camera_idx, strict=True)}
 
 
-__all__ = ["check_images", "check_names", "check_number", "image_files", "images_left_out", "read_gray"]
+__all__ = ["check_images", "check_names", "check_number", "image_files", "image_reader", "images_left_out", "read_gray"]

@@ -17,18 +17,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
+from groma.execution import map_work, work_with
 from groma.features.images import GrayImage
 from groma.features.patch_alignment import SIZE, Alignment, Templates, align_templates, cut_templates, smoothed
 from groma.gates import gate
 from groma.geometry.algebra import norm, perpendicular, unit
+from groma.mapping.groups import grouped
 from groma.mapping.noise.landmarks import project_points
-from groma.mapping.work import map_work
-from groma.problem.parallel import available_cores
 from groma.scene import Scene
 
 
@@ -117,16 +118,16 @@ def refine_points(
     search = _Search(scene, read, by_plane, usable, _references(scene, by_plane, usable))
     pixel, deviation = table.pixel.copy(), np.full(len(table), np.inf)
     chunks = [range(first, min(first + gates.points_at_once, count)) for first in range(0, count, gates.points_at_once)]
-    threads = options.threads or available_cores()
-
     say = progress or (lambda done, total: None)
 
     def step(number: int) -> Callable[[int, int], None]:
         return lambda done, images: say(number * images + done, 2 * len(chunks) * images)
 
     for k, points in enumerate(chunks):
-        templates = search.templates(points, threads, step(2 * k))
-        for rows, found in search.places(points, templates, threads, step(2 * k + 1)):
+        with work_with(options.threads):
+            templates = search.templates(points, step(2 * k))
+            places = search.places(points, templates, step(2 * k + 1))
+        for rows, found in places:
             spread = np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2) + gates.sigma_floor**2)
             good = found.found & (found.correlation >= options.min_correlation) & (spread < sigma_px)
             good &= norm(found.pixels - table.pixel[rows]) <= options.max_shift
@@ -160,39 +161,49 @@ class _Search:
         chosen[self.reference[self.reference >= 0]] = True
         return chosen
 
-    def templates(self, points: range, threads: int, progress: Callable[[int, int], None]) -> Templates:
+    def templates(self, points: range, progress: Callable[[int, int], None]) -> Templates:
         """Grey levels around the observations that define some points."""
         table, rows = self.scene.point_observations, self.reference[points.start : points.stop]
         found = Templates(np.zeros((len(points), SIZE, SIZE), np.float32), np.full((len(points), 2), np.nan))
-
-        def of_image(image: int) -> None:
-            chosen = np.flatnonzero((rows >= 0) & (table.image_idx[rows] == image))
-            if len(chosen):
-                cut = cut_templates(smoothed(self.read(image)), table.pixel[rows[chosen]])
-                found.levels[chosen], found.fractions[chosen] = cut.levels, cut.fractions
-
-        map_work(of_image, range(self.scene.num_images), progress, threads)
+        defined = np.flatnonzero(rows >= 0)
+        order, starts = grouped(table.image_idx[rows[defined]], self.scene.num_images)
+        chosen = [defined[order[starts[i] : starts[i + 1]]] for i in range(self.scene.num_images)]
+        work = [(i, table.pixel[rows[points_here]]) for i, points_here in enumerate(chosen)]
+        for points_here, cut in zip(chosen, map_work(partial(_templates_in, self.read), work, progress), strict=True):
+            if cut is not None:
+                found.levels[points_here], found.fractions[points_here] = cut.levels, cut.fractions
         return found
 
     def places(
-        self, points: range, templates: Templates, threads: int, progress: Callable[[int, int], None]
+        self, points: range, templates: Templates, progress: Callable[[int, int], None]
     ) -> list[tuple[IntArray, Alignment]]:
         """Rows of the other observations of these points in each image, and where their templates are found."""
         table = self.scene.point_observations
         point = table.point_idx
         searched = self.usable & ~self.is_reference() & (self.reference[point] >= 0)
         searched &= (point >= points.start) & (point < points.stop)
+        searched = np.flatnonzero(searched)
+        shapes = self.by_plane[searched] @ np.linalg.inv(self.by_plane[self.reference[point[searched]]])
+        order, starts = grouped(table.image_idx[searched], self.scene.num_images)
+        work, rows = [], []
+        for i in range(self.scene.num_images):
+            here = order[starts[i] : starts[i + 1]]
+            rows.append(searched[here])
+            work.append((i, point[rows[-1]] - points.start, table.pixel[rows[-1]], shapes[here]))
+        found = map_work(partial(_places_in, self.read, templates), work, progress)
+        return [(rows[i], one) for i, one in enumerate(found) if one is not None]
 
-        def of_image(image: int) -> tuple[IntArray, Alignment] | None:
-            rows = np.flatnonzero(searched & (table.image_idx == image))
-            if len(rows) == 0:
-                return None
-            shapes = self.by_plane[rows] @ np.linalg.inv(self.by_plane[self.reference[point[rows]]])
-            gray = smoothed(self.read(image))
-            return rows, align_templates(gray, templates, point[rows] - points.start, table.pixel[rows], shapes)
 
-        found = map_work(of_image, range(self.scene.num_images), progress, threads)
-        return [one for one in found if one is not None]
+def _templates_in(read: Callable[[int], GrayImage], image: tuple[int, FloatArray]) -> Templates | None:
+    """Templates at pixels of an image; None where there are none, and the image is not read."""
+    return cut_templates(smoothed(read(image[0])), image[1]) if len(image[1]) else None
+
+
+def _places_in(
+    read: Callable[[int], GrayImage], templates: Templates, image: tuple[int, IntArray, FloatArray, FloatArray]
+) -> Alignment | None:
+    """Where some templates are found in an image, from their pixels and shapes there; None for no template."""
+    return align_templates(smoothed(read(image[0])), templates, *image[1:]) if len(image[1]) else None
 
 
 def _moves_in_image(scene: Scene) -> tuple[FloatArray, BoolArray]:

@@ -26,42 +26,6 @@ from groma._typing import FloatArray
 from groma.geometry.manifold import Manifold
 from groma.problem.problem import Problem
 
-GAUGE_NAMES = (
-    "translation along x",
-    "translation along y",
-    "translation along z",
-    "rotation about x",
-    "rotation about y",
-    "rotation about z",
-    "scale",
-)
-
-
-def move_world(
-    kind: str, ambient: FloatArray, translation: FloatArray, rotation: FloatArray, scale: float
-) -> FloatArray:
-    r"""Ambient numbers of objects after the world frame moved by :math:`X' = s R X + a`.
-
-    Poses keep their metric form: :math:`R'_{cw} = R_{cw} R^\top`, :math:`t'_{cw} = s\,t_{cw} - R'_{cw} a`.
-    """
-    R, a, s = rotation, translation, scale
-    if kind == "point":
-        return s * ambient @ R.T + a
-    if kind == "direction":
-        return ambient @ R.T
-    if kind == "line":
-        d = ambient[:, 3:] @ R.T
-        return np.hstack([s * ambient[:, :3] @ R.T + np.cross(a, d), d])
-    if kind == "plane":
-        n = ambient[:, :3] @ R.T
-        return np.hstack([n, s * ambient[:, 3:] - (n @ a)[:, None]])
-    if kind == "pose":
-        T = ambient.reshape(-1, 3, 4)
-        R_cw = T[:, :, :3] @ R.T
-        t_cw = s * T[:, :, 3] - R_cw @ a
-        return np.concatenate([R_cw, t_cw[:, :, None]], axis=2).reshape(-1, 12)
-    return ambient
-
 
 def gauge_directions(
     manifold: Manifold,
@@ -88,7 +52,7 @@ def gauge_directions(
     Returns
     -------
     (7, count, dof) float
-        In the order of :data:`GAUGE_NAMES`. Zero for kinds without a place in the world.
+        Translation along x, y, z, rotation about x, y, z, scale. Zero for kinds without a place in the world.
     """
     directions = np.zeros((7, len(state), manifold.dof))
     if manifold.kind not in ("point", "direction", "line", "plane", "pose") or len(state) == 0:

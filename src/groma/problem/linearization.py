@@ -6,7 +6,7 @@ cache. The records are whitened, weighted by the robust loss, chained with the c
 
 .. math:: V = \sum J_l^\top J_l, \quad W = \sum J_l^\top J_c, \quad H = \sum J_c^\top J_c, \quad g = \sum J^\top r .
 
-V, W and the landmarks' gradient belong to a chunk alone; H and the cameras' gradient are summed per thread.
+V, W and the landmarks' gradient belong to a chunk alone; H and the cameras' gradient are summed per share.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class NormalEquations:
         for chunk in layout.chunks:
             for f, begin, end in chunk.factors:
                 self._sizes[f] = max(self._sizes[f], end - begin)
-        self.shares = shares_of(layout.chunks, workers.count)
+        self.shares = shares_of(layout)
         self._scratch: list[dict[int, FloatArray]] = [{} for _ in self.shares]
         self._references = [tuple(ref for _, ref in factor.factor.references()) for factor in layout.factors]
         self._free = {}

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Threads that share the work of one solve. The compiled loops release the GIL; the threads sleep while they wait."""
+"""Threads that share the work of one solve. The compiled loops release the GIL; the threads sleep while they wait.
+
+The work is divided into *shares*, which depend on the problem alone: each has sums of its own, and these are added in
+the order of the shares. The result is therefore the same to the last digit for any number of threads.
+"""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from queue import Empty, SimpleQueue
 from typing import TypeVar
 
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.problem.layout import Chunk
+from groma.problem.layout import Chunk, Layout
 
 T = TypeVar("T")
 
@@ -29,12 +34,24 @@ class Workers:
             return [function(task) for task in range(tasks)]
         if self._pool is None:
             self._pool = ThreadPoolExecutor(self.count - 1, thread_name_prefix="groma")
-        futures = [self._pool.submit(function, task) for task in range(1, tasks)]
+        results: dict[int, T] = {}
+        waiting: SimpleQueue[int] = SimpleQueue()
+        for task in range(tasks):
+            waiting.put(task)
+
+        def work() -> None:
+            with suppress(Empty):
+                while True:
+                    task = waiting.get_nowait()
+                    results[task] = function(task)
+
+        futures = [self._pool.submit(work) for _ in range(min(self.count, tasks) - 1)]
         try:
-            first = function(0)
+            work()
         finally:
-            rest = [future.result() for future in futures]
-        return [first, *rest]
+            for future in futures:
+                future.result()
+        return [results[task] for task in range(tasks)]
 
     def close(self) -> None:
         """End the threads."""
@@ -43,17 +60,35 @@ class Workers:
             self._pool = None
 
 
-def available_cores() -> int:
-    """Return the number of cores this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1
+#: Problems with fewer factors are one share: they are not worth a thread.
+FACTORS_FOR_THREADS = 50_000
+#: Most shares, and most bytes that their copies of the reduced system take, unless two take more.
+MAX_SHARES, MAX_BYTES = 16, 2**30
+#: Landmarks add to each block of a copy so many times on average, or clearing and adding the copies takes too long.
+USES_OF_A_BLOCK = 20
 
 
-def shares_of(chunks: tuple[Chunk, ...], count: int) -> list[list[Chunk]]:
-    """Divide consecutive chunks among ``count`` threads, about equal in the number of factors."""
-    if count == 1 or len(chunks) < 2 * count:
+def num_shares(layout: Layout) -> int:
+    """Return into how many shares the work on a problem is divided, whatever the number of threads."""
+    size = sum(chunk.size for chunk in layout.chunks)
+    if size < FACTORS_FOR_THREADS:
+        return 1
+    numbers = blocks = uses = 0
+    for (a, b), (rows, _) in layout.blocks.items():
+        numbers, blocks = numbers + len(rows) * layout.kept[a].width * layout.kept[b].width, blocks + len(rows)
+    for group in layout.eliminated:
+        uses += sum(len(seen.pair_slots) for seen in group.incidences.values())
+        uses += sum(len(slots) for slots, _ in group.cross.values())
+    count = min(MAX_SHARES, MAX_BYTES // max(8 * numbers, 1), len(layout.chunks) // 2)
+    if layout.eliminated:
+        count = min(count, uses // max(USES_OF_A_BLOCK * blocks, 1)) if blocks else count
+    return max(2, count)
+
+
+def shares_of(layout: Layout) -> list[list[Chunk]]:
+    """Divide consecutive chunks into shares, about equal in the number of factors."""
+    chunks, count = layout.chunks, num_shares(layout)
+    if count == 1:
         return [list(chunks)]
     done = np.concatenate([[0], np.cumsum([max(chunk.size, 1) for chunk in chunks])])
     cuts = np.searchsorted(done, done[-1] * np.arange(count + 1) / count)

@@ -34,7 +34,10 @@ class Variables:
             )
         if not np.isfinite(state).all():
             bad = int(np.flatnonzero(~np.isfinite(state).all(axis=1))[0])
-            raise ProblemError(f"The state of variable {bad} is not finite: {state[bad]}. Remove or re-initialise it.")
+            raise ProblemError(
+                f"The state of variable {bad} is not finite ({self.manifold.kind}): {state[bad]}. "
+                "Remove or re-initialise it."
+            )
         object.__setattr__(self, "state", state)
         if not isinstance(self.constant, bool | np.bool_):
             constant = np.asarray(self.constant, dtype=bool)

@@ -28,6 +28,8 @@ class Trial:
     promised: float = np.inf
     #: Euclidean length of the step in increments.
     length: float = np.inf
+    #: How large the step is for the states, whatever the unit of length: :func:`groma.solver.steps.share_of_states`.
+    relative_length: float = np.inf
     #: What the damping holds back of the decrease, to first order.
     withheld: float = 0.0
     #: Whether all variables have converged, where each is judged on its own; None where the cost decides.
@@ -35,7 +37,9 @@ class Trial:
 
     def without_step(self) -> Self:
         """Return what stands for a step that could not be found, because the linear system was singular."""
-        return replace(self, cost=np.inf, gain_ratio=0.0, promised=np.inf, length=np.inf, withheld=0.0)
+        return replace(
+            self, cost=np.inf, gain_ratio=0.0, promised=np.inf, length=np.inf, relative_length=np.inf, withheld=0.0
+        )
 
     @property
     def has_step(self) -> bool:
@@ -81,11 +85,11 @@ class DampedProblem(Protocol[T]):
         ...
 
     def largest_gradient(self) -> float:
-        """Return the largest component of the gradient of the linearised cost."""
+        """Return the largest component of the gradient, each over the root of its diagonal in the normal equations."""
         ...
 
-    def size(self) -> float:
-        """Return the Euclidean length of the present states."""
+    def is_curved(self) -> bool:
+        """Whether the linearised cost depends on any variable: some factor counts."""
         ...
 
     def try_step(self) -> T:

@@ -22,7 +22,7 @@ from groma.solver.damped_problem import Trial
 from groma.solver.linear.schur import MIN_DIAGONAL, invert_blocks
 from groma.solver.options import SolverOptions, first_damping
 from groma.solver.report import SolveReport, Stopwatch, note_costs
-from groma.solver.steps import States, size_of
+from groma.solver.steps import States, landmark_slopes
 from groma.solver.termination import Termination
 
 #: A variable whose damping exceeds this has reached its minimum to machine precision.
@@ -74,21 +74,21 @@ class IndependentBlocks:
 
     def reset(self) -> None:
         """Forget the dampings of earlier steps, and that variables have converged."""
-        self._open = [np.ones(e.count, bool) for e in self.layout.eliminated]
+        self._unfinished = [np.ones(e.count, bool) for e in self.layout.eliminated]
         self._begun = False
         self.damping = [np.full(e.count, self._initial_damping) for e in self.layout.eliminated]
         self._growth = [np.full(e.count, 2.0) for e in self.layout.eliminated]
 
     def _wanted(self, chunk: Chunk) -> bool:
         """Whether some variable of a chunk has not converged."""
-        return chunk.eliminated is not None and bool(self._open[chunk.eliminated][chunk.begin : chunk.end].any())
+        return chunk.eliminated is not None and bool(self._unfinished[chunk.eliminated][chunk.begin : chunk.end].any())
 
     def costs(self, states: States, known: list[FloatArray] | None = None) -> list[FloatArray]:
         """Return the cost of each variable of each group; where it has converged, that of ``known`` if given."""
         costs = [np.zeros(e.count) for e in self.layout.eliminated]
         self.equations.cost(self.equations.prepare(states), costs, None if known is None else self._wanted)
         if known is not None:
-            costs = [np.where(mine, new, old) for mine, new, old in zip(self._open, costs, known, strict=True)]
+            costs = [np.where(mine, new, old) for mine, new, old in zip(self._unfinished, costs, known, strict=True)]
         return costs
 
     def step(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
@@ -103,8 +103,8 @@ class IndependentBlocks:
         self._begun = True
 
     def largest_gradient(self) -> float:
-        """Return the largest component of the gradient."""
-        return max((float(np.abs(g).max(initial=0.0)) for g in self.equations.g_landmarks), default=0.0)
+        """Return the largest component of the gradient, each over the root of its curvature."""
+        return max(landmark_slopes(self.equations), default=0.0)
 
     def advance(self, states: States, costs: list[FloatArray]) -> tuple[States, list[FloatArray], BlockProgress]:
         """Take the step of every variable from where they were linearised, if it lowers the variable's cost."""
@@ -117,9 +117,9 @@ class IndependentBlocks:
             better = new_costs[e] < costs[e]
             moved[group.group] = np.where(better[:, None], moved[group.group], states[group.group])
             decrease = np.where(better, costs[e] - new_costs[e], promised[e])
-            open_ended = better | (self.damping[e] < self._max_damping)
-            self._open[e] &= open_ended & (decrease > self._tolerance * costs[e])
-            unfinished += int(self._open[e].sum())
+            can_go_on = better | (self.damping[e] < self._max_damping)
+            self._unfinished[e] &= can_go_on & (decrease > self._tolerance * costs[e])
+            unfinished += int(self._unfinished[e].sum())
             squared_length += float((np.where(better[:, None], deltas[e], 0.0) ** 2).sum())
             new_costs[e] = np.where(better, new_costs[e], costs[e])
             self._adapt(e, better)
@@ -131,7 +131,7 @@ class IndependentBlocks:
         for e, group in enumerate(self.layout.eliminated):
             V, g = self.equations.V[e].reshape(group.count, -1), self.equations.g_landmarks[e]
             g = g.reshape(group.count, group.dof)
-            delta = np.where(self._open[e][:, None], self._h[e].reshape(group.count, group.dof), 0.0)
+            delta = np.where(self._unfinished[e][:, None], self._h[e].reshape(group.count, group.dof), 0.0)
             diagonal = np.maximum(V[:, :: group.dof + 1], MIN_DIAGONAL)
             pull = -np.einsum("ni,ni->n", g, delta)
             promised.append(0.5 * (pull + self.damping[e] * np.einsum("ni,ni,ni->n", delta, diagonal, delta)))
@@ -173,7 +173,7 @@ class IndependentBlocks:
         for e in range(len(deltas)):
             decrease = costs[e] - new_costs[e]
             ratio = decrease / np.maximum(promised[e], 1e-300)
-            counts = self._open[e] & (np.maximum(np.abs(decrease), promised[e]) > self._tolerance * costs[e])
+            counts = self._unfinished[e] & (np.maximum(np.abs(decrease), promised[e]) > self._tolerance * costs[e])
             wrong = counts & ((ratio > STRETCH_GAIN_RATIO) | (ratio < SHORTEN_GAIN_RATIO))
             factors.append(np.where(wrong, stretch_factor(ratio), 1.0))
 
@@ -236,7 +236,7 @@ class IndependentProblem:
         self._at_start = self._blocks.equations.costs
         cost = float(sum(self._at_start))
         self._outside = cost - _total(costs)
-        self._here = replace(self._here, cost=cost, costs=costs)
+        self._here = replace(self._here, cost=cost, costs=costs, num_hidden=self._blocks.equations.num_hidden)
         return self._here
 
     def linearize(self) -> None:  # noqa: D102
@@ -246,8 +246,8 @@ class IndependentProblem:
     def largest_gradient(self) -> float:  # noqa: D102
         return self._blocks.largest_gradient()
 
-    def size(self) -> float:  # noqa: D102
-        return size_of(self.states)
+    def is_curved(self) -> bool:  # noqa: D102
+        return any(bool(V.any()) for V in self._blocks.equations.V)
 
     def try_step(self) -> IndependentTrial:  # noqa: D102
         with self._watch("linearize"):

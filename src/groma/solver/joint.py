@@ -17,7 +17,7 @@ from groma.solver.linear.schur import ReducedSystem
 from groma.solver.options import SolverOptions, first_damping
 from groma.solver.refinement import landmark_refiner
 from groma.solver.report import SolveReport, Stopwatch, note_costs
-from groma.solver.steps import States, Step, gradient, largest, retract, size_of
+from groma.solver.steps import States, Step, landmark_slopes, largest_slope, relative_length, retract
 from groma.solver.termination import Termination
 from groma.solver.trial import JointTrial, evaluated
 
@@ -70,10 +70,13 @@ class JointProblem:
         self._reduction.form(self._here.states, self._here.inputs, self.damping)
 
     def largest_gradient(self) -> float:  # noqa: D102
-        return largest(gradient(self.equations))
+        equations, kept = self.equations, range(len(self._layout.kept))
+        slopes = [largest_slope(equations.g_kept[c], self._system.diagonal(c).reshape(-1)) for c in kept]
+        return max([*slopes, *landmark_slopes(equations)], default=0.0)
 
-    def size(self) -> float:  # noqa: D102
-        return size_of(self._here.states)
+    def is_curved(self) -> bool:  # noqa: D102
+        kept = (self._system.diagonal(c) for c in range(len(self._layout.kept)))
+        return any(bool(part.any()) for part in (*kept, *self.equations.V))
 
     def try_step(self) -> JointTrial:  # noqa: D102
         kept = self._reduction.solve()
@@ -90,6 +93,7 @@ class JointProblem:
             found = evaluated(self.equations, moved)
         ratio = (self._here.cost - found["cost"]) / promised if promised > 0 else 0.0
         found |= {"gain_ratio": float(ratio), "promised": promised, "length": step.norm(), "withheld": withheld}
+        found["relative_length"] = relative_length(self._layout, self._here.states, step)
         return JointTrial(**found, step=step)
 
     def stretch(self, trial: JointTrial, factor: float) -> JointTrial:  # noqa: D102

@@ -30,7 +30,7 @@ class Iteration:
     gain_ratio: float
     #: Euclidean length of the step in increments.
     step_norm: float
-    #: Largest component of the gradient at the start of the step.
+    #: Largest component of the gradient at the start of the step, over the root of its curvature.
     gradient_max: float
     #: Iterations of the linear solver; 0 for direct solvers.
     linear_iterations: int
@@ -155,8 +155,8 @@ def warn_of_oddities(report: SolveReport) -> None:
         )
     if report.num_underdetermined_landmarks:
         report.warnings.append(
-            "The observations leave a direction of "
-            f"{counted(report.num_underdetermined_landmarks, 'landmarks')} open; there nothing was moved."
+            f"{counted(report.num_underdetermined_landmarks, 'landmarks')} with an unobservable direction; along it "
+            "nothing was moved."
         )
     if report.num_residuals < report.num_unknowns:
         report.warnings.append(

@@ -23,10 +23,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.execution import available_cores
 from groma.problem.lay_out import lay_out
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
-from groma.problem.parallel import Workers, available_cores
+from groma.problem.parallel import FACTORS_FOR_THREADS, Workers
 from groma.problem.problem import Problem
 from groma.solver.damped_problem import DampedProblem, T
 from groma.solver.independent import STRETCH_GAIN_RATIO, IndependentProblem, stretch_factor
@@ -36,9 +37,6 @@ from groma.solver.options import SolverOptions
 from groma.solver.report import Iteration, SolveReport, Stopwatch, count_unknowns, note_costs, warn_of_oddities
 from groma.solver.steps import States
 from groma.solver.termination import Criteria, Termination
-
-#: From this many factors on, all cores are used unless the caller says otherwise.
-FACTORS_FOR_THREADS = 50_000
 
 #: Called after every step tried; returning False stops the solve.
 Progress = Callable[[Iteration], bool | None]
@@ -113,20 +111,25 @@ def minimise(
     report.initial_cost = report.final_cost = best.cost
     if not np.isfinite(best.cost):
         return Termination.NOT_FINITE
+    if best.num_hidden == problem.num_factors:
+        return Termination.NO_FACTOR_COUNTS
     share, criteria = best.cost / max(1, problem.num_factors), Criteria(options)
     while report.iterations < options.max_iterations:
         problem.linearize()
         slope, damping = problem.largest_gradient(), problem.damping
         if slope <= options.gradient_tolerance:
-            return Termination.GRADIENT_CONVERGED
+            return Termination.GRADIENT_CONVERGED if problem.is_curved() else Termination.NO_FACTOR_COUNTS
+        step = problem.try_step()
+        if not report.iterations and step.promised <= options.start_tolerance * best.cost:
+            return Termination.COST_CONVERGED
         report.iterations += 1
-        trial, accepted = _improved(problem, problem.try_step(), best, share)
+        trial, accepted = _improved(problem, step, best, share)
         if accepted:
             problem.accept(trial)
-            ended = criteria.after_accepted(trial, best, problem.size)
+            ended = criteria.after_accepted(trial, best)
             best = trial
         else:
-            ended = criteria.after_refused(trial, best, problem.size) or problem.refuse(trial)
+            ended = criteria.after_refused(trial, best) or problem.refuse(trial)
         report.final_cost = best.cost
         record = Iteration(
             iteration=report.iterations,
@@ -170,6 +173,8 @@ def _evaluate(
     report.initial_cost = report.final_cost = cost
     note_costs(report, layout, equations, equations.costs, 0)
     report.termination = Termination.MAX_ITERATIONS if np.isfinite(cost) else Termination.NOT_FINITE
+    if equations.num_hidden == sum(len(factor.factor) for factor in layout.factors):
+        report.termination = Termination.NO_FACTOR_COUNTS
     return states
 
 

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.geometry.manifold import Manifold
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 
@@ -43,38 +45,86 @@ class Step:
 def retract(layout: Layout, states: States, step: Step) -> States:
     """Return the states moved by a step, each group through its chart."""
     new = dict(states)
+    for manifold, name, delta in parts_of(layout, step):
+        new[name] = manifold.retract(states[name], delta)
+    return new
+
+
+def squares_of_step(manifold: Manifold, delta: FloatArray) -> FloatArray:
+    """Return the squared Euclidean length of the lengths, of the turns of cameras and of all else in a step (3,).
+
+    They are compared with the states one by one, so that the unit of length does not decide which of them count.
+    """
+    squares = np.einsum("ij,ij->j", delta, delta)
+    total = float(squares.sum())
+    if manifold.kind == "point":
+        return np.array([total, 0.0, 0.0])
+    if manifold.kind == "pose":
+        return np.array([float(squares[:3].sum()), float(squares[3:].sum()), 0.0])
+    return np.array([0.0, 0.0, total])
+
+
+def squares_of_states(manifold: Manifold, state: FloatArray) -> FloatArray:
+    """Return the same of states, if each were as long as the middle one of its group; a turn is compared with 1.
+
+    A few points at a great distance, as wrong matches make them, would otherwise make every step look negligible.
+    """
+    rows = state[:: 1 + len(state) // SAMPLE]
+    if len(rows) == 0:
+        return np.zeros(3)
+    if manifold.kind in ("point", "pose"):
+        ambient = manifold.ambient(rows)
+        rows = ambient if manifold.kind == "point" else ambient[:, 3::4]
+    length = len(state) * float(np.median(np.einsum("ij,ij->i", rows, rows)))
+    if manifold.kind == "pose":
+        return np.array([length, len(state), 0.0])
+    return np.array([length, 0.0, 0.0] if manifold.kind == "point" else [0.0, 0.0, length])
+
+
+def share_of_states(step: FloatArray, states: FloatArray) -> float:
+    """Return how large a step is for the states: the largest of its three parts, relative to the same of the states."""
+    moved = step > 0.0
+    if not moved.any():
+        return 0.0
+    return float(np.sqrt(np.max(step[moved] / np.maximum(states[moved], np.finfo(float).tiny))))
+
+
+def relative_length(layout: Layout, states: States, step: Step) -> float:
+    """Return :func:`share_of_states` of a step of all free variables."""
+    squares, sizes = np.zeros(3), np.zeros(3)
+    for manifold, name, delta in parts_of(layout, step):
+        squares += squares_of_step(manifold, delta)
+        sizes += squares_of_states(manifold, states[name])
+    return share_of_states(squares, sizes)
+
+
+def parts_of(layout: Layout, step: Step) -> Iterator[tuple[Manifold, str, FloatArray]]:
+    """Yield chart, name and increments (count, dof) of every group in a step."""
+    variables = layout.problem.variables
     for kept, delta in zip(layout.kept, step.kept, strict=True):
         blocks = delta.reshape(kept.count, kept.width)
         for member in kept.members:
             part = blocks[:, member.offset : member.offset + member.dof]
             if member.block_of is not None:
                 part = part[member.block_of]
-            manifold = layout.problem.variables[member.group].manifold
-            new[member.group] = manifold.retract(states[member.group], np.ascontiguousarray(part))
+            yield variables[member.group].manifold, member.group, np.ascontiguousarray(part)
     for group, delta in zip(layout.eliminated, step.landmarks, strict=True):
-        manifold = layout.problem.variables[group.group].manifold
-        new[group.group] = manifold.retract(states[group.group], delta.reshape(group.count, group.dof))
-    return new
+        yield variables[group.group].manifold, group.group, delta.reshape(group.count, group.dof)
 
 
-def size_of(states: States) -> float:
-    """Return the Euclidean length of all states together, if each were as long as the middle one of its group.
+def largest_slope(gradient: FloatArray, curvature: FloatArray) -> float:
+    r"""Return the largest component of a gradient, each divided by the root of its curvature.
 
-    A few points at a great distance, as wrong matches make them, would otherwise make every step look negligible.
+    Half its square is what moving that coordinate alone would gain, whatever its unit.
     """
-    squares = 0.0
-    for state in states.values():
-        rows = state[:: 1 + len(state) // SAMPLE]
-        if len(rows):
-            squares += len(state) * float(np.median(np.einsum("ij,ij->i", rows, rows)))
-    return float(np.sqrt(squares)) + 1e-12
+    roots = np.sqrt(np.maximum(curvature, np.finfo(float).tiny))
+    return float(np.max(np.abs(gradient) / roots, initial=0.0))
 
 
-def gradient(equations: NormalEquations) -> Step:
-    """Return the gradient of the cost."""
-    return Step(equations.g_kept, equations.g_landmarks)
-
-
-def largest(step: Step) -> float:
-    """Return the largest component of a step."""
-    return max((float(np.abs(part).max()) for part in step.parts() if part.size), default=0.0)
+def landmark_slopes(equations: NormalEquations) -> list[float]:
+    """Return :func:`largest_slope` of each group of landmarks."""
+    groups = equations.layout.eliminated
+    curvatures = [
+        np.einsum("nii->ni", V.reshape(e.count, e.dof, e.dof)) for e, V in zip(groups, equations.V, strict=True)
+    ]
+    return [largest_slope(g, c.reshape(-1)) for g, c in zip(equations.g_landmarks, curvatures, strict=True)]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from enum import Enum
 from typing import TYPE_CHECKING
 
@@ -64,6 +63,13 @@ class Termination(Enum):
         "Stopped: the cost is not finite at the start. Causes: (a) NaN or infinite measurements or noise, "
         "(b) states of absurd size. Check the input.",
     )
+    NO_FACTOR_COUNTS = (
+        "no_factor_counts",
+        False,
+        "Stopped: no factor counts. Causes: (a) none can be evaluated at the start (points behind their cameras or in "
+        "their focal plane, lines through camera centres), (b) all have a sqrt_information of zero, (c) all lie beyond "
+        "a loss that rejects them (take a wider loss_scale). Nothing was moved; check poses, landmarks and noise.",
+    )
     NOTHING_TO_DO = (
         "nothing_to_do",
         True,
@@ -120,21 +126,21 @@ class Criteria:
         self._options = options
         self._fell = 0.0  # relative decrease in the last step, 0 where it was refused
 
-    def after_accepted(self, trial: Trial, best: Trial, size: Callable[[], float]) -> Termination | None:
-        """Return why to stop after a step from ``best`` to ``trial``, to states of a ``size``."""
+    def after_accepted(self, trial: Trial, best: Trial) -> Termination | None:
+        """Return why to stop after a step from ``best`` to ``trial``."""
         if trial.settled is not None:
             return Termination.COST_CONVERGED if trial.settled else None
         before, self._fell = self._fell, (best.cost - trial.cost) / best.cost
         withheld, tolerance = trial.withheld / best.cost, self._options.function_tolerance
         if cost_converged(self._fell, before, trial.gain_ratio, withheld, tolerance):
             return Termination.COST_CONVERGED
-        return Termination.STEP_CONVERGED if trial.length <= self._options.step_tolerance * size() else None
+        return Termination.STEP_CONVERGED if trial.relative_length <= self._options.step_tolerance else None
 
-    def after_refused(self, trial: Trial, best: Trial, size: Callable[[], float]) -> Termination | None:
+    def after_refused(self, trial: Trial, best: Trial) -> Termination | None:
         """Return why to stop after a step that was refused."""
         self._fell = 0.0
         if trial.settled is not None:
             return Termination.COST_CONVERGED if trial.settled else None
         if trial.promised <= self._options.function_tolerance * best.cost:
             return Termination.COST_CONVERGED  # even as promised the step would have ended the solve
-        return Termination.DAMPING_EXHAUSTED if trial.length <= NO_CHANGE * size() else None
+        return Termination.DAMPING_EXHAUSTED if trial.relative_length <= NO_CHANGE else None

@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from groma.bounded.images import decoded
+from groma.errors import FileFormatError
+
 Picture = npt.NDArray[np.uint8]
 #: A folder of images, or image files by the names that the scene gives them.
 ImageFiles = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
@@ -34,7 +37,10 @@ def read_picture(path: str | os.PathLike[str], max_size: int | None = None) -> P
     """
     import cv2
 
-    picture = cv2.imread(os.fspath(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        picture = decoded(Path(path).read_bytes(), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except (OSError, FileFormatError):
+        return None
     if picture is None:
         return None
     scale = 1.0 if max_size is None else max_size / max(picture.shape[:2])

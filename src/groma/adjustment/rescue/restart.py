@@ -23,7 +23,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import LINE_FACTORS, disassemble
 from groma.cameras import model as camera_model
-from groma.estimators.line_ends import trim
+from groma.estimators.line_ends import SegmentRays, trim
 from groma.estimators.line_triangulation import triangulate_planes
 from groma.estimators.trimming import TrimStatus, trim_to_ray
 from groma.factors.contract import Factor, Ref
@@ -200,11 +200,9 @@ def with_seen_ends(scene: Scene, lines: IntArray) -> Scene:
         segments[chosen, end] = foot + place[:, None] * plucker[:, 3:] / length
     by_line = good[np.argsort(owner, kind="stable")]
     pixels = segment2.length(table.segment[rows])
-    X, everything = segments[chosen], np.ones(len(good), np.bool_)
-    trim(
-        center, np.arange(len(rows)), rays, pixels, np.append(first, len(good)), by_line, everything, X,
-        np.empty(len(good), np.bool_),
-    )  # fmt: skip
+    seen_from = SegmentRays(center, np.arange(len(rows)), rays, pixels)
+    everything = np.ones(len(good), np.bool_)
+    X, _ = trim(seen_from, np.append(first, len(good)), by_line, everything, segments[chosen])
     backward = ((X[:, 1] - X[:, 0]) * plucker[:, 3:]).sum(axis=1) < 0.0
     X[backward] = X[backward, ::-1]
     segments[chosen] = X

@@ -37,6 +37,8 @@ def poses(
     from groma.io import read_scene
 
     scores = evaluate_poses(read_scene(estimate), read_scene(reference))
+    for warning in scores.warnings:
+        console.warn(warning)
     console.say(f"{counted(scores.num_images, 'images')} in both, after similarity alignment")
     if scores.num_missing:
         missing = counted(scores.num_missing, "images")
@@ -165,6 +167,14 @@ def trajectory(
     max_time_difference: Annotated[
         float, typer.Option("--max-time-difference", metavar="S", help="Largest difference of associated times, s.")
     ] = 0.01,
+    times: Annotated[
+        Path | None,
+        typer.Option(
+            "--times",
+            metavar="FILE",
+            help="Times of a REF without any (KITTI), one a line; by default times.txt beside it.",
+        ),
+    ] = None,
     rpe_delta: Annotated[float, typer.Option("--rpe-delta", metavar="D", help="Step of the relative errors.")] = 1.0,
     rpe_unit: Annotated[_StepUnit, typer.Option("--rpe-unit", help="Unit of the step.")] = "frames",
     force: _options.Force = False,
@@ -173,13 +183,17 @@ def trajectory(
     quiet: _options.Quiet = False,
     verbose: _options.Verbose = False,
 ) -> None:
-    """Compare a trajectory with a reference: absolute and relative errors, and drift; poses are matched by time."""
+    """Compare a trajectory with a reference: absolute and relative errors, and drift; poses are matched by time.
+
+    Two files of equal length of which one has no times (KITTI) are matched by line.
+    """
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
     check_inputs(estimate, reference)
 
-    from groma.evaluation.trajectory import Spread, score_trajectory
+    from groma.evaluation.trajectory import Spread, counts_lines, score_trajectory
     from groma.io import read_trajectory
+    from groma.io.trajectories import read_times
 
     def row(name: str, spread: Spread, unit: str) -> None:
         console.say(
@@ -187,19 +201,32 @@ def trajectory(
             f"{spread.max:10.6g} max  {unit}"
         )
 
+    ours, theirs = read_trajectory(estimate, format), read_trajectory(reference, format)
+    beside = reference.with_name("times.txt")
+    if times is None and counts_lines(theirs) and not counts_lines(ours) and beside.is_file():
+        times = beside if len(read_times(beside)) == len(theirs) else None
+    if times is not None:
+        theirs = read_trajectory(reference, format, read_times(times))
+        console.detail(f"The poses of {reference} have the times of {times}.")
     scores = score_trajectory(
-        read_trajectory(estimate, format),
-        read_trajectory(reference, format),
+        ours,
+        theirs,
         align,
         max_time_difference,
         rpe_delta,
         rpe_unit,
     )
+    for warning in scores.warnings:
+        console.warn(warning)
     applied = {"se3": "rotation and translation", "sim3": f"similarity of scale {scores.similarity.scale:.6g}"}
     console.say(
-        f"{counted(scores.num_poses, 'poses')} associated of {scores.num_estimate:,} and {scores.num_reference:,}, "
+        f"{counted(scores.num_poses, 'poses')} associated by {scores.association} of {scores.num_estimate:,} and "
+        f"{scores.num_reference:,}, "
         f"path of {scores.path_length:.6g} m; alignment: {applied.get(align, 'none')}"
+        + (", by positions and orientations" if scores.by_orientations else "")
     )
+    if scores.by_orientations:
+        console.say("  The positions alone do not determine the rotation between the two.")
     step = f"{rpe_delta:g} {rpe_unit.removesuffix('s') if rpe_delta == 1 else rpe_unit}"
     row("absolute, position", scores.ate, "m")
     row("absolute, rotation", scores.rotation_deg, "deg")

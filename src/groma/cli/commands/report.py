@@ -43,7 +43,7 @@ def report(
     from groma.io import read_scene
     from groma.scene.counts import counts_of
     from groma.viz.pictures import image_file
-    from groma.viz.report.page import write_report
+    from groma.viz.report.page import PageContents, write_report
     from groma.viz.report.saved import saved_report
 
     if images is not None and not images.is_dir():
@@ -54,15 +54,7 @@ def report(
         console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[0]!r}.")
     saved = saved_report(source) if source.is_dir() else None
     with _output.atomic_output(output, force) as draft:
-        write_report(
-            draft,
-            earlier,
-            scene,
-            saved,
-            images,
-            title=source.absolute().name,
-            outcomes=saved.outcomes if saved is not None else None,
-            explanation=saved.explanation if saved is not None else "",
-        )
+        contents = None if saved is None else PageContents(saved.outcomes, saved.explanation)
+        write_report(draft, earlier, scene, saved, images, source.absolute().name, contents)
     console.say(f"Wrote {output}")
     _output.write_json(json_target, {"output": str(output), **counts_of(scene)}, force)

@@ -50,7 +50,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.compilation.time import compilation_time
     from groma.io import check_target, read_scene, structures_of, write_scene
-    from groma.viz.report.page import write_report
+    from groma.viz.report.page import PageContents, write_report
     from groma.viz.report.tables import contributions_card
 
     before = read_scene(source)
@@ -75,9 +75,11 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
                 result.scene,
                 result.report,
                 title=f"Adjustment of {source.absolute().name}",
-                warnings=numbers["warnings"],
-                diagnosis=numbers["diagnosis"],
-                cards=contributions_card(numbers.get("contributions")),
+                contents=PageContents(
+                    warnings=numbers["warnings"],
+                    diagnosis=numbers["diagnosis"],
+                    cards=contributions_card(numbers.get("contributions")),
+                ),
             )
     failure = None
     if wanted.covariance is not None:

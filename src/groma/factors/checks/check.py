@@ -249,7 +249,7 @@ def check_factor(
     factor : type of factor, factor or Example
         What to check. Of a type or an instance, :meth:`Factor.example` is drawn; an :class:`Example` is taken as is.
     rng : numpy.random.Generator, optional
-        Source of chance for the example; seeded with 0 if not given.
+        Random generator of the example; seeded with 0 if not given.
     tolerance : float
         Largest deviation of a block, relative to its largest entry.
 

@@ -105,9 +105,7 @@ class LineBearing(CameraFactor):
         normalize_rows(self, "start_bearings", 3)
         normalize_rows(self, "end_bearings", 3)
 
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 2
+    rows: ClassVar[int] = 2
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

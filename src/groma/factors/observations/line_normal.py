@@ -129,9 +129,7 @@ class LineNormal(CameraFactor):
         super().__post_init__()
         normalize_rows(self, "normals", 3)
 
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 2
+    rows: ClassVar[int] = 2
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

@@ -139,10 +139,7 @@ class LineReprojection(PixelFactor):
     pinhole_only: ClassVar[bool] = True
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 4),)
-
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 2
+    rows: ClassVar[int] = 2
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

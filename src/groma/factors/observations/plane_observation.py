@@ -121,9 +121,7 @@ class PlaneInCamera(CameraFactor):
         super().__post_init__()
         normalize_rows(self, "planes_in_cam", self.num_normalized)
 
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 3
+    rows: ClassVar[int] = 3
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

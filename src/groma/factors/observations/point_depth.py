@@ -70,10 +70,7 @@ class PointDepth(CameraFactor):
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), EXTRINSICS)
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("depths", 0),)
-
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 1
+    rows: ClassVar[int] = 1
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

@@ -113,10 +113,7 @@ class PointReprojection(PixelFactor):
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 2),)
-
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 2
+    rows: ClassVar[int] = 2
 
     def _arguments(self, inputs: tuple[Any, ...]) -> tuple[Any, ...]:
         smallest_depth = self.smallest_depth if self.require_in_front else -np.inf

@@ -109,10 +109,7 @@ class StereoLine(StereoFactor):
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 8),)
-
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 4
+    rows: ClassVar[int] = 4
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

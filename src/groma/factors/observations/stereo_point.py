@@ -107,10 +107,7 @@ class StereoPoint(StereoFactor):
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 3),)
-
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 3
+    rows: ClassVar[int] = 3
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

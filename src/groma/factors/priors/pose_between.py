@@ -103,9 +103,7 @@ class PoseBetween(Factor):
     def __post_init__(self) -> None:
         set_rows(self, "first_from_second", 7)
 
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 6
+    rows: ClassVar[int] = 6
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return *ambients, poses_from_states(self.first_from_second)

@@ -173,9 +173,7 @@ class PosePrior(Factor):
     def __post_init__(self) -> None:
         set_rows(self, "cam_from_world", 7)
 
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 6
+    rows: ClassVar[int] = 6
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return ambients[0], self._priors

@@ -53,9 +53,7 @@ class PositionPrior(Factor):
     def __post_init__(self) -> None:
         set_rows(self, "cam_center_in_world", 3)
 
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 3
+    rows: ClassVar[int] = 3
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return ambients[0], self.cam_center_in_world

@@ -122,10 +122,7 @@ class _LineAndPlane(Factor):
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("line", "line"), Slot("plane", "plane"))
     invariance: ClassVar[Invariance] = WORLD_FIXED  # anchors and ends are world points
-
-    @property
-    def residual_size(self) -> int:
-        return 2
+    rows: ClassVar[int] = 2
 
     def _evaluate(
         self,

@@ -42,10 +42,7 @@ class LineToPixel(PixelFactor):
     pinhole_only: ClassVar[bool] = True
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 2),)
-
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 1
+    rows: ClassVar[int] = 1
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

@@ -237,9 +237,7 @@ class PointOnPlanePixels(_OnPlanePixels):
         POSE, Slot("point", "point"), Slot("plane", "plane"), Slot("intrinsics", "intrinsics"), EXTRINSICS,
     )  # fmt: skip
 
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 2
+    rows: ClassVar[int] = 2
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
@@ -280,9 +278,7 @@ class SegmentOnPlanePixels(_OnPlanePixels):
         super().__post_init__()
         set_rows(self, "ends", 2, 3)
 
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 4
+    rows: ClassVar[int] = 4
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

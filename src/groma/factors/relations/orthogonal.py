@@ -68,9 +68,7 @@ class _Orthogonal(DirectionPair):
     #: The other variable.
     second: Ref
 
-    @property
-    def residual_size(self) -> int:
-        return 1
+    rows: ClassVar[int] = 1
 
     def linearize(
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

@@ -88,14 +88,8 @@ class PointOnLine(Factor):
     line: Ref
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("point", "point"), Slot("line", "line"))
-
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 3
-
-    @property
-    def residual_rank(self) -> int:  # noqa: D102
-        return 2
+    rows: ClassVar[int] = 3
+    independent_rows: ClassVar[int] = 2
 
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

@@ -67,10 +67,7 @@ class PointOnPlane(Factor):
     plane: Ref
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("point", "point"), Slot("plane", "plane"))
-
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 1
+    rows: ClassVar[int] = 1
 
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

@@ -95,9 +95,7 @@ class PointToImageLine(PixelFactor):
         super().__post_init__()
         normalize_rows(self, "image_lines", 2)
 
-    @property
-    def residual_size(self) -> int:  # noqa: D102
-        return 1
+    rows: ClassVar[int] = 1
 
     def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

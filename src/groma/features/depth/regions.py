@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._numba import kernel, loop
+from groma._numba import inline_kernel, kernel, loop
 from groma.gates import gate
 
 #: Regions that are remembered: the size of an array.
@@ -135,14 +135,10 @@ def block_sums(depth, pinhole, noise, size, step, sums, counts):
             counts[i // size, block] += count
 
 
-@loop
-def grow(sums, counts, noise, limits, gates, min_blocks, labels, regions, region_counts):
-    """Label blocks (R, C) by region, -1 for none; write the sums of regions. Return their number."""
-    gate, bend, cos_floor = limits
-    min_count, flat, turn = gates
+@inline_kernel
+def _fit_blocks(sums, counts, gate, min_count, flat, thetas, quality, labels):
+    """Fit a plane to every block: -1 labels those that can seed a region, by their quality; -2 all others."""
     rows, columns = counts.shape
-    thetas = np.zeros((rows, columns, 3))
-    quality = np.full(rows * columns, np.inf)
     for i in range(rows):
         for j in range(columns):
             labels[i, j] = -2  # cannot be part of a plane
@@ -157,6 +153,17 @@ def grow(sums, counts, noise, limits, gates, min_blocks, labels, regions, region
                 labels[i, j] = -1
                 # Blocks with few pixels fit well by chance and say little: they are tried last.
                 quality[i * columns + j] = (chi + 1.0) / counts[i, j]
+
+
+@loop
+def grow(sums, counts, noise, limits, gates, min_blocks, labels, regions, region_counts):
+    """Label blocks (R, C) by region, -1 for none; write the sums of regions. Return their number."""
+    gate, bend, cos_floor = limits
+    min_count, flat, turn = gates
+    rows, columns = counts.shape
+    thetas = np.zeros((rows, columns, 3))
+    quality = np.full(rows * columns, np.inf)
+    _fit_blocks(sums, counts, gate, min_count, flat, thetas, quality, labels)
     order = np.argsort(quality)
     queue = np.empty((rows * columns, 2), np.int64)
     theta, region = np.empty(3), np.empty(10)

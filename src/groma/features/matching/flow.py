@@ -33,18 +33,18 @@ MIN_IMAGE = 16  # pixels; smaller images give DIS no patch to compare
 class FlowOptions:
     """What counts as a match."""
 
+    #: Distance of the points along a segment, pixels.
     step: float = 3.0
-    """Distance of the points along a segment, pixels."""
+    #: A point must come back to within this distance, pixels.
     round_trip: float = 2.0
-    """A point must come back to within this distance, pixels."""
+    #: A point votes for a segment within this distance, pixels.
     max_distance: float = 3.0
-    """A point votes for a segment within this distance, pixels."""
+    #: Largest angle between a segment and the path of its points in the other image, radians.
     max_angle: float = 0.2
-    """Largest angle between a segment and the path of its points in the other image, radians."""
+    #: Smallest share of votes.
     min_score: float = 0.4
-    """Smallest share of votes."""
+    #: By which share of the score a match must beat any rival.
     margin: float = 0.1
-    """By which share of the score a match must beat any rival."""
 
 
 def dense_flow(image_1: npt.NDArray[np.generic], image_2: npt.NDArray[np.generic]) -> Flow:

@@ -18,12 +18,12 @@ from groma.features.segments import Segments
 class NearbyPoints:
     """Points near each segment of one image, as a compressed table with ascending identifiers in every row."""
 
+    #: (N + 1,) row n is begin[n] to begin[n + 1].
     begin: npt.NDArray[np.int64]
-    """(N + 1,) row n is begin[n] to begin[n + 1]."""
+    #: (E,) identifiers, shared with the other images.
     point_id: npt.NDArray[np.int64]
-    """(E,) identifiers, shared with the other images."""
+    #: (E,) signed distance from the segment's line in pixels, positive on the right.
     distance: FloatArray
-    """(E,) signed distance from the segment's line in pixels, positive on the right."""
 
     def common_with(self, other: NearbyPoints) -> NearbyPoints:
         """Without the points that are near no segment of the other image: not seen there, or far from all lines."""

@@ -33,7 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from groma._numba import kernel, loop
+from groma._numba import inline_kernel, kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.features.matches import LineMatches, mutual_best
@@ -52,18 +52,18 @@ FEATURES = 6  # descriptor distance; points for, against, near one only; overlap
 class WideBaselineOptions:
     """What counts as a match."""
 
+    #: Candidates further apart are not looked at.
     max_descriptor_distance: float = 0.9
-    """Candidates further apart are not looked at."""
+    #: Smallest epipolar overlap, as a share of the smaller extent; only with a fundamental matrix.
     min_overlap: float = 0.3
-    """Smallest epipolar overlap, as a share of the smaller extent; only with a fundamental matrix."""
+    #: How far outside the epipolar beam an end point may lie, pixels.
     beam_tolerance: float = 2.0
-    """How far outside the epipolar beam an end point may lie, pixels."""
+    #: Points within this distance of a segment support it, pixels.
     reach: float = 40.0
-    """Points within this distance of a segment support it, pixels."""
+    #: Smallest score of a match.
     min_score: float = 0.5
-    """Smallest score of a match."""
+    #: By how much a match must beat any rival, logarithm of odds: 0.7 is twice as likely.
     margin: float = 0.7
-    """By how much a match must beat any rival, logarithm of odds: 0.7 is twice as likely."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +140,46 @@ def _points(ids_1, distance_1, low_1, high_1, ids_2, distance_2, low_2, high_2, 
     out[2] = min(high_1 - low_1, high_2 - low_2) - shared
 
 
+@inline_kernel
+def _epipolar_line(F, u, v):
+    """Return the epipolar line of a pixel, scaled so that a product with (u, v, 1) is a distance in pixels."""
+    a0, a1, a2 = (
+        F[0, 0] * u + F[0, 1] * v + F[0, 2],
+        F[1, 0] * u + F[1, 1] * v + F[1, 2],
+        F[2, 0] * u + F[2, 1] * v + F[2, 2],
+    )
+    scale = 1.0 / max(math.hypot(a0, a1), 1e-300)
+    return a0 * scale, a1 * scale, a2 * scale
+
+
+@inline_kernel
+def _overlaps(a, b, ends, j, min_overlap, tolerance, min_extent):
+    """Return whether segment j can lie between two epipolar lines, and the shares of both segments that overlap.
+
+    Shares are -1 where the geometry does not tell.
+    """
+    on_1 = -1.0
+    on_2 = -1.0
+    u, v = ends[j, 0], ends[j, 1]
+    pa, pb = a[0] * u + a[1] * v + a[2], b[0] * u + b[1] * v + b[2]
+    u, v = ends[j, 2], ends[j, 3]
+    qa, qb = a[0] * u + a[1] * v + a[2], b[0] * u + b[1] * v + b[2]
+    if min(min(pa, pb), min(qa, qb)) > tolerance or max(max(pa, pb), max(qa, qb)) < -tolerance:
+        return False, on_1, on_2
+    # Extents in pixels: of the second across the epipolar lines, of the beam at the second.
+    turn, beam = 0.5 * ((qa - pa) + (qb - pb)), 0.5 * ((pa - pb) + (qa - qb))
+    if abs(turn) > min_extent and abs(beam) > min_extent:
+        if turn * beam < 0.0:
+            return False, on_1, on_2
+        if pa != qa and pb != qb:
+            on_2 = _share(_crossing(pa, qa), _crossing(pb, qb))
+        if pa != pb and qa != qb:
+            on_1 = _share(_crossing(pa, pb), _crossing(qa, qb))
+        if min(on_1, on_2) < min_overlap:
+            return False, on_1, on_2
+    return True, on_1, on_2
+
+
 @loop
 def _candidates(
     first_row, ends_1, ends_2, products, begin_1, ids_1, distance_1, begin_2, ids_2, distance_2,
@@ -153,29 +193,10 @@ def _candidates(
     points = np.zeros(3)
     for row in range(n1):
         i = first_row + row
-        a0 = 0.0
-        a1 = 0.0
-        a2 = 0.0
-        b0 = 0.0
-        b1 = 0.0
-        b2 = 0.0
+        a = b = (0.0, 0.0, 0.0)
         if has_F:
-            u, v = ends_1[i, 0], ends_1[i, 1]
-            a0, a1, a2 = (
-                F[0, 0] * u + F[0, 1] * v + F[0, 2],
-                F[1, 0] * u + F[1, 1] * v + F[1, 2],
-                F[2, 0] * u + F[2, 1] * v + F[2, 2],
-            )
-            u, v = ends_1[i, 2], ends_1[i, 3]
-            b0, b1, b2 = (
-                F[0, 0] * u + F[0, 1] * v + F[0, 2],
-                F[1, 0] * u + F[1, 1] * v + F[1, 2],
-                F[2, 0] * u + F[2, 1] * v + F[2, 2],
-            )
-            scale = 1.0 / max(math.hypot(a0, a1), 1e-300)
-            a0, a1, a2 = a0 * scale, a1 * scale, a2 * scale
-            scale = 1.0 / max(math.hypot(b0, b1), 1e-300)
-            b0, b1, b2 = b0 * scale, b1 * scale, b2 * scale
+            a = _epipolar_line(F, ends_1[i, 0], ends_1[i, 1])
+            b = _epipolar_line(F, ends_1[i, 2], ends_1[i, 3])
         for j in range(n2):
             product = products[row, j]
             if product < min_product:
@@ -183,35 +204,13 @@ def _candidates(
             on_1 = -1.0
             on_2 = -1.0
             if has_F:
-                u, v = ends_2[j, 0], ends_2[j, 1]
-                pa, pb = a0 * u + a1 * v + a2, b0 * u + b1 * v + b2
-                u, v = ends_2[j, 2], ends_2[j, 3]
-                qa, qb = a0 * u + a1 * v + a2, b0 * u + b1 * v + b2
-                if min(min(pa, pb), min(qa, qb)) > tolerance or max(max(pa, pb), max(qa, qb)) < -tolerance:
+                possible, on_1, on_2 = _overlaps(a, b, ends_2, j, min_overlap, tolerance, min_extent)
+                if not possible:
                     continue
-                # Extents in pixels: of the second across the epipolar lines, of the beam at the second.
-                turn, beam = 0.5 * ((qa - pa) + (qb - pb)), 0.5 * ((pa - pb) + (qa - qb))
-                if abs(turn) > min_extent and abs(beam) > min_extent:
-                    if turn * beam < 0.0:
-                        continue
-                    if pa != qa and pb != qb:
-                        on_2 = _share(_crossing(pa, qa), _crossing(pb, qb))
-                    if pa != pb and qa != qb:
-                        on_1 = _share(_crossing(pa, pb), _crossing(qa, qb))
-                    if min(on_1, on_2) < min_overlap:
-                        continue
             _points(
-                ids_1,
-                distance_1,
-                begin_1[i],
-                begin_1[i + 1],
-                ids_2,
-                distance_2,
-                begin_2[j],
-                begin_2[j + 1],
-                on_line,
+                ids_1, distance_1, begin_1[i], begin_1[i + 1], ids_2, distance_2, begin_2[j], begin_2[j + 1], on_line,
                 points,
-            )
+            )  # fmt: skip
             if count == room:
                 more_pairs, more_features = np.zeros((2 * room, 2), dtype=np.int64), np.zeros((2 * room, FEATURES))
                 more_pairs[:room], more_features[:room] = pairs, features

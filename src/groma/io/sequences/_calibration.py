@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from groma import cameras
 from groma._typing import FloatArray
+from groma.bounded.text import finite, read_text, whole
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
 from groma.io.sequences.frame import SequenceCamera, checked_params
@@ -114,7 +115,7 @@ def calibration_of(camera: CameraLike) -> Calibration:
 def read_calibration(path: Path) -> Calibration:
     """Read a calibration from a file in one of the accepted forms."""
     with reading(path, "camera file"):
-        return _from_text(path.read_text(encoding="utf-8"), str(path))
+        return _from_text(read_text(path), str(path))
 
 
 def find_calibration(folder: Path) -> Calibration | None:
@@ -140,17 +141,15 @@ def _from_text(text: str, source: str) -> Calibration:
     lines = [words for words in lines if words]
     if not lines:
         raise FileFormatError(f"{source} holds no camera; {_HELP}.")
-    try:
-        for skip in (0, 1):  # with or without the number of the camera
-            words = lines[0][skip:]
-            if len(words) > 3 and words[0][:1].isalpha():
-                if len(lines) > 1:
-                    raise FileFormatError(f"{source} holds {len(lines)} cameras; expected one. Remove the others.")
-                size, params = (int(words[1]), int(words[2])), np.array([float(word) for word in words[3:]])
-                return _checked(words[0], params, size, source)
-        numbers = np.array([float(word) for words in lines for word in words])
-    except ValueError as error:
-        raise FileFormatError(f"{source} is not a camera ({error}); {_HELP}.") from error
+    wrong = f"{source} is not a camera"
+    for skip in (0, 1):  # with or without the number of the camera
+        words = lines[0][skip:]
+        if len(words) > 3 and words[0][:1].isalpha():
+            if len(lines) > 1:
+                raise FileFormatError(f"{source} holds {len(lines)} cameras; expected one. Remove the others.")
+            size = whole(words[1], wrong, "the width"), whole(words[2], wrong, "the height")
+            return _checked(words[0], np.array(finite(words[3:], wrong)), size, source)
+    numbers = np.array(finite((word for words in lines for word in words), wrong, _HELP.removeprefix("expected ")))
     if len(lines) == 3 and len(numbers) == 9:
         return _from_numbers(numbers[[0, 4, 2, 5]], source)
     return _from_numbers(numbers, source)

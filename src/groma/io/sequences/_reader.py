@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from groma.errors import InputError
+from groma.bounded.images import decoded
+from groma.errors import FileFormatError, InputError
 from groma.io.sequences._calibration import Calibration, Rectification, rectification
 from groma.io.sequences.frame import Frame, Kind, SequenceCamera
 from groma.io.trajectories import Trajectory
@@ -141,7 +142,11 @@ class FileSequence:
         if path is None:
             remarks.append(f"{name} has no depth image.")
             return None
-        raw = _decode(path, cv2.IMREAD_UNCHANGED)
+        try:
+            raw = _decode(path, cv2.IMREAD_UNCHANGED)
+        except FileFormatError as error:
+            remarks.append(f"{path.name}: {error}")
+            return None
         width, height = self._file_size
         if raw is None or raw.ndim != 2 or raw.shape != (height, width):
             what = "cannot be read" if raw is None else f"is {raw.shape[1]}x{raw.shape[0]}, not {width}x{height} grey"
@@ -211,14 +216,17 @@ def simple_sequence(
 def _decode(path: Path, flags: int) -> npt.NDArray[Any] | None:
     """Return the image in a file, or None."""
     try:
-        data = np.fromfile(path, np.uint8)
-        return cv2.imdecode(data, flags) if len(data) else None
-    except (OSError, cv2.error):
+        return decoded(path.read_bytes(), flags)
+    except OSError:
         return None
 
 
 def _image(path: Path, shape: tuple[int, int], remarks: list[str], otherwise: str) -> npt.NDArray[np.uint8] | None:
-    image = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        image = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except FileFormatError as error:
+        remarks.append(f"{path.name}: {error}")
+        return None
     if image is None:
         remarks.append(f"{path.name} cannot be read; {otherwise}.")
         return None

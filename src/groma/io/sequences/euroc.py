@@ -10,7 +10,6 @@ The reference is ``state_groundtruth_estimate0/data.csv``, moved from the body t
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,8 @@ import numpy as np
 
 from groma import cameras
 from groma._typing import FloatArray
+from groma.bounded.names import listed_file
+from groma.bounded.text import finite, read_lines, whole
 from groma.errors import FileFormatError, InputError
 from groma.geometry import se3
 from groma.io.reading import reading
@@ -121,7 +122,7 @@ def _sensor(folder: Path, calibration: Calibration | None) -> _Sensor:
     pose = np.eye(4)
     if path.is_file():
         with reading(path, "sensor.yaml"):
-            entries = _yaml(path.read_text(encoding="utf-8"))
+            entries = _yaml(path)
             pose = _numbers(entries, "data").reshape(4, 4)
             if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > 1e-3:
                 raise FileFormatError("T_BS is not a rigid motion.")
@@ -145,16 +146,30 @@ def _calibration(entries: dict[str, str]) -> Calibration:
     raise FileFormatError(f"distortion_model must be radial-tangential or equidistant; got {kind}.")
 
 
-def _yaml(text: str) -> dict[str, str]:
+def _yaml(path: Path) -> dict[str, str]:
     """Return the scalars and the flow lists of a YAML file by key, whatever they are nested in."""
-    bare = "\n".join(line.partition("#")[0] for line in text.splitlines())
-    return {key: value.strip() for key, value in re.findall(r"(\w+)[ \t]*:[ \t]*(\[[^\]]*\]|[^\n\[]+)", bare)}
+    entries: dict[str, list[str]] = {}
+    key = None  # of a list that goes on
+    for _, line in read_lines(path):
+        if key is None:
+            name, colon, value = line.partition(":")
+            name = name.strip()
+            if not colon or not name:
+                continue
+            entries[name] = [value]
+            key = name if "[" in value else None
+        else:
+            entries[key].append(line)
+        if "]" in line:
+            key = None
+    return {name: " ".join(parts).strip() for name, parts in entries.items()}
 
 
 def _numbers(entries: dict[str, str], key: str) -> FloatArray:
     if key not in entries:
         raise FileFormatError(f"it has no entry {key}.")
-    return np.array([float(word) for word in re.split(r"[,\s]+", entries[key].strip("[]").strip()) if word])
+    words = entries[key].partition("[")[2].partition("]")[0].replace(",", " ").split()
+    return np.array(finite(words, key, "a list of finite numbers"))
 
 
 def _images(folder: Path) -> list[tuple[float, Path]]:
@@ -164,9 +179,13 @@ def _images(folder: Path) -> list[tuple[float, Path]]:
         named = sorted((path for path in data.iterdir() if path.stem.isdecimal()), key=lambda path: int(path.stem))
         return [(int(path.stem) * 1e-9, path) for path in named]
     with reading(table, "list of images"):
-        lines = (line.partition("#")[0].strip() for line in table.read_text(encoding="utf-8").splitlines())
-        words = [line.replace(",", " ").split() for line in lines if line]
-        return [(int(row[0]) * 1e-9, data / (row[1] if len(row) > 1 else f"{row[0]}.png")) for row in words]
+        found = []
+        for number, line in read_lines(table):
+            place = f"{table}, line {number}"
+            time, *names = line.replace(",", " ").split() or [""]
+            name = names[0] if names else f"{time}.png"
+            found.append((whole(time, place, "a time in nanoseconds") * 1e-9, listed_file(data, name, place)))
+        return found
 
 
 def _reference(root: Path, body_from_cam: FloatArray) -> Trajectory | None:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError, InputError
 from groma.io.endings import IMAGES
 from groma.io.reading import reading
@@ -143,10 +144,9 @@ def _times(folder: Path, images: list[Path]) -> list[float]:
         path = folder / name
         if path.is_file():
             with reading(path, "list of times"):
-                rows = [line.partition("#")[0].split() for line in path.read_text(encoding="utf-8").splitlines()]
-                times = [float(row[0]) for row in rows if row]
-                if len(times) != len(images) or not np.isfinite(times).all():
-                    raise FileFormatError(f"expected {len(images)} finite times, one per image; got {len(times)}.")
+                times = [finite(row[:1], f"{path}, line {line}", "a finite time")[0] for line, row in read_words(path)]
+                if len(times) != len(images):
+                    raise FileFormatError(f"expected {len(images)} times, one per image; got {len(times)}.")
             return times
     stems = [path.stem for path in images]
     if all(re.fullmatch(r"\d+\.\d+", stem) for stem in stems):

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.bounded.text import finite, read_lines, read_words
 from groma.errors import FileFormatError
 from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, from_opencv
@@ -51,49 +52,56 @@ def open_kitti(folder: Path, calibration: Calibration | None, selection: Selecti
     images = sorted(path for path in (folder / left).iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
     # The number in a name is the frame; without numbers, or with missing times, frames are counted.
     numbers = [int(path.stem) if path.stem.isdecimal() else row for row, path in enumerate(images)]
-    last = max(numbers, default=-1)
-    times = _times(folder / "times.txt", last + 1, warnings)
+    count = max(numbers, default=-1) + 1
+    times = _times(folder / "times.txt", count, warnings)
     rights = {path.name for path in (folder / right).iterdir()} if has_right else set()
     entries = [
-        Entry(times[number], path, right=folder / right / path.name if path.name in rights else None)
+        Entry(_time(times, number), path, right=folder / right / path.name if path.name in rights else None)
         for number, path in zip(numbers, images, strict=True)
     ]
-    reference = _reference(folder, times, warnings)
+    reference = _reference(folder, times, count if times is None else len(times), warnings)
     return simple_sequence(kind, selection.of(entries, warnings), calibration, reference, warnings, baseline=baseline)
 
 
 def _matrices(path: Path) -> dict[str, FloatArray]:
     """Return the 3x4 matrices P0 to P3."""
     with reading(path, "KITTI calibration"):
-        named = (line.partition(":") for line in path.read_text(encoding="utf-8").splitlines())
-        return {
-            name.strip(): np.array([float(word) for word in values.split()]).reshape(3, 4)
-            for name, _, values in named
-            if name.strip() in ("P0", "P1", "P2", "P3")
-        }
+        found = {}
+        for number, line in read_lines(path):
+            name, _, values = line.partition(":")
+            if (name := name.strip()) in ("P0", "P1", "P2", "P3"):
+                numbers = finite(values.split(), f"{path}, line {number}", "12 finite numbers")
+                found[name] = np.array(numbers).reshape(3, 4)
+                if found[name][0, 0] <= 0:
+                    raise FileFormatError(f"{path}, line {number}: expected a positive focal length; got {numbers[0]}.")
+        return found
 
 
-def _times(path: Path, count: int, warnings: list[str]) -> list[float]:
-    """Return at least ``count`` times."""
+def _times(path: Path, count: int, warnings: list[str]) -> list[float] | None:
+    """Return at least ``count`` times, or None where there are none."""
     if not path.is_file():
         warnings.append(f"There is no times.txt; {RATE:g} frames a second are assumed.")
-        return [number / RATE for number in range(count)]
+        return None
     with reading(path, "list of times"):
-        times = [float(word) for word in path.read_text(encoding="utf-8").split()]
-        if not np.isfinite(times).all() or len(times) < count:
+        times = [time for line, words in read_words(path) for time in finite(words, f"{path}, line {line}")]
+        if len(times) < count:
             raise FileFormatError(f"expected {count} finite times, one per frame; got {len(times)}.")
     return times
 
 
-def _reference(folder: Path, times: list[float], warnings: list[str]) -> Trajectory | None:
+def _time(times: list[float] | None, number: int) -> float:
+    return number / RATE if times is None else times[number]
+
+
+def _reference(folder: Path, times: list[float] | None, count: int, warnings: list[str]) -> Trajectory | None:
     resolved = folder.resolve()
     for path in (folder / "poses.txt", resolved.parent.parent / "poses" / f"{resolved.name}.txt"):
         if path.is_file():
             poses = read_trajectory(path, "kitti")
-            if len(poses) > len(times):
-                warnings.append(f"{path.name} holds {len(poses)} poses for {len(times)} times; the rest is left out.")
-                poses = poses.take(np.arange(len(times)))
-            return poses.replace(timestamps=np.array(times[: len(poses)]))
+            if len(poses) > count:
+                warnings.append(f"{path.name} holds {len(poses)} poses for {count} times; the rest is left out.")
+                poses = poses.take(np.arange(count))
+            return poses.replace(timestamps=np.array([_time(times, number) for number in range(len(poses))]))
     return None
 
 

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from groma._numba import loop
 from groma._typing import FloatArray
+from groma.bounded.text import read_words
 from groma.errors import FileFormatError
 from groma.geometry import se3
 from groma.io.reading import reading
@@ -115,7 +116,8 @@ def _reference(root: Path, colors: list[Path]) -> Trajectory | None:
         if not path.is_file():
             continue
         with reading(path, "pose"):
-            matrix = np.array([float(word) for word in path.read_text(encoding="utf-8").split()]).reshape(4, 4)
+            words = [word for _, row in read_words(path) for word in row]
+            matrix = np.array([float(word) for word in words]).reshape(4, 4)
             if not np.isfinite(matrix).all():
                 continue  # frames that were not tracked
             u, _, vt = np.linalg.svd(matrix[:3, :3])

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.bounded.names import listed_file
+from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, find_calibration, from_opencv
@@ -93,10 +95,11 @@ def _entries(folder: Path) -> list[Entry]:
                     f"{folder / 'associations.txt'}, line {number}: expected a time and a file, twice; got "
                     f"{len(words)} words."
                 )
-            color, depth = (words[:2], words[2:])
-            if "depth" in color[1] and "depth" not in depth[1]:
-                color, depth = depth, color
-            entries.append(Entry(float(color[0]), folder / color[1], folder / depth[1]))
+            pair = [_listed(folder / "associations.txt", number, part) for part in (words[:2], words[2:])]
+            if "depth" in words[1] and "depth" not in words[3]:
+                pair.reverse()
+            (time, color), (_, depth) = pair
+            entries.append(Entry(time, color, depth))
         return entries
     colors = _list(folder / "rgb.txt")
     depths = _list(folder / "depth.txt") if (folder / "depth.txt").is_file() else []
@@ -111,17 +114,19 @@ def _list(path: Path) -> list[tuple[float, Path]]:
     for number, words in _lines(path):
         if len(words) < 2:
             raise FileFormatError(f"{path}, line {number}: expected a time and a file; got {words}.")
-        listed.append((float(words[0]), path.parent / words[1]))
+        listed.append(_listed(path, number, words[:2]))
     return listed
+
+
+def _listed(path: Path, number: int, words: list[str]) -> tuple[float, Path]:
+    """Return the time and the file that two words of a line say."""
+    place = f"{path}, line {number}"
+    return finite(words[:1], place, "a finite time")[0], listed_file(path.parent, words[1], place)
 
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     with reading(path, "list of images"):
-        lines = [line.partition("#")[0].split() for line in path.read_text(encoding="utf-8").splitlines()]
-        for number, words in enumerate(lines, start=1):
-            if words and not np.isfinite([float(words[0]), float(words[2]) if len(words) == 4 else 0.0]).all():
-                raise FileFormatError(f"{path}, line {number}: times must be finite; got {words}.")
-    return [(number, words) for number, words in enumerate(lines, start=1) if words]
+        return list(read_words(path))
 
 
 __all__ = ["is_tum_rgbd", "open_tum_rgbd", "pair_by_time"]

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """3D lines from the segments of posed images.
 
-In come segments and perhaps matches. Neighbouring images propose places in space for every segment (``proposals.py``,
-``known_points.py``); the place on which most of them agree is kept (``consensus.py``, ``places.py``). Segments with the
-same place are linked to lines (``link.py``), which recover further segments (``growth.py``), are merged (``merge.py``)
-and filtered (``filters.py``). Out comes a :class:`~groma.mapping.lines.line_map.LineMap`: lines, their observations,
-and the rejection reason of every other segment.
+In come segments and perhaps matches. Neighbouring images propose places in space for every segment, and the place on
+which most of them agree is kept (``hypotheses``). Segments with the same place are linked to lines, which recover
+further segments and are merged (``linking``), and what is not well determined, texture or a duplicate is rejected
+(``filtering``). ``build.py`` is the order of these stages. Out comes a
+:class:`~groma.mapping.lines.line_map.LineMap`: lines, their observations, and the rejection reason of every other
+segment.
 """

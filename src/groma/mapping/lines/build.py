@@ -5,12 +5,13 @@ Stages, each on all images before the next begins:
 
 1. neighbours by the points that images share (:mod:`groma.mapping.lines.neighbors`);
 2. segments without distortion, with the depths at which to look for them (:mod:`groma.mapping.lines.views`), and how
-   vanishing points say that the depth changes along them (:mod:`groma.mapping.lines.directions`);
-3. the place of every segment in space, on which most of its neighbours agree (:mod:`groma.mapping.lines.places`);
-4. lines: segments whose places agree, and what else lies on them (:mod:`groma.mapping.lines.growth`);
-5. lines that were mapped more than once are joined (:mod:`groma.mapping.lines.merge`);
+   vanishing points say that the depth changes along them (:mod:`groma.mapping.lines.hypotheses.directions`);
+3. the place of every segment in space, on which most of its neighbours agree
+   (:mod:`groma.mapping.lines.hypotheses.places`);
+4. lines: segments whose places agree, and what else lies on them (:mod:`groma.mapping.lines.linking.growth`);
+5. lines that were mapped more than once are joined (:mod:`groma.mapping.lines.linking.merge`);
 6. filters: seen by enough images, well determined, no texture, no duplicate, long enough
-   (:mod:`groma.mapping.lines.filters`).
+   (:mod:`groma.mapping.lines.filtering.filters`).
 
 Every segment ends with an :class:`Outcome` (:mod:`groma.mapping.lines.outcomes`), so that the question why a line is
 missing has an answer.
@@ -26,17 +27,18 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
-from groma.mapping.lines.directions import depth_ratios
-from groma.mapping.lines.filters import Evidence, filtered
-from groma.mapping.lines.growth import grow
+from groma.execution import work_with
+from groma.mapping.lines.filtering.filters import Evidence, filtered
+from groma.mapping.lines.hypotheses.directions import depth_ratios
+from groma.mapping.lines.hypotheses.places import find_places
 from groma.mapping.lines.line_map import LineMap, explain
+from groma.mapping.lines.linking.growth import grow
+from groma.mapping.lines.linking.merge import merge_agreeing
+from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.matches import MatchProvider, external_matches, segment_matches
-from groma.mapping.lines.merge import merge_agreeing
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
-from groma.mapping.lines.places import find_places
-from groma.mapping.lines.tracks import Tracks
 from groma.mapping.lines.views import build_views
 from groma.scene import Lines, Scene
 
@@ -97,19 +99,20 @@ def map_lines(
     choose = neighbors or partial(
         covisible_neighbors, num_neighbors=options.num_neighbors, min_shared=options.min_shared
     )
-    compared = choose(scene)
-    views = build_views(scene, segments, options.min_length, options.noise, options.depth_margin)
-    ratios = depth_ratios(scene, segments, views) if options.use_directions else np.zeros((len(views.image_idx), 2))
-    places = find_places(scene, views, ratios, compared, matches, options, partial(report, "proposals"))
-    unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, partial(report, "tracks"))
-    evidence = Evidence(
-        options=options,
-        neighbors=compared,
-        strength=np.concatenate([np.zeros(0), *(one.strength for one in segments)]),
-        size=np.column_stack([scene.cameras.width, scene.cameras.height])[scene.images.camera_idx],
-        unmerged=unmerged,
-    )
-    return _line_map(filtered(merge_agreeing(unmerged), evidence), compared)
+    with work_with():
+        compared = choose(scene)
+        views = build_views(scene, segments, options.min_length, options.noise, options.depth_margin)
+        ratios = depth_ratios(scene, segments, views) if options.use_directions else np.zeros((len(views.image_idx), 2))
+        places = find_places(scene, views, ratios, compared, matches, options, partial(report, "proposals"))
+        unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, partial(report, "tracks"))
+        evidence = Evidence(
+            options=options,
+            neighbors=compared,
+            strength=np.concatenate([np.zeros(0), *(one.strength for one in segments)]),
+            size=np.column_stack([scene.cameras.width, scene.cameras.height])[scene.images.camera_idx],
+            unmerged=unmerged,
+        )
+        return _line_map(filtered(merge_agreeing(unmerged), evidence), compared)
 
 
 def _line_map(tracks: Tracks, neighbors: list[IntArray]) -> LineMap:

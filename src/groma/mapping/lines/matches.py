@@ -8,6 +8,8 @@ one image (for example descriptors) is made once and kept; matches are not.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -35,27 +37,33 @@ class _Matched:
     def __init__(self, scene: Scene, segments: Sequence[Segments], image: ImageReader, matcher: SegmentMatcher) -> None:
         self.scene, self.segments, self.image, self.matcher = scene, segments, image, matcher
         self._described: dict[int, Any] = {}
+        self._locks = [Lock() for _ in segments]  # threads ask at the same time
         seen = scene.point_observations
         self._by_image = np.argsort(seen.image_idx, kind="stable")
         self._first = np.searchsorted(seen.image_idx[self._by_image], np.arange(scene.num_images + 1))
 
+    def __reduce__(self) -> tuple:
+        return _Matched, (self.scene, self.segments, self.image, self.matcher)  # each process describes what it needs
+
     def _of(self, i: int) -> Any:
-        if i not in self._described:
-            scene, seen = self.scene, self.scene.point_observations
-            camera, rows = scene.images.camera_idx[i], self._by_image[self._first[i] : self._first[i + 1]]
-            self._described[i] = self.matcher.describe(
-                ImageView(
-                    name=scene.images.names[i],
-                    image=to_gray(self.image(i)),
-                    segments=self.segments[i],
-                    camera_model=camera_models.model(scene.cameras.models[camera]),
-                    camera_params=scene.cameras.params_of(camera),
-                    cam_from_world=scene.cam_from_world[i],
-                    point_pixels=seen.pixel[rows],
-                    point_ids=seen.point_idx[rows],
-                )
-            )
-        return self._described[i]
+        with self._locks[i]:
+            if i not in self._described:
+                self._described[i] = self.matcher.describe(self._view(i))
+            return self._described[i]
+
+    def _view(self, i: int) -> ImageView:
+        scene, seen = self.scene, self.scene.point_observations
+        camera, rows = scene.images.camera_idx[i], self._by_image[self._first[i] : self._first[i + 1]]
+        return ImageView(
+            name=scene.images.names[i],
+            image=to_gray(self.image(i)),
+            segments=self.segments[i],
+            camera_model=camera_models.model(scene.cameras.models[camera]),
+            camera_params=scene.cameras.params_of(camera),
+            cam_from_world=scene.cam_from_world[i],
+            point_pixels=seen.pixel[rows],
+            point_ids=seen.point_idx[rows],
+        )
 
     def __call__(self, i: int, j: int) -> LineMatches:
         found = self.matcher.match(self._of(i), self._of(j))
@@ -100,8 +108,16 @@ def external_matches(scene: Scene, segments: Sequence[Segments], matches: Extern
                 found.check(len(segments[index[first]]), len(segments[index[second]]))
             except InputError as error:
                 raise InputError(f"Matches of {first} and {second}: {error}") from error
-    names = scene.images.names
-    return lambda i, j: matches.match(names[i], names[j])
+    return given_matches(scene.images.names, matches)
+
+
+def given_matches(names: Sequence[str], matches: ExternalMatches) -> MatchProvider:
+    """Matches of a file, by the names of images."""
+    return partial(_match_of, names, matches)
+
+
+def _match_of(names: Sequence[str], matches: ExternalMatches, i: int, j: int) -> LineMatches:
+    return matches.match(names[i], names[j])
 
 
 def _one_per_image(scene: Scene, segments: Sequence[Segments]) -> None:
@@ -109,4 +125,4 @@ def _one_per_image(scene: Scene, segments: Sequence[Segments]) -> None:
         raise InputError(f"segments must hold one set per image ({scene.num_images}); got {len(segments)}.")
 
 
-__all__ = ["ImageReader", "MatchProvider", "external_matches", "segment_matches"]
+__all__ = ["ImageReader", "MatchProvider", "external_matches", "given_matches", "segment_matches"]

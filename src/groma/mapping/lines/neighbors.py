@@ -13,14 +13,15 @@ viewing directions and the distance of the cameras instead.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy import sparse
 
 from groma._typing import FloatArray, IntArray
+from groma.execution import map_work
 from groma.gates import gate
 from groma.geometry import quaternion
-from groma.mapping.work import map_work
 from groma.scene import Scene
 
 
@@ -75,31 +76,44 @@ def covisible_neighbors(
     """
     if len(scene.point_observations) == 0:
         return _by_geometry(scene, num_neighbors, gates)
-    centers, sees = scene.cam_centers_in_world, _sees(scene)
-    shared = (sees @ sees.T).tocsr()
+    sees = _sees(scene)
+    shared = _Shared(sees, (sees @ sees.T).tocsr(), scene.points.xyz, scene.cam_centers_in_world, gates)
+    return map_work(partial(shared.best_of, num=num_neighbors, min_shared=min_shared), range(scene.num_images))
 
-    def seen_by(image: int) -> IntArray:
-        return sees.indices[sees.indptr[image] : sees.indptr[image + 1]]
 
-    def of_image(i: int) -> IntArray:
-        row = slice(shared.indptr[i], shared.indptr[i + 1])
-        others, counts = shared.indices[row], shared.data[row]
+@dataclass(frozen=True, eq=False)
+class _Shared:
+    """The points that images share."""
+
+    #: (C, P) one where an image sees a point, and (C, C) how many two images share.
+    sees: sparse.csr_array
+    number: sparse.csr_array
+    xyz: FloatArray
+    centers: FloatArray
+    gates: NeighborGates
+
+    def best_of(self, i: int, num: int, min_shared: int) -> IntArray:
+        """The best neighbours of an image."""
+        gates, row = self.gates, slice(self.number.indptr[i], self.number.indptr[i + 1])
+        others, counts = np.asarray(self.number.indices[row]), np.asarray(self.number.data[row], np.int64)
         keep = (others != i) & (counts >= min_shared)
         others, counts = others[keep], counts[keep]
         # Angles are looked at for four times as many as are wanted.
-        order = np.argsort(-counts, kind="stable")[: 4 * num_neighbors]
+        order = np.argsort(-counts, kind="stable")[: 4 * num]
         others, counts = others[order], counts[order]
-        angles = np.zeros(len(others))
-        for k, j in enumerate(others):
-            common = np.intersect1d(seen_by(i), seen_by(j), assume_unique=True)
-            xyz = scene.points.xyz[common[:: max(1, len(common) // gates.sample)]]
-            angles[k] = np.median(_angles(xyz - centers[i], xyz - centers[j]))
-        safe = np.maximum(angles, 1e-6)
+        safe = np.maximum(np.array([self._angle(i, int(j)) for j in others]), 1e-6)
         low, high = np.deg2rad(gates.min_angle_deg), np.deg2rad(gates.max_angle_deg)
         score = counts * np.minimum(1.0, safe / low) * np.minimum(1.0, high / safe)
-        return others[np.argsort(-score, kind="stable")[:num_neighbors]].astype(np.int64)
+        return others[np.argsort(-score, kind="stable")[:num]].astype(np.int64)
 
-    return map_work(of_image, range(scene.num_images))
+    def _angle(self, i: int, j: int) -> float:
+        """Median angle under which rays of shared points meet."""
+        common = np.intersect1d(self._seen_by(i), self._seen_by(j), assume_unique=True)
+        xyz = self.xyz[common[:: max(1, len(common) // self.gates.sample)]]
+        return float(np.median(_angles(xyz - self.centers[i], xyz - self.centers[j])))
+
+    def _seen_by(self, image: int) -> IntArray:
+        return self.sees.indices[self.sees.indptr[image] : self.sees.indptr[image + 1]]
 
 
 def _sees(scene: Scene) -> sparse.csr_array:
@@ -135,7 +149,7 @@ def _by_geometry(scene: Scene, num_neighbors: int, gates: NeighborGates) -> list
         cost = turn[others] / np.deg2rad(gates.turn_scale_deg) + distance[others] / spread
         return others[np.argsort(cost, kind="stable")[:num_neighbors]]
 
-    return map_work(of_image, range(len(poses)))
+    return [of_image(i) for i in range(len(poses))]
 
 
 __all__ = ["NeighborGates", "covisible_neighbors"]

@@ -16,9 +16,9 @@ class MapLinesOptions:
     min_longest: float = 0.0
     #: Neighbours per image.
     num_neighbors: int = 10
-    #: Fewest shared points of neighbours.
+    #: Smallest number of shared points of neighbours.
     min_shared: int = 8
-    #: Fewest images of a line.
+    #: Smallest number of images of a line.
     min_images: int = 3
     #: Error of poses and cameras in the image, added in quadrature to the segments' sigma; pixels.
     noise: float = 0.15
@@ -40,9 +40,9 @@ class MapLinesOptions:
     max_unchecked: float = 0.04
     #: A place is ambiguous if another one has more than this share of its support.
     max_rival: float = 0.95
-    #: Smallest repeatability of the segments of a line (:mod:`groma.mapping.lines.kinds`); more is required where the
-    #: scene as a whole is less repeatable. 0 keeps all lines of texture, also those that
-    #: :mod:`groma.mapping.lines.texture` finds.
+    #: Smallest repeatability of the segments of a line (:mod:`groma.mapping.lines.filtering.kinds`); more is required
+    #: where the scene as a whole is less repeatable. 0 keeps all lines of texture, also those that
+    #: :mod:`groma.mapping.lines.filtering.texture` finds.
     min_repeatability: float = 0.4
     #: Use lines through known points as further proposals.
     use_points: bool = True

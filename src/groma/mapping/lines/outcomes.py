@@ -19,7 +19,7 @@ class Outcome(IntEnum):
     NO_NEIGHBOR = 3
     #: No segment of a neighbour can be the same line: none in the epipolar beam at a plausible depth, or none matched.
     NO_MATCH = 4
-    #: Every candidate leaves the depth open: the line runs along the epipolar lines of all neighbours.
+    #: Every candidate leaves the depth undetermined: the line runs along the epipolar lines of all neighbours.
     DEGENERATE = 5
     #: Too few neighbours agree on a place.
     NO_SUPPORT = 6
@@ -47,7 +47,7 @@ WORDS = {
     Outcome.TOO_SHORT: "fell short of the least length, or lay where the lens model does not hold",
     Outcome.NO_NEIGHBOR: "lay in images that share too few points with others",
     Outcome.NO_MATCH: "had no counterpart in any neighbouring image",
-    Outcome.DEGENERATE: "ran along the epipolar lines of all neighbours, which leaves the depth open",
+    Outcome.DEGENERATE: "ran along the epipolar lines of all neighbours, which leaves the depth undetermined",
     Outcome.NO_SUPPORT: "had no place in space on which neighbouring images agree",
     Outcome.AMBIGUOUS: "had two places in space that fit equally well",
     Outcome.NOT_LINKED: "had a place in space that no other segment shares",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,10 +18,10 @@ from scipy.spatial import KDTree
 
 from groma import cameras as camera_models
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.execution import map_work
 from groma.gates import gate
 from groma.geometry import quaternion, segment2
 from groma.mapping.groups import grouped
-from groma.mapping.work import map_work
 from groma.scene import Scene
 
 if TYPE_CHECKING:
@@ -118,17 +119,13 @@ def build_views(
     camera = _cameras(scene)
     by_image, starts = grouped(scene.point_observations.image_idx, count)
 
-    def of_image(i: int) -> dict[str, np.ndarray]:
-        columns = _undistorted(scene, i, segments[i], min_length)
-        points = scene.points.xyz[scene.point_observations.point_idx[by_image[starts[i] : starts[i + 1]]]]
-        depths, search = _depth_range(scene, i, camera[i], points, columns["ends"], depth_margin, gates)
-        return columns | {"sigma": np.hypot(segments[i].sigma, noise), "range": search, "inverse_depth": depths[None]}
-
+    seen = scene.points.xyz[scene.point_observations.point_idx[by_image]]
+    work = [(i, segments[i], camera[i], seen[starts[i] : starts[i + 1]]) for i in range(count)]
     none = {
         "ends": np.zeros((0, 4)), "ray": np.zeros((0, 2, 3)), "across": np.zeros((0, 3)), "length": np.zeros(0),
         "usable": np.zeros(0, bool), "sigma": np.zeros(0), "range": np.zeros((0, 2)), "inverse_depth": np.zeros((0, 2)),
     }  # fmt: skip
-    parts = [none, *map_work(of_image, range(count))]
+    parts = [none, *map_work(partial(_columns_of, scene, (min_length, noise, depth_margin), gates), work)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in none}
     sizes = [len(item.ends) for item in segments]
     return LineViews(
@@ -139,6 +136,19 @@ def build_views(
         line=segment2.to_line(columns["ends"]),
         **columns,
     )
+
+
+def _columns_of(
+    scene: Scene,
+    limits: tuple[float, float, float],
+    gates: ViewGates,
+    image: tuple[int, Segments, FloatArray, FloatArray],
+) -> dict[str, np.ndarray]:
+    """Columns of one image: its number, segments, pinhole camera and points."""
+    (min_length, noise, depth_margin), (i, segments, camera, points) = limits, image
+    columns = _undistorted(scene, i, segments, min_length)
+    depths, search = _depth_range(scene, i, camera, points, columns["ends"], depth_margin, gates)
+    return columns | {"sigma": np.hypot(segments.sigma, noise), "range": search, "inverse_depth": depths[None]}
 
 
 def _cameras(scene: Scene) -> FloatArray:

@@ -86,11 +86,6 @@ class Structure:
     point_sigma_px: float
     line_sigma_px: float
 
-    @property
-    def orthogonal_directions(self) -> IntArray:
-        """(M, 2) pairs of directions that are orthogonal within their uncertainty."""
-        return self.directions.orthogonal
-
 
 def find_structure(
     scene: Scene,

@@ -18,7 +18,7 @@ from groma.geometry import quaternion
 from groma.scene.camera import Cameras
 from groma.scene.landmarks import Lines
 from groma.scene.observations import Relations
-from groma.scene.synthetic.noise import SyntheticScene, assemble, project_pinhole, rotated
+from groma.scene.synthetic.noise import Structure, SyntheticScene, assemble, project_pinhole, rotated
 
 WIDTH, HEIGHT, FOCAL = 1280, 960, 800.0
 #: Half width and height of the corridor, range of depths that are seen.
@@ -115,7 +115,8 @@ def corridor(
         line_on_plane=np.column_stack([np.arange(len(segments)), line_plane]),
     )
     camera = Cameras(np.array([1]), ("PINHOLE",), params[None], np.array([WIDTH]), np.array([HEIGHT]))
-    truth = assemble(rng, camera, poses, xyz, point_obs, segments, line_obs, trims, planes, relations, noise_px)
+    exact = Structure(xyz, segments, planes, relations, point_obs, line_obs, trims)
+    truth = assemble(rng, camera, poses, exact, noise_px)
 
     rotation_deg, shift, structure, tilt = START
     turned = rotated(rng, poses, rotation_deg)

@@ -27,46 +27,34 @@ class SyntheticScene:
     noise_px: float
 
 
-def assemble(
-    rng: np.random.Generator,
-    camera: Cameras,
-    poses: FloatArray,
-    xyz: FloatArray,
-    point_obs: IntArray,
-    segments: FloatArray,
-    line_obs: IntArray,
-    trims: FloatArray | None,
-    planes: FloatArray,
-    relations: Relations,
-    noise_px: float,
-) -> Scene:
-    """Return the true scene with noisy measurements.
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """True landmarks and who sees them."""
 
-    Parameters
-    ----------
-    rng : Generator
-        Source of the noise.
-    camera : Cameras
-        One PINHOLE camera.
-    poses : (N, 7) float
-        True cam_from_world.
-    xyz, segments, planes : (P, 3), (L, 2, 3), (K, 4) float
-        True landmarks.
-    point_obs, line_obs : (M, 2) int
-        Pairs (landmark, image).
-    trims : (M, 2) float or None
-        Where each observed segment begins and ends on the line's segment, 0 to 1; all of it by default.
-    relations : Relations
-        Which landmarks belong together.
-    noise_px : float
-        Standard deviation of pixel coordinates.
-    """
+    #: (P, 3), (L, 2, 3) and (K, 4) points, segments and planes.
+    xyz: FloatArray
+    segments: FloatArray
+    planes: FloatArray
+    #: Which of them belong together.
+    relations: Relations
+    #: (M, 2) pairs (landmark, image) of points and of lines.
+    point_obs: IntArray
+    line_obs: IntArray
+    #: (M, 2) where each observed segment begins and ends on the line's segment, 0 to 1; all of it by default.
+    trims: FloatArray | None = None
+
+
+def assemble(
+    rng: np.random.Generator, camera: Cameras, poses: FloatArray, structure: Structure, noise_px: float
+) -> Scene:
+    """Return the true scene with measurements of a standard deviation in pixels; poses (N, 7) of one PINHOLE camera."""
+    point_obs, line_obs, segments = structure.point_obs, structure.line_obs, structure.segments
     point_obs = point_obs[np.lexsort((point_obs[:, 1], point_obs[:, 0]))]
     order = np.lexsort((line_obs[:, 1], line_obs[:, 0]))
     line_obs = line_obs[order]
     params = camera.params[0]
-    pixel = project_pinhole(params, poses[point_obs[:, 1]], xyz[point_obs[:, 0]])[0]
-    share = np.tile([0.0, 1.0], (len(line_obs), 1)) if trims is None else trims[order]
+    pixel = project_pinhole(params, poses[point_obs[:, 1]], structure.xyz[point_obs[:, 0]])[0]
+    share = np.tile([0.0, 1.0], (len(line_obs), 1)) if structure.trims is None else structure.trims[order]
     start, end = segments[line_obs[:, 0], 0], segments[line_obs[:, 0], 1]
     ends = [project_pinhole(params, poses[line_obs[:, 1]], start + s[:, None] * (end - start))[0] for s in share.T]
     seen = np.hstack(ends)
@@ -76,14 +64,14 @@ def assemble(
         [f"{row + 1:05d}.png" for row in range(count)],
         np.zeros(count, int),
         poses,
-        points=Points.at(xyz),
+        points=Points.at(structure.xyz),
         point_observations=PointObservations.numbered(
             point_obs[:, 1], point_obs[:, 0], pixel + rng.normal(0, noise_px, pixel.shape)
         ),
         lines=Lines.through(segments),
         line_observations=LineObservations(line_obs[:, 1], line_obs[:, 0], seen + rng.normal(0, noise_px, seen.shape)),
-        planes=Planes(np.arange(len(planes)) + 1, planes),
-        relations=relations,
+        planes=Planes(np.arange(len(structure.planes)) + 1, structure.planes),
+        relations=structure.relations,
     )
 
 
@@ -104,4 +92,4 @@ def rotated(rng: np.random.Generator, poses: FloatArray, sigma_deg: float) -> Fl
     return turned
 
 
-__all__ = ["SyntheticScene", "assemble", "project_pinhole", "rotated"]
+__all__ = ["Structure", "SyntheticScene", "assemble", "project_pinhole", "rotated"]

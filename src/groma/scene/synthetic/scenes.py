@@ -19,7 +19,7 @@ from groma.scene.camera import Cameras
 from groma.scene.landmarks import Lines
 from groma.scene.observations import Relations
 from groma.scene.synthetic.corridor import corridor
-from groma.scene.synthetic.noise import SyntheticScene, assemble, rotated
+from groma.scene.synthetic.noise import Structure, SyntheticScene, assemble, rotated
 
 WIDTH, HEIGHT, FOCAL = 1024, 768, 800.0
 #: Half extent of the cube, radius of the camera sphere, least depth of anything observed.
@@ -82,6 +82,27 @@ def holistic(
     choose = _ViewChoice(rng, poses, views)
     track = (min(TRACK[0], max(2, num_images // 2)), min(TRACK[1], num_images))
 
+    exact = _structure(rng, choose, num_images, track)
+    intrinsics = np.array([[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]])
+    camera = Cameras(np.array([1]), ("PINHOLE",), intrinsics, np.array([WIDTH]), np.array([HEIGHT]))
+    truth = assemble(rng, camera, poses, exact, noise_px)
+
+    turned = rotated(rng, poses, rotation_deg)
+    turned[:, 4:] += rng.normal(0, translation, (num_images, 3))
+    moved = exact.planes.copy()
+    moved[:, :3] = quaternion.rotate(
+        quaternion.exp(rng.normal(0, structure / 5, (len(exact.planes), 3))), exact.planes[:, :3]
+    )
+    moved[:, 3] += rng.normal(0, structure, len(exact.planes))
+    start = truth.replace(
+        points=truth.points.replace(xyz=exact.xyz + rng.normal(0, structure, exact.xyz.shape)),
+        lines=Lines.through(exact.segments + rng.normal(0, structure, exact.segments.shape)),
+    )
+    return SyntheticScene(truth, start.with_poses(turned).with_planes(moved), noise_px)
+
+
+def _structure(rng: np.random.Generator, choose: _ViewChoice, num_images: int, track: tuple[int, int]) -> Structure:
+    """Return planes, lines on some of them, points on both, and which images see them."""
     planes = np.zeros((num_images // 5, 4))
     planes[:, :3] = np.eye(3)[rng.integers(0, 3, len(planes))]
     planes[:, 3] = -rng.uniform(-0.8 * HALF_EXTENT, 0.8 * HALF_EXTENT, len(planes))
@@ -108,25 +129,7 @@ def holistic(
         line_on_plane=_pairs(line_plane),
         point_on_line=np.column_stack([np.arange(on_line), point_line]),
     )
-    camera = Cameras(
-        np.array([1]),
-        ("PINHOLE",),
-        np.array([[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]]),
-        np.array([WIDTH]),
-        np.array([HEIGHT]),
-    )
-    truth = assemble(rng, camera, poses, xyz, point_obs, segments, line_obs, None, planes, relations, noise_px)
-
-    turned = rotated(rng, poses, rotation_deg)
-    turned[:, 4:] += rng.normal(0, translation, (num_images, 3))
-    moved = planes.copy()
-    moved[:, :3] = quaternion.rotate(quaternion.exp(rng.normal(0, structure / 5, (len(planes), 3))), planes[:, :3])
-    moved[:, 3] += rng.normal(0, structure, len(planes))
-    start = truth.replace(
-        points=truth.points.replace(xyz=xyz + rng.normal(0, structure, xyz.shape)),
-        lines=Lines.through(segments + rng.normal(0, structure, segments.shape)),
-    )
-    return SyntheticScene(truth, start.with_poses(turned).with_planes(moved), noise_px)
+    return Structure(xyz, segments, planes, relations, point_obs, line_obs)
 
 
 def _sphere_of_cameras(rng: np.random.Generator, count: int) -> FloatArray:

@@ -42,7 +42,7 @@ RANK_TOLERANCE = 1e-9
 class FreeMotions:
     """World motions that change no residual."""
 
-    #: (7, k) each as a combination of the seven motions of :data:`groma.problem.gauge.GAUGE_NAMES`, about ``center``
+    #: (7, k) each as a combination of those of :func:`groma.problem.gauge.gauge_directions`, about ``center``
     #: and with ``length`` as the unit of the translations.
     combinations: FloatArray
     center: FloatArray

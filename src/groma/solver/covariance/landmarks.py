@@ -150,7 +150,7 @@ class Landmarks:
         return out
 
     def undetermined(self, e: int, held: BoolArray) -> BoolArray:
-        """Return which landmarks have a direction that what sees them leaves open; ``held`` coordinates are known."""
+        """Return which landmarks have an unobservable direction; ``held`` coordinates are known."""
         dof = self._layout.eliminated[e].dof
         V = self._equations.V[e].reshape(-1, dof, dof).copy()
         steps = np.arange(dof)

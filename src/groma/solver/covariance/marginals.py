@@ -36,7 +36,13 @@ from groma.problem.parallel import Workers
 from groma.problem.problem import Problem
 from groma.solver.covariance.datum import constrained, free_motions, held_coordinates
 from groma.solver.covariance.landmarks import Landmarks
-from groma.solver.covariance.rank_deficient import LOOSE, deficiency, hold_open_blocks, loses_the_cameras, zero_modes
+from groma.solver.covariance.rank_deficient import (
+    LOOSE,
+    deficiency,
+    hold_unobservable_blocks,
+    loses_the_cameras,
+    zero_modes,
+)
 from groma.solver.covariance.s_transform import Transformation, datum_weights, transformation
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.linear.blocks import Blocks
@@ -96,7 +102,7 @@ class Covariances:
 
     Notes
     -----
-    Variables held constant have covariance zero. Where the data leave a few variables open (a point seen once, a plane
+    Variables held constant have covariance zero. Where a few variables are unobservable (a point seen once, a plane
     with two points), these have no covariance: theirs are NaN, see :meth:`undetermined`; all others are not affected.
     """
 
@@ -118,7 +124,7 @@ class Covariances:
         self._landmarks = Landmarks(layout, equations, self._system)
         self._position = {e.group: np.argsort(e.order) for e in layout.eliminated}
         self._held, self._held_landmarks = held_coordinates(layout)
-        self._open = [self._landmarks.undetermined(e, held) for e, held in enumerate(self._held_landmarks)]
+        self._undetermined = [self._landmarks.undetermined(e, held) for e, held in enumerate(self._held_landmarks)]
         self._datum: Transformation | None = None
         self._sigma: Blocks = {}
         if layout.kept:
@@ -149,7 +155,7 @@ class Covariances:
                 raise deficiency(layout, smallest(layout, self._fronts, S), 0)
         self._sigma = divided(layout, inverse, self._size)
         if motions is not None and motions.count:
-            weights = datum_weights(layout, datum, self._open)
+            weights = datum_weights(layout, datum, self._undetermined)
             parts = self._landmarks, self._solve, motions, G, self._held_landmarks
             self._datum = transformation(layout, *parts, weights)
 
@@ -162,10 +168,10 @@ class Covariances:
         return inverse if all((part < MAX_VARIANCE).all() for part in variances) else None
 
     def _without_open_variables(self, S: Blocks, G: FloatArray, gauge: str) -> Blocks:
-        """Hold the variables that the data leave open, and note them and the landmarks they move."""
+        """Hold the unobservable variables, and note them and the landmarks they move."""
         layout = self._layout
         known = [held | unseen for held, unseen in zip(self._held, self._unseen, strict=True)]
-        S, is_open = hold_open_blocks(self._equations, S, self._size, known, G)
+        S, unobservable = hold_unobservable_blocks(self._equations, S, self._size, known, G)
         modes = zero_modes(layout, self._fronts, S)
         null = modes.vectors[:, : modes.num_null]
         if modes.num_null or not len(modes.values):
@@ -175,9 +181,9 @@ class Covariances:
             S = constrained(layout, S, null)
         loose = np.any(np.abs(null) > LOOSE, axis=1)
         for c, kept in enumerate(layout.kept):
-            self._unseen[c] |= is_open[c] | loose[kept.start : kept.start + kept.count * kept.width]
-        for e in range(len(self._open)):
-            self._open[e] |= self._landmarks.moved(e, null / self._size[:, None], LOOSE)
+            self._unseen[c] |= unobservable[c] | loose[kept.start : kept.start + kept.count * kept.width]
+        for e in range(len(self._undetermined)):
+            self._undetermined[e] |= self._landmarks.moved(e, null / self._size[:, None], LOOSE)
         return S
 
     def _solve(self, rhs: FloatArray) -> FloatArray:
@@ -236,14 +242,14 @@ class Covariances:
             out += self._datum.correction(self._datum.G_landmarks[e][rows], self._datum.A_landmarks[e][rows])
         held = self._held_landmarks[e].reshape(-1, dof)[landmarks]
         out = np.where(held[:, :, None] | held[:, None, :], 0.0, out)
-        return np.where(self._open[e][landmarks][:, None, None], np.nan, out)
+        return np.where(self._undetermined[e][landmarks][:, None, None], np.nan, out)
 
     def undetermined(self, group: str) -> IntArray:
-        """Return the indices of the variables of a group that the data leave open; their covariances are NaN."""
+        """Return the indices of the unobservable variables of a group; their covariances are NaN."""
         self._checked(group, None)
         for e, eliminated in enumerate(self._layout.eliminated):
             if eliminated.group == group:
-                return np.sort(eliminated.order[self._open[e]]).astype(np.int64)
+                return np.sort(eliminated.order[self._undetermined[e]]).astype(np.int64)
         for c, kept in enumerate(self._layout.kept):
             for member in kept.members:
                 if member.group == group:

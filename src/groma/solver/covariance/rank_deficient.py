@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Kept variables that the data leave open: how to hold them, so that all others have their covariances.
+r"""Unobservable kept variables: how to hold them, so that all others have their covariances.
 
 There are two sorts. A direction x of one plane with :math:`x^\top H x = 0` (two points hold it, and it can turn about
 them) moves no residual by itself, so it is coupled to nothing; small matrices tell, for any number of planes. What
@@ -27,7 +27,7 @@ LOOSE, MAX_LOOSE = 1e-6, 0.2
 MAX_MODES = 1024
 
 
-def hold_open_blocks(
+def hold_unobservable_blocks(
     equations: NormalEquations, S: Blocks, size: FloatArray, known: list[BoolArray], G: FloatArray
 ) -> tuple[Blocks, list[BoolArray]]:
     """Hold the directions in which planes, directions and other kept landmarks move no residual.
@@ -48,9 +48,9 @@ def hold_open_blocks(
     Returns
     -------
     tuple
-        The system, and by kept class which unknowns are open.
+        The system, and by kept class which unknowns are unobservable.
     """
-    S, is_open = dict(S), [np.zeros(len(part), bool) for part in known]
+    S, unobservable = dict(S), [np.zeros(len(part), bool) for part in known]
     for c, kept in enumerate(equations.layout.kept):
         if _kind(equations.layout, kept) in ("pose", "intrinsics"):
             continue
@@ -68,8 +68,8 @@ def hold_open_blocks(
             blocks = S[c, c].copy()
             blocks[: kept.count] += X @ np.swapaxes(X, 1, 2)
             S[c, c] = blocks
-            is_open[c] = np.any(np.abs(X) > LOOSE, axis=2).reshape(-1)
-    return S, is_open
+            unobservable[c] = np.any(np.abs(X) > LOOSE, axis=2).reshape(-1)
+    return S, unobservable
 
 
 def zero_modes(layout: Layout, fronts: Fronts, S: Blocks) -> Modes:
@@ -92,7 +92,7 @@ def loses_the_cameras(layout: Layout, modes: Modes) -> bool:
 
 
 def deficiency(layout: Layout, modes: Modes, num_free: int) -> ProblemError:
-    """Return the error that says how many directions are open, and what they move.
+    """Return the error that says how many directions are unobservable, and what they move.
 
     ``num_free`` of them are motions of the whole scene that nothing holds.
     """
@@ -125,4 +125,4 @@ def _kind(layout: Layout, kept: KeptClass) -> str:
     return layout.problem.variables[kept.members[0].group].manifold.kind
 
 
-__all__ = ["LOOSE", "deficiency", "hold_open_blocks", "loses_the_cameras", "zero_modes"]
+__all__ = ["LOOSE", "deficiency", "hold_unobservable_blocks", "loses_the_cameras", "zero_modes"]

@@ -78,7 +78,7 @@ def transformation(
     Raises
     ------
     InputError
-        If the weights leave some motion open.
+        If the weights do not hold some motion.
     """
     D_kept, D_landmarks = weights
     G_landmarks = [np.where(mask[:, None], 0.0, part) for part, mask in zip(motions.landmarks, held, strict=True)]

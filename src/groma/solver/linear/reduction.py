@@ -30,18 +30,17 @@ class Reduction:
         self._states, self._damping = states, damping
         with self.watch("solve"):
             self.linear.follow(states)
-        spent = [0.0]
+        spent = [0.0] * len(self.equations.shares)
 
         def eliminate(share: int, chunk: Chunk) -> None:
             begin = self.watch.elapsed()
             self.system.eliminate_chunk(share, chunk, damping)
-            if share == 0:
-                spent[0] += self.watch.elapsed() - begin
+            spent[share] += self.watch.elapsed() - begin
 
         with self.watch("linearize"):
             self.system.clear()
             cost = self.equations.linearize(states, inputs, eliminate)
-        self.watch.move("linearize", "schur", spent[0])
+        self.watch.move("linearize", "schur", sum(spent) / min(self.equations.workers.count, len(spent)))
         return cost
 
     def form(self, states: States, inputs: list[tuple], damping: float) -> None:

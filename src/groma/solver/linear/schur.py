@@ -14,8 +14,8 @@ are reduced to the kept blocks; some landmarks take a share of the damping, see 
           \delta_l = N (g_l + W \delta_c).
 
 Cost per landmark with n incidences: one inverse of size 3 or 4, n products ``N W`` and n(n+1)/2 block products that are
-added to S. The block products dominate; they run in explicit vectors (:mod:`groma._simd`). Each thread adds to its own
-copy of S, because two landmarks may touch the same block.
+added to S. The block products dominate; they run in explicit vectors (:mod:`groma._simd`). Each share of the
+work has its own copy of S, because two landmarks may touch the same block.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from groma.problem.layout import Chunk, Layout
 from groma.problem.linearization import NormalEquations
 from groma.problem.parallel import sum_of
 
-#: Diagonal entries are damped as if they were at least this large.
-MIN_DIAGONAL = 1e-6
+#: Diagonal entries are damped as if they were at least this large, so that nothing is divided by zero. It is no
+#: tolerance: entries change with the square of the unit of length, and what the solver does must not.
+MIN_DIAGONAL = 1e-100
 #: Damping of landmarks by kind, relative to that of all other variables; 1 where a kind is not named. The damping is
 #: measured by the diagonal, which says little about the depth of a far point: along its rays the cost is flatter by the
 #: square of the angle between them, and a damping that suits the cameras holds the point back for many steps.
@@ -243,7 +244,7 @@ class ReducedSystem:
         self.equations.workers.map(work, len(self.equations.shares))
 
     def assemble(self, damping: float) -> None:
-        """Sum the threads' parts, add H and the damping: the blocks ``S`` and the right-hand side ``rhs``."""
+        """Sum the parts of all shares, add H and the damping: the blocks ``S`` and the right-hand side ``rhs``."""
         layout = self.layout
         self.num_singular_landmarks = sum(self._singular)
         self.S: dict[tuple[int, int], FloatArray] = {}

@@ -14,7 +14,7 @@ from groma.solver.observability.inspection import Inspection
 
 
 def camera_findings(inspection: Inspection, reported: set[tuple[str, int]]) -> list[Finding]:
-    """Find the cameras that stand out; ``reported`` are known to be open and are not mentioned again."""
+    """Find the cameras that stand out; ``reported`` are known to be unobservable and are not mentioned again."""
     findings: list[Finding] = []
     for name, (sums, rows) in inspection.residuals_of_cameras.items():
         seen = rows > 0

@@ -40,7 +40,7 @@ from groma.solver.observability.gates import DIAGNOSIS
 from groma.solver.observability.inspection import Inspection
 from groma.solver.observability.landmarks import landmark_findings
 from groma.solver.observability.messages import Names, listing, scene_freedom
-from groma.solver.observability.system import open_modes, separate_parts, unseen_variables
+from groma.solver.observability.system import separate_parts, unobservable_modes, unseen_variables
 from groma.solver.observability.variables import variable_findings
 
 
@@ -53,10 +53,10 @@ class Diagnosis:
     #: How many such motions there are, 0 to 7.
     num_free_motions: int
     #: Directions beyond these that are not determined, of cameras, planes and calibrations.
-    num_open_directions: int
+    num_unobservable_directions: int
     findings: tuple[Finding, ...]
     #: For each group of landmarks, the standard deviation of every one, cameras held, as a share of the viewing
-    #: distance: in all directions together where it is small, in the weakest where it is not; infinite where open.
+    #: distance: in all directions together where it is small, in the weakest where it is not; else infinite.
     weakness: dict[str, FloatArray]
     seconds: float
 
@@ -70,7 +70,7 @@ class Diagnosis:
         return {
             "free_motions": list(self.free_motions),
             "num_free_motions": self.num_free_motions,
-            "num_open_directions": self.num_open_directions,
+            "num_unobservable_directions": self.num_unobservable_directions,
             "sentences": self.sentences,
             "findings": [finding.to_dict() for finding in self.findings],
             "observability": {
@@ -132,7 +132,7 @@ def _diagnosis(inspection: Inspection, begin: float) -> Diagnosis:
     weakness: dict[str, FloatArray] = {}
     moves: dict[tuple[str, int], FloatArray] = {}
     words: list[str] = []
-    free, num_open, reported = 0, 0, set()
+    free, num_unobservable, reported = 0, 0, set()
     for e in range(len(inspection.layout.eliminated)):
         _eliminated(inspection, e, findings, weakness, moves)
     for kept in inspection.layout.kept:
@@ -146,9 +146,9 @@ def _diagnosis(inspection: Inspection, begin: float) -> Diagnosis:
         findings += separate_parts(inspection)
         unseen, reported = unseen_variables(inspection)
         apart = any(finding.kind == "separate_parts" for finding in findings)
-        whole, open_moves, num_open = open_modes(inspection, apart)
+        whole, unobservable_moves, num_unobservable = unobservable_modes(inspection, apart)
         findings += unseen + whole
-        moves |= open_moves
+        moves |= unobservable_moves
     described = variable_findings(inspection, {key: move for key, move in moves.items() if key not in reported})
     findings += described
     reported |= {(finding.group, i) for finding in described for i in finding.indices}
@@ -164,7 +164,7 @@ def _diagnosis(inspection: Inspection, begin: float) -> Diagnosis:
     if not any(finding.severity == "problem" for finding in findings):
         but = " apart from the frame" if words else ""
         findings.insert(0, Finding("determined", "note", f"Everything{but} is determined by the data."))
-    return Diagnosis(tuple(words), free, num_open, tuple(findings), weakness, time.perf_counter() - begin)
+    return Diagnosis(tuple(words), free, num_unobservable, tuple(findings), weakness, time.perf_counter() - begin)
 
 
 def _eliminated(
@@ -217,13 +217,13 @@ def _landmarks(
         sigma = np.sqrt(np.maximum(variance, 0.0))
         rank = np.einsum("nij,nji->n", information, inverse)  # less where the elimination dropped a direction
         unsure = ~(sigma < DIAGNOSIS.weak) | (rank < dof - 0.5) | held.any(axis=1)
-    num_open = np.zeros(len(group), np.int64)
+    num_unobservable = np.zeros(len(group), np.int64)
     if unsure.any():
         J = motion(group.manifold, group.state[unsure], seen.middle[unsure], seen.distance[unsure])
         all_sigma, _ = weakest(_with_held(information[unsure], held[unsure]), J)
-        sigma[unsure], num_open[unsure] = all_sigma[:, 0], (all_sigma > DIAGNOSIS.undetermined).sum(axis=1)
+        sigma[unsure], num_unobservable[unsure] = all_sigma[:, 0], (all_sigma > DIAGNOSIS.undetermined).sum(axis=1)
     weakness[name] = sigma
-    return landmark_findings(inspection, name, seen, sigma, num_open)
+    return landmark_findings(inspection, name, seen, sigma, num_unobservable)
 
 
 def _with_held(information: FloatArray, held: BoolArray) -> FloatArray:

@@ -16,7 +16,7 @@ from groma.solver.observability.messages import listing
 class Finding:
     """One thing worth knowing."""
 
-    #: For programs: ``point_no_parallax``, ``line_along_motion``, ``camera_open`` and so on.
+    #: For programs: ``point_no_parallax``, ``line_along_motion``, ``camera_unobservable`` and so on.
     kind: str
     #: ``note``, ``warning`` or ``problem``.
     severity: str

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
@@ -12,8 +14,45 @@ from groma.solver.observability.gates import DIAGNOSIS
 from groma.solver.observability.inspection import Inspection
 
 
+@dataclass(frozen=True)
+class _Landmarks:
+    """The points or lines of a group that are not determined, sorted by how much of them is seen."""
+
+    inspection: Inspection
+    #: The group and its kind: point, line.
+    name: str
+    kind: str
+    seen: Observers
+    #: (count,) as given to :func:`landmark_findings`.
+    weakness: FloatArray
+    num_unobservable: IntArray
+    #: (count,) not determined and seen by one camera, by several, by none.
+    alone: BoolArray
+    rest: BoolArray
+    unseen: BoolArray
+    #: (count,) determined, but weak.
+    shaky: BoolArray
+
+    def finding(self, code: str, severity: str, which: BoolArray, one: str, many: str, remedy: str) -> list[Finding]:
+        """Say of some landmarks what is wrong, in words for one and for many; nothing of none."""
+        bad = np.flatnonzero(which)
+        if len(bad) == 0:
+            return []
+        names = [self.inspection.names(self.name, int(i)) for i in bad[:1]]
+        if len(bad) == 1:
+            text, remedy = f"{first_upper(names[0])} {one}", _of_one(remedy)
+        elif len(bad) > max(DIAGNOSIS.most * len(which), 1):
+            everyone = "All" if len(bad) == len(which) else "Nearly all"
+            text = f"{everyone} {self.kind}s ({len(bad):,} of {len(which):,}) {many}"
+        else:
+            listed = few([self.inspection.names(self.name, int(i)).removeprefix(f"{self.kind} ") for i in bad])
+            text = f"{len(bad):,} of {len(which):,} {self.kind}s {many} ({self.kind}s {listed})"
+        values = {"share": len(bad) / len(which), "weakest": float(self.weakness[bad].max())}
+        return [Finding(code, severity, f"{text}. {remedy}", self.name, tuple(int(i) for i in bad), values)]
+
+
 def landmark_findings(
-    inspection: Inspection, name: str, seen: Observers, weakness: FloatArray, num_open: IntArray
+    inspection: Inspection, name: str, seen: Observers, weakness: FloatArray, num_unobservable: IntArray
 ) -> list[Finding]:
     """Explain the points or lines of a group whose weakest direction is not determined, or weak.
 
@@ -27,101 +66,94 @@ def landmark_findings(
         Who sees it.
     weakness : (count,) float
         Standard deviation of the weakest direction, as a share of the viewing distance.
-    num_open : (count,) int
+    num_unobservable : (count,) int
         Directions that are not determined.
     """
     kind = inspection.problem.variables[name].manifold.kind
-    is_open = ~(weakness <= DIAGNOSIS.undetermined)
+    unobservable = ~(weakness <= DIAGNOSIS.undetermined)
+    poses = np.bincount(seen.of(unobservable)[0], minlength=len(unobservable))
+    alone, rest, unseen = unobservable & (poses == 1), unobservable & (poses > 1), unobservable & (poses == 0)
+    shaky = ~unobservable & (weakness > DIAGNOSIS.weak)
     findings: list[Finding] = []
-    poses = np.zeros(len(is_open), np.int64)
-    variable, pose = seen.of(is_open)
-    np.add.at(poses, variable, 1)
-    alone, rest = is_open & (poses == 1), is_open & (poses > 1)
-
-    def add(code: str, severity: str, which: BoolArray, one: str, many: str, remedy: str) -> None:
-        bad = np.flatnonzero(which)
-        if len(bad) == 0:
-            return
-        names = [inspection.names(name, int(i)) for i in bad[:1]]
-        if len(bad) == 1:
-            text, remedy = f"{first_upper(names[0])} {one}", _of_one(remedy)
-        elif len(bad) > max(DIAGNOSIS.most * len(which), 1):
-            text = (
-                f"{'All' if len(bad) == len(which) else 'Nearly all'} {kind}s ({len(bad):,} of {len(which):,}) {many}"
-            )
-        else:
-            listed = few([inspection.names(name, int(i)).removeprefix(f"{kind} ") for i in bad])
-            text = f"{len(bad):,} of {len(which):,} {kind}s {many} ({kind}s {listed})"
-        values = {"share": len(bad) / len(which), "weakest": float(weakness[bad].max())}
-        findings.append(Finding(code, severity, f"{text}. {remedy}", name, tuple(int(i) for i in bad), values))
-
-    shaky = ~is_open & (weakness > DIAGNOSIS.weak)
     turning = _only_turning(kind, seen, rest, shaky)
     if turning is not None:
         bad = tuple(int(i) for i in np.flatnonzero(rest | shaky))
         findings.append(Finding("pure_rotation", "problem", turning[0], name, bad, {"spread": turning[1]}))
         rest, shaky = np.zeros_like(rest), np.zeros_like(shaky)
-    if kind == "point":
-        angle = _parting(inspection, name, variable, pose, seen)
-        apart = angle > DIAGNOSIS.parallax
-        if rest.any():
-            apart |= (angle > DIAGNOSIS.small_parallax) & (
-                inspection.worst_residuals(name, rest) > DIAGNOSIS.discounted
-            )
-        add(
-            "point_seen_once", "problem", alone,
-            "is seen by one camera only: its depth is open", "are seen by one camera only: their depth is open",
-            "Drop them or add views.",
-        )  # fmt: skip
-        add(
-            "point_no_parallax", "problem", rest & ~apart,
-            "has no parallax: the rays to it are almost parallel, it could be at infinity",
-            "have no parallax: the rays to them are almost parallel, they could be at infinity",
-            "Add views from farther apart if their place matters; for the rotation of the cameras they count.",
-        )  # fmt: skip
-        rest = rest & apart
-        findings += _flat(inspection, name, weakness, seen)
-    else:
-        end_on, same_plane, along = _line_geometry(inspection, name, seen)
-        can = f"can slide {'and' if (num_open[rest & same_plane] > 1).all() else 'or'} turn in it"
-        add(
-            "line_end_on", "problem", (alone | rest) & end_on,
-            "is seen end-on: it points at the cameras", "are seen end-on: they point at the cameras",
-            "A view from the side would determine them.",
-        )  # fmt: skip
-        alone, rest = alone & ~end_on, rest & ~end_on
-        add(
-            "line_seen_once", "problem", alone,
-            "is seen by one camera only: it can be any line in the plane through it and the camera",
-            "are seen by one camera only: each can be any line in the plane through it and the camera",
-            "Drop them or add views.",
-        )  # fmt: skip
-        add(
-            "line_along_motion", "problem", rest & same_plane & along,
-            f"runs along the motion of the cameras, so they all see it in one plane: it {can}",
-            f"run along the motion of the cameras, so these see each in one plane: they {can}",
-            "A view from beside the path would determine them.",
-        )  # fmt: skip
-        add(
-            "line_in_epipolar_plane", "problem", rest & same_plane & ~along,
-            f"lies in a plane with the cameras that see it (its epipolar plane) and {can}",
-            f"lie in a plane with the cameras that see them (their epipolar plane) and {can}",
-            "A view from outside that plane would determine them.",
-        )  # fmt: skip
-        rest = rest & ~same_plane
-    add(
-        f"{kind}_open", "problem", rest,
+    landmarks = _Landmarks(inspection, name, kind, seen, weakness, num_unobservable, alone, rest, unseen, shaky)
+    special, explained = _point_findings(landmarks) if kind == "point" else _line_findings(landmarks)
+    return [*findings, *special, *_general_findings(landmarks, rest & ~explained)]
+
+
+def _point_findings(landmarks: _Landmarks) -> tuple[list[Finding], BoolArray]:
+    """Explain points by their rays; also return which of those seen by several cameras that explains."""
+    inspection, name, rest = landmarks.inspection, landmarks.name, landmarks.rest
+    angle = _parting(inspection, name, landmarks.alone | rest | landmarks.unseen, landmarks.seen)
+    apart = angle > DIAGNOSIS.parallax
+    if rest.any():
+        apart |= (angle > DIAGNOSIS.small_parallax) & (inspection.worst_residuals(name, rest) > DIAGNOSIS.discounted)
+    findings = landmarks.finding(
+        "point_seen_once", "problem", landmarks.alone,
+        "is seen by one camera only: its depth is not determined",
+        "are seen by one camera only: their depth is not determined",
+        "Drop them or add views.",
+    )  # fmt: skip
+    findings += landmarks.finding(
+        "point_no_parallax", "problem", rest & ~apart,
+        "has no parallax: the rays to it are almost parallel, it could be at infinity",
+        "have no parallax: the rays to them are almost parallel, they could be at infinity",
+        "Add views from farther apart if their place matters; for the rotation of the cameras they count.",
+    )  # fmt: skip
+    return findings + _flat(inspection, name, landmarks.weakness, landmarks.seen), ~apart
+
+
+def _line_findings(landmarks: _Landmarks) -> tuple[list[Finding], BoolArray]:
+    """Explain lines by where their cameras are; also return which of those seen by several cameras that explains."""
+    end_on, same_plane, along = _line_geometry(landmarks.inspection, landmarks.name, landmarks.seen)
+    alone, rest = landmarks.alone & ~end_on, landmarks.rest & ~end_on
+    several = landmarks.num_unobservable[landmarks.rest & same_plane] > 1
+    can = f"can slide {'and' if several.all() else 'or'} turn in it"
+    findings = landmarks.finding(
+        "line_end_on", "problem", (landmarks.alone | landmarks.rest) & end_on,
+        "is seen end-on: it points at the cameras", "are seen end-on: they point at the cameras",
+        "A view from the side would determine them.",
+    )  # fmt: skip
+    findings += landmarks.finding(
+        "line_seen_once", "problem", alone,
+        "is seen by one camera only: it can be any line in the plane through it and the camera",
+        "are seen by one camera only: each can be any line in the plane through it and the camera",
+        "Drop them or add views.",
+    )  # fmt: skip
+    findings += landmarks.finding(
+        "line_along_motion", "problem", rest & same_plane & along,
+        f"runs along the motion of the cameras, so they all see it in one plane: it {can}",
+        f"run along the motion of the cameras, so these see each in one plane: they {can}",
+        "A view from beside the path would determine them.",
+    )  # fmt: skip
+    findings += landmarks.finding(
+        "line_in_epipolar_plane", "problem", rest & same_plane & ~along,
+        f"lies in a plane with the cameras that see it (its epipolar plane) and {can}",
+        f"lie in a plane with the cameras that see them (their epipolar plane) and {can}",
+        "A view from outside that plane would determine them.",
+    )  # fmt: skip
+    return findings, end_on | same_plane
+
+
+def _general_findings(landmarks: _Landmarks, rest: BoolArray) -> list[Finding]:
+    """Name the landmarks that nothing else explains, those that nobody sees, and weak ones."""
+    findings = landmarks.finding(
+        f"{landmarks.kind}_unobservable", "problem", rest,
         "is not determined: some of its observations contradict the others, and hardly count under a robust loss",
         "are not determined: some of their observations contradict the others, and hardly count under a robust loss",
         "These may be wrong matches.",
     )  # fmt: skip
-    add(
-        f"{kind}_unseen", "problem", is_open & (poses == 0),
+    findings += landmarks.finding(
+        f"{landmarks.kind}_unseen", "problem", landmarks.unseen,
         "is seen by no camera and not determined otherwise", "are seen by no camera and not determined otherwise",
         "Drop them.",
     )  # fmt: skip
-    add(
-        f"{kind}_weak", "warning", shaky,
+    findings += landmarks.finding(
+        f"{landmarks.kind}_weak", "warning", landmarks.shaky,
         f"is weak: uncertain by more than {DIAGNOSIS.weak:.0%} of the distance",
         f"are weak: uncertain by more than {DIAGNOSIS.weak:.0%} of the distance",
         "Views from farther apart would help.",
@@ -129,8 +161,9 @@ def landmark_findings(
     return findings
 
 
-def _parting(inspection: Inspection, name: str, variable: IntArray, pose: IntArray, seen: Observers) -> FloatArray:
+def _parting(inspection: Inspection, name: str, which: BoolArray, seen: Observers) -> FloatArray:
     """Twice the largest angle (count,) between the mean ray to a point and one of its rays; zero without rays."""
+    variable, pose = seen.of(which)
     group = inspection.problem.variables[name]
     ray = group.ambient()[variable] - seen.centers[pose]
     ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-300)
@@ -157,7 +190,7 @@ def _only_turning(kind: str, seen: Observers, rest: BoolArray, shaky: BoolArray)
     elif spread < DIAGNOSIS.near_one_place and affected > 0.5 * len(rest):
         text = (
             f"The cameras hardly move: their centres are within {spread:.1%} of the viewing distance, and the depth of "
-            f"{_so_many(kind, affected, len(rest))} is open or uncertain by more than {DIAGNOSIS.weak:.0%}."
+            f"{_so_many(kind, affected, len(rest))} is not determined or uncertain by more than {DIAGNOSIS.weak:.0%}."
         )
     else:
         return None

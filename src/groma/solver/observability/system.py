@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the reduced system leaves open: parts that share nothing, variables that nothing sees, and weak modes."""
+"""What the reduced system cannot determine: parts that share nothing, variables that nothing sees, and weak modes."""
 
 from __future__ import annotations
 
@@ -73,15 +73,17 @@ def unseen_variables(inspection: Inspection) -> tuple[list[Finding], set[tuple[s
     return findings, found
 
 
-def open_modes(inspection: Inspection, apart: bool) -> tuple[list[Finding], dict[tuple[str, int], FloatArray], int]:
+def unobservable_modes(
+    inspection: Inspection, apart: bool
+) -> tuple[list[Finding], dict[tuple[str, int], FloatArray], int]:
     """Find the motions of kept variables that are not determined with the scene held.
 
     Returns
     -------
     tuple
         A finding on modes of many cameras, unless the scene is in parts anyway (``apart``); of each variable that can
-        move otherwise its motions (m, k) at one standard deviation; and the number of open modes, without those of
-        landmarks alone.
+        move otherwise its motions (m, k) at one standard deviation; and the number of unobservable modes, without
+        those of landmarks alone.
     """
     layout, problem = inspection.layout, inspection.problem
     unseen = _unseen(inspection)
@@ -100,23 +102,23 @@ def open_modes(inspection: Inspection, apart: bool) -> tuple[list[Finding], dict
         return [], {}, 0
     kinds = {name: problem.variables[name].manifold.kind for name in excursions}
     largest = np.max([np.abs(part).max(axis=(0, 1), initial=0.0) for part in excursions.values()], axis=0)
-    is_open = largest > DIAGNOSIS.undetermined
-    if not is_open.any():
+    unobservable = largest > DIAGNOSIS.undetermined
+    if not unobservable.any():
         return [], {}, 0
-    whole = np.zeros(len(is_open), bool)
+    whole = np.zeros(len(unobservable), bool)
     for name, part in excursions.items():
         if kinds[name] == "pose" and len(part) > 3:
             moving = (np.linalg.norm(part, axis=1) > DIAGNOSIS.takes_part * largest).sum(axis=0)
-            whole |= is_open & (moving > DIAGNOSIS.whole * len(part))
+            whole |= unobservable & (moving > DIAGNOSIS.whole * len(part))
     findings = [_whole_modes(inspection, excursions, whole)] if whole.any() and not apart else []
-    local, moves = is_open & ~whole, {}
+    local, moves = unobservable & ~whole, {}
     for name, part in excursions.items():
         amount = np.linalg.norm(part[:, :, local], axis=1)
         for i in np.flatnonzero(
             (amount > np.maximum(DIAGNOSIS.takes_part * largest[local], DIAGNOSIS.undetermined)).any(axis=1)
         ):
             moves[name, int(i)] = part[i][:, local]
-    return findings, moves, int(is_open.sum())
+    return findings, moves, int(unobservable.sum())
 
 
 def _unseen(inspection: Inspection) -> BoolArray:
@@ -191,4 +193,4 @@ def _whole_modes(inspection: Inspection, excursions: dict[str, FloatArray], whol
     return Finding(kind, "problem", text, listing(sorted(moved)) if moved else "", values={"count": count})
 
 
-__all__ = ["open_modes", "separate_parts", "unseen_variables"]
+__all__ = ["separate_parts", "unobservable_modes", "unseen_variables"]

@@ -22,7 +22,7 @@ def variable_findings(inspection: Inspection, moves: dict[tuple[str, int], Float
     by_group: dict[str, list[tuple[int, FloatArray]]] = defaultdict(list)
     for (name, i), motions in sorted(moves.items(), key=lambda item: item[0]):
         U, values, _ = np.linalg.svd(motions, full_matrices=False)
-        # directions that move with another one, but less than an undetermined one must, are not open themselves
+        # directions that move with another one, but less than an undetermined one must, are not unobservable themselves
         free = U[:, (values > DIAGNOSIS.undetermined) & (values > DIAGNOSIS.open_share * values[0])]
         if free.shape[1]:
             by_group[name].append((i, free))
@@ -36,7 +36,9 @@ def variable_findings(inspection: Inspection, moves: dict[tuple[str, int], Float
 
 def _cameras(inspection: Inspection, name: str, found: list[tuple[int, FloatArray]]) -> list[Finding]:
     if len(found) > DIAGNOSIS.one_by_one:
-        return [_many(inspection, "camera_open", name, found, "cameras can move or turn without the data noticing")]
+        return [
+            _many(inspection, "camera_unobservable", name, found, "cameras can move or turn without the data noticing")
+        ]
     rotations = inspection.problem.variables[name].ambient().reshape(-1, 3, 4)[:, :, :3]
     findings = []
     for i, moves in found:
@@ -44,13 +46,13 @@ def _cameras(inspection: Inspection, name: str, found: list[tuple[int, FloatArra
         label = first_upper(inspection.names(name, i))
         text = f"{label} can {camera_freedom(moves, rotations[i])} without the data noticing"
         text += f"; it has {rows} measured numbers for 6 unknowns." if rows < 12 else "."
-        findings.append(Finding("camera_open", "problem", text, name, (i,), {"directions": moves.shape[1]}))
+        findings.append(Finding("camera_unobservable", "problem", text, name, (i,), {"directions": moves.shape[1]}))
     return findings
 
 
 def _planes(inspection: Inspection, name: str, found: list[tuple[int, FloatArray]]) -> list[Finding]:
     if len(found) > DIAGNOSIS.one_by_one:
-        return [_many(inspection, "plane_open", name, found, "planes are not held by what lies on them")]
+        return [_many(inspection, "plane_unobservable", name, found, "planes are not held by what lies on them")]
     ambient = inspection.problem.variables[name].ambient()
     findings = []
     for i, moves in found:
@@ -60,13 +62,13 @@ def _planes(inspection: Inspection, name: str, found: list[tuple[int, FloatArray
             text += ": the cameras that see it lie in it, so it is seen edge-on."
         else:
             text += f": it rests on {on_it} only." if on_it else ": too little lies on it."
-        code = "plane_edge_on" if edge_on else "plane_open"
+        code = "plane_edge_on" if edge_on else "plane_unobservable"
         findings.append(Finding(code, "problem", text, name, (i,), {"directions": moves.shape[1]}))
     return findings
 
 
 def _parameters(inspection: Inspection, name: str, found: list[tuple[int, FloatArray]]) -> list[Finding]:
-    """One sentence for all calibrations of which the same parameters are open."""
+    """One sentence for all calibrations of which the same parameters are unobservable."""
     words = parameter_names(inspection, name)
     alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
     for i, moves in found:
@@ -81,7 +83,7 @@ def _parameters(inspection: Inspection, name: str, found: list[tuple[int, FloatA
             f"{listing(known)}; the shape of the scene makes up for {'them' if several else 'it'}. Hold "
             f"{'them' if several else 'it'}, or add views turned or from elsewhere."
         )
-        findings.append(Finding("parameters_open", "problem", text, name, tuple(members)))
+        findings.append(Finding("parameters_unobservable", "problem", text, name, tuple(members)))
     return findings
 
 
@@ -89,7 +91,7 @@ def _others(inspection: Inspection, name: str, found: list[tuple[int, FloatArray
     kind = inspection.problem.variables[name].manifold.kind
     names = few([inspection.names(name, i) for i, _ in found])
     text = f"{first_upper(names)} {'is' if len(found) == 1 else 'are'} not determined by the data."
-    return [Finding(f"{kind}_open", "problem", text, name, tuple(i for i, _ in found))]
+    return [Finding(f"{kind}_unobservable", "problem", text, name, tuple(i for i, _ in found))]
 
 
 def _many(inspection: Inspection, code: str, name: str, found: list[tuple[int, FloatArray]], words: str) -> Finding:

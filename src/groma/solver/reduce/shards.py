@@ -27,11 +27,12 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import ProblemError
+from groma.execution import available_cores
 from groma.factors.contract import Factor
 from groma.problem.lay_out import lay_out
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
-from groma.problem.parallel import Workers, available_cores
+from groma.problem.parallel import Workers
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.damped_problem import Trial
@@ -44,7 +45,7 @@ from groma.solver.reduce.alone import Alone, Reducer
 from groma.solver.reduce.shared_system import SharedSystem
 from groma.solver.report import SolveReport, Stopwatch
 from groma.solver.solve import Progress, minimise
-from groma.solver.steps import States, size_of
+from groma.solver.steps import States, share_of_states, squares_of_states, squares_of_step
 from groma.solver.termination import Termination
 
 #: Damping of the first step where the options give none.
@@ -182,14 +183,11 @@ class ShardedProblem:
             self._form()
 
     def largest_gradient(self) -> float:
-        """Return the largest component of the gradient of the kept variables."""
+        """Return the largest component of the gradient of the kept variables, over the root of its curvature."""
         return self._sums.largest_gradient()
 
-    def size(self) -> float:  # noqa: D102
-        states = self.states
-        shared = size_of({name: state for name, state in states.items() if name not in self._landmarks})
-        own = sum(size_of({name: states[name][rows] for name, rows in s.landmarks.items()}) ** 2 for s in self._shards)
-        return float(np.sqrt(shared**2 + self._reducer.sum(np.array([own]))[0]))
+    def is_curved(self) -> bool:  # noqa: D102
+        return self._sums.is_curved()
 
     def try_step(self) -> ShardedTrial:
         """Solve the shared system, and visit all shards: they are moved, and linearised where they come to be."""
@@ -213,7 +211,8 @@ class ShardedProblem:
             num_hidden=visit.num_hidden,
             gain_ratio=fell / max(promised, 1e-300),
             promised=promised,
-            length=factor * visit.length,
+            length=factor * float(np.sqrt(visit.lengths.sum())),
+            relative_length=factor * share_of_states(visit.lengths, visit.sizes),
             withheld=withheld,
             states=visit.states,
             curvature=2.0 * (factor * slope - fell) / max(factor**2 * bend, 1e-300),
@@ -300,7 +299,7 @@ class ShardedProblem:
         trial = {**states, **self._sums.retract(states, [factor * delta for delta in step])}
         trial |= {name: states[name].copy() for name in self._landmarks}
         self._sums.clear()
-        found = np.zeros(5)
+        found = np.zeros(10)
         for shard in self._shards:
             layout, equations, system, own = self._open(shard, states)
             self._linearize(equations, system, own, self.damping)
@@ -315,15 +314,25 @@ class ShardedProblem:
                 back = to_original_order(layout, moved)
                 for name, rows in shard.landmarks.items():
                     trial[name][rows] = back[name]
-                length = sum(float(delta @ delta) for delta in deltas)
-                found[:3] += (system.landmark_squares, system.landmark_slope, length)
+                found[:2] += (system.landmark_squares, system.landmark_slope)
+                for group, delta in zip(layout.eliminated, deltas, strict=True):
+                    found[4:] += self._lengths(group.group, own[group.group], delta)
             cost = self._linearize(equations, system, moved, lower)
-            found[3:] += (cost, sum(equations.num_degenerate))
+            found[2:4] += (cost, sum(equations.num_degenerate))
             with self._watch("schur"):
                 self._sums.add(layout, system)
-        squares, slope, length, cost, num_hidden = (float(value) for value in self._sum_up(found))
-        length += sum(float(part @ part) for part in step)
-        return _Visit(trial, cost, int(num_hidden), float(np.sqrt(length)), squares, slope)
+        found = self._sum_up(found)
+        squares, slope, cost, num_hidden = (float(value) for value in found[:4])
+        lengths = found[4:]
+        for name, delta in zip(self._kept, step, strict=True):
+            lengths += self._lengths(name, states[name], delta)
+        return _Visit(trial, cost, int(num_hidden), lengths[:3], lengths[3:], squares, slope)
+
+    def _lengths(self, group: str, state: FloatArray, delta: FloatArray) -> FloatArray:
+        """Return the squares of a step of a group, and of its states (6,); see :mod:`groma.solver.steps`."""
+        manifold = self._variables[group].manifold
+        squares = squares_of_step(manifold, delta.reshape(len(state), manifold.dof))
+        return np.concatenate([squares, squares_of_states(manifold, state)])
 
 
 @dataclass(frozen=True)
@@ -333,8 +342,9 @@ class _Visit:
     states: States
     cost: float
     num_hidden: int
-    #: Euclidean length of the step.
-    length: float
+    #: Squares of the step and of the states it began from, in three parts each.
+    lengths: FloatArray
+    sizes: FloatArray
     #: Over all landmarks: delta D delta and g delta.
     squares: float
     slope: float

@@ -13,7 +13,7 @@ from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.linear.schur import MIN_DIAGONAL, ReducedSystem
 from groma.solver.reduce.alone import Reducer
-from groma.solver.steps import States
+from groma.solver.steps import States, largest_slope
 
 
 class SharedSystem:
@@ -41,8 +41,12 @@ class SharedSystem:
             blocks[:] = 0.0
 
     def largest_gradient(self) -> float:
-        """Return the largest component of the gradient of the kept variables."""
-        return max((float(np.abs(g).max()) for g in self._gradient if g.size), default=0.0)
+        """Return the largest component of the gradient of the kept variables, each over the root of its curvature."""
+        return max(map(largest_slope, self._gradient, self._curvature), default=0.0)
+
+    def is_curved(self) -> bool:
+        """Whether the cost depends on any kept variable."""
+        return any(bool(part.any()) for part in self._curvature)
 
     def add(self, layout: Layout, system: ReducedSystem) -> None:
         """Add the part of a shard."""

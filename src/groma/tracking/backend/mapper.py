@@ -14,8 +14,8 @@ from groma.geometry import se3
 from groma.solver.report import SolveReport
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
 from groma.tracking.backend.loop_closure import LoopSearch, close_loop, search_for_loop
-from groma.tracking.backend.stereo_calibration import correct_map, estimate_turn, matters
-from groma.tracking.backend.submaps import Joint, find_joint, join_maps, search_older_maps
+from groma.tracking.backend.stereo_calibration import correct_map, estimate_turn, shift_between
+from groma.tracking.backend.submaps import Joint, find_joint, search_older_maps
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.frame.rectification import RightCamera, RightTurn
@@ -68,15 +68,19 @@ class _Pending:
 class Mapper:
     """Makes keyframes of chosen frames and keeps the map adjusted."""
 
-    def __init__(self, camera: TrackCamera, options: TrackOptions) -> None:
+    def __init__(self, camera: TrackCamera, options: TrackOptions, right_turn: RightTurn | None = None) -> None:
         #: Maps begun so far; more than one after the track was lost for long.
         self.maps, self.current = [TrackMap()], 0
         #: How maps join older ones, by the number of the newer.
         self.joints: dict[int, Joint] = {}
         self.camera, self.options = camera, options
         #: The right camera of stereo pairs, and the number of keyframes that tell next how it is turned.
-        self.right = RightCamera(camera, options.gates.rectification, options.gates.features)
+        self.right = RightCamera(camera, options.gates.rectification, options.gates.features, right_turn)
         self._next_look = options.gates.rectification.min_keyframes
+        #: What the first keyframes were made with; None once the track need not start over.
+        self._assumed = self.right.turn if right_turn is None else None
+        #: How the right camera is turned, if so far from what was taken that the track should start over.
+        self.better_turn: RightTurn | None = None
         self.metric = True
         self.loops = 0
         #: A frame that is to become a keyframe; its features are being found meanwhile.
@@ -136,6 +140,18 @@ class Mapper:
         relative = se3.compose(present.pose[None], se3.inverse(near.pose[None]))[0]
         self.due = _Chosen(data, near.index, relative, present.followed)
 
+    def keep_present(self, present: Present, watch: Stopwatch) -> None:
+        """Make a keyframe of the present frame, unless one stands for it, and take up all that is being worked out."""
+        if self.due is not None:
+            self.make_keyframe(present, watch)
+        if present.frames_since_keyframe > 0:
+            assert present.data is not None
+            self.choose(present, present.data)
+            self.make_keyframe(present, watch)
+        else:
+            with watch("take up"):
+                self.take_up(present, now=True)
+
     def make_keyframe(self, present: Present, watch: Stopwatch) -> None:
         """Make a keyframe of the frame that was chosen."""
         assert self.due is not None
@@ -156,7 +172,7 @@ class Mapper:
             merge_planes(self.map.planes, self.options.gates.planes)
             if self.options.relations:
                 find_lines_on_planes(self.map)
-        present.frames_since_keyframe = 0
+        present.frames_since_keyframe = max(chosen.age - 1, 0)
         with watch("right camera"):
             self._look_at_right_camera(present)
         with watch("adjust"):
@@ -206,11 +222,11 @@ class Mapper:
         if search.newest is not self.map.keyframes[search.newest.index]:
             return
         if pairs and not any(pair[0] in self.map.living() for pair in pairs):
-            joint = find_joint(self.maps, self.camera, search.newest, pairs, self.options.gates)
+            joint = find_joint(self.maps, self.camera, self.current, search.newest, pairs, self.options.gates)
             if joint is not None:
                 self.joints[self.current] = joint
-                self.map.pinned.add(joint.newest.index)
-                self.maps[joint.older].pinned.add(joint.keyframe.index)
+                self.map.pinned.add(joint.newest)
+                self.maps[joint.older].pinned.add(joint.keyframe)
             return
         last = self.map.last
         before = last.pose.copy()
@@ -227,9 +243,15 @@ class Mapper:
         gates, living = self.options.gates.rectification, self.map.living()
         if not self.camera.baseline > 0 or len(living) < self._next_look:
             return
+        if len(living) == gates.min_keyframes and self._assumed is not None:
+            self._assumed = self.right.turn
         self._next_look = math.ceil(gates.growth * len(living))
         turn, job = estimate_turn(self.map, self.camera, self.right.turn, gates)
-        if matters(self.camera, self.right.turn, turn, gates):
+        if self._assumed is not None and len(living) >= gates.start_over_keyframes:
+            if shift_between(self.camera, self._assumed, turn) > gates.start_over:
+                self.better_turn = turn
+            self._assumed = None
+        if shift_between(self.camera, self.right.turn, turn) > gates.matters:
             last = self.map.last
             before = last.pose.copy()
             for track_map in self.maps:
@@ -256,18 +278,16 @@ class Mapper:
                 report = job.report
         return report
 
-    def end(self, present: Present) -> dict[int, tuple[int, int]]:
-        """End the threads and join the maps; see :func:`~groma.tracking.backend.submaps.join_maps` for what is
-        returned.
-        """
-        if self.due is not None:
-            self.make_keyframe(present, Stopwatch())
-        self.take_up(present, now=True)
-        for pool in (self._pool, self._workers):
+    def abandon(self) -> None:
+        """Leave what was begun and not taken up."""
+        self.due = self._pending = self._search = None
+
+    def close(self) -> None:
+        """End the threads."""
+        pools, self._pool, self._workers = (self._pool, self._workers), None, None
+        for pool in pools:
             if pool is not None:
-                pool.shutdown(wait=True)
-        self._pool = self._workers = None
-        return join_maps(self.maps, self.joints)
+                pool.shutdown(wait=True, cancel_futures=True)
 
     def adjust_at_end(self, part: int) -> tuple[SolveReport | None, RightTurn]:
         """Adjust all keyframes of a map together; return the report and how the right camera is turned."""
@@ -278,7 +298,7 @@ class Mapper:
         report = self._adjust_all()
         if self.camera.baseline > 0:
             turn, job = estimate_turn(self.map, self.camera, self.right.turn, self.options.gates.rectification)
-            if matters(self.camera, self.right.turn, turn, self.options.gates.rectification):
+            if shift_between(self.camera, self.right.turn, turn) > self.options.gates.rectification.matters:
                 correct_map(self.map, self.camera, self.right.turn, turn, self.options, job)
                 report = self._adjust_all()
         return report, turn

@@ -112,11 +112,11 @@ def _alike(job: AdjustmentJob, camera: TrackCamera, rotation: FloatArray, gates:
     return max(float((sums**2).sum()), float((error[good] ** 2).sum())) / max(int(good.sum()), 1)
 
 
-def matters(camera: TrackCamera, old: RightTurn, new: RightTurn, gates: RectificationGates) -> bool:
-    """Whether two turns differ enough for columns to be corrected: anywhere in the image."""
+def shift_between(camera: TrackCamera, old: RightTurn, new: RightTurn) -> float:
+    """Return by how much a pixel of the right image moves at most when one turn is taken for another."""
     corners = np.array([[x, y] for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0)]) * (camera.width, camera.height)
     shift = retargeted(camera, corners, old.angles, new.angles) - corners
-    return float(np.abs(shift).max()) > gates.matters
+    return float(np.abs(shift).max())
 
 
 # -------------------------------------------------------------------------------------------------- correcting maps
@@ -229,4 +229,4 @@ def _log(rotation: FloatArray) -> FloatArray:
     return so3.log(rotation[None])[0]
 
 
-__all__ = ["correct_map", "estimate_turn", "matters"]
+__all__ = ["correct_map", "estimate_turn", "shift_between"]

@@ -70,10 +70,12 @@ class RightTurn:
 class RightCamera:
     """The right camera of all pairs, and how it is turned as far as that is known."""
 
-    def __init__(self, camera: TrackCamera, gates: RectificationGates, features: FeatureGates) -> None:
+    def __init__(
+        self, camera: TrackCamera, gates: RectificationGates, features: FeatureGates, turn: RightTurn | None = None
+    ) -> None:
         self._camera, self._gates, self._features = camera, gates, features
-        self.turn = RightTurn.unknown(gates)
-        self._looks = gates.looks
+        self.turn = turn or RightTurn.unknown(gates)
+        self._looks = gates.looks if turn is None else 0
 
     def rows_aligned(self, left: GrayImage, right: GrayImage) -> GrayImage:
         """Return a right image with the rows of the left one; the first pairs tell pitch and roll."""

@@ -142,6 +142,12 @@ class RectificationGates:
     )
     max_iterations: int = gate(50, "steps", "steps of the adjustment that tells yaw", "cost: converges in fewer")
     growth: float = gate(1.5, "ratio", "angles are estimated anew when so many more keyframes tell them", "cost: adds up")
+    start_over_keyframes: int = gate(
+        8, "keyframes", "tell whether a sequence is tracked from its start again", "chosen on KITTI 06"
+    )
+    start_over: float = gate(
+        0.3, "px", "with a larger error in the right image the first landmarks are not worth keeping", "chosen on KITTI 06"
+    )
     matters: float = gate(0.05, "px", "a smaller change in the right image is not worth adjusting anew", "cost: time")
 
 
@@ -150,6 +156,8 @@ class FeatureGates:
     """Described features."""
 
     fast_threshold: int = gate(7, "grey levels", "contrast of a corner (FAST)", SEQUENCES)
+    candidates: int = gate(4, "ratio", "features found for each that is described", "cost: time per keyframe")
+    cell: int = gate(32, "px", "described features are taken from cells of this side in turn", "chosen on EuRoC V1_01")
     max_bits: int = gate(
         64, "bits", "descriptors of a pair differ in at most so many of 256",
         "derived from chance: unlike descriptors differ in fewer once in 10^15",

@@ -17,7 +17,6 @@ from groma.tracking.map.landmarks import DEAD
 from groma.tracking.map.lines import FollowedSegments, carried, coarse_flow, expected_segments, measured_edges
 from groma.tracking.map.points import PointTracks, follow_points
 from groma.tracking.map.track_map import TrackMap
-from groma.tracking.options import TrackOptions
 from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
 from groma.tracking.pose.relocalise import match_planes
 
@@ -37,8 +36,6 @@ class Attempt:
 
 def follow_frame(
     track_map: TrackMap,
-    camera: TrackCamera,
-    options: TrackOptions,
     before: FrameFeatures,
     data: FrameFeatures,
     followed: Followed,
@@ -48,7 +45,8 @@ def follow_frame(
     watch,
 ) -> tuple[PoseEstimate | None, Followed]:
     """Return the pose of a frame that follows another, and what is still followed."""
-    tracks, segments, gates = followed.points, followed.lines, options.gates
+    camera, options, gates = data.camera, data.options, data.options.gates
+    tracks, segments = followed.points, followed.lines
     with watch("points"):
         tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
         if options.points:

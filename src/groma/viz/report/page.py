@@ -12,6 +12,7 @@ import html
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -54,6 +55,24 @@ class Report(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class PageContents:
+    """What a page says beside the scenes and the report of their adjustment."""
+
+    #: Numbers of segments by what became of them, of a map, and the same in words.
+    outcomes: Mapping[str, int] | None = None
+    explanation: str = ""
+    #: Sentences in a box; by default those of the report.
+    warnings: Sequence[str] | None = None
+    #: What the data determine, as :meth:`groma.solver.observability.diagnosis.Diagnosis.to_dict` gives it; by default
+    #: what the numbers of the report hold under ``diagnosis``.
+    diagnosis: Mapping[str, Any] | None = None
+    #: HTML before the charts.
+    cards: str = ""
+    #: HTML of the large numbers instead of the usual ones.
+    tiles: str | None = None
+
+
 def write_report(
     path: str | os.PathLike[str],
     scene_before: Scene | None,
@@ -61,13 +80,7 @@ def write_report(
     report: Report | None = None,
     images: ImageFiles | None = None,
     title: str = "Adjustment",
-    *,
-    outcomes: Mapping[str, int] | None = None,
-    explanation: str = "",
-    warnings: Sequence[str] | None = None,
-    diagnosis: Mapping[str, Any] | None = None,
-    cards: str = "",
-    tiles: str | None = None,
+    contents: PageContents | None = None,
 ) -> None:
     """Write a page that opens in any browser.
 
@@ -84,19 +97,8 @@ def write_report(
         embedded, and made smaller the more there are.
     title
         Heading of the page.
-    outcomes
-        Numbers of segments by what became of them, of a map.
-    explanation
-        The same in words.
-    warnings
-        Sentences in a box; by default those of the report.
-    diagnosis
-        What the data determine, as :meth:`groma.solver.observability.diagnosis.Diagnosis.to_dict` gives it; by default
-        what the numbers of the report hold under ``diagnosis``.
-    cards
-        HTML before the charts.
-    tiles
-        HTML of the large numbers instead of the usual ones.
+    contents
+        What else the page says.
 
     Raises
     ------
@@ -116,18 +118,22 @@ def write_report(
     states = [state for state in (before, after) if state is not None]
     numbers = report.to_dict() if report is not None else None
     history = [step for step in report.history if _iteration(step) > 0] if report is not None else None
-    sentences = warnings if warnings is not None else report.warnings if report is not None else ()
+    said = contents or PageContents()
+    sentences = said.warnings if said.warnings is not None else report.warnings if report is not None else ()
+    diagnosis = said.diagnosis
     if diagnosis is None and numbers is not None:
         diagnosis = numbers.get("diagnosis")
     page = files("groma.viz.report").joinpath("_page.html").read_text(encoding="utf-8")
     parts = {
         "TITLE": html.escape(title),
         "LEAD": _lead(scene_after, after, report),
-        "TILES": _page_tables.tiles(scene_after, before, after, numbers) if tiles is None else tiles,
+        "TILES": _page_tables.tiles(scene_after, before, after, numbers) if said.tiles is None else said.tiles,
         "WARNINGS": "".join(f'<p class="warning">{html.escape(text)}</p>' for text in sentences),
-        "CHARTS": cards
+        "CHARTS": said.cards
         + _page_tables.diagnosis_card(diagnosis)
-        + _page_tables.chart_cards(scene_after, before, after, history, _stages(numbers), outcomes, explanation),
+        + _page_tables.chart_cards(
+            scene_after, before, after, history, _stages(numbers), said.outcomes, said.explanation
+        ),
         "TABLES": _page_tables.number_tables(scene_after, before, after, numbers),
         "FOOTER": _footer(),
         "DATA": script_json({**scene_data(scenes, states), **image_data(scene_after, states, images)}),

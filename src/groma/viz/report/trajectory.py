@@ -25,7 +25,7 @@ from groma.viz.framing import horizontal, upward
 from groma.viz.pictures import ImageFiles
 from groma.viz.report import digits as _digits
 from groma.viz.report import tables as _page_tables
-from groma.viz.report.page import write_report
+from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.path_charts import Curve, legend, over_time, path
 
 if TYPE_CHECKING:
@@ -145,10 +145,15 @@ def write_track_report(
         None,
         images,
         title,
-        warnings=track.warnings if warnings is None else warnings,
-        diagnosis=diagnosis,
-        cards=_path_cards(track, scores) + _time_cards(track, frames, scores) + _stage_table(track) + _scores(scores),
-        tiles=_tiles(track, scores),
+        PageContents(
+            warnings=track.warnings if warnings is None else warnings,
+            diagnosis=diagnosis,
+            cards=_path_cards(track, scores)
+            + _time_cards(track, frames, scores)
+            + _stage_table(track)
+            + _scores(scores),
+            tiles=_tiles(track, scores),
+        ),
     )
 
 
@@ -292,6 +297,8 @@ def _scores(scores: TrajectoryScores | None) -> str:
     caption = f"{scores.num_poses:,} poses over {scores.path_length:.4g}; aligned: {words[scores.alignment]}"
     if scores.alignment == "sim3":
         caption += f" ({scores.similarity.scale:.4g})"
+    if scores.by_orientations:
+        caption += ", by positions and orientations, since the positions alone do not determine the rotation"
     if scores.drift_percent is not None:
         caption += f". Drift {scores.drift_percent:.3g} %, {scores.drift_deg_per_metre:.3g} degrees per unit"
     return _page_tables.table("Against the reference", caption + ".", ["error", "rms", "median", "largest"], rows)

@@ -17,9 +17,11 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import FloatArray
+from groma.bounded.text import finite, read_words
 from groma.errors import GromaError
 from groma.geometry import quaternion, se3
 from groma.io import read_scene
+from groma.io.reading import reading
 from groma.io.trajectories import read_tum
 from groma.scene.patches import patch_groups, plane_patches, triangle_fans
 from groma.viz import colours as _colours
@@ -191,8 +193,9 @@ class LiveView:
 
 def read_frames(path: Path) -> FloatArray:
     """Poses (n, 7) world_from_cam of the frames of the map that is followed now; a row that is not complete is left."""
-    rows = [line.split() for line in path.read_text(encoding="utf-8").split("\n")[:-1]]
-    table = np.array([row for row in rows if len(row) == 9], dtype=float).reshape(-1, 9)
+    with reading(path, "list of frames"):
+        rows = [(line, words) for line, words in read_words(path) if len(words) == 9]
+        table = np.array([finite(words, f"{path}, line {line}") for line, words in rows]).reshape(-1, 9)
     return np.hstack([table[:, 4:8], table[:, 1:4]])[table[:, 8] == (table[-1, 8] if len(table) else 0)]
 
 

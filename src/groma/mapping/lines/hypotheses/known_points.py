@@ -163,7 +163,7 @@ def lines_through_points(
     -------
     (m, 3) int, (m, 6) float64
         Segment, slot, -1; and inverse depths, their covariance, and score, as in
-        :class:`groma.mapping.lines.proposals.Proposals`.
+        :class:`groma.mapping.lines.hypotheses.proposals.Proposals`.
     """
     index, values = np.empty((2 * len(ratios), 3), np.int64), np.empty((2 * len(ratios), 6))
     count = _propose(

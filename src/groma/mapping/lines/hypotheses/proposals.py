@@ -12,9 +12,10 @@ which is linear in the image line. Its covariance follows from the distance of t
 Where the line is parallel to the epipolar line, :math:`l^\top a \to 0` and the covariance grows without bound. Such
 proposals are discarded; the segment can still join a line that other segments determine. Where only the change of depth
 along the segment is uncertain, because the other image sees a small part of it, the vanishing point of the segment
-supplies it (:mod:`groma.mapping.lines.directions`).
+supplies it (:mod:`groma.mapping.lines.hypotheses.directions`).
 
-Known points on a segment give further proposals, without another segment (:mod:`groma.mapping.lines.known_points`).
+Known points on a segment give further proposals, without another segment
+(:mod:`groma.mapping.lines.hypotheses.known_points`).
 
 References
 ----------
@@ -32,7 +33,7 @@ from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
-from groma.mapping.lines.known_points import lines_through_points
+from groma.mapping.lines.hypotheses.known_points import lines_through_points
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.views import LineViews
 
@@ -40,8 +41,8 @@ from groma.mapping.lines.views import LineViews
 _NUM_BINS = 2048
 # How far a candidate got; the best of all candidates of a segment is reported.
 NOTHING, OUT_OF_BEAM, WEAK, PROPOSED = 0, 1, 2, 3
-#: Proposals of a pair of images for which there is room at first.
-_ROOM = 1 << 14
+#: Proposals of a segment by one other image for which there is room at first; what is not written takes no memory.
+_ROOM = 64
 
 
 @dataclass(frozen=True)
@@ -93,46 +94,51 @@ def _use_direction(ratio, max_squared, out):
 
 
 @kernel
+def _carry(M, ray, across, b):
+    """The rays of a segment, and their change across it, as the other camera sees them: rows of b (3, 3)."""
+    for c in range(3):
+        b[0, c] = M[c, 0] * ray[0, 0] + M[c, 1] * ray[0, 1] + M[c, 2] * ray[0, 2]
+        b[1, c] = M[c, 0] * ray[1, 0] + M[c, 1] * ray[1, 1] + M[c, 2] * ray[1, 2]
+        b[2, c] = M[c, 0] * across[0] + M[c, 1] * across[1] + M[c, 2] * across[2]
+
+
+@kernel
 def _propose(
-    ray, across, sigma, q_low, q_high, ratio, line, ends, sigma_j, M, a, directed, min_overlap, max_relative, limits,
-    out,
+    b, sigma, q_low, q_high, ratio, line, ends, sigma_j, a, directed, min_overlap, max_relative, limits, out
 ):  # fmt: skip
     """One pair of segments: fill out = q1 q2 c11 c12 c22; return how far it got.
 
-    ``limits`` are the least change over the range of depths in sigma, the margin of the ends, and the largest squared
-    disagreement with the direction.
+    ``b`` are the rays of the first segment by :func:`_carry`. ``limits`` are the least change over the range of depths
+    in sigma, the margin of the ends, and the largest squared disagreement with the direction.
     """
     gain = line[0] * a[0] + line[1] * a[1] + line[2] * a[2]
     if not abs(gain) * (q_high - q_low) > limits[0] * sigma_j:
         return WEAK  # the whole range of depths lies within the noise
+    per_gain = -1.0 / gain
+    out[0] = (line[0] * b[0, 0] + line[1] * b[0, 1] + line[2] * b[0, 2]) * per_gain
+    out[1] = (line[0] * b[1, 0] + line[1] * b[1, 1] + line[2] * b[1, 2]) * per_gain
+    middle = 0.5 * (out[0] + out[1])
+    if not (middle >= q_low and middle <= q_high):
+        return OUT_OF_BEAM
+    least, most = q_low / limits[1], q_high * limits[1]
+    if not (out[0] >= least and out[0] <= most and out[1] >= least and out[1] <= most):
+        return OUT_OF_BEAM
     ux, uy = ends[2] - ends[0], ends[3] - ends[1]
     length2 = ux * ux + uy * uy
-    n0 = M[0, 0] * across[0] + M[0, 1] * across[1] + M[0, 2] * across[2]
-    n1 = M[1, 0] * across[0] + M[1, 1] * across[1] + M[1, 2] * across[2]
-    n2 = M[2, 0] * across[0] + M[2, 1] * across[1] + M[2, 2] * across[2]
-    shift = line[0] * n0 + line[1] * n1 + line[2] * n2
+    shift = line[0] * b[2, 0] + line[1] * b[2, 1] + line[2] * b[2, 2]
     t1 = t2 = g1 = g2 = h1 = h2 = 0.0
     for k in range(2):
-        b0 = M[0, 0] * ray[k, 0] + M[0, 1] * ray[k, 1] + M[0, 2] * ray[k, 2]
-        b1 = M[1, 0] * ray[k, 0] + M[1, 1] * ray[k, 1] + M[1, 2] * ray[k, 2]
-        b2 = M[2, 0] * ray[k, 0] + M[2, 1] * ray[k, 1] + M[2, 2] * ray[k, 2]
-        q = -(line[0] * b0 + line[1] * b1 + line[2] * b2) / gain
-        if not (q >= q_low / limits[1] and q <= q_high * limits[1]):
-            return OUT_OF_BEAM
-        z = q * a[2] + b2
+        q = out[k]
+        z = q * a[2] + b[k, 2]
         if z <= 0.05:
             return OUT_OF_BEAM
-        x, y = (q * a[0] + b0) / z, (q * a[1] + b1) / z
+        x, y = (q * a[0] + b[k, 0]) / z, (q * a[1] + b[k, 1]) / z
         t = ((x - ends[0]) * ux + (y - ends[1]) * uy) / length2
-        out[k] = q
         if k == 0:
             t1, g1, h1 = t, gain / z, shift / z
         else:
             t2, g2, h2 = t, gain / z, shift / z
     if directed and t2 <= t1:
-        return OUT_OF_BEAM
-    middle = 0.5 * (out[0] + out[1])
-    if not (middle >= q_low and middle <= q_high):
         return OUT_OF_BEAM
     low, high = min(t1, t2), max(t1, t2)
     overlap = min(high, 1.0) - max(low, 0.0)
@@ -157,19 +163,20 @@ def _propose_beam(
 ):  # fmt: skip
     """All pairs whose angles about the baseline overlap; return the number written, or needed if out is too short."""
     count = 0
-    work = np.empty(5)
+    work, b = np.empty(5), np.empty((3, 3))
     num_bins = len(bin_pointers) - 1
     size = 2.0 * math.pi / num_bins
     for i in range(len(rows_i)):
         s = rows_i[i]
+        _carry(M, ray[s], across[s], b)
         low, high = beam_i[i, 0], beam_i[i, 1]
         bin_low, bin_high = int(np.floor(low / size)), int(np.floor(high / size))
         for k in range(bin_low, min(bin_high, bin_low + num_bins - 1) + 1):
-            b = k % num_bins
-            for e in range(bin_pointers[b], bin_pointers[b + 1]):
+            here = k % num_bins
+            for e in range(bin_pointers[here], bin_pointers[here + 1]):
                 j = bin_members[e]
                 # A pair that shares several bins counts in the first of them.
-                if k != bin_low and int(np.floor(beam_j[j, 0] / size)) % num_bins != b:
+                if k != bin_low and int(np.floor(beam_j[j, 0] / size)) % num_bins != here:
                     continue
                 away = 0.5 * (low + high) - 0.5 * (beam_j[j, 0] + beam_j[j, 1])
                 away -= 2.0 * math.pi * math.floor(away / (2.0 * math.pi) + 0.5)
@@ -177,8 +184,8 @@ def _propose_beam(
                     continue
                 r = rows_j[j]
                 got = _propose(
-                    ray[s], across[s], sigma[s], search[s, 0], search[s, 1], ratio[s], line[r], ends[r], sigma[r], M, a,
-                    directed, min_overlap, max_relative, limits, work,
+                    b, sigma[s], search[s, 0], search[s, 1], ratio[s], line[r], ends[r], sigma[r], a, directed,
+                    min_overlap, max_relative, limits, work,
                 )  # fmt: skip
                 reached[i] = max(reached[i], got)
                 if got == PROPOSED:
@@ -198,14 +205,15 @@ def _propose_pairs(
 ):  # fmt: skip
     """Given pairs of segments; return how many proposals there are."""
     count = 0
-    work = np.empty(5)
+    work, b = np.empty(5), np.empty((3, 3))
     for k in range(len(pairs)):
         i, s, r = pairs[k, 0], start_i + pairs[k, 0], start_j + pairs[k, 1]
         if not (usable[s] and usable[r]):
             continue
+        _carry(M, ray[s], across[s], b)
         got = _propose(
-            ray[s], across[s], sigma[s], search[0], search[1], ratio[s], line[r], ends[r], sigma[r], M, a,
-            False, min_overlap, max_relative, limits, work,
+            b, sigma[s], search[0], search[1], ratio[s], line[r], ends[r], sigma[r], a, False, min_overlap,
+            max_relative, limits, work,
         )  # fmt: skip
         reached[i] = max(reached[i], got)
         if got == PROPOSED:
@@ -316,7 +324,7 @@ class Proposer:
         beam_j = angles_about_baseline(views.ray[rows_j], baseline)
         bins = _bins_of(beam_j)
         furthest = np.zeros(len(rows_i), np.int64)
-        room = _ROOM
+        room = _ROOM * len(rows_i)
         while True:
             index, values = np.empty((room, 3), np.int64), np.empty((room, 6))
             needed = _propose_beam(

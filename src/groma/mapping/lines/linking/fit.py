@@ -17,8 +17,9 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._simd import width
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators.batch_least_squares import Observations, solve_batch, solve_damped
+from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE, Observations, solve_batch, solve_damped
 from groma.estimators.two_point_line import TWO_POINT_LINE, line_residuals
+from groma.execution import map_ranges
 from groma.mapping.lines.views import LineViews
 
 #: Scale of the Cauchy loss, in sigma.
@@ -93,10 +94,14 @@ def fit_lines(
     observations = Observations(views.camera, views.image_idx[rows], own, pointers, active)
     found = solve_batch(TWO_POINT_LINE, observations, start, cauchy_scale=_CAUCHY)
     fit = Fit(found.states, np.zeros(len(rows)), np.zeros(len(start)), np.zeros(len(start)))
-    _examine(
-        observations.shared, observations.shared_idx, own, pointers, active, fit.X, found.frames,
-        fit.squared, fit.uncertainty, fit.unchecked,
-    )  # fmt: skip
+
+    def examine(part: slice) -> None:
+        _examine(
+            observations.shared, observations.shared_idx, own, pointers[part.start : part.stop + 1], active,
+            fit.X[part], found.frames[part], fit.squared, fit.uncertainty[part], fit.unchecked[part],
+        )  # fmt: skip
+
+    map_ranges(examine, len(start), PROBLEMS_AT_ONCE)
     return fit
 
 
@@ -105,6 +110,11 @@ def fit_lines(
 def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_overlap, min_px, found, distance):
     """Segments (rows) of one image that lie on projections of lines; return the number written, or needed."""
     count = 0
+    u, v, allowed = ends[rows, 0], ends[rows, 1], gate * sigma[rows] * sigma[rows]
+    for k in range(len(rows)):
+        if not usable[rows[k]]:
+            allowed[k] = -1.0
+    near = np.empty(len(rows), np.bool_)
     for e in range(len(lines)):
         n = lines[e]
         x0 = P[0, 0] * X[n, 0, 0] + P[0, 1] * X[n, 0, 1] + P[0, 2] * X[n, 0, 2] + P[0, 3]
@@ -121,16 +131,17 @@ def find_on_lines(P, X, lines, rows, ends, sigma, usable, forward, gate, min_ove
         if length < min_px:
             continue
         dx, dy = dx / length, dy / length
+        offset = x0 * dy - y0 * dx
+        for k in range(len(rows)):  # most segments are far away; this loop becomes vector instructions
+            first = u[k] * dy - v[k] * dx - offset
+            near[k] = first * first <= allowed[k]
         for k in range(len(rows)):
+            if not near[k]:
+                continue
             s = rows[k]
-            if not usable[s]:
-                continue
-            allowed = gate * sigma[s] * sigma[s]
             first = (ends[s, 0] - x0) * dy - (ends[s, 1] - y0) * dx
-            if first * first > allowed:
-                continue
             second = (ends[s, 2] - x0) * dy - (ends[s, 3] - y0) * dx
-            if first * first + second * second > allowed:
+            if first * first + second * second > allowed[k]:
                 continue
             t0 = (ends[s, 0] - x0) * dx + (ends[s, 1] - y0) * dy
             t1 = (ends[s, 2] - x0) * dx + (ends[s, 3] - y0) * dy

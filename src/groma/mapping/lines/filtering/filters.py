@@ -15,12 +15,12 @@ from scipy.special import logit
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
-from groma.mapping.lines.duplicates import not_duplicates
-from groma.mapping.lines.kinds import found_again
+from groma.mapping.lines.filtering.duplicates import not_duplicates
+from groma.mapping.lines.filtering.kinds import found_again
+from groma.mapping.lines.filtering.texture import edge_odds, num_expected
+from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
-from groma.mapping.lines.texture import edge_odds, num_expected
-from groma.mapping.lines.tracks import Tracks
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma import cameras as camera_models
 from groma._typing import FloatArray
+from groma.execution import map_work
 from groma.features.vanishing_points import find_vanishing_points
 from groma.gates import gate
 from groma.geometry import quaternion
 from groma.mapping.lines.views import LineViews
-from groma.mapping.work import map_work
 from groma.scene import Scene
 
 if TYPE_CHECKING:
@@ -49,25 +50,28 @@ def depth_ratios(
     scene: Scene, segments: Sequence[Segments], views: LineViews, gates: DirectionGates = DirectionGates()
 ) -> FloatArray:
     """Ratio q2 / q1 of each segment and its standard deviation, (S, 2); zero without a vanishing point."""
-    ratios = np.zeros((len(views.image_idx), 2))
+    work = []
+    for i in range(scene.num_images):
+        rows, camera = views.rows(i), scene.images.camera_idx[i]
+        chosen = views.usable_rows(i) - rows.start
+        chosen = chosen[np.argsort(-views.length[rows][chosen], kind="stable")[: gates.num_voters]]
+        model = camera_models.model(scene.cameras.models[camera]), scene.cameras.params_of(camera)
+        work.append((segments[i].select(chosen), chosen, views.ray[rows], scene.cam_from_world[i, :4], model))
+    return np.concatenate([np.zeros((0, 2)), *map_work(partial(_ratios_in, gates), work)])
 
-    def of_image(i: int) -> None:
-        first = views.pointers[i]
-        chosen = views.usable_rows(i) - first
-        chosen = chosen[np.argsort(-views.length[first + chosen], kind="stable")[: gates.num_voters]]
-        if len(chosen) < gates.min_voters:
-            return
-        camera = scene.images.camera_idx[i]
-        model, params = camera_models.model(scene.cameras.models[camera]), scene.cameras.params_of(camera)
-        found = find_vanishing_points(segments[i].ends[chosen], segments[i].sigma[chosen], model, params)
-        with_one = found.label >= 0
-        label = found.label[with_one]
-        sigma = np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2))[label]
-        direction = (found.directions @ quaternion.to_matrix(scene.cam_from_world[i, :4]))[label]
-        here = first + chosen[with_one]
-        ratios[here] = _ratios(views.ray[here], direction, sigma, gates.max_sigma)
 
-    map_work(of_image, range(scene.num_images))
+def _ratios_in(gates: DirectionGates, image: tuple) -> FloatArray:
+    """The same of one image, from its longest segments, which they are, and the rays of all."""
+    longest, chosen, ray, cam_from_world, (model, params) = image
+    ratios = np.zeros((len(ray), 2))
+    if len(chosen) < gates.min_voters:
+        return ratios
+    found = find_vanishing_points(longest.ends, longest.sigma, model, params)
+    with_one = found.label >= 0
+    label, here = found.label[with_one], chosen[with_one]
+    sigma = np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2))[label]
+    direction = (found.directions @ quaternion.to_matrix(cam_from_world))[label]
+    ratios[here] = _ratios(ray[here], direction, sigma, gates.max_sigma)
     return ratios
 
 

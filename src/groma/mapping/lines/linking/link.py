@@ -17,9 +17,13 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.execution import map_ranges
 from groma.mapping.groups import distinct_pairs
-from groma.mapping.lines.places import Places
+from groma.mapping.lines.hypotheses.places import Places
 from groma.mapping.lines.views import LineViews
+
+#: Pairs of segments compared by one piece of work.
+_EDGES_AT_ONCE = 8192
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -142,7 +146,11 @@ def link(
         views.ends,
     )  # fmt: skip
     keep = np.zeros(len(edges), bool)
-    _mutual(edges, *tables, max_squared, keep)
+
+    def compare(part: slice) -> None:
+        _mutual(edges[part], *tables, max_squared, keep[part])
+
+    map_ranges(compare, len(edges), _EDGES_AT_ONCE)
     edges = edges[keep]
     rank = places.score * np.sqrt(views.length)
     edges = edges[np.argsort(-rank[edges].min(1), kind="stable")]

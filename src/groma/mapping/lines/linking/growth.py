@@ -2,15 +2,15 @@
 r"""From the places of single segments to lines that many images see, step by step.
 
 link
-    Segments whose places support each other become lines (:mod:`groma.mapping.lines.link`).
+    Segments whose places support each other become lines (:mod:`groma.mapping.lines.linking.link`).
 scale the noise
     The standard deviations of all segments are scaled to what the residuals of the first lines show.
 recover
     Lines are projected into the images of their neighbourhood. A free segment on a line joins it, also one whose own
     proposals were degenerate; a segment of another line is a vote that both are one.
 
-After each step lines are fitted again (:mod:`groma.mapping.lines.fit`), observations that fail a chi-square test are
-let go, and the ends of a line are cut to the part of it that at least two images see
+After each step lines are fitted again (:mod:`groma.mapping.lines.linking.fit`), observations that fail a chi-square
+test are let go, and the ends of a line are cut to the part of it that at least two images see
 (:mod:`groma.estimators.line_ends`).
 """
 
@@ -18,19 +18,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.special import ndtri
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.execution import map_work
 from groma.mapping.groups import distinct_pairs
-from groma.mapping.lines.fit import find_on_lines
 from groma.mapping.lines.gates import AGREEMENT
-from groma.mapping.lines.link import join_once, link
+from groma.mapping.lines.hypotheses.places import Places
+from groma.mapping.lines.linking.fit import find_on_lines
+from groma.mapping.lines.linking.link import join_once, link
+from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.options import MapLinesOptions
-from groma.mapping.lines.places import Places
-from groma.mapping.lines.tracks import Tracks
-from groma.mapping.work import map_work
 
 
 # ---------------------------------------------------------------------------------------------------------------- steps
@@ -119,26 +120,34 @@ def _on_lines(
     tracks: Tracks, neighbors: list[IntArray], sigma: FloatArray, forward: FloatArray, max_squared: float
 ) -> tuple[IntArray, FloatArray]:
     """Lines and segments on them (M, 2), in the images of the lines and their neighbours; and squared distances."""
-    views = tracks.views
-    reach = tracks.lines_near_images(neighbors)
-
-    def of_image(image: int) -> tuple[IntArray, FloatArray]:
-        rows = np.arange(views.pointers[image], views.pointers[image + 1])
-        hits, distances = np.empty((4096, 2), np.int64), np.empty(4096)
-        while True:
-            needed = find_on_lines(
-                views.camera[image], tracks.lines, reach[image], rows, views.ends, sigma, views.usable, forward,
-                max_squared, AGREEMENT.min_overlap, tracks.gates.min_overlap_px, hits, distances,
-            )  # fmt: skip
-            if needed <= len(hits):
-                return hits[:needed], distances[:needed]
-            hits, distances = np.empty((needed, 2), np.int64), np.empty(needed)
-
-    found = map_work(of_image, range(len(views.camera)))
+    views, gates = tracks.views, (max_squared, AGREEMENT.min_overlap, tracks.gates.min_overlap_px)
+    segments = views.ends, sigma, views.usable
+    work = [
+        (views.camera[image], lines, np.arange(views.pointers[image], views.pointers[image + 1]))
+        for image, lines in enumerate(tracks.lines_near_images(neighbors))
+    ]
+    found = map_work(partial(_on_lines_in, tracks.lines, segments, forward, gates), work)
     return (
         np.concatenate([np.empty((0, 2), np.int64), *(hits for hits, _ in found)]),
         np.concatenate([np.empty(0), *(distances for _, distances in found)]),
     )
+
+
+def _on_lines_in(
+    ends: FloatArray,
+    segments: tuple[np.ndarray, ...],
+    forward: FloatArray,
+    gates: tuple[float, float, float],
+    image: tuple[FloatArray, IntArray, IntArray],
+) -> tuple[IntArray, FloatArray]:
+    """The same of one image: its camera, lines to look for, and rows of its segments."""
+    camera, lines, rows = image
+    hits, distances = np.empty((4096, 2), np.int64), np.empty(4096)
+    while True:
+        needed = find_on_lines(camera, ends, lines, rows, *segments, forward, *gates, hits, distances)
+        if needed <= len(hits):
+            return hits[:needed], distances[:needed]
+        hits, distances = np.empty((needed, 2), np.int64), np.empty(needed)
 
 
 def _same_lines(tracks: Tracks, hit: IntArray) -> IntArray:

@@ -23,11 +23,13 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
 from groma.estimators.two_point_line import across_basis, line_residuals
+from groma.execution import map_ranges
 from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
+from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.outcomes import Outcome
-from groma.mapping.lines.tracks import Tracks
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,12 @@ def _compare(tracks: Tracks, gates: MergeGates) -> _Pairs:
     rows, pointers = tracks.table()
     H, U = np.zeros((count, 4, 4)), np.zeros((count, 2, 3))
     own = np.column_stack([views.ends[rows], tracks.sigma[rows]])
-    _information(views.camera, views.image_idx[rows], own, pointers, X, H, U)
+    image = views.image_idx[rows]
+
+    def inform(part: slice) -> None:
+        _information(views.camera, image, own, pointers[part.start : part.stop + 1], X[part], H[part], U[part])
+
+    map_ranges(inform, count, PROBLEMS_AT_ONCE)
     unit = _pixel_size(tracks)
     pairs, span = _candidates(X, gates.max_distance * unit, gates)
     a, b = pairs.T

@@ -1,28 +1,30 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The place of every segment in space: what every neighbour proposes, and what most of them agree on.
 
-One image at a time: proposals (:mod:`groma.mapping.lines.proposals`) from the segments of its neighbours, from known
-points and vanishing directions, then the choice among them (:mod:`groma.mapping.lines.consensus`).
+One image at a time: proposals from the segments of its neighbours, from known points and vanishing directions
+(:mod:`groma.mapping.lines.hypotheses.proposals`), then the choice among them
+(:mod:`groma.mapping.lines.hypotheses.consensus`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
+from groma.execution import map_work
 from groma.mapping.groups import grouped
-from groma.mapping.lines.consensus import choose
+from groma.mapping.lines.hypotheses.consensus import choose
+from groma.mapping.lines.hypotheses.proposals import WEAK, Proposer
 from groma.mapping.lines.matches import MatchProvider
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
-from groma.mapping.lines.proposals import WEAK, Proposer
 from groma.mapping.lines.views import LineViews
-from groma.mapping.work import map_work
 from groma.scene import Scene
 
 if TYPE_CHECKING:
@@ -88,36 +90,42 @@ def find_places(
     options, progress
         Gates; called with the number of images done and in all.
     """
-    proposer = Proposer(views, ratios, options)
     points = _points_by_image(scene, views) if options.use_points else [None] * scene.num_images
-    width = max(1, options.num_neighbors)
-
-    def of_image(i: int) -> Places:
-        rows, others = views.rows(i), neighbors[i]
-        count = rows.stop - rows.start
-        if len(others) == 0:
-            return Places.none(count, width, Outcome.NO_NEIGHBOR)
-        given = [_given(matches, i, int(j)) for j in others]
-        for j, pairs in zip(others, given, strict=True):
-            _check_pairs(pairs, i, int(j), views)
-        proposals = proposer.propose(i, others, given, points[i])
-        # A line of min_images images is this segment and min_images - 1 neighbours; two of them must agree.
-        chosen = choose(proposals, count, len(others), max(1, min(2, options.min_images - 1)))
-        ambiguous = chosen.found & (chosen.rival > options.max_rival * chosen.score)
-        found = chosen.found & ~ambiguous
-        supporters = np.full((count, width), -1)
-        supporters[found, : len(others)] = chosen.supporters[found]
-        rejection = np.select(
-            [found, ambiguous, proposals.reached > WEAK, proposals.reached == WEAK],
-            [Outcome.NOT_LINKED, Outcome.AMBIGUOUS, Outcome.NO_SUPPORT, Outcome.DEGENERATE],
-            Outcome.NO_MATCH,
-        )
-        return Places(found, chosen.q, chosen.covariance, np.where(found, chosen.score, 0.0), supporters, rejection)
-
-    found = [Places.none(0, width, Outcome.NO_MATCH), *map_work(of_image, range(len(neighbors)), progress)]
+    work = list(zip(range(len(neighbors)), neighbors, points, strict=True))
+    found = map_work(partial(_places_in, Proposer(views, ratios, options), matches), work, progress)
+    found = [Places.none(0, max(1, options.num_neighbors), Outcome.NO_MATCH), *found]
     columns = {item.name: np.concatenate([getattr(one, item.name) for one in found]) for item in fields(Places)}
     columns["rejection"][~views.usable] = Outcome.TOO_SHORT
     return Places(**columns)
+
+
+def _places_in(
+    proposer: Proposer,
+    matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
+    image: tuple[int, IntArray, tuple[FloatArray, FloatArray] | None],
+) -> Places:
+    """The same of one image: its number, neighbours and known points."""
+    views, options, (i, others, points) = proposer.views, proposer.options, image
+    rows, width = views.rows(i), max(1, options.num_neighbors)
+    count = rows.stop - rows.start
+    if len(others) == 0:
+        return Places.none(count, width, Outcome.NO_NEIGHBOR)
+    given = [_given(matches, i, int(j)) for j in others]
+    for j, pairs in zip(others, given, strict=True):
+        _check_pairs(pairs, i, int(j), views)
+    proposals = proposer.propose(i, others, given, points)
+    # A line of min_images images is this segment and min_images - 1 neighbours; two of them must agree.
+    chosen = choose(proposals, count, len(others), max(1, min(2, options.min_images - 1)))
+    ambiguous = chosen.found & (chosen.rival > options.max_rival * chosen.score)
+    found = chosen.found & ~ambiguous
+    supporters = np.full((count, width), -1)
+    supporters[found, : len(others)] = chosen.supporters[found]
+    rejection = np.select(
+        [found, ambiguous, proposals.reached > WEAK, proposals.reached == WEAK],
+        [Outcome.NOT_LINKED, Outcome.AMBIGUOUS, Outcome.NO_SUPPORT, Outcome.DEGENERATE],
+        Outcome.NO_MATCH,
+    )
+    return Places(found, chosen.q, chosen.covariance, np.where(found, chosen.score, 0.0), supporters, rejection)
 
 
 def _given(

@@ -21,15 +21,17 @@ Scenes without texture, such as plain boxes, keep their lines that are seen in f
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import betaln, expit, gammaln, log_expit
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.execution import map_work
 from groma.gates import gate
-from groma.mapping.lines.kinds import features_of
-from groma.mapping.lines.tracks import Tracks
+from groma.mapping.lines.filtering.kinds import features_of
+from groma.mapping.lines.linking.tracks import Tracks
 
 
 @dataclass(frozen=True)
@@ -65,20 +67,26 @@ def num_expected(tracks: Tracks, neighbors: list[IntArray], size: IntArray, min_
 
     ``size`` (C, 2) is the width and height of the images, pixels; 0 where it is not known.
     """
-    views = tracks.views
     reach = tracks.lines_near_images(neighbors)
     bound = np.where(size > 0, size, np.inf)
     count = np.zeros(tracks.num_lines, np.int64)
-    for P, lines, limit in zip(views.camera, reach, bound, strict=True):
-        x = tracks.lines[lines] @ P[:, :3].T + P[:, 3]
-        ahead = (x[..., 2] > 1e-6).all(1)
-        pixel = x[ahead, :, :2] / x[ahead, :, 2:]
-        along = pixel[:, 1] - pixel[:, 0]
-        safe = np.where(np.abs(along) < 1e-9, 1e-9, along)
-        both = np.sort([-pixel[:, 0] / safe, (limit - pixel[:, 0]) / safe], axis=0)
-        shown = (both[1].min(1).clip(max=1.0) - both[0].max(1).clip(0.0)) * np.linalg.norm(along, axis=1)
-        count[lines[ahead][shown >= min_length]] += 1
+    work = list(zip(tracks.views.camera, reach, bound, strict=True))
+    for shown in map_work(partial(_shown_in, tracks.lines, min_length), work):
+        count[shown] += 1
     return np.maximum(count, tracks.num_images())
+
+
+def _shown_in(ends: FloatArray, min_length: float, image: tuple[FloatArray, IntArray, FloatArray]) -> IntArray:
+    """Lines, of those to look for, that an image with this camera and size should show."""
+    P, lines, limit = image
+    x = ends[lines] @ P[:, :3].T + P[:, 3]
+    ahead = (x[..., 2] > 1e-6).all(1)
+    pixel = x[ahead, :, :2] / x[ahead, :, 2:]
+    along = pixel[:, 1] - pixel[:, 0]
+    safe = np.where(np.abs(along) < 1e-9, 1e-9, along)
+    both = np.sort([-pixel[:, 0] / safe, (limit - pixel[:, 0]) / safe], axis=0)
+    length = (both[1].min(1).clip(max=1.0) - both[0].max(1).clip(0.0)) * np.linalg.norm(along, axis=1)
+    return lines[ahead][length >= min_length]
 
 
 def edge_odds(

@@ -17,9 +17,9 @@ import numpy as np
 from groma._typing import BoolArray, IntArray
 from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
-from groma.mapping.lines.growth import near_lines, votes_for_same
-from groma.mapping.lines.merge import seen_apart
-from groma.mapping.lines.tracks import Tracks
+from groma.mapping.lines.linking.growth import near_lines, votes_for_same
+from groma.mapping.lines.linking.merge import seen_apart
+from groma.mapping.lines.linking.tracks import Tracks
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators.line_ends import trim
+from groma.estimators.line_ends import SegmentRays, trim
 from groma.gates import gate
 from groma.mapping.groups import grouped, num_distinct
-from groma.mapping.lines.fit import fit_lines
 from groma.mapping.lines.gates import AGREEMENT
+from groma.mapping.lines.linking.fit import fit_lines
 from groma.mapping.lines.outcomes import Outcome
 from groma.mapping.lines.views import LineViews
 
@@ -140,11 +140,12 @@ class Tracks:
         views = self.views
         rows, pointers = self.table()
         lines, uncertainty, unchecked = self.lines, self.uncertainty, self.unchecked
-        active, squared, front = np.ones(len(rows), bool), np.zeros(len(rows)), np.zeros(len(rows), bool)
+        seen = SegmentRays(views.center, views.image_idx, views.ray, views.length)
+        active, squared = np.ones(len(rows), bool), np.zeros(len(rows))
         for k in range(self.gates.fitting_rounds):
             fit = fit_lines(views, self.sigma, pointers, rows, active, lines)
-            lines, squared, uncertainty, unchecked = fit.X, fit.squared, fit.uncertainty, fit.unchecked
-            trim(views.center, views.image_idx, views.ray, views.length, pointers, rows, active, lines, front)
+            squared, uncertainty, unchecked = fit.squared, fit.uncertainty, fit.unchecked
+            lines, front = trim(seen, pointers, rows, active, fit.X)
             fits = (squared < AGREEMENT.max_squared(2)) & front
             if k == self.gates.fitting_rounds - 1:
                 fits &= active

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Names of files that stand in files: they mean something inside a folder, never outside of it.
+
+Only names are looked at. A symbolic link inside the folder is followed: it was put there by whoever made the folder.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from groma.bounded.text import shown
+from groma.errors import FileFormatError
+
+
+def stays_inside(name: str) -> bool:
+    """Whether a name, taken as a path in some folder, can only mean something in that folder."""
+    if not name or "\0" in name or os.path.isabs(name) or os.path.splitdrive(name)[0]:
+        return False
+    way = os.path.normpath(name).replace(os.sep, "/").split("/")
+    return way[0] not in ("..", "")
+
+
+def listed_file(folder: Path, name: str, place: object) -> Path:
+    """Return the path that a list means by a name.
+
+    Raises
+    ------
+    FileFormatError
+        If the name leaves the folder, or cannot be one; ``place`` says where it stands.
+    """
+    if not stays_inside(name):
+        raise FileFormatError(
+            f"{place}: expected the name of a file in {folder}; got {shown(name)}, which is none or lies outside. "
+            "Move the file into the folder, or link to it from there."
+        )
+    return folder / name
+
+
+def outside(names: Iterable[str]) -> list[str]:
+    """Return the names that leave their folder."""
+    return [name for name in names if not stays_inside(name)]
+
+
+__all__ = ["listed_file", "outside", "stays_inside"]

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One executor for all work that falls into independent pieces: images, pairs of images, chunks of lines or points.
+
+What goes through images one by one calls :func:`map_work`; what goes through many small problems in a compiled loop
+calls :func:`map_ranges`. Neither knows who does the work. That is the caller's choice, made once around it::
+
+    with work_with(8):                                  # threads; None: one for each core
+        groma.map_images(...)
+
+    with MPIPoolExecutor() as processes, work_with(processes):
+        groma.map_images(...)
+
+Threads suffice on one machine, because compiled loops and OpenCV release the interpreter. Any other
+``concurrent.futures.Executor`` is taken too. The result does not depend on the number of workers: pieces are the same
+for any number of them, and are put together in their order.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+#: Pieces of work that wait for each worker; more would only take memory.
+_WAITING = 2
+#: Calls to an executor of processes that each of its workers gets, so that all end at about the same time.
+_CALLS = 4
+
+
+@dataclass(frozen=True)
+class _Crew:
+    """Who does the work."""
+
+    #: None for the calling thread alone.
+    executor: Executor | None
+    workers: int
+
+    @property
+    def shares_memory(self) -> bool:
+        """Whether a piece of work costs nothing to hand over."""
+        return isinstance(self.executor, ThreadPoolExecutor)
+
+
+_CREW: ContextVar[_Crew | None] = ContextVar("groma_crew", default=None)
+
+
+def available_cores() -> int:
+    """Return the number of cores this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
+@contextmanager
+def work_with(workers: int | Executor | None = None) -> Iterator[None]:
+    """Do the independent pieces of work inside with some workers; an executor given around this one goes first.
+
+    Parameters
+    ----------
+    workers : int, Executor or None
+        A number of threads, one for the calling thread alone, None for one per core; or any executor of
+        ``concurrent.futures``, such as those of ``mpi4py.futures`` and ``dask.distributed``, which stays open.
+
+    Examples
+    --------
+    >>> from groma.execution import map_work, work_with
+    >>> with work_with(2):
+    ...     map_work(abs, [-1, -2, -3])
+    [1, 2, 3]
+    """
+    if _CREW.get() is not None:
+        yield
+        return
+    if workers is None:
+        workers = available_cores()
+    if isinstance(workers, Executor):
+        with _set(_Crew(workers, _num_workers(workers))):
+            yield
+    elif workers <= 1:
+        with _set(_Crew(None, 1)):
+            yield
+    else:
+        with ThreadPoolExecutor(workers, thread_name_prefix="groma") as pool, _set(_Crew(pool, workers)):
+            yield
+
+
+def num_workers() -> int:
+    """Return how many workers :func:`work_with` has given, one without it."""
+    crew = _CREW.get()
+    return 1 if crew is None else crew.workers
+
+
+def num_threads() -> int:
+    """Return how many of them are threads of this process, one if they are not."""
+    crew = _CREW.get()
+    return crew.workers if crew is not None and crew.shares_memory else 1
+
+
+def map_work(
+    function: Callable[[_Item], _Result],
+    items: Sequence[_Item],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[_Result]:
+    """Return the results of a function of every item, in the order of the items.
+
+    Parameters
+    ----------
+    function : callable
+        Must not depend on the order in which items are done, nor change anything: it may run in another thread or, as
+        a function of a module with its arguments bound by ``functools.partial``, in another process.
+    items : sequence
+        Images or chunks, by number.
+    progress : callable, optional
+        Called in this thread with the number of items done and their total, before the first and after each. It may
+        raise to end the work.
+    """
+    total, crew = len(items), _CREW.get()
+    say = progress or (lambda done, total: None)
+    results: list[_Result] = []
+    say(0, total)
+    if crew is None or crew.executor is None or total < 2:
+        for item in items:
+            results.append(function(item))
+            say(len(results), total)
+        return results
+    size = 1 if crew.shares_memory else -(-total // (_CALLS * crew.workers))
+    calls = (items[first : first + size] for first in range(0, total, size))
+    pending: deque[Future[list[_Result]]] = deque()
+    try:
+        for call in calls:
+            pending.append(crew.executor.submit(_each, function, call))
+            if len(pending) > _WAITING * crew.workers:
+                results += pending.popleft().result()
+                say(len(results), total)
+        while pending:
+            results += pending.popleft().result()
+            say(len(results), total)
+    finally:
+        for future in pending:
+            future.cancel()
+        wait(pending)
+    return results
+
+
+def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
+    """Do what :func:`map_work` does in threads, if that is what :func:`work_with` has given, else in this thread.
+
+    It is for pieces that share more memory than they are worth: they are not sent to other processes.
+    """
+    return map_work(function, items) if num_threads() > 1 else [function(item) for item in items]
+
+
+def map_ranges(function: Callable[[slice], Any], count: int, size: int) -> None:
+    """Call a function that writes into arrays with slices of ``size`` rows that cover ``count``, in threads.
+
+    The rows of a slice must depend on no other row.
+    """
+    map_in_threads(function, [slice(first, min(first + size, count)) for first in range(0, count, size)])
+
+
+def _each(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
+    """Do some of the work, where a worker is."""
+    return [function(item) for item in items]
+
+
+@contextmanager
+def _set(crew: _Crew) -> Iterator[None]:
+    token = _CREW.set(crew)
+    try:
+        yield
+    finally:
+        _CREW.reset(token)
+
+
+def _num_workers(executor: Any) -> int:
+    """How many workers an executor has, as far as it tells."""
+    for name in ("_max_workers", "num_workers"):
+        number = getattr(executor, name, None)
+        if isinstance(number, int) and number > 0:
+            return number
+    client = getattr(executor, "_client", None)  # of dask.distributed
+    return max(1, sum(client.nthreads().values())) if client is not None else available_cores()
+
+
+__all__ = [
+    "available_cores",
+    "map_in_threads",
+    "map_ranges",
+    "map_work",
+    "num_threads",
+    "num_workers",
+    "work_with",
+]

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Work in independent pieces: its order, its end, and the same result whoever does it."""
+
+import importlib.util
+import multiprocessing
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import threading
+import time
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import nullcontext
+from functools import partial
+
+import numpy as np
+import pytest
+from _wireframe import arc, random_lines, wireframe
+
+from groma.execution import available_cores, map_ranges, map_work, num_workers, work_with
+from groma.mapping.lines.build import MapLinesOptions, map_lines
+
+
+def processes() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(2, multiprocessing.get_context("spawn"))
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_work_keeps_its_order_and_ends_with_an_error(workers):
+    said = []
+    with work_with(workers):
+        found = map_work(lambda i: i * i, range(7), lambda done, total: said.append((done, total)))
+        assert found == [i * i for i in range(7)]
+        assert said == [(done, 7) for done in range(8)]
+        assert map_work(str, []) == []
+        done = []
+
+        def interrupted(number, _):
+            if number == 2:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            map_work(done.append, range(10_000), interrupted)
+        assert len(done) < 100
+        with pytest.raises(ZeroDivisionError):
+            map_work(lambda i: 1 // i, [1, 0, 1])
+        assert map_work(abs, [-1, -2]) == [1, 2]  # the executor is as good as before
+
+
+def test_few_pieces_wait_at_a_time():
+    started, lock = [], threading.Lock()
+    taken = 0
+
+    def work(i):
+        with lock:
+            started.append(i)
+        time.sleep(1e-3)
+        return i
+
+    def progress(done, total):
+        nonlocal taken
+        taken = max(taken, len(started) - done)
+
+    with work_with(2):
+        map_work(work, range(60), progress)
+    assert len(started) == 60
+    assert taken <= 2 * 2 + 1
+
+
+def test_workers_are_those_given_outermost_and_none_inside_a_worker():
+    assert num_workers() == 1
+    with work_with(3):
+        assert num_workers() == 3
+        with work_with(1):
+            assert num_workers() == 3
+        assert map_work(lambda _: num_workers(), range(4)) == [1] * 4
+    with work_with():
+        assert num_workers() == available_cores()
+    with ThreadPoolExecutor(5) as pool, work_with(pool):
+        assert num_workers() == 5
+    assert num_workers() == 1
+
+
+@pytest.mark.parametrize("workers", [1, 4])
+def test_ranges_cover_all_rows_once(workers):
+    count = np.zeros(1001, int)
+
+    def add(part):
+        count[part] += 1
+
+    with work_with(workers):
+        map_ranges(add, len(count), 64)
+        map_ranges(add, 0, 64)
+    assert (count == 1).all()
+
+
+@pytest.mark.parametrize("make", [partial(nullcontext, 1), partial(nullcontext, 3), processes], ids=["1", "3", "spawn"])
+def test_lines_do_not_depend_on_who_maps_them(make):
+    same_lines_as_alone(make())
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mpi4py") is None, reason="mpi4py is not installed")
+def test_lines_mapped_by_mpi():
+    mpiexec = shutil.which("mpiexec", path=sysconfig.get_path("scripts")) or shutil.which("mpiexec")
+    if mpiexec is None:
+        pytest.skip("there is no mpiexec")
+    command = [mpiexec, "-n", "3", sys.executable, "-m", "mpi4py.futures", __file__]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    said = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
+    assert said.returncode == 0, said.stderr
+    assert said.stdout.split() == ["2", "workers", "agree"]
+
+
+@pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask.distributed is not installed")
+def test_lines_mapped_by_dask():
+    from distributed import Client
+
+    with Client(n_workers=2, threads_per_worker=1, dashboard_address=None) as client:
+        same_lines_as_alone(client.get_executor())
+
+
+def same_lines_as_alone(workers):
+    """Compare all that mapping says of a small wireframe."""
+    rng = np.random.default_rng(4)
+    world = wireframe(arc(5), random_lines(40, rng), rng)
+    alone, found = None, None
+    with work_with(1):
+        alone = map_lines(world.scene, world.segments, None, MapLinesOptions())
+    with workers as chosen:
+        assert isinstance(chosen, int | Executor)
+        with work_with(chosen):
+            found = map_lines(world.scene, world.segments, None, MapLinesOptions())
+    assert alone.num_lines > 20
+    for name in ("lines", "segments", "image_idx", "segment_idx", "line_idx", "residual", "uncertainty"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+
+
+if __name__ == "__main__":
+    from mpi4py.futures import MPIPoolExecutor
+
+    with MPIPoolExecutor() as ranks:
+        number = ranks.num_workers
+        same_lines_as_alone(ranks)
+        print(number, "workers agree")
