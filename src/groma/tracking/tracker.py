@@ -96,19 +96,14 @@ class Tracker:
         """The map so far."""
         return self._mapper.map
 
-    @property
-    def better_turn(self) -> RightTurn | None:
-        """How the right camera is turned, where that differs so much from what was taken that a track of the same
-        frames that knows it from the start is better: frames that can be read again should be.
-        """
-        return self._mapper.better_turn
-
-    def begun_anew(self) -> Tracker:
-        """End this track without a result; return one for the same frames that knows the right camera better."""
+    def begun_anew(self) -> Tracker | None:
+        """End this track and return one for the same frames, if the right camera is turned far from what was taken."""
+        if self._mapper.better_turn is None:
+            return None
         self._finished = True
         self._mapper.abandon()
         self._mapper.close()
-        return Tracker(self._given, self.options, self.better_turn)
+        return Tracker(self._given, self.options, self._mapper.better_turn)
 
     # ------------------------------------------------------------------------------------------------- each frame
 
@@ -363,8 +358,7 @@ class Tracker:
 
         A step that fails, or that Ctrl-C interrupts, is left out; a warning says so.
         """
-        mapper, history = self._mapper, self._history
-        self._finished = True
+        self._finished, mapper, history = True, self._mapper, self._history
         ending = Ending(mapper, history)
         ending.settle(self._present)
         where = ending.join()

@@ -61,7 +61,9 @@ def estimate_turn(
         return known, None
     held = np.arange(len(living)) == 0
     own = so3.exp(-turn.angles[None])[0]
-    prior = RightTurnPrior(_log(own @ _exp(known.angles)), np.linalg.cholesky(np.linalg.inv(known.covariance)).T)
+    prior = RightTurnPrior(
+        _log(own @ _exp(known.angles)), np.asarray(np.linalg.cholesky(np.linalg.inv(known.covariance)).T, np.float64)
+    )
     options = replace(TRACKING, lines=False, planes=False, right_turn=prior)
     job = job_of(track_map, camera, living, held, False, gates.max_iterations, options, gates.min_views)
     if job is None or np.isfinite(job.point_table.right[:, 0]).sum() < gates.min_columns:
@@ -73,11 +75,11 @@ def estimate_turn(
         covariance = Covariances(job.solved).of(RIGHT_CAMERAS, 0)[0, 3:, 3:]
     except ProblemError:
         return known, None
-    # The stated noise of columns is a guess; what they tell on their own is weighted anew.
+    # What columns tell on their own counts for less where their errors are alike.
     both, beforehand = np.linalg.inv(covariance), np.linalg.inv(known.covariance)
     alike = _alike(job, camera, rotation, gates)
     columns, pull = (both - beforehand) / alike, (both @ _log(rotation) - beforehand @ prior.angles) / alike
-    covariance = np.linalg.inv(columns + beforehand)
+    covariance = np.asarray(np.linalg.inv(columns + beforehand), np.float64)
     angles = covariance @ (pull + beforehand @ prior.angles)
     return RightTurn(_log(_exp(turn.angles) @ _exp(angles)), covariance), job
 
@@ -97,7 +99,7 @@ def _alike(job: AdjustmentJob, camera: TrackCamera, rotation: FloatArray, gates:
     """How much larger the variance of a mean column is than that of independent errors of the stated noise.
 
     The errors of neighbouring points are alike in all pairs, since most are what the lens model left; the sums of
-    cells of the image are independent.
+    cells of the image are independent. The stated noise is a bound: points that drift along a surface are no better.
     """
     assert job.solved is not None
     table = job.point_table
@@ -109,7 +111,7 @@ def _alike(job: AdjustmentJob, camera: TrackCamera, rotation: FloatArray, gates:
         good = np.abs(error) < GATE
     cells = cells_of(camera, table.pixel[good], gates)
     sums = np.bincount(cells, weights=error[good])
-    return max(float((sums**2).sum()), float((error[good] ** 2).sum())) / max(int(good.sum()), 1)
+    return max(float((sums**2).sum()) / max(int(good.sum()), 1), 1.0)
 
 
 def shift_between(camera: TrackCamera, old: RightTurn, new: RightTurn) -> float:
@@ -167,7 +169,7 @@ class _Change:
     new: FloatArray
 
     def stretch(self, in_cam: FloatArray) -> FloatArray:
-        """Move points (N, 3) in a camera along their rays to where the corrected disparity puts them; NaN if nowhere."""
+        """Move points (N, 3) in a camera along their rays to where corrected disparities put them; NaN if nowhere."""
         pixels = self.camera.project(in_cam)
         depth = retargeted_depths(self.camera, pixels, in_cam[:, 2], self.old, self.new)
         return in_cam * (depth / in_cam[:, 2])[:, None]
@@ -195,9 +197,7 @@ def _lines_in_cameras(track_map: TrackMap, change: _Change):
     if not len(rows):
         return rows, np.zeros((0, 2, 3))
     first = np.array([track_map.pose_of(int(k)) for k in lines.first_keyframe[rows]])
-    ends = np.stack(
-        [change.stretch(se3.transform_points(first, lines.segment[rows, k])) for k in (0, 1)], axis=1
-    )
+    ends = np.stack([change.stretch(se3.transform_points(first, lines.segment[rows, k])) for k in (0, 1)], axis=1)
     lost = np.isnan(ends).any(axis=(1, 2))
     track_map.drop_lines(rows[lost])
     return rows[~lost], ends[~lost]
@@ -213,9 +213,7 @@ def _correct_keyframe(keyframe: Keyframe, change: _Change, options: TrackOptions
     )
     lines = replace(lines, inverse_depth=retargeted_ends(camera, lines.ends, lines.inverse_depth, old, new))
     keyframe.measured = replace(keyframe.measured, points=points, lines=lines)
-    keyframe.features = replace(
-        features, depth=retargeted_depths(camera, features.pixel, features.depth, old, new)
-    )
+    keyframe.features = replace(features, depth=retargeted_depths(camera, features.pixel, features.depth, old, new))
     if len(keyframe.depth_grid):
         grid = grid_pixels(camera, options.gates.depth)
         keyframe.depth_grid = retargeted_depths(camera, grid, keyframe.depth_grid, old, new)

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
+from groma.features.images import GrayImage
 from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
 from groma.tracking.frame.camera import TrackCamera
@@ -23,9 +24,14 @@ from groma.tracking.frame.depth import (
     depth_sigma,
     segment_inverse_depths,
 )
-from groma.features.images import GrayImage
 from groma.tracking.frame.planes import FramePlanes, frame_planes
-from groma.tracking.frame.rectification import RightCamera, retargeted, retargeted_depths, retargeted_ends, turned_disparities
+from groma.tracking.frame.rectification import (
+    RightCamera,
+    retargeted,
+    retargeted_depths,
+    retargeted_ends,
+    turned_disparities,
+)
 from groma.tracking.frame.sparse_depth import fill_sparse
 from groma.tracking.frame.stereo import Disparities, dense_disparities, match_right
 from groma.tracking.gates import DEFAULT, DepthGates, FeatureGates
@@ -192,8 +198,14 @@ class FrameFeatures:
         raw = np.ascontiguousarray(self.frame.right)
         turn, none = self._turn, np.zeros(3)
         return match_right(
-            self.gray, raw, pixels, expected, coarse, gates,
-            lambda p: retargeted(self.camera, p, none, -turn), lambda p: retargeted(self.camera, p, none, turn),
+            self.gray,
+            raw,
+            pixels,
+            expected,
+            coarse,
+            gates,
+            lambda p: retargeted(self.camera, p, none, -turn),
+            lambda p: retargeted(self.camera, p, none, turn),
         )
 
     @cached_property

@@ -2,7 +2,7 @@
 r"""Pairs whose right camera is turned a little.
 
 A pixel p of the rectified right image is seen at :math:`K\,\mathrm{Exp}(\omega)\,K^{-1} p`. With
-:math:`x = (u - c_x)/f_x,\ y = (v - c_y)/f_y` small angles :math:`\omega` (pitch, yaw, roll: about x, y and z) shift it by
+:math:`x = (u - c_x)/f_x,\ y = (v - c_y)/f_y` small angles :math:`\omega` (pitch, yaw, roll: about x, y, z) shift it by
 
 .. math:: \delta u = f_x \big(\omega_y (1 + x^2) - \omega_x x y - \omega_z y\big), \qquad
           \delta v = f_y \big(\omega_z x - \omega_x (1 + y^2) + \omega_y x y\big).
@@ -49,7 +49,7 @@ class RightTurn:
     def joined(self, other: FloatArray, information: FloatArray) -> RightTurn:
         """Return the estimate that takes independent angles into account."""
         own = np.linalg.inv(self.covariance)
-        covariance = np.linalg.inv(own + information)
+        covariance = np.asarray(np.linalg.inv(own + information), np.float64)
         return RightTurn(covariance @ (own @ self.angles + information @ other), covariance)
 
     def numbers(self, camera: TrackCamera) -> dict[str, list[float]]:
@@ -100,7 +100,8 @@ def rows_turned_back(camera: TrackCamera, right: GrayImage, angles: FloatArray) 
     x, y = (u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy
     pitch, yaw, roll = angles.astype(np.float32)
     row = v + camera.fy * (roll * x - pitch * (1 + y * y) + yaw * x * y)
-    return cv2.remap(right, u, row.astype(np.float32), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    moved = cv2.remap(right, u, row.astype(np.float32), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(moved, np.uint8)
 
 
 def turned_disparities(camera: TrackCamera, disparities: Disparities, angles: FloatArray) -> Disparities:
@@ -163,7 +164,7 @@ def find_pairs(
         if not found:
             return np.zeros((0, 2)), np.zeros((0, 2))
         places.append(np.asarray(cv2.KeyPoint.convert(found), np.float64) + 0.5)
-        bits.append(np.unpackbits(descriptors, axis=1).astype(np.float32))
+        bits.append(np.unpackbits(np.asarray(descriptors, np.uint8), axis=1).astype(np.float32))
     here, there = places
     band = camera.fx * np.radians(gates.band_deg)
     disparity, row = here[:, None, 0] - there[None, :, 0], there[None, :, 1] - here[:, None, 1]
@@ -194,16 +195,19 @@ def fit_rows(
     count = len(np.unique(cells))
     if len(left) < gates.min_pairs or count <= gates.min_cells:
         return np.zeros(3), np.zeros((3, 3))
-    weight, angles, inverse = np.ones(len(left)), np.zeros(3), np.eye(3)
+    angles, error, share = np.zeros(3), offset, np.zeros(len(left))
     loose = np.eye(3) / np.radians(gates.keystone_deg) ** 2
     for _ in range(gates.iterations):
-        inverse = np.linalg.inv((basis * weight[:, None]).T @ basis + loose)
-        angles = inverse @ (basis.T @ (weight * offset))
+        weighted = basis / (1.0 + share[:, None]) ** 2
+        angles = np.linalg.solve(weighted.T @ basis + loose, weighted.T @ offset)
         error = offset - basis @ angles
         scale = max(1.4826 * float(np.median(np.abs(error))), _LEAST_SCALE)
-        weight = 1.0 / (1.0 + (error / (gates.loss * scale)) ** 2)
-    push = basis * (weight * error)[:, None]  # pyright: ignore[reportPossiblyUnboundVariable]
+        share = (error / (gates.loss * scale)) ** 2
+    # The covariance of a robust estimate from independent sums: how they push, by how the push changes with the angles.
+    push = basis * (error / (1.0 + share) ** 2)[:, None]
     pushes = np.stack([np.bincount(cells, weights=column) for column in push.T], axis=1)
+    slope = (1.0 - 3.0 * share) / (1.0 + share) ** 3
+    inverse = np.linalg.inv((basis * slope[:, None]).T @ basis + loose)
     covariance = inverse @ (pushes.T @ pushes) @ inverse * count / (count - 3)
     kept = [0, 2]
     information = np.zeros((3, 3))

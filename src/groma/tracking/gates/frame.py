@@ -128,25 +128,36 @@ class RectificationGates:
     )
     num_features: int = gate(1500, "features", "described in each image of the first pairs", "cost: 0.1 seconds")
     max_disparity: float = gate(0.2, "share", "largest disparity, of the width of the image", "cost: search is wide")
-    max_shift: float = gate(2.5, "px", "a described feature is refined by less", "derived from five pixels of coarse scales")
+    max_shift: float = gate(
+        2.5, "px", "a described feature is refined by less", "derived from five pixels of coarse scales"
+    )
     looks: int = gate(10, "pairs", "pairs that are asked until one shows enough", "cost: 0.1 seconds each")
-    loss: float = gate(2.385, "scales", "scale of the Cauchy loss of rows", "derived from 95 % efficiency on normal noise")
+    loss: float = gate(3.0, "sigma", "scale of the Geman-McClure loss of rows", "derived from normal noise: 3 sigma")
     iterations: int = gate(15, "steps", "reweighted fits of rows", "cost: converges in fewer")
     cells: int = gate(8, "cells", "cells along the width, within which errors are alike", "chosen on KITTI 06")
-    min_cells: int = gate(6, "cells", "cells that show points; three numbers are fitted", "derived from twice the numbers")
+    min_cells: int = gate(
+        6, "cells", "cells that show points; three numbers are fitted", "derived from twice the numbers"
+    )
     min_pairs: int = gate(30, "points", "points found in both images", "derived from five a cell")
-    min_keyframes: int = gate(3, "keyframes", "keyframes that tell yaw", "derived from the gauge: two are as good as held")
+    min_keyframes: int = gate(
+        3, "keyframes", "keyframes that tell yaw", "derived from the gauge: two are as good as held"
+    )
     min_columns: int = gate(200, "points", "columns that tell yaw", "chosen on KITTI 06")
     min_views: int = gate(
         3, "keyframes", "see a point whose columns count: in two of them its place gives way", "derived from redundancy"
     )
     max_iterations: int = gate(50, "steps", "steps of the adjustment that tells yaw", "cost: converges in fewer")
-    growth: float = gate(1.5, "ratio", "angles are estimated anew when so many more keyframes tell them", "cost: adds up")
+    growth: float = gate(
+        1.5, "ratio", "angles are estimated anew when so many more keyframes tell them", "cost: adds up"
+    )
     start_over_keyframes: int = gate(
         8, "keyframes", "tell whether a sequence is tracked from its start again", "chosen on KITTI 06"
     )
     start_over: float = gate(
-        0.3, "px", "with a larger error in the right image the first landmarks are not worth keeping", "chosen on KITTI 06"
+        0.3,
+        "px",
+        "with a larger error in the right image the first landmarks are not worth keeping",
+        "chosen on KITTI 06",
     )
     matters: float = gate(0.05, "px", "a smaller change in the right image is not worth adjusting anew", "cost: time")
 
