@@ -99,7 +99,7 @@ def _alike(job: AdjustmentJob, camera: TrackCamera, rotation: FloatArray, gates:
     """How much larger the variance of a mean column is than that of independent errors of the stated noise.
 
     The errors of neighbouring points are alike in all pairs, since most are what the lens model left; the sums of
-    cells of the image are independent. The stated noise is a bound: points that drift along a surface are no better.
+    cells of the image are independent. In the left images, which tell motion, neighbours drift alike in each of them.
     """
     assert job.solved is not None
     table = job.point_table
@@ -109,9 +109,14 @@ def _alike(job: AdjustmentJob, camera: TrackCamera, rotation: FloatArray, gates:
     error = (column - table.right[:, 0]) / table.sigma
     with np.errstate(invalid="ignore"):
         good = np.abs(error) < GATE
-    cells = cells_of(camera, table.pixel[good], gates)
-    sums = np.bincount(cells, weights=error[good])
-    return max(float((sums**2).sum()) / max(int(good.sum()), 1), 1.0)
+    if not good.any():
+        return 1.0
+    cells = cells_of(camera, table.pixel, gates)[good]
+    _, places_of = np.unique(np.column_stack([job.point_pose[good], cells]), axis=0, return_inverse=True)
+    left = ((camera.project(at) - table.pixel) / table.sigma[:, None])[good]
+    sums = [np.bincount(cells, weights=error[good])]
+    sums += [np.bincount(places_of.ravel(), weights=column) for column in np.clip(left, -GATE, GATE).T]
+    return max(float((of**2).sum()) for of in sums) / int(good.sum())
 
 
 def shift_between(camera: TrackCamera, old: RightTurn, new: RightTurn) -> float:
