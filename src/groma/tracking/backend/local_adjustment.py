@@ -55,12 +55,13 @@ class AdjustmentJob:
     line_rows: IntArray
     line_pose: IntArray
     max_iterations: int = 6
+    function_tolerance: float = 1e-3
     report: SolveReport | None = None
     solved: Problem | None = field(default=None)
 
     def solve(self) -> None:
         """Solve; reads and changes nothing but this job."""
-        options = SolverOptions(max_iterations=self.max_iterations, function_tolerance=1e-3, threads=1)
+        options = SolverOptions(max_iterations=self.max_iterations, function_tolerance=self.function_tolerance, threads=1)
         solution = solve(self.problem, options)
         self.solved, self.report = solution.problem, solution.report
 

@@ -68,6 +68,7 @@ def estimate_turn(
     job = job_of(track_map, camera, living, held, False, gates.max_iterations, options, gates.min_views)
     if job is None or np.isfinite(job.point_table.right[:, 0]).sum() < gates.min_columns:
         return known, None
+    job.function_tolerance = 1e-6
     job.solve()
     assert job.solved is not None
     rotation = quaternion.to_matrix(job.solved.variables[RIGHT_CAMERAS].state[0, :4])
