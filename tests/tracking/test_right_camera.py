@@ -149,7 +149,7 @@ def _map(seed, turn, assumed=NONE, noise=0.3, keyframes=7):
 
 @pytest.mark.parametrize("assumed", [NONE, TURN, -TURN])
 def test_a_map_tells_all_three_angles(assumed):
-    """Whatever they were turned back by; yaw to a tenth of a pixel, and within its standard deviation."""
+    """Whatever they were turned back by: to a tenth of a pixel, and yaw within its standard deviation."""
     total = 0.0
     for seed in range(4):
         track_map, _ = _map(seed, TURN, assumed)
@@ -157,12 +157,12 @@ def test_a_map_tells_all_three_angles(assumed):
         turn, job = estimate_turn(track_map, CAMERA, before, GATES)
         assert job is not None
         error = turn.angles - TURN
-        total += error @ np.linalg.inv(turn.covariance) @ error
+        total += error[1] ** 2 / turn.covariance[1, 1]
         np.testing.assert_allclose(error * [710, 700, 610], 0.0, atol=0.12)
         assert shift_between(CAMERA, before, turn) == pytest.approx(
             shift_between(CAMERA, before, RightTurn(TURN, np.eye(3))), abs=0.25
         )
-    assert total < 32.9  # chi-square of 12 degrees of freedom, one in a thousand
+    assert total < 18.5  # chi-square of 4 degrees of freedom, one in a thousand
 
 
 def test_a_camera_that_stands_tells_no_yaw():
@@ -239,7 +239,7 @@ def _turned_frames(turn, truth):
 
 def test_a_track_with_a_turned_right_camera():
     """Of 0.1, 0.2 and -0.15 degrees pitch and roll are found at once, and yaw as far as motion tells it."""
-    turn, truth = np.radians([0.1, 0.2, -0.15]), _room.poses(40)
+    turn, truth = np.radians([0.1, 0.2, -0.15]), _room.poses(60)
     tracker = Tracker(_room.camera(_room.BASELINE))
     assert {tracker.process(frame).status for frame in _turned_frames(turn, truth)} == {"tracked"}
     result = tracker.finish()

@@ -61,7 +61,9 @@ class AdjustmentJob:
 
     def solve(self) -> None:
         """Solve; reads and changes nothing but this job."""
-        options = SolverOptions(max_iterations=self.max_iterations, function_tolerance=self.function_tolerance, threads=1)
+        options = SolverOptions(
+            max_iterations=self.max_iterations, function_tolerance=self.function_tolerance, threads=1
+        )
         solution = solve(self.problem, options)
         self.solved, self.report = solution.problem, solution.report
 
