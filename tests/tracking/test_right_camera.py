@@ -142,7 +142,7 @@ def _map(seed, turn, assumed=NONE, noise=0.3, keyframes=7):
         table = PointMeasurements(rows, pixel, np.ones(len(rows)), nothing, nothing, right)
         measured = replace(Measurements.empty(), points=table)
         track_map.keyframes.append(
-            Keyframe(k, float(k), f"{k}.png", pose, None, measured, Features.none(), np.zeros(0))
+            Keyframe(k, float(k), f"{k}.png", pose, None, measured, Features.none(), np.zeros(0), 20.0)
         )
     return track_map, places
 

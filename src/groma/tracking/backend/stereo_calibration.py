@@ -57,7 +57,7 @@ def estimate_turn(
     """
     known = RightTurn.unknown(gates).joined(*_rows_of(track_map, camera, turn, gates))
     living = track_map.living()
-    if len(living) < gates.min_keyframes:
+    if len(living) < gates.min_keyframes or _step(living) > gates.max_step:
         return known, None
     held = np.arange(len(living)) == 0
     own = so3.exp(-turn.angles[None])[0]
@@ -83,6 +83,13 @@ def estimate_turn(
     covariance = np.asarray(np.linalg.inv(columns + beforehand), np.float64)
     angles = covariance @ (pull + beforehand @ prior.angles)
     return RightTurn(_log(_exp(turn.angles) @ _exp(angles)), covariance), job
+
+
+def _step(keyframes: list[Keyframe]) -> float:
+    """The usual distance from keyframe to keyframe, as a share of the depth: patches change their size by as much."""
+    centers = se3.inverse(np.array([keyframe.pose for keyframe in keyframes]))[:, 4:]
+    depth = np.array([keyframe.depth for keyframe in keyframes[1:]])
+    return float(np.median(np.linalg.norm(np.diff(centers, axis=0), axis=1) / depth))
 
 
 def _rows_of(

@@ -139,7 +139,15 @@ class RectificationGates:
         6, "cells", "cells that show points; three numbers are fitted", "derived from twice the numbers"
     )
     min_pairs: int = gate(30, "points", "points found in both images", "derived from five a cell")
-    min_keyframes: int = gate(3, "keyframes", "keyframes at which angles are first estimated", "cost: rows alone before")
+    min_keyframes: int = gate(
+        3, "keyframes", "keyframes at which angles are first estimated", "cost: rows alone before"
+    )
+    max_step: float = gate(
+        0.22,
+        "share",
+        "of the depth between keyframes; patches that grow by more slide",
+        "chosen on KITTI 06, strides 1 to 3",
+    )
     min_columns: int = gate(200, "points", "columns that tell yaw", "chosen on KITTI 06")
     min_views: int = gate(
         4,
