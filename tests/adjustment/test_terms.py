@@ -10,6 +10,7 @@ from _measured import with_measurements
 
 import groma
 from groma.adjustment.assemble import TERMS, AssemblyOptions, assemble
+from groma.adjustment.assembly_options import RightTurnPrior
 from groma.adjustment.parts import adjust_parts, write_parts
 from groma.adjustment.terms.contract import Group, Term
 from groma.errors import InputError
@@ -252,7 +253,8 @@ def test_turned_right_cameras_are_found(noisy):
     start = noisy[1]
     table = start.right_columns
     start = start.replace(right_columns=table.replace(u_right=table.u_right + 0.3))
-    options = AssemblyOptions(right_turn_sigma_px=0.5)
+    sigma = np.array([1e-5, 0.5 / start.cameras.params[0, 0], 1e-5])
+    options = AssemblyOptions(right_turn=RightTurnPrior(np.zeros(3), np.diag(1.0 / sigma)))
     solution = solve(assemble(start, options).problem, SolverOptions())
     axis = groma.geometry.quaternion.to_matrix(solution["right_cameras"][0, :4])[:, 2]
     offset = start.cameras.params[0, 0] * axis[0] / axis[2]

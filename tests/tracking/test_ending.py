@@ -134,7 +134,7 @@ def test_a_step_that_fails_at_the_end_is_told_and_left_out(monkeypatch, step, er
 def test_an_adjustment_that_does_not_converge_is_told(monkeypatch):
     tracker = _tracked(4)
     report = SolveReport(termination=Termination.MAX_ITERATIONS, iterations=15)
-    monkeypatch.setattr(Mapper, "adjust_at_end", lambda self, part: (report, 0.0))
+    monkeypatch.setattr(Mapper, "adjust_at_end", lambda self, part: (report, self.right.turn))
     assert any("did not converge in 15 steps" in sentence for sentence in tracker.finish().warnings)
 
 

@@ -18,7 +18,7 @@ from groma.tracking.frame.features import segment_noise
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.frame.planes import frame_planes
 from groma.tracking.frame.sparse_depth import fill_sparse
-from groma.tracking.frame.stereo import dense_disparities, match_columns
+from groma.tracking.frame.stereo import dense_disparities, match_right
 from groma.tracking.map.landmarks import ALIVE, DEAD, LineTable, PlaneTable, PointTable
 from groma.tracking.map.lines import assign, carried, line_ends
 from groma.tracking.map.planes import add_planes, assign_planes, merge_planes
@@ -43,7 +43,7 @@ def _points(rng, count, noise=0.5):
     seen = CAMERA.project(in_cam) + noise * rng.normal(size=(count, 2))
     nothing = np.full(count, np.nan)
     measured = PointMeasurements(
-        np.arange(count), seen, np.full(count, max(noise, 0.1)), nothing, nothing.copy(), nothing.copy()
+        np.arange(count), seen, np.full(count, max(noise, 0.1)), nothing, nothing.copy(), np.full((count, 2), np.nan)
     )
     return table, measured
 
@@ -264,11 +264,11 @@ def test_stereo_columns():
     pixel = pixel[(pixel[:, 0] > 40) & (pixel[:, 0] < 300)]
     row, column = pixel[:, 1].astype(int), pixel[:, 0].astype(int)
     expected = pixel[:, 0] - _room.FOCAL * _room.BASELINE / depth[row, column]
-    found = match_columns(left, right, pixel, np.full(len(pixel), np.nan), dense_disparities(left, right))
+    found = match_right(left, right, pixel, np.full(len(pixel), np.nan), dense_disparities(left, right))[:, 0]
     known = np.isfinite(found)
     assert known.mean() > 0.6
     assert np.median(np.abs(found - expected)[known]) < 0.15
-    near = match_columns(left, right, pixel, expected + 0.5, None)
+    near = match_right(left, right, pixel, expected + 0.5, None)[:, 0]
     assert np.nanmedian(np.abs(near - expected)) < 0.15
 
 

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from groma.tracking.frame.stereo import dense_disparities, match_columns
+from groma.tracking.frame.stereo import dense_disparities, match_right
 
 HEIGHT, WIDTH = 160, 480
 
@@ -44,6 +44,7 @@ def test_a_pixel_without_a_disparity_asks_its_neighbours():
     pixels = np.array([[200.5, 80.5], [300.5, 60.5]])
     coarse = np.zeros(left.shape, np.float32)
     unknown = np.full(2, np.nan)
-    assert np.isnan(match_columns(left, right, pixels, unknown, coarse)).all()
+    assert np.isnan(match_right(left, right, pixels, unknown, coarse)).all()
     coarse[83, 200], coarse[66, 306] = 9.4, 8.7
-    np.testing.assert_allclose(match_columns(left, right, pixels, unknown, coarse), pixels[:, 0] - 9.0, atol=0.1)
+    found = match_right(left, right, pixels, unknown, coarse)
+    np.testing.assert_allclose(found, pixels - [9.0, 0.0], atol=0.1)

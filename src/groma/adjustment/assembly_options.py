@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from groma._typing import BoolArray
+from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError
 from groma.factors.losses import Loss, Trivial
 from groma.geometry.charts.line_charts import LINE_CHARTS
@@ -19,6 +19,16 @@ SURFACE_SIGMA_PX = 0.2
 LINE_RESIDUALS = ("endpoints", "bearing", "normal")
 #: How planes measured in the camera are compared with planes: see :mod:`groma.adjustment.terms.plane_observations`.
 PLANE_RESIDUALS = ("normal_offset", "quaternion")
+
+
+@dataclass(frozen=True)
+class RightTurnPrior:
+    """What is known of the small rotation that turns right cameras away from where their columns say they look."""
+
+    #: (3,) angles about x, y and z (pitch, yaw, roll), radians.
+    angles: FloatArray
+    #: (3, 3) square root of their information.
+    sqrt_information: FloatArray
 
 
 @dataclass(frozen=True)
@@ -43,9 +53,9 @@ class AssemblyOptions:
     refine_principal_point: bool = False
     #: Estimate where cameras sit on their rig.
     refine_rigs: bool = False
-    #: Estimate by how much the right cameras of stereo pairs are turned about their vertical axis, all alike: the
-    #: standard deviation of what that shifts, known beforehand, pixels. None: rectified pairs are right as they are.
-    right_turn_sigma_px: float | None = None
+    #: Estimate how the right cameras of stereo pairs are turned, all alike, from what is known beforehand. None:
+    #: rectified pairs are right as they are.
+    right_turn: RightTurnPrior | None = None
     #: How points move: ``auto``, far ones linearly in their inverse depth; or ``euclidean``.
     point_chart: str = "auto"
     #: A name of :data:`groma.geometry.charts.line_charts.LINE_CHARTS`.
@@ -118,4 +128,4 @@ class AssemblyOptions:
         return math.sqrt((1.0 + self.line_end_correlation) / (1.0 - self.line_end_correlation))
 
 
-__all__ = ["LINE_RESIDUALS", "PLANE_RESIDUALS", "SURFACE_SIGMA_PX", "AssemblyOptions"]
+__all__ = ["LINE_RESIDUALS", "PLANE_RESIDUALS", "SURFACE_SIGMA_PX", "AssemblyOptions", "RightTurnPrior"]

@@ -17,6 +17,7 @@ from groma.io.trajectories import Trajectory
 from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.submaps import Joint, Part, Places, best_joint
+from groma.tracking.frame.rectification import RightTurn
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.outcome import History
 from groma.tracking.result import map_to_scene
@@ -87,17 +88,18 @@ class Ending:
         what = f"joining maps {joint.older + 1} and {joint.newer + 1}"
         return self.attempt(what, lambda: places.joined(joint), places)
 
-    def adjust(self, part: int) -> tuple[SolveReport | None, float]:
-        """Adjust all keyframes of a map; return the report and the offset of the right images, pixels."""
-        report, offset = self.attempt(
-            "the adjustment of all keyframes", lambda: self._mapper.adjust_at_end(part), (None, 0.0)
+    def adjust(self, part: int) -> tuple[SolveReport | None, RightTurn]:
+        """Adjust all keyframes of a map; return the report and how the right camera is turned."""
+        nothing = None, self._mapper.right.turn
+        report, turn = self.attempt(
+            "the adjustment of all keyframes", lambda: self._mapper.adjust_at_end(part), nothing
         )
         if report is not None and not report.converged:
             self.warnings.append(
                 f"The adjustment of all keyframes did not converge in {report.iterations} steps "
                 f"({report.termination.key}). groma adjust on scene.npz continues it."
             )
-        return report, offset
+        return report, turn
 
     def submap(self, root: int) -> Part:
         """Return the trajectory and the scene of a map."""

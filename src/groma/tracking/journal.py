@@ -31,6 +31,10 @@ class Journal:
         self._folder = folder
         self._next = 0.0
 
+    def begun_anew(self) -> Journal:
+        """Return an empty journal in place of this one."""
+        return Journal(self._folder)
+
     def frame(self, frame: TrackedFrame) -> None:
         """Note a frame that has a pose."""
         if frame.pose is not None:

@@ -145,7 +145,8 @@ def track(
         sequence = open_sequence(sequence)
     tracker = Tracker(sequence.camera, options)
     frames: list[TrackedFrame] = []
-    completed = _follow(tracker, sequence, frames, progress, None if work is None else Journal(Path(work)))
+    journal = None if work is None else Journal(Path(work))
+    tracker, completed = _follow(tracker, sequence, frames, progress, journal)
     if progress is not None:
         progress(TrackProgress("adjusting all keyframes", 0, 1))
     result = tracker.finish()
@@ -178,8 +179,11 @@ def _follow(
     frames: list[TrackedFrame],
     progress: Callable[[TrackProgress], bool | None] | None,
     journal: Journal | None,
-) -> bool:
-    """Track all frames, noting in ``frames`` what became of each; return whether none was left out."""
+) -> tuple[Tracker, bool]:
+    """Track all frames, noting in ``frames`` what became of each; return the tracker and whether none was left out.
+
+    Where the tracker would rather begin anew, another one does.
+    """
     total = sequence.num_frames or 0
     try:
         for frame in sequence:
@@ -192,10 +196,14 @@ def _follow(
             if journal is not None and tracked.keyframe:
                 journal.keyframe(tracker, tracked)
             if not go_on:
-                return False
+                return tracker, False
+            better = tracker.begun_anew()
+            if better is not None:
+                frames.clear()
+                return _follow(better, sequence, frames, progress, None if journal is None else journal.begun_anew())
     except KeyboardInterrupt:
-        return False
-    return True
+        return tracker, False
+    return tracker, True
 
 
 def _compared(result: TrackResult, sequence: Sequence) -> tuple[TrajectoryScores | None, str]:

@@ -30,6 +30,7 @@ from groma.tracking.frame.camera import TrackCamera, back
 from groma.tracking.frame.checks import FrameChecks
 from groma.tracking.frame.coarse_alignment import turned, turned_prediction
 from groma.tracking.frame.features import FrameFeatures, grid_pixels
+from groma.tracking.frame.rectification import RightTurn
 from groma.tracking.map.keyframes import Followed, keyframe_nearby, wants_keyframe
 from groma.tracking.map.points import find_again
 from groma.tracking.map.track_map import TrackMap
@@ -65,17 +66,21 @@ class Tracker:
         The camera of all frames; free of distortion.
     options
         See :class:`TrackOptions`.
+    right_turn
+        How the right camera of a stereo pair is turned, if that is known from a track before.
     """
 
-    def __init__(self, camera: SequenceCamera, options: TrackOptions | None = None) -> None:
+    def __init__(
+        self, camera: SequenceCamera, options: TrackOptions | None = None, right_turn: RightTurn | None = None
+    ) -> None:
         self.options = options or TrackOptions()
-        self.camera = TrackCamera.of(camera)
+        self._given, self.camera = camera, TrackCamera.of(camera)
         self.status = STARTING
         self._gates = self.options.gates.verification
         self._checks = FrameChecks(self.camera, self.options.gates.checks)
         self._motion = MotionModel(self.options.gates.motion)
         self._initialiser: Initialiser | None = None
-        self._mapper = Mapper(self.camera, self.options)
+        self._mapper = Mapper(self.camera, self.options, right_turn)
         self._present = Present()
         self._history = History()
         self._verification = PoseVerification(self.camera, self.options)
@@ -90,6 +95,15 @@ class Tracker:
     def map(self) -> TrackMap:
         """The map so far."""
         return self._mapper.map
+
+    def begun_anew(self) -> Tracker | None:
+        """End this track and return one for the same frames, if the right camera is turned far from what was taken."""
+        if self._mapper.better_turn is None:
+            return None
+        self._finished = True
+        self._mapper.abandon()
+        self._mapper.close()
+        return Tracker(self._given, self.options, self._mapper.better_turn)
 
     # ------------------------------------------------------------------------------------------------- each frame
 
@@ -114,8 +128,8 @@ class Tracker:
         reason = self._checks.reason_to_skip(frame)
         if reason:
             return self._skip(frame, reason, began)
-        data = FrameFeatures(frame, self.camera, self.options)
         present, mapper = self._present, self._mapper
+        data = FrameFeatures(frame, self.camera, self.options, mapper.right)
         mapper.advance(present, watch)
         if not self.map.keyframes:
             return self._start(data, began, watch)
@@ -340,8 +354,7 @@ class Tracker:
 
         A step that fails, or that Ctrl-C interrupts, is left out; a warning says so.
         """
-        mapper, history = self._mapper, self._history
-        self._finished = True
+        self._finished, mapper, history = True, self._mapper, self._history
         ending = Ending(mapper, history)
         ending.settle(self._present)
         where = ending.join()
@@ -359,7 +372,7 @@ class Tracker:
         warnings += about_submaps(self._breaks, where, [count[root] for root in others])
         return TrackResult(whole.trajectory, whole.scene, whole.keyframes, statistics, tuple(warnings), tuple(submaps))
 
-    def statistics(self, report: SolveReport | None = None, right_offset_px: float = 0.0) -> dict:
+    def statistics(self, report: SolveReport | None = None, right_turn: RightTurn | None = None) -> dict:
         """Return counts and times so far as plain numbers."""
         out: dict = {
             "frames": dict(self._history.statuses),
@@ -373,8 +386,8 @@ class Tracker:
             "metric": self._mapper.metric,
             "milliseconds": self._history.milliseconds(),
         }
-        if right_offset_px:
-            out["right_offset_px"] = right_offset_px
+        if self.camera.baseline > 0:
+            out["right_camera"] = (right_turn or self._mapper.right.turn).numbers(self.camera)
         if report is not None:
             out["final_adjustment"] = {"iterations": report.iterations, "seconds": dict(report.seconds)}
         return out

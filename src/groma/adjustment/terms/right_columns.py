@@ -3,9 +3,13 @@ r"""Points found in both images of rectified stereo pairs.
 
 The observation in the left image and the column in the right one are one residual of three rows under one loss
 (:mod:`groma.factors.observations.stereo_point`), so :mod:`groma.adjustment.terms.points` leaves these observations to
-this term. Where the right cameras are not quite rectified (``right_turn_sigma_px``), the column is a measurement of its
-own: the reprojection into a right camera that may turn about its vertical axis, of which only the row of the column
-counts. A turn by :math:`\alpha` shifts columns near the middle by :math:`f \alpha` pixels; a prior holds it.
+this term. Where the right cameras are not quite rectified (``right_turn``), the column is a measurement of its own: the
+reprojection into a right camera that may turn, of which only the row of the column counts. With
+:math:`x_n = (u - c_x)/f_x,\ y_n = (v - c_y)/f_y` small angles :math:`\omega` shift it by
+
+.. math:: \delta u = f_x \big( \omega_y (1 + x_n^2) - \omega_x x_n y_n - \omega_z y_n \big),
+
+so that columns tell yaw, :math:`\omega_y`, well and the others hardly; a prior holds them.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.adjustment.assembly_options import RightTurnPrior
 from groma.adjustment.terms.contract import Draft, Group, Term
 from groma.cameras import model as camera_model
 from groma.errors import InputError
@@ -22,6 +27,7 @@ from groma.factors.contract import Ref
 from groma.factors.observations.point_reprojection import PointReprojection
 from groma.factors.observations.stereo_point import StereoPoint
 from groma.factors.priors.pose_prior import PosePrior
+from groma.geometry import quaternion
 from groma.geometry.charts.pose_charts import POSE_CHARTS
 from groma.problem.variables import Variables
 
@@ -33,7 +39,7 @@ def measured_in_pairs(draft: Draft) -> BoolArray:
     """Which point observations are part of a residual with their column in the right image."""
     scene = draft.scene
     paired = np.zeros(len(scene.point_observations), dtype=bool)
-    if len(scene.right_columns) and draft.options.right_turn_sigma_px is None:
+    if len(scene.right_columns) and draft.options.right_turn is None:
         paired[_usable(draft)[1]] = True
     return paired
 
@@ -53,8 +59,8 @@ def _factors(draft: Draft) -> Iterator[Group]:
     usable, observation = _usable(draft)
     if len(usable) < len(scene.right_columns):
         draft.notes.append("Left out: columns in right images of cameras with distortion. Rectify the pairs first.")
-    if options.right_turn_sigma_px is not None:
-        yield from _turned(draft, usable, observation, options.right_turn_sigma_px)
+    if options.right_turn is not None:
+        yield from _turned(draft, usable, observation, options.right_turn)
         return
     seen, table = scene.point_observations, scene.right_columns.take(usable)
     for name, rows, intrinsics in draft.by_model(seen.image_idx[observation]):
@@ -85,21 +91,20 @@ def _weights(left: FloatArray, right: FloatArray) -> FloatArray:
     return out
 
 
-def _turned(draft: Draft, usable: IntArray, observation: IntArray, sigma_px: float) -> Iterator[Group]:
-    """Columns in right cameras that may turn about their vertical axes, and the prior that holds them."""
+def _turned(draft: Draft, usable: IntArray, observation: IntArray, prior: RightTurnPrior) -> Iterator[Group]:
+    """Columns in right cameras that may turn about their centres, and the prior that holds them."""
     scene, seen = draft.scene, draft.scene.point_observations
     if draft.has_rigs:
-        raise InputError("right_turn_sigma_px needs a scene without rigs; its images are those of the left cameras.")
+        raise InputError("right_turn needs a scene without rigs; its images are those of the left cameras.")
     table = scene.right_columns.take(usable)
     baselines, of = np.unique(table.baseline, return_inverse=True)
-    start = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(baselines), 1))
-    start[:, 4] = -baselines
-    all_but_the_turn = np.tile([True, True, True, True, False, True], (len(baselines), 1))
-    draft.variables[RIGHT_CAMERAS] = Variables(POSE_CHARTS["left"], start, all_but_the_turn)
-    focal = np.ones(len(baselines))
+    centers = np.column_stack([baselines, np.zeros((len(baselines), 2))])
+    turn = quaternion.exp(prior.angles[None])
+    start = np.hstack([np.tile(turn, (len(baselines), 1)), -quaternion.rotate(turn, centers)])
+    held = np.tile([True, True, True, False, False, False], (len(baselines), 1))
+    draft.variables[RIGHT_CAMERAS] = Variables(POSE_CHARTS["left"], start, held)
     for name, rows, intrinsics in draft.by_model(seen.image_idx[observation]):
         left = observation[rows]
-        focal[of[rows]] = draft.params(name, seen.image_idx[left])[:, camera_model(name).focal_indices[0]]
         weight = np.zeros((len(rows), 2, 2))
         weight[:, 0, 0] = 1.0 / (draft.options.point_sigma_px * table.sigma[rows])
         yield Group(
@@ -114,8 +119,8 @@ def _turned(draft: Draft, usable: IntArray, observation: IntArray, sigma_px: flo
                 extrinsics=Ref(RIGHT_CAMERAS, of[rows]),
             )
         )
-    weight = np.tile(np.eye(6), (len(baselines), 1, 1))
-    weight[:, 4, 4] = focal / sigma_px
+    weight = np.zeros((len(baselines), 6, 6))
+    weight[:, 3:, 3:] = prior.sqrt_information
     yield Group(
         PosePrior(pose=Ref(RIGHT_CAMERAS, np.arange(len(baselines))), cam_from_world=start, sqrt_information=weight)
     )

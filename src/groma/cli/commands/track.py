@@ -124,6 +124,13 @@ def _say(console: "Console", numbers: dict[str, Any]) -> None:
     total = numbers["milliseconds"].get("total")
     if total:
         console.say(f"Time per frame: median {total['median']:.1f} ms, 95 % below {total['p95']:.1f} ms")
+    if "right_camera" in numbers:
+        turn = numbers["right_camera"]
+        angles = ", ".join(
+            f"{angle:+.3f} ± {sigma:.3f} ({name})"
+            for name, angle, sigma in zip(("pitch", "yaw", "roll"), turn["angles_deg"], turn["sigma_deg"], strict=True)
+        )
+        console.say(f"The right camera is turned by {angles} degrees; this is taken into account.")
     scores = numbers.get("reference", {})
     if "ate_rmse" in scores:
         drift = scores["drift_percent"]

@@ -30,6 +30,8 @@ from groma.tracking.pose.estimate import GATE
 
 #: Keyframes outside the window that are held as its border.
 BORDER = 8
+#: Columns in right images whose noise is taken from themselves, and what it is at least, of what is stated.
+MIN_COLUMNS, LEAST_NOISE = 100, 0.05
 
 
 @dataclass
@@ -53,12 +55,15 @@ class AdjustmentJob:
     line_rows: IntArray
     line_pose: IntArray
     max_iterations: int = 6
+    function_tolerance: float = 1e-3
     report: SolveReport | None = None
     solved: Problem | None = field(default=None)
 
     def solve(self) -> None:
         """Solve; reads and changes nothing but this job."""
-        options = SolverOptions(max_iterations=self.max_iterations, function_tolerance=1e-3, threads=1)
+        options = SolverOptions(
+            max_iterations=self.max_iterations, function_tolerance=self.function_tolerance, threads=1
+        )
         solution = solve(self.problem, options)
         self.solved, self.report = solution.problem, solution.report
 
@@ -101,6 +106,7 @@ class AdjustmentJob:
             at = se3.transform_points(poses[self.point_pose], track_map.points.xyz[points.index])
             away = np.linalg.norm(self.camera.project(at) - points.pixel, axis=1) / points.sigma
             wrong = ~(away < GATE * 1.2)
+            self._forget_columns(at)
             self._forget("points", wrong, self.point_pose, self.point_rows)
             left = np.bincount(points.index[~wrong], minlength=len(track_map.points))
             gone = self.points[left[self.points] < 1]
@@ -119,6 +125,26 @@ class AdjustmentJob:
             self._forget("lines", wrong, self.line_pose, self.line_rows)
             left = np.bincount(lines.index[~wrong], minlength=len(track_map.lines))
             track_map.drop_lines(self.lines[left[self.lines] < 1])
+
+    def _forget_columns(self, at: FloatArray) -> None:
+        """Forget columns in right images that lie far from the others, as of points that are hidden there.
+
+        Their noise is a fraction of what is stated for points, so it is taken from the columns themselves.
+        """
+        table = self.point_table
+        found = np.flatnonzero(np.isfinite(table.right[:, 0]))
+        if len(found) < MIN_COLUMNS:
+            return
+        column = self.camera.project(at[found] - [self.camera.baseline, 0.0, 0.0])[:, 0]
+        error = np.abs(column - table.right[found, 0]) / table.sigma[found]
+        limit = GATE * max(1.4826 * float(np.nanmedian(error)), LEAST_NOISE)
+        wrong = found[~(error <= limit)]
+        for k in np.unique(self.point_pose[wrong]):
+            keyframe = self.keyframes[k]
+            points = keyframe.measured.points
+            right = points.right.copy()
+            right[self.point_rows[wrong[self.point_pose[wrong] == k]]] = np.nan
+            keyframe.measured = replace(keyframe.measured, points=replace(points, right=right))
 
     def _forget(self, kind: str, wrong: BoolArray, pose: IntArray, rows: IntArray) -> None:
         for k in np.unique(pose[wrong]):
@@ -165,8 +191,9 @@ def job_of(
     relations: bool,
     max_iterations: int = 6,
     options: AssemblyOptions = TRACKING,
+    min_views: int = 2,
 ) -> AdjustmentJob | None:
-    """Prepare the adjustment of some keyframes and all that at least two of them see."""
+    """Prepare the adjustment of some keyframes and all that at least two, or ``min_views``, of them see."""
     living = [track_map.living_measurements(keyframe) for keyframe in keyframes]
     rows = {}
     for kind, table in (("points", track_map.points), ("lines", track_map.lines)):
@@ -181,7 +208,7 @@ def job_of(
     in_table = {kind: np.concatenate(rows[kind]) if rows[kind] else np.zeros(0, np.int64) for kind in rows}
     # Points seen once tell nothing about poses; points that no free keyframe sees neither.
     free = ~held
-    often = np.bincount(points.index, minlength=len(track_map.points)) >= 2
+    often = np.bincount(points.index, minlength=len(track_map.points)) >= min_views
     moving = np.zeros(len(track_map.points), dtype=bool)
     moving[points.index[free[pose["points"]]]] = True
     keep = often[points.index] & moving[points.index]

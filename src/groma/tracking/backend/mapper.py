@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -13,10 +14,11 @@ from groma.geometry import se3
 from groma.solver.report import SolveReport
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
 from groma.tracking.backend.loop_closure import LoopSearch, close_loop, search_for_loop
-from groma.tracking.backend.stereo_calibration import correct_offset, estimate_offset
+from groma.tracking.backend.stereo_calibration import correct_map, estimate_turn, shift_between
 from groma.tracking.backend.submaps import Joint, find_joint, search_older_maps
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
+from groma.tracking.frame.rectification import RightCamera, RightTurn
 from groma.tracking.map.culling import drop_repeating_keyframes, drop_unseen
 from groma.tracking.map.keyframes import Followed, add_keyframe
 from groma.tracking.map.planes import merge_planes
@@ -66,12 +68,19 @@ class _Pending:
 class Mapper:
     """Makes keyframes of chosen frames and keeps the map adjusted."""
 
-    def __init__(self, camera: TrackCamera, options: TrackOptions) -> None:
+    def __init__(self, camera: TrackCamera, options: TrackOptions, right_turn: RightTurn | None = None) -> None:
         #: Maps begun so far; more than one after the track was lost for long.
         self.maps, self.current = [TrackMap()], 0
         #: How maps join older ones, by the number of the newer.
         self.joints: dict[int, Joint] = {}
         self.camera, self.options = camera, options
+        #: The right camera of stereo pairs, and the number of keyframes that tell next how it is turned.
+        self.right = RightCamera(camera, options.gates.rectification, options.gates.features, right_turn)
+        self._next_look = options.gates.rectification.min_keyframes
+        #: What the first keyframes were made with; None once the track need not start over.
+        self._assumed = self.right.turn if right_turn is None else None
+        #: How the right camera is turned, if so far from what was taken that the track should start over.
+        self.better_turn: RightTurn | None = None
         self.metric = True
         self.loops = 0
         #: A frame that is to become a keyframe; its features are being found meanwhile.
@@ -124,6 +133,7 @@ class Mapper:
 
     def choose(self, present: Present, data: FrameFeatures) -> None:
         """Choose the present frame as a keyframe; its features are found in other threads meanwhile."""
+        data.keep_up()
         if self._workers is not None:
             data.prepare(self._workers)
         near = self.map.near
@@ -163,6 +173,8 @@ class Mapper:
             if self.options.relations:
                 find_lines_on_planes(self.map)
         present.frames_since_keyframe = max(chosen.age - 1, 0)
+        with watch("right camera"):
+            self._look_at_right_camera(present)
         with watch("adjust"):
             job = window_job(self.map, self.camera, self.options.window, self.options.relations, self.metric)
             if job is not None:
@@ -226,6 +238,30 @@ class Mapper:
         """Take up the result of an adjustment."""
         _follow_world(present, job.apply(self.map))
 
+    def _look_at_right_camera(self, present: Present) -> None:
+        """Find now and then how the right camera is turned; correct the maps if that is not as it was taken to be."""
+        gates, living = self.options.gates.rectification, self.map.living()
+        if not self.camera.baseline > 0 or len(living) < self._next_look:
+            return
+        if len(living) == gates.min_keyframes and self._assumed is not None:
+            self._assumed = self.right.turn
+        self._next_look = math.ceil(gates.growth * len(living))
+        turn, job = estimate_turn(self.map, self.camera, self.right.turn, gates)
+        if self._assumed is not None and len(living) >= gates.start_over_keyframes:
+            if shift_between(self.camera, self._assumed, turn) > gates.start_over:
+                self.better_turn = turn
+            self._assumed = None
+        if shift_between(self.camera, self.right.turn, turn) > gates.matters:
+            last = self.map.last
+            before = last.pose.copy()
+            for track_map in self.maps:
+                correct_map(
+                    track_map, self.camera, self.right.turn, turn, self.options, job if track_map is self.map else None
+                )
+            self.right.turn = turn
+            self._adjust_all()
+            _follow_world(present, se3.compose(se3.inverse(last.pose[None]), before[None])[0])
+
     def _adjust_all(self) -> SolveReport | None:
         """Adjust all keyframes of the map together, twice: outliers are left out in between."""
         report, living = None, self.map.living()
@@ -253,17 +289,19 @@ class Mapper:
             if pool is not None:
                 pool.shutdown(wait=True, cancel_futures=True)
 
-    def adjust_at_end(self, part: int) -> tuple[SolveReport | None, float]:
-        """Adjust all keyframes of a map together; return the report and the offset of the right images, pixels."""
+    def adjust_at_end(self, part: int) -> tuple[SolveReport | None, RightTurn]:
+        """Adjust all keyframes of a map together; return the report and how the right camera is turned."""
         self.current = part
+        turn = self.right.turn
         if not self.options.adjust_at_end or len(self.map.living()) < 2:
-            return None, 0.0
+            return None, turn
         report = self._adjust_all()
-        offset = estimate_offset(self.map, self.camera)
-        if offset:
-            correct_offset(self.map, self.camera, offset)
-            report = self._adjust_all()
-        return report, offset
+        if self.camera.baseline > 0:
+            turn, job = estimate_turn(self.map, self.camera, self.right.turn, self.options.gates.rectification)
+            if shift_between(self.camera, self.right.turn, turn) > self.options.gates.rectification.matters:
+                correct_map(self.map, self.camera, self.right.turn, turn, self.options, job)
+                report = self._adjust_all()
+        return report, turn
 
 
 def _follow_world(present: Present, new_from_old: FloatArray) -> None:

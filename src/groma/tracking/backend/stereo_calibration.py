@@ -1,57 +1,243 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""The residual offset of a rectified pair, estimated from a finished map.
+r"""How the right camera of a rectified pair is turned, estimated from a map, and the map corrected.
 
-A rectification that is wrong by a fraction of a pixel shifts all disparities alike, and depths by
+Rectification leaves up to a tenth of a degree about each axis. The rows of points found in both images tell pitch and
+roll (:mod:`groma.tracking.frame.rectification`). Yaw shifts all disparities alike, and depths by
 :math:`\delta z / z = -\delta / d`: a wrong scale, other for near points than for far ones. Motion tells the shape of
-the scene without the pair, so near and far points together tell the offset. Here the right camera may turn a little
-about the vertical axis, which shifts its columns, against a prior that holds it where the map does not tell.
+the scene without the pair, so near and far points together tell yaw: all keyframes and points are adjusted together
+with a right camera that may turn, against a prior of what rectification leaves and what the rows tell.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from groma._typing import FloatArray
+from groma.adjustment.assembly_options import RightTurnPrior
 from groma.adjustment.terms.right_columns import RIGHT_CAMERAS
-from groma.tracking.backend.local_adjustment import job_of
-from groma.tracking.frame.camera import TrackCamera, rotation
+from groma.errors import ProblemError
+from groma.geometry import quaternion, se3, so3
+from groma.scene import Lines
+from groma.solver.covariance.marginals import Covariances
+from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of
+from groma.tracking.frame.camera import TrackCamera, back, into
+from groma.tracking.frame.features import grid_pixels
+from groma.tracking.frame.measurements import LineMeasurements
+from groma.tracking.frame.rectification import (
+    RightTurn,
+    cells_of,
+    fit_rows,
+    retargeted,
+    retargeted_depths,
+    retargeted_ends,
+    turned_pixels,
+)
+from groma.tracking.gates import RectificationGates
 from groma.tracking.map.map_scene import TRACKING
-from groma.tracking.map.track_map import TrackMap
-
-#: Standard deviation of the offset before anything is known, pixels.
-PRIOR_PX = 0.5
-#: Keyframes and measured pairs that an estimate needs.
-MIN_KEYFRAMES, MIN_PAIRS = 5, 200
-#: Larger offsets are not a matter of fractions of a pixel, and are left alone.
-MAX_PX = 1.5
+from groma.tracking.map.track_map import Keyframe, TrackMap
+from groma.tracking.options import TrackOptions
+from groma.tracking.pose.estimate import GATE
 
 
-def estimate_offset(track_map: TrackMap, camera: TrackCamera) -> float:
-    """Return by how much columns in the right image are too large, pixels; 0 where the map does not tell."""
+def estimate_turn(
+    track_map: TrackMap, camera: TrackCamera, turn: RightTurn, gates: RectificationGates
+) -> tuple[RightTurn, AdjustmentJob | None]:
+    """Return how the right camera is turned, and the adjustment that told it, if one did.
+
+    Parameters
+    ----------
+    track_map, camera
+        A map, and the camera of its keyframes.
+    turn
+        By which the right images of the map were turned back.
+    gates
+        What is known beforehand, and how much an estimate needs.
+    """
+    known = RightTurn.unknown(gates).joined(*_rows_of(track_map, camera, turn, gates))
     living = track_map.living()
-    if len(living) < MIN_KEYFRAMES or not camera.baseline > 0:
-        return 0.0
-    held = np.zeros(len(living), dtype=bool)
-    held[0] = True
-    options = replace(TRACKING, lines=False, planes=False, right_turn_sigma_px=PRIOR_PX)
-    job = job_of(track_map, camera, living, held, relations=False, max_iterations=25, options=options)
-    if job is None or np.isfinite(job.point_table.right).sum() < MIN_PAIRS:
-        return 0.0
+    if len(living) < gates.min_keyframes or _step(living) > gates.max_step:
+        return known, None
+    held = np.arange(len(living)) == 0
+    own = so3.exp(-turn.angles[None])[0]
+    prior = RightTurnPrior(
+        _log(own @ _exp(known.angles)), np.asarray(np.linalg.cholesky(np.linalg.inv(known.covariance)).T, np.float64)
+    )
+    options = replace(TRACKING, lines=False, planes=False, right_turn=prior)
+    job = job_of(track_map, camera, living, held, False, gates.max_iterations, options, gates.min_views)
+    if job is None or np.isfinite(job.point_table.right[:, 0]).sum() < gates.min_columns:
+        return known, None
+    job.function_tolerance = 1e-6
     job.solve()
     assert job.solved is not None
-    axis = rotation(job.solved.variables[RIGHT_CAMERAS].state[0])[:, 2]
-    offset = camera.fx * float(axis[0] / axis[2])
-    return offset if abs(offset) < MAX_PX else 0.0
+    rotation = quaternion.to_matrix(job.solved.variables[RIGHT_CAMERAS].state[0, :4])
+    try:
+        covariance = Covariances(job.solved).of(RIGHT_CAMERAS, 0)[0, 3:, 3:]
+    except ProblemError:
+        return known, None
+    # What columns tell on their own counts for less where their errors are alike.
+    both, beforehand = np.linalg.inv(covariance), np.linalg.inv(known.covariance)
+    alike = _alike(job, camera, rotation, gates)
+    columns, pull = (both - beforehand) / alike, (both @ _log(rotation) - beforehand @ prior.angles) / alike
+    covariance = np.asarray(np.linalg.inv(columns + beforehand), np.float64)
+    angles = covariance @ (pull + beforehand @ prior.angles)
+    return RightTurn(_log(_exp(turn.angles) @ _exp(angles)), covariance), job
 
 
-def correct_offset(track_map: TrackMap, camera: TrackCamera, offset: float) -> None:
-    """Take an offset out of all measured columns, and out of the inverse depths along segments."""
-    for keyframe in track_map.living():
-        points, lines = keyframe.measured.points, keyframe.measured.lines
-        points = replace(points, right=points.right - offset)
-        inverse = lines.inverse_depth + offset / (camera.fx * camera.baseline)
-        keyframe.measured = replace(keyframe.measured, points=points, lines=replace(lines, inverse_depth=inverse))
+def _step(keyframes: list[Keyframe]) -> float:
+    """The usual distance from keyframe to keyframe, as a share of the depth: patches change their size by as much."""
+    centers = se3.inverse(np.array([keyframe.pose for keyframe in keyframes]))[:, 4:]
+    depth = np.array([keyframe.depth for keyframe in keyframes[1:]])
+    return float(np.median(np.linalg.norm(np.diff(centers, axis=0), axis=1) / depth))
 
 
-__all__ = ["correct_offset", "estimate_offset"]
+def _rows_of(
+    track_map: TrackMap, camera: TrackCamera, turn: RightTurn, gates: RectificationGates
+) -> tuple[FloatArray, FloatArray]:
+    """Return the angles that the rows of all pairs of a map tell, and their information."""
+    tables = [keyframe.measured.points for keyframe in track_map.living()]
+    left = np.concatenate([table.pixel for table in tables])
+    right = np.concatenate([table.right for table in tables])
+    found = np.isfinite(right[:, 0])
+    return fit_rows(camera, left[found], turned_pixels(camera, right[found], _exp(turn.angles)), gates)
+
+
+def _alike(job: AdjustmentJob, camera: TrackCamera, rotation: FloatArray, gates: RectificationGates) -> float:
+    """How much larger the variance of a mean column is than that of independent errors of the stated noise.
+
+    The errors of neighbouring points are alike in all pairs, since most are what the lens model left; the sums of
+    cells of the image are independent. In the left images, which tell motion, neighbours drift alike in each of them.
+    """
+    assert job.solved is not None
+    table = job.point_table
+    poses, places = job.solved.variables["frames"].state, job.solved.variables["points"].ambient()
+    at = se3.transform_points(poses[job.point_pose], places[np.searchsorted(job.points, table.index)])
+    column = camera.project((at - [camera.baseline, 0.0, 0.0]) @ rotation.T)[:, 0]
+    error = (column - table.right[:, 0]) / table.sigma
+    with np.errstate(invalid="ignore"):
+        good = np.abs(error) < GATE
+    if not good.any():
+        return 1.0
+    cells = cells_of(camera, table.pixel, gates)[good]
+    _, places_of = np.unique(np.column_stack([job.point_pose[good], cells]), axis=0, return_inverse=True)
+    left = ((camera.project(at) - table.pixel) / table.sigma[:, None])[good]
+    sums = [np.bincount(cells, weights=error[good])]
+    sums += [np.bincount(places_of.ravel(), weights=column) for column in np.clip(left, -GATE, GATE).T]
+    return max(float((of**2).sum()) for of in sums) / int(good.sum())
+
+
+def shift_between(camera: TrackCamera, old: RightTurn, new: RightTurn) -> float:
+    """Return by how much a pixel of the right image moves at most when one turn is taken for another."""
+    corners = np.array([[x, y] for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0)]) * (camera.width, camera.height)
+    shift = retargeted(camera, corners, old.angles, new.angles) - corners
+    return float(np.abs(shift).max())
+
+
+# -------------------------------------------------------------------------------------------------- correcting maps
+
+
+def correct_map(
+    track_map: TrackMap,
+    camera: TrackCamera,
+    old: RightTurn,
+    new: RightTurn,
+    options: TrackOptions,
+    job: AdjustmentJob | None,
+) -> None:
+    """Correct all that right images told a map when they were turned back by other angles.
+
+    Parameters
+    ----------
+    track_map, camera, options
+        The map, its camera and options.
+    old, new
+        The angles, and those that are known better.
+    job
+        The adjustment of :func:`estimate_turn`, if that is the map that told the angles: its poses and points.
+    """
+    change = _Change(camera, old.angles, new.angles)
+    _correct_points(track_map, change, job)
+    rows, ends = _lines_in_cameras(track_map, change)
+    if job is not None:
+        # Old columns and lines, which are where these put them, are no judges.
+        job.line_table = LineMeasurements.empty()
+        job.point_table = replace(job.point_table, right=np.full_like(job.point_table.right, np.nan))
+        job.apply(track_map)
+    if len(rows):
+        first = np.array([track_map.pose_of(int(k)) for k in track_map.lines.first_keyframe[rows]])
+        ends = np.stack([se3.transform_points(se3.inverse(first), ends[:, k]) for k in (0, 1)], axis=1)
+        moved = Lines.through(ends)
+        track_map.lines.segment[rows], track_map.lines.plucker[rows] = moved.segments, moved.plucker
+    for keyframe in track_map.keyframes:
+        _correct_keyframe(keyframe, change, options)
+
+
+@dataclass(frozen=True)
+class _Change:
+    """From one turn of the right camera to another."""
+
+    camera: TrackCamera
+    old: FloatArray
+    new: FloatArray
+
+    def stretch(self, in_cam: FloatArray) -> FloatArray:
+        """Move points (N, 3) in a camera along their rays to where corrected disparities put them; NaN if nowhere."""
+        pixels = self.camera.project(in_cam)
+        depth = retargeted_depths(self.camera, pixels, in_cam[:, 2], self.old, self.new)
+        return in_cam * (depth / in_cam[:, 2])[:, None]
+
+
+def _correct_points(track_map: TrackMap, change: _Change, job: AdjustmentJob | None) -> None:
+    """Move points that no adjustment moves, in the keyframes that saw them first."""
+    points = track_map.points
+    loose = points.alive.copy()
+    if job is not None:
+        loose[job.points] = False
+    for index in np.unique(points.first_keyframe[loose]):
+        pose = track_map.pose_of(int(index))
+        rows = np.flatnonzero(loose & (points.first_keyframe == index))
+        moved = change.stretch(into(pose, points.xyz[rows]))
+        lost = np.isnan(moved[:, 0])
+        points.xyz[rows[~lost]] = back(pose, moved[~lost])
+        track_map.drop_points(rows[lost])
+
+
+def _lines_in_cameras(track_map: TrackMap, change: _Change):
+    """Corrected ends (n, 2, 3) of lines in the keyframes that saw them first, and their rows; drops those with none."""
+    lines = track_map.lines
+    rows = np.flatnonzero(lines.alive)
+    if not len(rows):
+        return rows, np.zeros((0, 2, 3))
+    first = np.array([track_map.pose_of(int(k)) for k in lines.first_keyframe[rows]])
+    ends = np.stack([change.stretch(se3.transform_points(first, lines.segment[rows, k])) for k in (0, 1)], axis=1)
+    lost = np.isnan(ends).any(axis=(1, 2))
+    track_map.drop_lines(rows[lost])
+    return rows[~lost], ends[~lost]
+
+
+def _correct_keyframe(keyframe: Keyframe, change: _Change, options: TrackOptions) -> None:
+    camera, old, new = change.camera, change.old, change.new
+    points, lines, features = keyframe.measured.points, keyframe.measured.lines, keyframe.features
+    points = replace(
+        points,
+        right=retargeted(camera, points.right, old, new),
+        depth=retargeted_depths(camera, points.pixel, points.depth, old, new),
+    )
+    lines = replace(lines, inverse_depth=retargeted_ends(camera, lines.ends, lines.inverse_depth, old, new))
+    keyframe.measured = replace(keyframe.measured, points=points, lines=lines)
+    keyframe.features = replace(features, depth=retargeted_depths(camera, features.pixel, features.depth, old, new))
+    if len(keyframe.depth_grid):
+        grid = grid_pixels(camera, options.gates.depth)
+        keyframe.depth_grid = retargeted_depths(camera, grid, keyframe.depth_grid, old, new)
+
+
+def _exp(angles: FloatArray) -> FloatArray:
+    return so3.exp(angles[None])[0]
+
+
+def _log(rotation: FloatArray) -> FloatArray:
+    return so3.log(rotation[None])[0]
+
+
+__all__ = ["correct_map", "estimate_turn", "shift_between"]

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
+from groma.features.images import GrayImage
 from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
 from groma.tracking.frame.camera import TrackCamera
@@ -24,8 +25,15 @@ from groma.tracking.frame.depth import (
     segment_inverse_depths,
 )
 from groma.tracking.frame.planes import FramePlanes, frame_planes
+from groma.tracking.frame.rectification import (
+    RightCamera,
+    retargeted,
+    retargeted_depths,
+    retargeted_ends,
+    turned_disparities,
+)
 from groma.tracking.frame.sparse_depth import fill_sparse
-from groma.tracking.frame.stereo import Disparities, dense_disparities, match_columns
+from groma.tracking.frame.stereo import Disparities, dense_disparities, match_right
 from groma.tracking.gates import DEFAULT, DepthGates, FeatureGates
 from groma.tracking.options import TrackOptions
 
@@ -77,9 +85,13 @@ class DetectedSegments:
 class FrameFeatures:
     """One frame and what was found in it so far."""
 
-    def __init__(self, frame: Frame, camera: TrackCamera, options: TrackOptions) -> None:
+    def __init__(
+        self, frame: Frame, camera: TrackCamera, options: TrackOptions, right_camera: RightCamera | None = None
+    ) -> None:
         self.frame, self.camera, self.options = frame, camera, options
         self.gray = np.ascontiguousarray(frame.gray)
+        self._right_camera = right_camera or RightCamera(camera, options.gates.rectification, options.gates.features)
+        self._turn = np.zeros(3)
         self._work: list[Future] = []
 
     @cached_property
@@ -129,7 +141,7 @@ class FrameFeatures:
         if self.depth is not None:
             return depth_at(self.depth, pixels, self.options.max_depth, self.options.gates.depth)
         if self.frame.right is not None:
-            disparity = pixels[:, 0] - self.right_columns(pixels)
+            disparity = pixels[:, 0] - self.right_pixels(pixels)[:, 0]
             with np.errstate(divide="ignore"):
                 depth = self.camera.fx * self.camera.baseline / disparity
             gates = self.options.gates
@@ -138,25 +150,63 @@ class FrameFeatures:
         return np.full(len(pixels), np.nan)
 
     @cached_property
+    def right(self) -> GrayImage | None:
+        """The right image of a pair, its rows moved to those of the left image."""
+        if self.frame.right is None:
+            return None
+        image = self._right_camera.rows_aligned(self.gray, self.frame.right)
+        self._turn = self._right_camera.turn.angles
+        return image
+
+    def keep_up(self) -> None:
+        """Correct what was found in the right image, if how that is turned has become known better since."""
+        old, new = self._turn, self._right_camera.turn.angles
+        if "right" not in self.__dict__ or np.array_equal(old, new):
+            return
+        for name in ("right", "disparities"):
+            self.__dict__.pop(name, None)
+        if "features" in self.__dict__:
+            depth = retargeted_depths(self.camera, self.features.pixel, self.features.depth, old, new)
+            self.features = replace(self.features, depth=depth)
+        if "depth_grid" in self.__dict__:
+            pixels = grid_pixels(self.camera, self.options.gates.depth)
+            self.depth_grid = retargeted_depths(self.camera, pixels, self.depth_grid, old, new)
+        if "detected" in self.__dict__:
+            ends = self.detected.segments.ends
+            inverse = retargeted_ends(self.camera, ends, self.detected.inverse_depth, old, new)
+            self.detected = replace(self.detected, inverse_depth=inverse)
+        self._turn = new
+
+    @cached_property
     def disparities(self) -> Disparities | None:
         """Dense disparities of a pair of images."""
-        right = self.frame.right
-        if right is None:
+        if self.right is None:
             return None
-        return dense_disparities(self.gray, np.ascontiguousarray(right), self.options.gates.stereo)
+        found = dense_disparities(self.gray, self.right, self.options.gates.stereo)
+        return turned_disparities(self.camera, found, self._turn)
 
-    def right_columns(self, pixels: FloatArray, expected: FloatArray | None = None) -> FloatArray:
-        """Columns (N,) in the right image; NaN where not found or without one.
+    def right_pixels(self, pixels: FloatArray, expected: FloatArray | None = None) -> FloatArray:
+        """Pixels (N, 2) in the right image; NaN where not found or without one.
 
         With ``expected`` (N,) columns only the points that have one are looked for.
         """
-        if self.frame.right is None:
-            return np.full(len(pixels), np.nan)
-        right = np.ascontiguousarray(self.frame.right)
+        if self.right is None:
+            return np.full((len(pixels), 2), np.nan)
         gates = self.options.gates.stereo
-        if expected is None:
-            return match_columns(self.gray, right, pixels, np.full(len(pixels), np.nan), self.disparities, gates)
-        return match_columns(self.gray, right, pixels, expected, None, gates)
+        coarse = self.disparities if expected is None else None
+        expected = np.full(len(pixels), np.nan) if expected is None else expected
+        raw = np.ascontiguousarray(self.frame.right)
+        turn, none = self._turn, np.zeros(3)
+        return match_right(
+            self.gray,
+            raw,
+            pixels,
+            expected,
+            coarse,
+            gates,
+            lambda p: retargeted(self.camera, p, none, -turn),
+            lambda p: retargeted(self.camera, p, none, turn),
+        )
 
     @cached_property
     def depth_grid(self) -> FloatArray:

@@ -53,14 +53,15 @@ class PointMeasurements(_Rows):
     #: (N,) depth and its standard deviation, scene units; NaN where unknown.
     depth: FloatArray
     depth_sigma: FloatArray
-    #: (N,) column in the right image, pixels; NaN where unknown.
+    #: (N, 2) pixel in the right image of a pair, turned back as it was known then; NaN where unknown. Its row tells
+    #: nothing but how the right camera is turned.
     right: FloatArray
 
     @classmethod
     def empty(cls) -> Self:
         """Return a table without rows."""
         none = np.zeros(0)
-        return cls(np.zeros(0, np.int64), np.zeros((0, 2)), none, none, none, none)
+        return cls(np.zeros(0, np.int64), np.zeros((0, 2)), none, none, none, np.zeros((0, 2)))
 
 
 @dataclass(frozen=True)

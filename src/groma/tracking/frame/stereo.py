@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Columns of points in the right image of a rectified pair.
+"""Points in the right image of a rectified pair.
 
 Where nothing is known, a dense comparison of blocks (OpenCV's StereoBM) gives the column to about a pixel;
-Lucas-Kanade then refines it, and the point must stay in its row. Where the depth is known, only the refinement runs.
+Lucas-Kanade then refines it, and the point must stay near its row. Where the depth is known, only the refinement runs.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -34,21 +36,25 @@ def dense_disparities(left: GrayImage, right: GrayImage, gates: StereoGates = DE
     return np.where((found > 0.5) & (found < column - gates.block // 2), found, np.float32(0.0))
 
 
-def match_columns(
+def match_right(
     left: GrayImage,
     right: GrayImage,
     pixels: FloatArray,
     expected: FloatArray,
     coarse: Disparities | None,
     gates: StereoGates = DEFAULT.stereo,
+    into_image: Callable[[FloatArray], FloatArray] = lambda pixels: pixels,
+    out_of_image: Callable[[FloatArray], FloatArray] = lambda pixels: pixels,
 ) -> FloatArray:
-    """Columns (N,) of points of the left image in the right one, pixels; NaN where not found.
+    """Pixels (N, 2) of points of the left image in the rectified right one; NaN where not found.
 
     ``expected`` (N,) are columns known beforehand; where they are NaN, the disparities ``coarse`` tell where to look.
+    The right image may be one that is not rectified: ``into_image`` moves rectified pixels there, and
+    ``out_of_image`` back. Nothing is resampled, which would shift columns by hundredths of a pixel.
     """
-    columns = np.full(len(pixels), np.nan)
+    out = np.full((len(pixels), 2), np.nan)
     if not len(pixels):
-        return columns
+        return out
     guess = np.asarray(expected, float).copy()
     unknown = ~np.isfinite(guess)
     if coarse is not None and unknown.any():
@@ -62,13 +68,15 @@ def match_columns(
         guess[unknown] = np.where(found > 0, pixels[unknown, 0] - found, np.nan)
     rows = np.flatnonzero(np.isfinite(guess))
     start = np.column_stack([guess[rows], pixels[rows, 1]])
-    there, good = follow(left, right, pixels[rows], start, levels=0, window=gates.window, round_trip=None)
+    guess_there = into_image(start)
+    there, good = follow(left, right, pixels[rows], guess_there, levels=0, window=gates.window, round_trip=None)
+    there = out_of_image(there)
     good &= (np.abs(there[:, 1] - pixels[rows, 1]) < gates.max_row) & (
         np.abs(there[:, 0] - guess[rows]) < gates.max_shift
     )
     good &= there[:, 0] < pixels[rows, 0] - 0.1
-    columns[rows[good]] = there[good, 0]
-    return columns
+    out[rows[good]] = there[good]
+    return out
 
 
 def _places_around(reach: int) -> IntArray:
@@ -77,4 +85,4 @@ def _places_around(reach: int) -> IntArray:
     return np.array(sorted(((v, u) for v in steps for u in steps), key=lambda at: at[0] ** 2 + at[1] ** 2))
 
 
-__all__ = ["Disparities", "dense_disparities", "match_columns"]
+__all__ = ["Disparities", "dense_disparities", "match_right"]

@@ -10,6 +10,7 @@ from groma.tracking.gates.frame import (
     DepthGates,
     FeatureGates,
     FramePlaneGates,
+    RectificationGates,
     SparseDepthGates,
     StereoGates,
     TurnGates,
@@ -35,6 +36,7 @@ class TrackingGates:
     sparse_depth: SparseDepthGates = field(default_factory=SparseDepthGates)
     frame_planes: FramePlaneGates = field(default_factory=FramePlaneGates)
     stereo: StereoGates = field(default_factory=StereoGates)
+    rectification: RectificationGates = field(default_factory=RectificationGates)
     features: FeatureGates = field(default_factory=FeatureGates)
     keyframes: KeyframeGates = field(default_factory=KeyframeGates)
     points: PointGates = field(default_factory=PointGates)
@@ -67,6 +69,7 @@ __all__ = [
     "MotionGates",
     "PlaneGates",
     "PointGates",
+    "RectificationGates",
     "SparseDepthGates",
     "StartGates",
     "StereoGates",

@@ -114,6 +114,64 @@ class StereoGates:
 
 
 @dataclass(frozen=True)
+class RectificationGates:
+    """How the right camera of a pair is turned."""
+
+    sigma_deg: float = gate(
+        0.1, "degree", "standard deviation of each angle before anything is known", "derived from rectified sequences"
+    )
+    band_deg: float = gate(
+        0.5, "degree", "the first pairs are searched this far from their rows", "derived from 5 standard deviations"
+    )
+    keystone_deg: float = gate(
+        2.0, "degree", "keystones and angles of rows stay well below", "derived from 20 standard deviations"
+    )
+    num_features: int = gate(1500, "features", "described in each image of the first pairs", "cost: 0.1 seconds")
+    max_disparity: float = gate(0.2, "share", "largest disparity, of the width of the image", "cost: search is wide")
+    max_shift: float = gate(
+        2.5, "px", "a described feature is refined by less", "derived from five pixels of coarse scales"
+    )
+    looks: int = gate(10, "pairs", "pairs that are asked until one shows enough", "cost: 0.1 seconds each")
+    loss: float = gate(3.0, "sigma", "scale of the Geman-McClure loss of rows", "derived from normal noise: 3 sigma")
+    iterations: int = gate(15, "steps", "reweighted fits of rows", "cost: converges in fewer")
+    cells: int = gate(8, "cells", "cells along the width, within which errors are alike", "chosen on KITTI 06")
+    min_cells: int = gate(
+        6, "cells", "cells that show points; three numbers are fitted", "derived from twice the numbers"
+    )
+    min_pairs: int = gate(30, "points", "points found in both images", "derived from five a cell")
+    min_keyframes: int = gate(
+        3, "keyframes", "keyframes at which angles are first estimated", "cost: rows alone before"
+    )
+    max_step: float = gate(
+        0.22,
+        "share",
+        "of the depth between keyframes; patches that grow by more slide",
+        "chosen on KITTI 06, strides 1 to 3",
+    )
+    min_columns: int = gate(200, "points", "columns that tell yaw", "chosen on KITTI 06")
+    min_views: int = gate(
+        4,
+        "keyframes",
+        "see a point whose columns count: wrong tracks agree with any yaw",
+        "chosen on KITTI 06, strides 1 to 3",
+    )
+    max_iterations: int = gate(50, "steps", "steps of the adjustment that tells yaw", "cost: converges in fewer")
+    growth: float = gate(
+        1.5, "ratio", "angles are estimated anew when so many more keyframes tell them", "cost: adds up"
+    )
+    start_over_keyframes: int = gate(
+        8, "keyframes", "tell whether a sequence is tracked from its start again", "chosen on KITTI 06"
+    )
+    start_over: float = gate(
+        0.3,
+        "px",
+        "with a larger error in the right image the first landmarks are not worth keeping",
+        "chosen on KITTI 06",
+    )
+    matters: float = gate(0.05, "px", "a smaller change in the right image is not worth adjusting anew", "cost: time")
+
+
+@dataclass(frozen=True)
 class FeatureGates:
     """Described features."""
 

@@ -53,8 +53,8 @@ def points_of_features(
     points.keyframe[new] = points.first_keyframe[new] = keyframe.index
     points.pixel[new] = points.first_pixel[new] = pixel
     keyframe.features = features.linked(rows, new)
-    unknown = np.full(len(new), np.nan)
-    table = PointMeasurements(new, pixel, sigma * features.scale[rows], features.depth[rows], depth_sigma, unknown)
+    nothing = np.full((len(new), 2), np.nan)
+    table = PointMeasurements(new, pixel, sigma * features.scale[rows], features.depth[rows], depth_sigma, nothing)
     keyframe.measured = replace(keyframe.measured, points=PointMeasurements.stack([keyframe.measured.points, table]))
     return new
 

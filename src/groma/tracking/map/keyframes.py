@@ -110,13 +110,13 @@ def measure_points(
     """Return what a frame measures of followed points: pixel, and depth or right column where it has them."""
     count = len(tracks)
     unknown = np.full(count, np.nan)
-    depth, right = unknown, unknown.copy()
+    depth, right = unknown, np.full((count, 2), np.nan)
     if data.frame.depth is not None:
         depth = data.depths(tracks.pixel)
     elif data.frame.right is not None:
         z = np.where(track_map.points.alive[tracks.index], into(pose, track_map.points.xyz[tracks.index])[:, 2], np.nan)
         expected = tracks.pixel[:, 0] - camera.fx * camera.baseline / np.where(z > 0, z, np.nan)
-        right = data.right_columns(tracks.pixel, expected)
+        right = data.right_pixels(tracks.pixel, expected)
     sigma = tracks.scale * options.point_sigma_px
     return PointMeasurements(tracks.index, tracks.pixel, sigma, depth, data.depth_sigma(depth), right)
 

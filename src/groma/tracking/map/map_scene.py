@@ -122,10 +122,10 @@ def _point_tables(camera: TrackCamera, table: PointMeasurements, image: IntArray
     rows = np.flatnonzero(np.isfinite(table.depth))
     if len(rows):
         tables["point_depths"] = PointDepths(image[rows], table.index[rows], table.depth[rows], table.depth_sigma[rows])
-    rows = np.flatnonzero(np.isfinite(table.right))
+    rows = np.flatnonzero(np.isfinite(table.right[:, 0]))
     if len(rows):
         baseline = np.full(len(rows), camera.baseline)
-        tables["right_columns"] = RightColumns(rows, table.right[rows], baseline, table.sigma[rows])
+        tables["right_columns"] = RightColumns(rows, table.right[rows, 0], baseline, table.sigma[rows])
     return tables
 
 

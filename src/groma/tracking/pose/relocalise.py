@@ -264,7 +264,7 @@ def _temporary_points(known: KnownFeatures, pairs: IntArray, data: FrameFeatures
     depth = data.features.depth[rows]
     sigma = data.features.scale[rows] * data.options.point_sigma_px
     depth_sigma = data.depth_sigma(depth)
-    unknown = np.full(count, np.nan)
+    unknown = np.full((count, 2), np.nan)
     table = PointMeasurements(np.arange(count), data.features.pixel[rows], sigma, depth, depth_sigma, unknown)
     return _Places(known.places[pairs[:, 0]]), table
 
