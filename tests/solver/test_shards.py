@@ -169,6 +169,7 @@ class Together:
 
     def __init__(self, count):
         self._barrier, self._given, self.size = threading.Barrier(count), {}, count
+        self.num_neighbours, self.num_cores = count, 1
         self._own = threading.local()
 
     @property
@@ -202,7 +203,9 @@ class Together:
 def of_process(problem, shards):
     """The variables of a process that has some of the shards, and these shards: landmarks of others it does not have."""
     names = {name for shard in shards for name in shard.landmarks}
-    variables = {name: group for name, group in problem.variables.items() if group.manifold.kind not in ("point", "line")}
+    variables = {
+        name: group for name, group in problem.variables.items() if group.manifold.kind not in ("point", "line")
+    }
     own, begin = [{} for _ in shards], {}
     for name in names:
         rows = [shard.landmarks[name] for shard in shards]

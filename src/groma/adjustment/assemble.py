@@ -163,6 +163,7 @@ def at_places_of(problem: Problem, scene: Scene) -> Problem:
 
 
 def camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variables]:
+    """Return the groups of frames, sensors and intrinsics, and what of them is held."""
     chart = POSE_CHARTS[options.pose_chart]
     held: bool | BoolArray = not options.refine_poses
     if options.refine_poses and options.gauge == "first_camera":

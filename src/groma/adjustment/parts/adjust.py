@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Adjustment of a scene that is too large for memory, in parts on disk.
+"""Adjustment of parts on disk, by one process or by many, in the stages of every adjustment.
 
-A part is a groma archive (``.npz``). All parts have the same cameras and images; each has landmarks of its own, with
-all their observations. One part is in memory at a time, besides the states of all cameras and landmarks; see
-:mod:`groma.solver.reduce.shards`. Points and lines take part; planes, directions and relations do not.
+::
+
+    open the parts, agree on the cameras
+    for every loss
+        solve                                             (a checkpoint after every step)
+        bring lines back that settled in wrong places     (each part on its own)
+    write the parts
 """
 
 from __future__ import annotations
@@ -15,21 +19,22 @@ from pathlib import Path
 
 import numpy as np
 
-from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble
-from groma.errors import InputError
-from groma.factors.contract import Factor
-from groma.factors.losses import Loss
-from groma.io.archive import read_archive, write_archive
-from groma.problem.problem import Problem
-from groma.problem.variables import Variables
-from groma.scene import Relations, Scene
+from groma.adjustment.adjust import COUNTED_OTHERWISE
+from groma.adjustment.assemble import AssemblyOptions
+from groma.adjustment.parts.checkpoint import FOLDER, Checkpoint, key_of
+from groma.adjustment.parts.cut import parts_of
+from groma.adjustment.parts.memory import room_for_parts
+from groma.adjustment.parts.opened import open_parts
+from groma.adjustment.parts.run import Run, Solved, Squares
+from groma.adjustment.parts.together import agreed
+from groma.adjustment.report import AdjustReport
+from groma.errors import InputError, OutputError
+from groma.factors.losses import Loss, Trivial
 from groma.solver.options import SolverOptions
-from groma.solver.reduce.shards import Shard, solve_shards
+from groma.solver.reduce.alone import Alone
+from groma.solver.reduce.contract import Reducer
 from groma.solver.report import SolveReport
 from groma.solver.solve import Progress
-
-#: Observations of a part, where a scene is cut: about 400 MB while it is worked on.
-PART_SIZE = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -39,72 +44,25 @@ class PartsResult:
     #: The archives written, in the order of the parts given.
     paths: tuple[Path, ...]
     report: SolveReport
-    warnings: tuple[str, ...] = ()
-
-
-def write_parts(
-    scene: Scene, folder: str | os.PathLike[str], observations: int = PART_SIZE, force: bool = False
-) -> tuple[Path, ...]:
-    """Cut a scene into parts with about so many observations each.
-
-    Landmarks are taken in the order of the first image that sees them, so that a part concerns few images.
-
-    Parameters
-    ----------
-    scene : Scene
-        What to cut; its relations between landmarks are left out.
-    folder : path
-        Where; made where it is missing.
-    observations : int
-        About so many in each part.
-    force : bool
-        Replace archives that exist in ``folder``.
-
-    Returns
-    -------
-    tuple of Path
-        ``part-00000.npz`` and so on, in ``folder``.
-
-    Raises
-    ------
-    InputError
-        If ``observations`` is not positive.
-    OutputError
-        If an archive exists already, or cannot be written.
-    """
-    if observations < 1:
-        raise InputError(f"A part needs at least one observation; got {observations}. The default is {PART_SIZE}.")
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    scene = scene.replace(relations=Relations())
-    seen_points = np.bincount(scene.point_observations.point_idx, minlength=scene.num_points)
-    seen_lines = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
-    seen = np.concatenate([seen_points, seen_lines])
-    first = np.full(len(seen), scene.num_images)
-    np.minimum.at(first, scene.point_observations.point_idx, scene.point_observations.image_idx)
-    np.minimum.at(first, scene.num_points + scene.line_observations.line_idx, scene.line_observations.image_idx)
-    order = np.argsort(first, kind="stable")
-    part = np.empty(len(seen), np.int64)
-    part[order] = (np.cumsum(seen[order]) - seen[order]) // observations
-    paths = []
-    for number in np.unique(part):
-        own = part == number
-        paths.append(folder / f"part-{number:05d}.npz")
-        cut = scene.keep(points=own[: scene.num_points], lines=own[scene.num_points :])
-        write_archive(cut, paths[-1], force)
-    return tuple(paths)
+    warnings: tuple[str, ...]
+    #: The same in the terms of the scene.
+    adjustment: AdjustReport
 
 
 def adjust_parts(
     parts: Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str],
-    loss: Loss | None = None,
+    loss: Loss | Sequence[Loss] | None = None,
     options: SolverOptions | None = None,
     progress: Progress | None = None,
     force: bool = False,
+    keep: str = "auto",
+    reducer: Reducer | None = None,
     **assembly: object,
 ) -> PartsResult:
     """Adjust the cameras, points and lines of all parts together.
+
+    A run that was killed goes on after its last step, if it is started again with the same parts, output and options.
 
     Parameters
     ----------
@@ -112,14 +70,19 @@ def adjust_parts(
         Archives with the same cameras and images, each with landmarks of its own.
     output : path
         Folder for the adjusted archives, which keep their names.
-    loss : Loss, optional
-        Robust loss, in standard deviations; squares if not given.
+    loss : Loss or sequence of Loss, optional
+        Robust loss, in standard deviations, or several, one after the other; squares if not given.
     options : SolverOptions, optional
         Steps, tolerances, threads.
     progress : callable, optional
-        Called after every step; return False to stop with the best state so far.
+        Called after every step; return False, on all processes, to stop with the best state so far.
     force : bool
         Replace archives that exist in ``output``.
+    keep : str
+        Whether parts stay in memory from one step to the next: ``always``, ``never``, or ``auto``, where they fit.
+    reducer : Reducer, optional
+        The processes that adjust the parts together, such as :class:`groma.solver.reduce.mpi.Ranks`; each of them calls
+        this function with the same arguments. Default: this process alone.
     **assembly
         Fields of :class:`groma.adjustment.assemble.AssemblyOptions`, such as ``refine_intrinsics``.
 
@@ -132,62 +95,98 @@ def adjust_parts(
     ------
     InputError
         If the parts do not have the same images, or there is nothing to adjust.
+    OutputError
+        If archives exist in ``output`` already, or cannot be written.
     """
+    reducer, options = reducer or Alone(), options or SolverOptions()
+    chosen = AssemblyOptions(**{"planes": False, **assembly})  # type: ignore[arg-type]
     paths = [Path(part) for part in parts]
+    with agreed(reducer):
+        _check_names(paths)
+    opened = open_parts(paths, chosen, reducer)
+    losses = [loss] if isinstance(loss, Loss) else list(loss or [Trivial()])
+    if isinstance(losses[-1], Trivial) and opened.has_lines:
+        losses = [Trivial(), Trivial()]  # lines are started anew between the two
+    how = replace(options, threads=None), losses, opened.options
+    checkpoint = Checkpoint(Path(output) / FOLDER, key_of(paths, *how), opened, reducer)
+    with agreed(reducer):
+        begin = checkpoint.load()
+    with agreed(reducer):
+        if reducer.rank == 0:
+            _prepare(Path(output), paths, begin is not None, force)
+    run = Run(opened, losses, options, progress, reducer, room_for_parts(keep, reducer), checkpoint)
+    solved = run.solve(begin)
+    after = run.write(solved, Path(output))
+    with agreed(reducer):
+        if reducer.rank == 0:
+            _tidy(Path(output), paths, checkpoint)
+    return _result(run, Path(output), solved, after)
+
+
+def _check_names(paths: Sequence[Path]) -> None:
+    if not paths:
+        raise InputError("There are no parts. Make them with groma convert MODEL PARTS --parts.")
     if len({path.name for path in paths}) < len(paths):
         raise InputError("Two parts have the same file name; the output keeps the names. Rename one.")
-    chosen = AssemblyOptions(**{"planes": False, **assembly})  # type: ignore[arg-type]
-    chosen = replace(chosen, loss=loss) if loss is not None else chosen
-    kept: dict[str, Variables] = {}
-    landmarks: dict[str, list[Variables]] = {}
-    shards, notes, first = [], set(), None
-    for path in paths:
-        scene = read_archive(path)
-        first = first or scene
-        if scene.images.names != first.images.names or scene.cameras.models != first.cameras.models:
-            raise InputError(f"{path} has other images or cameras than {paths[0]}. All parts need the same ones.")
-        made = assemble(scene, chosen)
-        notes |= set(made.notes)
-        rows = {}
-        for name, group in made.problem.variables.items():
-            if name in ("points", "lines"):
-                begin = sum(map(len, landmarks.setdefault(name, [])))
-                rows[name] = slice(begin, begin + len(group))
-                landmarks[name].append(group)
-            else:
-                kept.setdefault(name, group)
-        shards.append(Shard(rows, _Reader(path, chosen)))
-    if not landmarks:
-        raise InputError("There is nothing to adjust: no part has points or lines with observations.")
-    variables = {**kept, **{name: _joined(groups) for name, groups in landmarks.items()}}
-    solution = solve_shards(variables, shards, options, progress)
-    target = Path(output)
-    target.mkdir(parents=True, exist_ok=True)
-    written = []
-    for path, shard in zip(paths, shards, strict=True):
-        part = {
-            name: Variables(group.manifold, group.state[shard.landmarks.get(name, slice(None))])
-            for name, group in solution.variables.items()
-            if name in kept or name in shard.landmarks
-        }
-        written.append(target / path.name)
-        write_archive(disassemble(read_archive(path), Problem(part, ())), written[-1], force)
-    return PartsResult(tuple(written), solution.report, tuple(sorted(notes)))
 
 
-@dataclass(frozen=True)
-class _Reader:
-    """Makes the factors of a part from its file."""
+def _prepare(output: Path, paths: Sequence[Path], goes_on: bool, force: bool) -> None:
+    """Make the folder of the result, unless it holds results that are not to be replaced."""
+    if any(path.parent.absolute() == output.absolute() for path in paths):
+        raise OutputError(f"{output} is the folder of the parts. They are not replaced; choose another name.")
+    output.mkdir(parents=True, exist_ok=True)
+    if goes_on or force:
+        return
+    if (output / FOLDER).exists():
+        raise OutputError(
+            f"{output} holds what an adjustment of other parts, or with other options, came to before it was stopped. "
+            "Pass force=True (--force) to begin anew, or choose another name."
+        )
+    there = next((path.name for path in paths if (output / path.name).exists()), None)
+    if there is not None:
+        raise OutputError(
+            f"{output / there} exists already. Pass force=True (--force) to replace it, or choose another name."
+        )
 
-    path: Path
-    options: AssemblyOptions
 
-    def __call__(self) -> Sequence[Factor]:
-        return assemble(read_archive(self.path), self.options).problem.factors
-
-
-def _joined(groups: list[Variables]) -> Variables:
-    return Variables(groups[0].manifold, np.concatenate([group.state for group in groups]))
+def _tidy(output: Path, paths: Sequence[Path], checkpoint: Checkpoint) -> None:
+    """Remove the checkpoint, and parts of an earlier result that this one does not have."""
+    for old in set(parts_of(output)) - {output / path.name for path in paths}:
+        old.unlink()
+    checkpoint.remove()
 
 
-__all__ = ["PART_SIZE", "PartsResult", "adjust_parts", "write_parts"]
+def _result(run: Run, output: Path, solved: Solved, after: Squares) -> PartsResult:
+    """Say what an adjustment did."""
+    opened, before = run.opened, [fact["squares"] for fact in run.opened.facts]
+    measurements: dict[str, int] = {}
+    for fact in opened.facts:
+        for name, count in fact["measurements"].items():
+            if name not in COUNTED_OTHERWISE and count:
+                measurements[name] = measurements.get(name, 0) + count
+    warnings = (*sorted({note for fact in opened.facts for note in fact["notes"]}), *solved.report.warnings)
+    adjustment = AdjustReport(
+        num_images=opened.num_images,
+        num_points=opened.total("points"),
+        num_lines=opened.total("lines"),
+        num_planes=0,
+        num_observations=opened.total("observations"),
+        rmse_px={kind: {"before": _rms(before, kind), "after": _rms(after, kind)} for kind in _kinds(before)},
+        solve=solved.report,
+        warnings=warnings,
+        stages=solved.stages,
+        num_measurements=measurements,
+    )
+    return PartsResult(tuple(output / path.name for path in opened.paths), solved.report, warnings, adjustment)
+
+
+def _kinds(squares: Squares) -> list[str]:
+    return sorted({kind for part in squares for kind in part}, reverse=True)
+
+
+def _rms(squares: Squares, kind: str) -> float:
+    total, count = np.sum([part[kind] for part in squares if kind in part], axis=0)
+    return float(np.sqrt(total / count))
+
+
+__all__ = ["PartsResult", "adjust_parts"]

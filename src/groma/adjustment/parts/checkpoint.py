@@ -2,10 +2,10 @@
 """Where an adjustment in parts stands, on disk after every accepted step, so that a killed run goes on.
 
 In the folder ``.checkpoint`` of the result lie ``state.npz``, written by rank 0 (cameras, damping, history), and of
-every part two files of its landmarks, written by its owner. A step writes the older of the two, and ``state.npz``, which
-says which of them is valid, when all processes have written theirs: whenever the run is killed, what ``state.npz`` says
-is complete. Every file is replaced in one go. There are never more than these, and none depends on the number of
-processes, so that a run may go on with more or fewer of them.
+every part two files of its landmarks, written by its owner. A step writes the older of the two; then, when all
+processes have written theirs, ``state.npz``, which says which of the two is valid. So whenever the run is killed, what
+``state.npz`` says is complete. Every file is replaced in one go. There are never more than these, and none depends on
+the number of processes, so that a run may go on with more or fewer of them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import json
 import shutil
 import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -138,11 +138,10 @@ def key_of(paths: Sequence[Path], *options: object) -> str:
     return hashlib.sha256(repr((files, options)).encode()).hexdigest()
 
 
-def reports_of(progressed: Progressed, like: SolveReport) -> list[SolveReport]:
+def reports_of(progressed: Progressed) -> list[SolveReport]:
     """Return the reports of the stages before, as far as they are known."""
     return [
-        replace(like, initial_cost=cost, final_cost=cost, history=history, iterations=len(history))
-        for cost, history in progressed.earlier
+        SolveReport(initial_cost=cost, history=history, iterations=len(history)) for cost, history in progressed.earlier
     ]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from groma.errors import InputError
+from groma.errors import InputError, OutputError
 from groma.io.archive import write_archive
 from groma.scene import PosePriors, Relations, Scene
 
@@ -62,6 +62,8 @@ def write_parts(
         raise InputError(f"A part needs at least one observation; got {observations}. The default is {PART_SIZE}.")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    if parts_of(folder) and not force:
+        raise OutputError(f"{folder} holds parts already. Pass force=True (--force) to replace them.")
     scene, no_priors = scene.replace(relations=Relations()), {"pose_priors": PosePriors()}
     seen_points = np.bincount(scene.point_observations.point_idx, minlength=scene.num_points)
     seen_lines = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
@@ -79,6 +81,8 @@ def write_parts(
         cut = scene.keep(points=own[: scene.num_points], lines=own[scene.num_points :])
         cut = cut.replace(**no_priors) if paths[1:] else cut  # each counts once
         write_archive(cut, paths[-1], force)
+    for old in set(parts_of(folder)) - set(paths):
+        old.unlink()  # of a scene that had more parts
     return tuple(paths)
 
 

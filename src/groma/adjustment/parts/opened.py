@@ -64,6 +64,7 @@ class OpenParts:
     near: Similarity | None
     #: Of every part: see :func:`_facts`.
     facts: tuple[dict[str, Any], ...]
+    num_images: int = 0
 
     @property
     def has_lines(self) -> bool:
@@ -159,7 +160,7 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
             raise InputError(f"Parts cannot share these variables: {', '.join(unknown)}. Leave their options out.")
     variables = {name: group for name, group in cameras.items() if name in used}
     variables |= {name: _joined(own) for name, own in groups.items()}
-    return OpenParts(tuple(paths), tuple(parts), variables, options, near, ordered)
+    return OpenParts(tuple(paths), tuple(parts), variables, options, near, ordered, head.num_images)
 
 
 def _read(path: Path, near: Similarity | None) -> Scene:

@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 from groma._typing import ComplexArray, IntArray
+from groma.execution import available_cores
 
 
 class Alone:
     """A :class:`groma.solver.reduce.contract.Reducer` that has nobody to ask."""
 
-    rank, size = 0, 1
+    rank, size, num_neighbours = 0, 1, 1
+
+    def __init__(self) -> None:
+        self.num_cores = available_cores()
 
     def sum(self, values: ComplexArray) -> ComplexArray:  # noqa: D102
         return values

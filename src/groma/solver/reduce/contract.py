@@ -18,6 +18,9 @@ class Reducer(Protocol):
     #: Number of this process, from 0, and how many there are.
     rank: int
     size: int
+    #: How many of them are on this machine, and how many of its cores this one may use.
+    num_neighbours: int
+    num_cores: int
 
     def sum(self, values: ComplexArray) -> ComplexArray:
         """Return the sums over processes of exact sums of one shape; ``values`` may be overwritten."""

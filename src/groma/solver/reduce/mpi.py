@@ -60,15 +60,16 @@ class Ranks:
         self.rank, self.size = int(self._world.rank), int(self._world.size)
         if self.size != started_as()[1] and started_as()[1] > 1:
             raise InputError(
-                f"{started_as()[1]} processes were started together, but MPI ({MPI.Get_library_version().split(chr(10))[0]}) "
-                f"sees {self.size}: mpiexec and mpi4py are of different MPIs. Use the mpiexec that came with it."
+                f"{started_as()[1]} processes were started together, but mpi4py sees {self.size}: the two are of different "
+                f"MPIs. Use the mpiexec of the MPI that mpi4py uses, {MPI.Get_library_version()[:30]!r}."
             )
+        self.num_neighbours, self.num_cores = self._share_of_machine()
         self._add: Any = MPI.Op.Create(_add, commute=True)
-        #: How often, and how many bytes in all, were summed.
-        self.num_sums = self.num_bytes = 0
+        #: Bytes that this rank gave to the last sum: what it sends and receives in a step, up to twice.
+        self.bytes_per_sum = 0
 
     def sum(self, values: ComplexArray) -> ComplexArray:  # noqa: D102
-        self.num_sums, self.num_bytes = self.num_sums + 1, self.num_bytes + values.nbytes
+        self.bytes_per_sum = values.nbytes
         self._world.Allreduce(self._mpi.IN_PLACE, values, op=self._add)
         return values
 
@@ -82,7 +83,7 @@ class Ranks:
     def gather(self, text: str) -> list[str]:  # noqa: D102
         return self._world.allgather(text)
 
-    def share_of_machine(self) -> tuple[int, int]:
+    def _share_of_machine(self) -> tuple[int, int]:
         """Return how many ranks there are on this machine, and how many of its cores this one may use."""
         machine = self._world.Split_type(self._mpi.COMM_TYPE_SHARED)
         own = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(available_cores()))

@@ -28,7 +28,6 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import ProblemError
-from groma.execution import available_cores
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
 from groma.problem.parallel import Workers
 from groma.problem.variables import Variables
@@ -108,7 +107,7 @@ def solve_shards(
     _check(variables, shards, reducer)
     report = SolveReport()
     watch = Stopwatch(report)
-    report.threads = options.threads or available_cores()
+    report.threads = options.threads or reducer.num_cores
     workers = Workers(report.threads)
     try:
         with one_blas_thread():

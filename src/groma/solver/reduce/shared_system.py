@@ -127,13 +127,16 @@ class SharedSystem:
             parts[key] = total[start : start + sums.size].reshape(sums.shape)
             start += sums.size
         groups = range(len(self._sizes))
-        self._on_diagonal, self._curvature = [parts["diagonal", a] for a in groups], [parts["curvature", a] for a in groups]
+        self._on_diagonal, self._curvature = (
+            [parts["diagonal", a] for a in groups],
+            [parts["curvature", a] for a in groups],
+        )
         self._gradient, self._rhs = [parts["gradient", a] for a in groups], [parts["rhs", a] for a in groups]
         self._blocks = {(a, b): parts["blocks", self._pair(a, b)] for a, b in self._number}
         return parts["found", 0]
 
     def _agree(self, reducer: Reducer) -> None:
-        """Find which blocks there are on any process, and put all sums into one buffer, in the same order everywhere."""
+        """Find which blocks there are on any process; put all sums into one buffer, in the same order everywhere."""
         for a in range(len(self._sizes)):
             for b in range(a, len(self._sizes)):
                 number = reducer.union(self._number.get((a, b), np.zeros(0, np.int64)))
