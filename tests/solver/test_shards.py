@@ -201,12 +201,12 @@ class Together:
 
 
 def of_process(problem, shards):
-    """The variables of a process that has some of the shards, and these shards: landmarks of others it does not have."""
+    """The variables of a process with some of the shards, and these: landmarks of others it does not have."""
     names = {name for shard in shards for name in shard.landmarks}
     variables = {
         name: group for name, group in problem.variables.items() if group.manifold.kind not in ("point", "line")
     }
-    own, begin = [{} for _ in shards], {}
+    own = [{} for _ in shards]
     for name in names:
         rows = [shard.landmarks[name] for shard in shards]
         group = problem.variables[name]

@@ -104,7 +104,7 @@ def adjust_parts(
     with agreed(reducer):
         _check_names(paths)
     opened = open_parts(paths, chosen, reducer)
-    losses = [loss] if isinstance(loss, Loss) else list(loss or [Trivial()])
+    losses: list[Loss] = [loss] if isinstance(loss, Loss) else list(loss or [Trivial()])
     if isinstance(losses[-1], Trivial) and opened.has_lines:
         losses = [Trivial(), Trivial()]  # lines are started anew between the two
     how = replace(options, threads=None), losses, opened.options

@@ -101,7 +101,7 @@ class Checkpoint:
         with agreed(self._reducer):
             self._folder.mkdir(exist_ok=True)
             for part in self._opened.parts:
-                arrays = {name: states[name][rows] for name, rows in part.rows.items()}
+                arrays: dict[str, np.ndarray] = {name: states[name][rows] for name, rows in part.rows.items()}
                 if "lines" in part.rows:
                     arrays["moved"] = self.moved[part.rows["lines"]]
                 _save(self._file(part.path, slot), arrays)
@@ -152,7 +152,7 @@ def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 def _load(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except (ValueError, KeyError, zipfile.BadZipFile) as error:
         raise FileFormatError(f"{path} is damaged ({error}). Pass --force to begin anew.") from error

@@ -60,8 +60,8 @@ class Ranks:
         self.rank, self.size = int(self._world.rank), int(self._world.size)
         if self.size != started_as()[1] and started_as()[1] > 1:
             raise InputError(
-                f"{started_as()[1]} processes were started together, but mpi4py sees {self.size}: the two are of different "
-                f"MPIs. Use the mpiexec of the MPI that mpi4py uses, {MPI.Get_library_version()[:30]!r}."
+                f"{started_as()[1]} processes were started together, but mpi4py sees {self.size}: the launcher is of "
+                f"another MPI. Use the mpiexec of the one that mpi4py uses, {MPI.Get_library_version()[:30]!r}."
             )
         self.num_neighbours, self.num_cores = self._share_of_machine()
         self._add: Any = MPI.Op.Create(_add, commute=True)

@@ -38,7 +38,7 @@ class SharedSystem:
         self._number: dict[tuple[int, int], IntArray] = {}
         #: Exact sums, as shards are added: by group the diagonal blocks, curvature, gradient and right-hand side, the
         #: blocks off the diagonal by pairs of groups, and what else was found.
-        self._sums = {("found", 0): np.zeros(NUM_FOUND, complex)}
+        self._sums: dict[tuple[str, int], ComplexArray] = {("found", 0): np.zeros(NUM_FOUND, complex)}
         for a, (count, dof) in enumerate(self._sizes):
             self._sums["diagonal", a] = np.zeros((count, dof, dof), complex)
             self._sums |= {(name, a): np.zeros((count, dof), complex) for name in ("curvature", "gradient", "rhs")}
