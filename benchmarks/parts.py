@@ -10,7 +10,7 @@ by :func:`groma.adjustment.parts.adjust_parts` in a process of its own; 50 milli
 Reported are CPU time per step, peak memory of the process, bytes per observation, and the exponent of growth.
 
 With ``--ranks`` the same parts are adjusted by so many processes together (``mpiexec`` must be at hand), in turn, for
-so many rounds. Reported are ratios to the first number, medians over the rounds: wall time per step and peak memory of a
+so many rounds. Reported are ratios to the first number, medians over the rounds: wall time per step, peak memory of a
 rank; the bytes that a rank puts into a sum; and the time foreseen for many ranks. That assumes: work on parts divides
 evenly, the shared system is solved by each, and a sum takes two passes of its bytes at ``BANDWIDTH`` and two latencies
 per doubling of ranks.

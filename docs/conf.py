@@ -28,6 +28,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "_factor_table",
+    "_navigation",
     "_reference",
     "_thresholds",
 ]

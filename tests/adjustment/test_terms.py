@@ -22,6 +22,7 @@ from groma.scene import Cameras, Relations, Similarity
 from groma.scene.synthetic.scenes import holistic
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
+from groma.solver.termination import Termination
 
 #: Every kind of relation has a standard deviation of its own in these scenes.
 SIGMA_ON, SIGMA_ANGLE = 0.02, math.radians(1.0)
@@ -152,6 +153,28 @@ def test_measured_lengths_bring_the_scale_back(noisy):
     assert [stage["loss"] for stage in report.stages] == ["cauchy"]
     assert set(report.relations) == {k for k in Relations.kinds() if len(getattr(start.relations, k))}
     assert "point depths" in str(report)
+
+
+def test_a_metric_scene_that_has_converged_is_kept(noisy):
+    """What an adjustment has left, and what tracking has, is no reason to move; a start that is off is."""
+    adjusted = groma.adjust(noisy[1]).scene
+    again = groma.adjust(adjusted)
+    assert again.report.solve.iterations == 0
+    assert again.report.termination is Termination.COST_CONVERGED
+    assert again.report.rmse_px["points"]["before"] == again.report.rmse_px["points"]["after"]
+    for name in ("cam_from_world", "points", "lines", "planes"):
+        before, after = (getattr(scene, name) for scene in (adjusted, again.scene))
+        fields = {"points": "xyz", "lines": "plucker", "planes": "hesse"}
+        before, after = (getattr(x, fields[name]) if name in fields else x for x in (before, after))
+        np.testing.assert_allclose(after, before, rtol=0, atol=1e-12)
+    further = groma.adjust(adjusted, groma.AdjustOptions(start_tolerance=0.0, function_tolerance=1e-12))
+    assert further.report.solve.iterations > 0
+    assert further.report.solve.final_cost <= again.report.solve.final_cost
+    poses = adjusted.frames.rig_from_world.copy()
+    poses[-1, 4:] += 0.02
+    moved = groma.adjust(adjusted.replace(frames=adjusted.frames.replace(rig_from_world=poses)))
+    assert moved.report.solve.iterations > 0
+    assert np.abs(moved.scene.cam_from_world - adjusted.cam_from_world).max() < 2e-3
 
 
 def test_a_metric_scene_is_held_by_its_first_camera_alone(noisy):

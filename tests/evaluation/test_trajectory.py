@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from groma.cli.app import app
 from groma.errors import InputError
+from groma.evaluation.alignment import align_points, pose_alignment
 from groma.evaluation.trajectory import apply_similarity, associate, score_trajectory
 from groma.geometry import quaternion, se3
 from groma.io import Trajectory, read_trajectory, write_trajectory
@@ -261,3 +262,60 @@ def test_relative_errors_are_those_of_evo(published, name, align, delta, unit, t
     np.testing.assert_allclose(
         [scores.rpe_translation.rmse, scores.rpe_rotation_deg.rmse], [translation, rotation], rtol=0, atol=1e-6
     )
+
+
+def _turning(spread, noise, turn_noise, seed=3):
+    """A camera that turns on the spot, within a spread of positions, and an estimate of it in another world."""
+    rng, count = np.random.default_rng(seed), 80
+    angle = np.linspace(0.0, 1.5, count)
+    turns = quaternion.exp(np.stack([0.2 * np.sin(3 * angle), angle, 0.1 * np.cos(2 * angle)], axis=1))
+    truth = Trajectory(np.arange(count) * 0.1, np.hstack([turns, spread * rng.standard_normal((count, 3))]))
+    noisy = truth.world_from_cam.copy()
+    noisy[:, 4:] += noise * rng.standard_normal((count, 3))
+    noisy[:, :4] = quaternion.multiply(quaternion.exp(turn_noise * rng.standard_normal((count, 3))), noisy[:, :4])
+    there = Similarity(1.0, SOME.rotation, SOME.translation)
+    return truth.replace(world_from_cam=apply_similarity(there, noisy)), truth, there
+
+
+def test_a_camera_that_turns_on_the_spot_is_aligned_by_its_orientations_too():
+    estimate, truth, there = _turning(spread=0.002, noise=0.01, turn_noise=np.radians(0.3))
+    scores = score_trajectory(estimate, truth, "se3")
+    assert scores.by_orientations and scores.to_dict()["by_orientations"]
+    # The mean of 80 orientations with 0.3 degrees of noise about each axis is good to 0.06 degrees.
+    away = quaternion.log(quaternion.from_matrix((scores.similarity.rotation @ there.rotation)[None]))
+    assert np.degrees(np.linalg.norm(away)) < 0.1
+    assert scores.rotation_deg.rmse < 0.3 * np.sqrt(3) * 1.2
+    # Positions are not worse for it than their noise.
+    assert scores.ate.rmse < 0.01 * np.sqrt(3) * 1.2
+
+
+def test_positions_that_determine_the_rotation_align_alone():
+    estimate, truth, _ = _turning(spread=1.0, noise=0.01, turn_noise=np.radians(3.0))
+    scores = score_trajectory(estimate, truth, "se3")
+    assert not scores.by_orientations
+    alone = align_points(estimate.world_from_cam[:, 4:], truth.world_from_cam[:, 4:], with_scale=False)
+    np.testing.assert_allclose(scores.similarity.rotation, alone.rotation, atol=1e-12)
+
+
+def test_alignment_by_both_is_at_the_minimum_of_what_it_minimises():
+    estimate, truth, _ = _turning(spread=0.004, noise=0.01, turn_noise=np.radians(2.0))
+    poses, others = se3.inverse(estimate.world_from_cam), se3.inverse(truth.world_from_cam)
+    found = pose_alignment(poses, others, with_scale=False)
+    assert found.by_orientations
+    x, y = estimate.world_from_cam[:, 4:], truth.world_from_cam[:, 4:]
+    alone = align_points(x, y, with_scale=False)
+    votes = quaternion.to_matrix(truth.world_from_cam[:, :4]) @ quaternion.to_matrix(
+        estimate.world_from_cam[:, :4]
+    ).transpose(0, 2, 1)
+    u, _, vt = np.linalg.svd(votes.sum(0))
+    noise2 = np.sum((y - alone.points(x)) ** 2) / (3 * len(x) - 6)
+    scatter2 = np.sum((votes - u @ vt) ** 2) / 2 / (3 * len(x) - 3)
+
+    def cost(rotation):
+        away = y - y.mean(0) - (x - x.mean(0)) @ rotation.T
+        return np.sum(away**2) / noise2 + np.mean(np.sum((votes - rotation) ** 2, axis=(1, 2))) / (2 * scatter2)
+
+    best = cost(found.similarity.rotation)
+    for axis in np.vstack([np.eye(3), -np.eye(3)]):
+        turn = quaternion.to_matrix(quaternion.exp(1e-3 * axis))
+        assert cost(turn @ found.similarity.rotation) > best

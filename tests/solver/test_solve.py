@@ -89,6 +89,21 @@ def test_start_alone_is_evaluated():
     assert report.final_costs == pytest.approx(full.initial_costs, rel=1e-12)
 
 
+def test_a_start_that_promises_little_is_kept():
+    problem = solve(scene_problem(num_lines=5), SolverOptions(function_tolerance=1e-3)).problem
+    step = solve(problem, SolverOptions(max_iterations=1)).report
+    promised = (step.initial_cost - step.final_cost) / step.history[0].gain_ratio / step.initial_cost
+    assert promised > 0.0
+    kept = solve(problem, SolverOptions(start_tolerance=1.01 * promised))
+    assert (kept.report.termination, kept.report.iterations) == (Termination.COST_CONVERGED, 0)
+    assert kept.report.final_cost == kept.report.initial_cost
+    for name, group in problem.variables.items():
+        np.testing.assert_array_equal(kept.problem.variables[name].state, group.state)
+    moved = solve(problem, SolverOptions(start_tolerance=0.99 * promised)).report
+    assert moved.iterations > 0
+    assert moved.final_cost < moved.initial_cost
+
+
 def test_robust_loss_ignores_an_outlier():
     problem = scene_problem(num_cameras=6, num_points=60)
     clean = solve(problem)

@@ -92,8 +92,10 @@ def test_stereo_pair(truth):
 
 
 def _adjusted_again(result):
-    """Adjust the scene of a track; return the report, and how far keyframes move against each other, scene units."""
-    again = groma.adjust(result.scene)
+    """Solve the scene of a track further; return the report, and how far keyframes move against each other, scene
+    units.
+    """
+    again = groma.adjust(result.scene, groma.AdjustOptions(start_tolerance=0.0))
     before, after = (
         se3.compose(s.cam_from_world, np.repeat(se3.inverse(s.cam_from_world[:1]), s.num_images, axis=0))
         for s in (result.scene, again.scene)

@@ -18,7 +18,15 @@ from groma.adjustment.report import AdjustReport, AdjustResult, Progress
 from groma.adjustment.rescue.clusters import settle_clusters
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
-from groma.adjustment.stages import METRIC_LOSS, METRIC_RELATION_LOSS, combined, stage_entries, with_costs_at, with_loss
+from groma.adjustment.stages import (
+    METRIC_LOSS,
+    METRIC_RELATION_LOSS,
+    METRIC_START_TOLERANCE,
+    combined,
+    stage_entries,
+    with_costs_at,
+    with_loss,
+)
 from groma.adjustment.terms.contract import Term
 from groma.errors import InputError
 from groma.factors.losses import GemanMcClure, Loss, Trivial
@@ -88,6 +96,10 @@ class AdjustOptions:
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in a step.
     function_tolerance: float = 1e-6
+    #: Keep the scene as it is if the first step promises to lower the cost by no more than this fraction. None: 1e-3,
+    #: where tracking ends, for scenes with depths, stereo pairs or planes measured in the cameras under the loss
+    #: ``auto``; else 0.
+    start_tolerance: float | None = None
     #: ``auto``, ``dense``, ``sparse``, ``pcg``, or a solver that was registered.
     linear_solver: str = "auto"
     #: ``cartesian``, ``orthonormal_right``, ``orthonormal_left``, ``free_right`` or ``free_left``.
@@ -162,6 +174,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         solver_options = SolverOptions(
             max_iterations=options.max_iterations - spent,
             function_tolerance=options.function_tolerance if last else stage_tolerance(loss),
+            start_tolerance=start_tolerance_of(scene, options),
             linear_solver=options.linear_solver,
             landmark_steps=_landmark_steps(options, loss, problem),
             landmark_groups=("lines",) if isinstance(loss, Trivial) and not _is_coupled(problem) else None,
@@ -179,8 +192,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
 
         if last and number:
             loss = stages[number] = _wide_enough(loss, replace(assembly, problem=problem))
-        staged = Problem(problem.variables, [with_loss(factor, loss, relation_loss) for factor in problem.factors])
-        solution = solve(staged, solver_options, tell)
+        solution = solve(with_loss(problem, loss, relation_loss), solver_options, tell)
         problem = solution.problem
         reports.append(solution.report)
         if stopped:
@@ -188,7 +200,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         for renew in () if last else (renew_lines, settle_clusters):
             problem, renewed = renew(scene, problem, options.threads)
             moved.append(renewed)
-        if not isinstance(loss, Trivial):
+        if not isinstance(loss, Trivial) and solution.report.iterations:
             problem, renewed = without_slips(problem, options.threads)
             moved.append(renewed)
             if last and problem is not solution.problem:
@@ -247,6 +259,13 @@ def losses_of(scene: Scene, options: AdjustOptions) -> list[Loss]:
 def relation_loss_of(scene: Scene, options: AdjustOptions) -> Loss | None:
     """Return the loss of relations between landmarks, if it does not follow from that of the observations."""
     return METRIC_RELATION_LOSS if options.loss == "auto" and scene.is_metric else None
+
+
+def start_tolerance_of(scene: Scene, options: AdjustOptions) -> float:
+    """Return what the first step must promise for it to be taken."""
+    if options.start_tolerance is not None:
+        return options.start_tolerance
+    return METRIC_START_TOLERANCE if options.loss == "auto" and scene.is_metric else 0.0
 
 
 def _wide_enough(loss: Loss, assembly: Assembly) -> Loss:

@@ -20,20 +20,25 @@ RELATION_SCALES = {"cauchy": 2.0, "geman_mcclure": 4.0}
 #: The loss of scenes with depths, stereo pairs or planes measured in the cameras, and that of their relations: each
 #: measurement has a standard deviation of its own, and what does not belong was left out in tracking.
 METRIC_LOSS, METRIC_RELATION_LOSS = Cauchy(2.0), Cauchy(1.0)
+#: Such a scene stays as it is if the first step promises to lower the cost by no more than this fraction: tracking ends
+#: there, and what is left is far below the noise of the measurements.
+METRIC_START_TOLERANCE = 1e-3
 
 
-def with_loss(factor: Factor, loss: Loss, relation_loss: Loss | None = None) -> Factor:
-    """Return the factors under a loss; priors stay without one.
+def with_loss(problem: Problem, loss: Loss, relation_loss: Loss | None = None) -> Problem:
+    """Return a problem under a loss; priors stay without one.
 
     Relations between landmarks have a noise of their own, and a given loss or the plain scale.
     """
-    if factor.type_name == "pose_prior":
-        return factor
-    if factor.type_name in RELATION_FACTORS and relation_loss is not None:
-        loss = relation_loss
-    elif factor.type_name in RELATION_FACTORS and loss.name in RELATION_SCALES:
-        loss = make_loss(loss.name, RELATION_SCALES[loss.name])
-    return factor if factor.loss == loss else replace(factor, loss=loss)
+    if relation_loss is None:
+        relation_loss = make_loss(loss.name, RELATION_SCALES[loss.name]) if loss.name in RELATION_SCALES else loss
+
+    def of(factor: Factor) -> Loss:
+        if factor.type_name == "pose_prior":
+            return factor.loss
+        return relation_loss if factor.type_name in RELATION_FACTORS else loss
+
+    return problem.with_losses([of(factor) for factor in problem.factors])
 
 
 def stage_entries(stages: list[Loss], reports: list[SolveReport]) -> tuple[dict[str, Any], ...]:
@@ -52,8 +57,7 @@ def combined(reports: list[SolveReport], start: Problem, stages: list[Loss]) -> 
         return last
     loss, first = stages[len(reports) - 1], reports[0]
     if loss != stages[0]:
-        under_last = [with_loss(factor, loss) for factor in start.factors]
-        first = solve(Problem(start.variables, under_last), SolverOptions(max_iterations=0)).report
+        first = solve(with_loss(start, loss), SolverOptions(max_iterations=0)).report
     return replace(one_after_another(reports), initial_cost=first.initial_cost, initial_costs=first.initial_costs)
 
 

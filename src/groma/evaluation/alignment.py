@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
+from groma.evaluation.gates import ALIGNMENT
 from groma.geometry import quaternion
 from groma.geometry.algebra import finite_rows
 from groma.scene import Similarity
@@ -57,11 +60,20 @@ def align_points(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool 
     return _with_rotation(x, y, _nearest_rotation(y0.T @ x0), with_scale)
 
 
+@dataclass(frozen=True, eq=False)
+class PoseAlignment:
+    """A similarity of two worlds, and what it was found from."""
+
+    #: ``target_from_source``.
+    similarity: Similarity
+    #: Whether the orientations took part: the camera centres alone do not determine the rotation.
+    by_orientations: bool
+
+
 def align_poses(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool = True) -> Similarity:
     """Return the similarity that takes the camera centres of source closest to those of target.
 
-    Where the centres do not fix the rotation (fewer than three, or on one line, as on a straight road), it is the
-    mean of what the orientations say.
+    Where the centres do not determine the rotation, the orientations take part: see :func:`pose_alignment`.
 
     Parameters
     ----------
@@ -82,6 +94,30 @@ def align_poses(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool =
     InputError
         If there is no pose, or one that is not finite.
     """
+    return pose_alignment(source, target, with_scale).similarity
+
+
+def pose_alignment(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool = True) -> PoseAlignment:
+    r"""Return the alignment of two worlds by the poses of the same cameras, and whether orientations took part.
+
+    The camera centres alone (:func:`align_points`) know the rotation to
+
+    .. math:: \sigma_p / \sqrt{\lambda_{\min}(\Lambda)}, \qquad
+        \Lambda = s^2 \sum_i (\lVert x_i \rVert^2 I - x_i x_i^\top),
+
+    with the centred :math:`x_i` and the noise :math:`\sigma_p` that the alignment leaves on a coordinate. On a straight
+    road, or of a camera that turns on the spot, that is little. Where it is worse than a degree, and worse than the
+    scatter :math:`\sigma_r` of single orientations about their mean, both take part, weighted by their noise:
+
+    .. math:: \min_{s, R, t} \sum_i \frac{\| y_i - (s R x_i + t) \|^2}{\sigma_p^2}
+        + \frac{1}{N} \sum_i \frac{\| V_i - R \|_F^2}{2 \sigma_r^2}, \qquad V_i = R_{y,i}^\top R_{x,i}.
+
+    All orientations together count as one: what a camera and its reference differ by is mostly common to them. So they
+    decide about the directions in which the centres say nothing, and about little else.
+
+    With fewer than three centres, or all on one line, the orientations alone give the rotation. Parameters and errors
+    are those of :func:`align_poses`.
+    """
     from_source, from_target = np.asarray(source, float), np.asarray(target, float)
     if from_source.shape != from_target.shape or from_source.ndim != 2 or from_source.shape[1] != 7:
         raise ShapeError(f"Poses must have shape (N, 7), twice; got {from_source.shape} and {from_target.shape}.")
@@ -92,10 +128,21 @@ def align_poses(source: npt.ArrayLike, target: npt.ArrayLike, with_scale: bool =
             row = int(np.argwhere(~np.isfinite(poses))[0, 0])
             raise InputError(f"Poses must be finite; row {row} of {name} is {poses[row].tolist()}. Leave it out.")
     x, y = camera_centers(from_source), camera_centers(from_target)
-    if len(x) >= 3 and min(_rank(x), _rank(y)) >= 2:
-        return align_points(x, y, with_scale)
     votes = quaternion.to_matrix(from_target[:, :4]).transpose(0, 2, 1) @ quaternion.to_matrix(from_source[:, :4])
-    return _with_rotation(x, y, _nearest_rotation(votes.sum(0)), with_scale)
+    mean = _nearest_rotation(votes.sum(0))
+    if len(x) < 3 or min(_rank(x), _rank(y)) < 2:
+        return PoseAlignment(_with_rotation(x, y, mean, with_scale), True)
+    by_centers = align_points(x, y, with_scale)
+    x0, y0 = x - x.mean(0), y - y.mean(0)
+    noise = np.sqrt(np.sum((y - by_centers.points(x)) ** 2) / (3 * len(x) - (7 if with_scale else 6)))
+    lever = by_centers.scale * np.sqrt(np.linalg.eigvalsh(np.sum(x0**2) * np.eye(3) - x0.T @ x0)[0])
+    scatter = np.sqrt(np.sum((votes - mean) ** 2) / 2 / (3 * len(x) - 3))
+    if noise <= lever * max(scatter, ALIGNMENT.known_rotation):
+        return PoseAlignment(by_centers, False)
+    # Orientations that agree to rounding are as good as those that agree to a part in a million.
+    weight = 2 * len(x) * by_centers.scale * max(scatter, 1e-6) ** 2 / noise**2
+    rotation = _nearest_rotation(weight * (y0.T @ x0) + votes.sum(0))
+    return PoseAlignment(_with_rotation(x, y, rotation, with_scale), True)
 
 
 def camera_centers(cam_from_world: npt.ArrayLike) -> FloatArray:
@@ -128,4 +175,4 @@ def _rank(points: FloatArray) -> int:
     return int((singular > noise).sum())
 
 
-__all__ = ["align_points", "align_poses", "camera_centers"]
+__all__ = ["PoseAlignment", "align_points", "align_poses", "camera_centers", "pose_alignment"]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from groma.gates import gate
@@ -53,7 +54,17 @@ class ScoreGates:
     segment_step: int = gate(10, "poses", "step between their first poses", _KITTI)
 
 
-#: The numbers in use.
-SCORES = ScoreGates()
+@dataclass(frozen=True)
+class AlignmentGates:
+    """When camera centres determine a rotation."""
 
-__all__ = ["SCORES", "ScoreGates"]
+    known_rotation: float = gate(
+        math.radians(1.0), "rad", "noise of a rotation known from centres; above it orientations may take part",
+        "convention: as for weak directions of a tracked pose",
+    )  # fmt: skip
+
+
+#: The numbers in use.
+SCORES, ALIGNMENT = ScoreGates(), AlignmentGates()
+
+__all__ = ["ALIGNMENT", "SCORES", "AlignmentGates", "ScoreGates"]

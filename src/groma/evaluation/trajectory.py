@@ -9,9 +9,11 @@ With poses :math:`P_i` (estimate, after alignment) and :math:`Q_i` (reference), 
 * **drift**: the same over segments of given lengths of the reference, divided by the length.
 
 Poses are associated by time: each pose of the shorter trajectory takes the nearest of the longer. Where one of two
-trajectories of equal length has no times (KITTI), they are associated by their lines instead. Alignment minimises
-the squared absolute errors. Steps in metres are measured along the aligned estimate, and steps do not overlap. Absolute
-and relative error are those of the program *evo* with the same options.
+trajectories of equal length has no times (KITTI), they are associated by their lines instead. Alignment minimises the
+squared absolute errors. Where the positions do not determine the rotation (a straight road, a camera that turns on the
+spot), the orientations take part (:func:`~groma.evaluation.alignment.pose_alignment`). Steps in metres are measured
+along the aligned estimate, and steps do not overlap. Absolute and relative error are those of the program *evo* with
+the same options.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
-from groma.evaluation.alignment import align_poses
+from groma.evaluation.alignment import pose_alignment
 from groma.evaluation.gates import SCORES
 from groma.evaluation.poses import rotation_angle, unrelated
 from groma.geometry import quaternion, se3
@@ -76,6 +78,8 @@ class TrajectoryScores:
     segment_lengths: tuple[float, ...]
     #: How the estimate was aligned: ``se3``, ``sim3`` or ``none``.
     alignment: Alignment
+    #: Whether orientations took part in it, as the positions alone do not determine the rotation.
+    by_orientations: bool
     #: ``reference_from_estimate``: the alignment that was applied; its scale is one unless ``sim3``.
     similarity: Similarity = field(repr=False)
     #: Number of poses that were compared, and of poses in the two trajectories.
@@ -102,8 +106,9 @@ class TrajectoryScores:
             for key in ("rmse", "mean", "median", "max"):
                 result[f"{name}_{key}"] = None if spread is None else getattr(spread, key)
         result["scale"] = self.similarity.scale
-        for name in ("alignment", "num_poses", "num_estimate", "num_reference", "num_pairs", "path_length"):
+        for name in ("alignment", "by_orientations", "num_poses", "num_estimate", "num_reference", "num_pairs"):
             result[name] = getattr(self, name)
+        result["path_length"] = self.path_length
         result["drift_percent"], result["drift_deg_per_metre"] = self.drift_percent, self.drift_deg_per_metre
         result["association"], result["warnings"] = self.association, list(self.warnings)
         result["segment_lengths"] = list(self.segment_lengths)
@@ -163,9 +168,10 @@ def score_trajectory(
     if len(i) == 0:
         raise InputError(_no_match(ours, theirs, max_time_difference))
     times, poses, truth = ours.timestamps[i], ours.world_from_cam[i], theirs.world_from_cam[j]
-    similarity = Similarity()
+    similarity, by_orientations = Similarity(), False
     if align != "none":
-        similarity = align_poses(se3.inverse(poses), se3.inverse(truth), align == "sim3")
+        found = pose_alignment(se3.inverse(poses), se3.inverse(truth), align == "sim3")
+        similarity, by_orientations = found.similarity, found.by_orientations
     aligned = apply_similarity(similarity, poses)
 
     errors = np.linalg.norm(aligned[:, 4:] - truth[:, 4:], axis=1)
@@ -184,6 +190,7 @@ def score_trajectory(
         drift_deg_per_metre=turn,
         segment_lengths=lengths,
         alignment=align,
+        by_orientations=by_orientations,
         similarity=similarity,
         num_poses=len(i),
         num_estimate=len(estimate),

@@ -26,6 +26,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -120,7 +121,12 @@ class Factor(ABC):
 
     def references(self) -> tuple[tuple[Slot, Ref], ...]:
         """The slots that are present, each with the variables it refers to, in order."""
-        return tuple((slot, getattr(self, slot.name)) for slot in self.slots if getattr(self, slot.name) is not None)
+        return self._references
+
+    @cached_property
+    def _references(self) -> tuple[tuple[Slot, Ref], ...]:
+        present = ((slot, getattr(self, slot.name)) for slot in self.slots)
+        return tuple((slot, ref) for slot, ref in present if ref is not None)
 
     def __len__(self) -> int:
         return len(self.references()[0][1].index)

@@ -17,7 +17,6 @@ from groma.adjustment.report import AdjustReport
 from groma.adjustment.stages import with_loss
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
-from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.solver.observability.diagnosis import Diagnosis
 from groma.viz.pictures import ImageFiles
@@ -59,8 +58,7 @@ class MapResult:
             refine_intrinsics=bool(told.refine_intrinsics),
         )
         problem, ended_with = assemble(self.scene, assembly).problem, last_loss(told)
-        factors = [with_loss(factor, ended_with) for factor in problem.factors]
-        return diagnose_scene(self.scene, problem=Problem(problem.variables, factors))
+        return diagnose_scene(self.scene, problem=with_loss(problem, ended_with))
 
     def contributions(self, reference: Scene | None = None) -> tuple[Contribution, ...]:
         """Repeat the last adjustment by points alone, with lines, with planes: :func:`groma.contributions`."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -27,7 +27,7 @@ def _reordered(factor: Factor, order: IntArray, name: str, landmarks: Ref) -> Fa
     Rows that were checked once need not be checked again in another order. So no ``__post_init__`` runs, unless a
     factor derives something there.
     """
-    fields = [field.name for field in dataclasses.fields(factor)]
+    fields = _field_names(type(factor))
     derived = [key for key in vars(factor) if key not in fields]
     plain = all(isinstance(getattr(type(factor), key, None), cached_property) for key in derived)
     if not plain or type(factor).take is not Factor.take:
@@ -46,6 +46,11 @@ def _reordered(factor: Factor, order: IntArray, name: str, landmarks: Ref) -> Fa
             value = float(value[0]) if same else value.take(order, axis=0)
         object.__setattr__(result, key, value)
     return result
+
+
+@cache
+def _field_names(kind: type[Factor]) -> tuple[str, ...]:
+    return tuple(field.name for field in dataclasses.fields(kind))
 
 
 class Draft:

@@ -7,7 +7,7 @@ The cost is :math:`\\tfrac12 \\sum_i \\rho_i(\\lVert \\Sigma_i^{-1/2} r_i \\rVer
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import ProblemError
 from groma.factors.contract import Factor
+from groma.factors.losses import Loss
 from groma.problem._numbers import refuse_unusable_numbers
 from groma.problem.variables import Variables
 
@@ -74,7 +75,21 @@ class Problem:
         object.__setattr__(moved, "variables", variables)
         return moved
 
+    def with_losses(self, losses: Sequence[Loss]) -> Problem:
+        """Return the same problem with other losses, one for each group of factors."""
+        other = copy.copy(self)  # a loss has no part in what was checked
+        object.__setattr__(other, "factors", tuple(map(_under, self.factors, losses)))
+        return other
+
     @property
     def num_residuals(self) -> int:
         """Total number of independent residual rows."""
         return sum(len(factor) * factor.residual_rank for factor in self.factors)
+
+
+def _under(factor: Factor, loss: Loss) -> Factor:
+    if factor.loss == loss:
+        return factor
+    other = copy.copy(factor)
+    object.__setattr__(other, "loss", loss)
+    return other

@@ -86,6 +86,8 @@ class Scene:
     def __post_init__(self) -> None:
         for name, column, side, target in references(Scene):
             index = getattr(getattr(self, name), column)
+            if not len(index):
+                continue
             where = f"{name}.{column}" if side is None else f"{name}.{column}[:, {side}]"
             index = index if side is None else index[:, side]
             check_index(where, index, len(getattr(self, target)), target.replace("_", " "))

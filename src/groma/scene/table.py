@@ -82,7 +82,7 @@ class Table:
 
     def __post_init__(self) -> None:
         length, first = -1, ""
-        for item in fields(self):
+        for item in columns_of(type(self)):
             value = convert(f"{type(self).__name__}.{item.name}", getattr(self, item.name), item)
             object.__setattr__(self, item.name, value)
             if not first:
@@ -108,7 +108,7 @@ class Table:
         return f"{type(self).__name__}({len(self):,} rows: {', '.join(item.name for item in fields(self))})"
 
     def __len__(self) -> int:
-        return len(getattr(self, fields(self)[0].name))
+        return len(getattr(self, columns_of(type(self))[0].name))
 
     def replace(self, **columns: Any) -> Self:
         """Return a copy with some columns replaced."""
@@ -118,7 +118,7 @@ class Table:
         """Return the chosen rows: integer indices or a boolean mask."""
         chosen = rows_of(f"rows of {type(self).__name__}", rows, len(self), f"{self.noun}s")
         columns = {}
-        for item in fields(self):
+        for item in columns_of(type(self)):
             value = getattr(self, item.name)
             columns[item.name] = tuple(value[i] for i in chosen) if isinstance(value, tuple) else value[chosen]
         return type(self)(**columns)
@@ -148,11 +148,19 @@ class Table:
         return self.take(kept).replace(**{name: column[kept] for name, column in columns.items()}), kept
 
 
+@cache
+def columns_of(table: type[Table]) -> tuple[Field[Any], ...]:
+    """Return the declarations of the columns of a table."""
+    return fields(table)
+
+
 def convert(name: str, value: Any, item: Field[Any]) -> Any:
     """Return a column as its declaration wants it, or raise."""
     dtype, row = item.metadata["dtype"], item.metadata["row"]
     if dtype is None:
         return _convert_text(name, value)
+    if type(value) is np.ndarray and value.dtype == dtype and value.shape == (0, *row):
+        return value
     try:
         source = np.asarray(value)
     except ValueError as error:

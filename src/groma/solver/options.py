@@ -21,6 +21,8 @@ class SolverOptions:
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in an accepted step.
     function_tolerance: float = 1e-6
+    #: Keep the start, as converged, when the first step promises to lower the cost by no more than this fraction.
+    start_tolerance: float = 0.0
     #: Stop when no component of the gradient, over the root of its diagonal in the normal equations, exceeds this.
     gradient_tolerance: float = 1e-10
     #: Stop when the lengths in a step, its turns and all else are below this fraction of those of the states.
@@ -63,7 +65,7 @@ class SolverOptions:
         for name in ("max_iterations", "landmark_steps"):
             if getattr(self, name) < 0:
                 raise InputError(f"{name} must not be negative; got {getattr(self, name)}.")
-        for name in ("function_tolerance", "gradient_tolerance", "step_tolerance"):
+        for name in ("function_tolerance", "start_tolerance", "gradient_tolerance", "step_tolerance"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"{name} must be a number that is not negative; got {getattr(self, name)}.")
         if self.threads is not None and self.threads < 1:

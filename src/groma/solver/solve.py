@@ -132,8 +132,11 @@ def minimise(
         slope, damping = problem.largest_gradient(), problem.damping
         if slope <= options.gradient_tolerance:
             return Termination.GRADIENT_CONVERGED if problem.is_curved() else Termination.NO_FACTOR_COUNTS
+        step = problem.try_step()
+        if not report.iterations and step.promised <= options.start_tolerance * best.cost:
+            return Termination.COST_CONVERGED
         report.iterations += 1
-        trial, accepted = _improved(problem, problem.try_step(), best, share)
+        trial, accepted = _improved(problem, step, best, share)
         if accepted:
             problem.accept(trial)
             ended = criteria.after_accepted(trial, best)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,6 +38,8 @@ class TrackedFrame:
     #: Why a frame was skipped.
     reason: str = ""
     keyframe: bool = False
+    #: Its name in the sequence.
+    name: str = ""
     #: The map that the pose refers to: 0, or more after the track was lost for long and a new map was begun.
     part: int = 0
 
@@ -88,7 +91,7 @@ class History:
         relative = se3.compose(pose[None], se3.inverse(keyframe.pose[None]))[0]
         self.entries.append(Entry(timestamp, keyframe.index, relative, part))
 
-    def joined(self, where: dict[int, tuple[int, int]]) -> None:
+    def joined(self, where: Sequence[tuple[int, int]]) -> None:
         """Take note of maps that were put into others."""
         for entry in self.entries:
             entry.part, shift = where[entry.part]

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from groma._counted import counted
 from groma._json import json_text
 from groma.errors import GromaError, InputError
 from groma.evaluation.trajectory import TrajectoryScores, score_trajectory
@@ -17,10 +18,12 @@ from groma.io.sequences import Sequence, open_sequence
 from groma.io.trajectories import write_tum
 from groma.tracking.journal import Journal
 from groma.tracking.options import TrackOptions
-from groma.tracking.outcome import TrackedFrame, TrackResult
+from groma.tracking.outcome import LOST, SKIPPED, TrackedFrame, TrackResult
 from groma.tracking.tracker import Tracker
 from groma.viz.report.trajectory import write_track_report
 
+#: Frames without a pose that are named in a warning.
+NAMED = 5
 #: Largest difference between the times of a frame and of a pose of the reference, seconds.
 MAX_TIME_DIFFERENCE = 0.02
 
@@ -58,13 +61,14 @@ class SequenceResult(TrackResult):
         """Return all numbers as plain values: the content of ``summary.json``."""
         numbers = {"kind": self.kind, "interrupted": self.interrupted, **self.statistics, "sequence": self.name}
         numbers["warnings"] = list(self.warnings)
+        numbers["frames_without_pose"] = [frame.name for frame in self.frames if frame.pose is None]
         if self.scores is not None:
             numbers["reference"] = self.scores.to_dict()
         elif self.not_compared:
             numbers["reference"] = {"error": self.not_compared}
         return numbers
 
-    def write(self, folder: str | os.PathLike[str], title: str = "Track", force: bool = False) -> None:
+    def write(self, folder: str | os.PathLike[str], title: str = "Track", force: bool = False) -> tuple[str, ...]:
         """Write everything that ``groma track`` writes to a folder, whole or not at all.
 
         ``trajectory.txt`` (TUM), the keyframes as a COLMAP model with lines and planes beside it (``structures``),
@@ -78,9 +82,15 @@ class SequenceResult(TrackResult):
             Heading of the page.
         force : bool
             Replace what is there.
+
+        Returns
+        -------
+        tuple of str
+            What could not be written, and why: trajectories and scenes are not lost to a report that fails.
         """
         with atomic_output(folder, force) as draft:
-            write_scene(self.scene, draft, format="colmap")
+            model = _failure("the COLMAP model", lambda: write_scene(self.scene, draft, format="colmap"))
+            draft.mkdir(exist_ok=True)
             write_scene(self.scene, draft / "scene.npz")
             write_tum(self.trajectory, draft / "trajectory.txt")
             for number, part in enumerate(self.parts, start=2):
@@ -88,8 +98,13 @@ class SequenceResult(TrackResult):
                 place.mkdir()
                 write_scene(part.scene, place / "scene.npz")
                 write_tum(part.trajectory, place / "trajectory.txt")
-            write_track_report(draft / "report.html", self, self.frames, self.scores, title=title)
-            (draft / "summary.json").write_text(json_text(self.summary()), encoding="utf-8")
+            page = draft / "report.html"
+            report = _failure(page.name, lambda: write_track_report(page, self, self.frames, self.scores, title=title))
+            failed = tuple(sentence for sentence in (model, report) if sentence)
+            numbers = self.summary()
+            numbers["warnings"] += failed
+            (draft / "summary.json").write_text(json_text(numbers), encoding="utf-8")
+        return failed
 
 
 def track(
@@ -134,7 +149,7 @@ def track(
     if progress is not None:
         progress(TrackProgress("adjusting all keyframes", 0, 1))
     result = tracker.finish()
-    warnings = [*sequence.warnings, *result.warnings]
+    warnings = [*sequence.warnings, *result.warnings, *_without_pose(frames)]
     if not len(result.trajectory):
         raise InputError(
             f"No frame of {name or 'the sequence'} could be tracked: {' '.join(warnings)} Check the camera and the "
@@ -192,6 +207,28 @@ def _compared(result: TrackResult, sequence: Sequence) -> tuple[TrajectoryScores
         return score_trajectory(result.trajectory, sequence.reference, align, MAX_TIME_DIFFERENCE), ""
     except GromaError as error:
         return None, str(error)
+    except Exception as error:  # nothing that was tracked may be lost to a comparison
+        return None, f"{type(error).__name__}: {error}"
+
+
+def _without_pose(frames: list[TrackedFrame]) -> list[str]:
+    """Name the frames that have no pose, once a map was begun."""
+    names = [frame.name or f"at {frame.timestamp:.3f} s" for frame in frames if frame.status in (LOST, SKIPPED)]
+    if not names:
+        return []
+    more = f" and {len(names) - NAMED:,} more (all are in summary.json)" if len(names) > NAMED else ""
+    return [f"No pose: {counted(len(names), 'frames')} of {len(frames):,}: {', '.join(names[:NAMED])}{more}."]
+
+
+def _failure(what: str, step: Callable[[], object]) -> str | None:
+    """Run a step; return a sentence if it fails for another reason than the disk."""
+    try:
+        step()
+    except OSError:
+        raise
+    except Exception as error:
+        return f"Not written: {what}, which failed ({type(error).__name__}: {error}). Please report it."
+    return None
 
 
 __all__ = ["SequenceResult", "TrackProgress", "track"]

@@ -24,13 +24,14 @@ from groma.io.trajectories import Trajectory
 from groma.scene import Scene
 from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
-from groma.tracking.backend.submaps import Part, about_parts
+from groma.tracking.backend.submaps import about_parts
+from groma.tracking.ending import Ending
 from groma.tracking.frame.camera import TrackCamera, back
 from groma.tracking.frame.checks import FrameChecks
 from groma.tracking.frame.coarse_alignment import turned, turned_prediction
 from groma.tracking.frame.features import FrameFeatures, grid_pixels
 from groma.tracking.map.keyframes import Followed, keyframe_nearby, wants_keyframe
-from groma.tracking.map.points import find_again
+from groma.tracking.map.points import agreeing, find_again
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.outcome import (
@@ -45,7 +46,7 @@ from groma.tracking.outcome import (
     TrackedFrame,
     TrackResult,
 )
-from groma.tracking.pose.estimate import PoseEstimate
+from groma.tracking.pose.estimate import GATE, PoseEstimate
 from groma.tracking.pose.following import Attempt, follow_frame
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
@@ -163,7 +164,8 @@ class Tracker:
         if estimate is None:
             return Attempt(predicted, prior_sigma, followed=followed)
         trusted = self._verification.trusts(self.map, data, estimate)
-        if not trusted or self._verification.is_surprised(estimate, predicted, prior_sigma):
+        doubt = self._verification.is_surprised(estimate, predicted, prior_sigma)
+        if not trusted or doubt or self._verification.misses_much(self.map, present.followed.points, estimate):
             return Attempt(predicted, prior_sigma, None, estimate, trusted, followed)
         return Attempt(predicted, prior_sigma, estimate, None, trusted, followed)
 
@@ -171,19 +173,19 @@ class Tracker:
         """Find a frame that could not be followed by described features, or keep the pose that was in doubt."""
         present, mapper, doubtful = self._present, self._mapper, attempt.doubtful
         before = present.pose
-        if self._lost_for == 0 and present.frames_since_keyframe > 0:
+        if self._lost_for == 0:
             # The frame before is the nearest there is to look for.
-            if mapper.due is not None:
-                mapper.make_keyframe(present, watch)
-            assert present.data is not None
-            mapper.choose(present, present.data)
-            mapper.make_keyframe(present, watch)
+            mapper.keep_present(present, watch)
         with watch("find"):
             found = self._find(data, attempt.predicted, attempt.prior_sigma, doubtful)
         if found is not None and not (
             attempt.trusted and doubtful is not None and self._verification.score(doubtful) >= found.score
         ):
-            followed = Followed(promote(self.map, found, data), found.lines)
+            pose, most = found.estimate.pose, GATE * self.options.point_sigma_px
+            points = agreeing(self.map, self.camera, attempt.followed.points, pose, most)
+            more = promote(self.map, found, data)
+            points = points.joined(more.take(~np.isin(more.index, points.index)))
+            followed = Followed(points, found.lines)
             return replace(attempt, estimate=found.estimate, followed=followed), found
         if doubtful is not None and (attempt.trusted or self._verification.confirms(self.map, data, doubtful)):
             # The new keyframe may have moved the map.
@@ -297,7 +299,8 @@ class Tracker:
     def _skip(self, frame: Frame, reason: str, began: float) -> TrackedFrame:
         self._history.note(SKIPPED)
         return TrackedFrame(
-            frame.timestamp, None, SKIPPED, {}, {"total": time.perf_counter() - began}, reason=reason
+            frame.timestamp, None, SKIPPED, {}, {"total": time.perf_counter() - began}, reason=reason,
+            name=frame.name,
         )  # fmt: skip
 
     def _lose(self, data: FrameFeatures, guess: FloatArray, began: float, watch: Stopwatch) -> TrackedFrame:
@@ -322,7 +325,8 @@ class Tracker:
         return TrackedFrame(
             frame.timestamp, self._present.pose.copy() if has_pose else None, status,
             estimate.counts if estimate is not None else {}, timings,
-            estimate.weak if estimate is not None else (), keyframe=is_keyframe, part=self._mapper.current,
+            estimate.weak if estimate is not None else (), keyframe=is_keyframe, name=frame.name,
+            part=self._mapper.current,
         )  # fmt: skip
 
     # ------------------------------------------------------------------------------------------------------ results
@@ -336,35 +340,28 @@ class Tracker:
         return map_to_scene(self.map, self.camera, self.options.relations)
 
     def finish(self) -> TrackResult:
-        """End the track: join its maps where that is possible, adjust all keyframes together and return the result."""
-        mapper, history = self._mapper, self._history
-        where = mapper.end(self._present)
-        history.joined(where)
-        self._finished = True
-        roots = sorted({root for root, _ in where.values() if mapper.maps[root].keyframes})
-        count = {root: sum(entry.part == root for entry in history.entries) for root in roots}
-        main = max(roots, key=lambda root: count[root], default=0)
-        reports = {root: mapper.adjust_at_end(root) for root in roots if root != main}
-        reports[main] = mapper.adjust_at_end(main)
-        parts = {root: self._part(root) for root in (roots or [main])}
-        warnings = list(self._checks.warnings)
-        if not roots:
-            warnings.append("No map was made: no frame could be used, or the camera did not move enough to start.")
-        warnings += about_parts(self._breaks, where, [count[root] for root in roots if root != main])
-        whole = parts.pop(main)
-        return TrackResult(
-            whole.trajectory, whole.scene, whole.keyframes, self.statistics(*reports[main]), tuple(warnings),
-            tuple(parts.values()),
-        )  # fmt: skip
+        """End the track: join its maps where that is possible, adjust all keyframes together and return the result.
 
-    def _part(self, root: int) -> Part:
-        track_map = self._mapper.maps[root]
-        stamps = np.array([keyframe.timestamp for keyframe in track_map.living()])
-        return Part(
-            self._history.trajectory(track_map, root),
-            map_to_scene(track_map, self.camera, self.options.relations),
-            stamps,
-        )
+        A step that fails, or that Ctrl-C interrupts, is left out; a warning says so.
+        """
+        mapper, history = self._mapper, self._history
+        self._finished = True
+        ending = Ending(mapper, history)
+        ending.settle(self._present)
+        where = ending.join()
+        roots = sorted({root for root, _ in where if mapper.maps[root].keyframes}) or [0]
+        count = {root: sum(entry.part == root for entry in history.entries) for root in roots}
+        main = max(roots, key=lambda root: count[root])
+        others = [root for root in roots if root != main]
+        for root in others:
+            ending.adjust(root)
+        statistics = self.statistics(*ending.adjust(main))
+        whole, *parts = [ending.part(root) for root in (main, *others)]
+        warnings = [*self._checks.warnings, *ending.warnings]
+        if not history.entries:
+            warnings.append("No map was made: no frame could be used, or the camera did not move enough to start.")
+        warnings += about_parts(self._breaks, where, [count[root] for root in others])
+        return TrackResult(whole.trajectory, whole.scene, whole.keyframes, statistics, tuple(warnings), tuple(parts))
 
     def statistics(self, report: SolveReport | None = None, right_offset_px: float = 0.0) -> dict:
         """Return counts and times so far as plain numbers."""

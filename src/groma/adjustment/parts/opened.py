@@ -79,12 +79,12 @@ class OpenParts:
         """Return a part as a scene, and as a problem at given states of all variables of this process."""
         scene = self.read(part)
         made = assemble(scene, self.options)
-        factors = [with_loss(factor, loss) for factor in made.problem.factors] if loss else made.problem.factors
         own = {} if states is None else self.states_of(part, states)
         variables = {
             name: replace(group, state=own.get(name, group.state)) for name, group in made.problem.variables.items()
         }
-        return scene, replace(made, problem=Problem(variables, factors))
+        problem = Problem(variables, made.problem.factors)
+        return scene, replace(made, problem=problem if loss is None else with_loss(problem, loss))
 
     def states_of(self, part: Part, states: States) -> States:
         """Return the states of the cameras and of the landmarks of a part."""

@@ -73,7 +73,7 @@ class Run:
             reports.append(report)
             if stopped:
                 break
-            states, moved = self._settled(states, losses[number], last)
+            states, moved = self._settled(states, losses[number], last, report.iterations)
             if moved and last:
                 reports[-1] = replace(report, final_cost=self._evaluate(states, losses[number]).final_cost)
         report, loss = one_after_another(reports), losses[len(reports) - 1]
@@ -117,13 +117,13 @@ class Run:
         options = replace(self.options, max_iterations=0)
         return solve_shards(variables, self.opened.shards(loss), options, reducer=self.reducer).report
 
-    def _settled(self, states: States, loss: Loss, last: bool) -> tuple[States, bool]:
+    def _settled(self, states: States, loss: Loss, last: bool, steps: int) -> tuple[States, bool]:
         """Bring lines back that settled in wrong places, and return whether any process did; cameras are held.
 
         Which lines fit worse than usual is told by the lines of their part.
         """
         robust = not isinstance(loss, Trivial)
-        if not self.opened.has_lines or (last and not robust):
+        if not self.opened.has_lines or (last and not robust) or not steps:
             return states, False
         states, found = dict(states), False
         states |= {name: states[name].copy() for name in LANDMARKS if name in states}

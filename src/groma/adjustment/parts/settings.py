@@ -7,7 +7,7 @@ import os
 from dataclasses import fields
 from typing import Any
 
-from groma.adjustment.adjust import AdjustOptions, assembly_options_of, losses_of
+from groma.adjustment.adjust import AdjustOptions, assembly_options_of, losses_of, start_tolerance_of
 from groma.factors.losses import Loss
 from groma.io.archive import read_archive
 from groma.solver.options import SolverOptions
@@ -26,6 +26,7 @@ def settings_of(
     solver = SolverOptions(
         max_iterations=options.max_iterations,
         function_tolerance=options.function_tolerance,
+        start_tolerance=start_tolerance_of(scene, options),
         linear_solver=options.linear_solver,
         threads=options.threads,
     )

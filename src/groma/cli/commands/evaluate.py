@@ -223,7 +223,10 @@ def trajectory(
         f"{counted(scores.num_poses, 'poses')} associated by {scores.association} of {scores.num_estimate:,} and "
         f"{scores.num_reference:,}, "
         f"path of {scores.path_length:.6g} m; alignment: {applied.get(align, 'none')}"
+        + (", by positions and orientations" if scores.by_orientations else "")
     )
+    if scores.by_orientations:
+        console.say("  The positions alone do not determine the rotation between the two.")
     step = f"{rpe_delta:g} {rpe_unit.removesuffix('s') if rpe_delta == 1 else rpe_unit}"
     row("absolute, position", scores.ate, "m")
     row("absolute, rotation", scores.rotation_deg, "deg")

@@ -108,7 +108,8 @@ def track(
     if result.interrupted:
         console.warn("interrupted; what was tracked so far is written.")
     _output.check_output(output, force)
-    result.write(output, f"Track of {sequence.absolute().name}", force)
+    for sentence in result.write(output, f"Track of {sequence.absolute().name}", force):
+        console.warn(sentence)
     shutil.rmtree(work, ignore_errors=True)
     numbers = result.summary()
     _say(console, numbers)
@@ -126,8 +127,9 @@ def _say(console: "Console", numbers: dict[str, Any]) -> None:
     scores = numbers.get("reference", {})
     if "ate_rmse" in scores:
         drift = scores["drift_percent"]
+        how = scores["alignment"] + (" by positions and orientations" if scores["by_orientations"] else "")
         console.say(
-            f"Against the reference ({scores['alignment']}): position error {scores['ate_rmse']:.4f} (root mean "
+            f"Against the reference ({how}): position error {scores['ate_rmse']:.4f} (root mean "
             f"square, units of the reference) over {scores['path_length']:.2f}"
             + (f"; drift {drift:.2f} %, {scores['drift_deg_per_metre']:.4f} deg per unit" if drift is not None else "")
         )

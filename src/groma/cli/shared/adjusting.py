@@ -45,13 +45,10 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
         If covariances are wanted that do not exist, after everything else was written and said.
     """
     from groma.adjustment.adjust import adjust
-    from groma.adjustment.contributions import contributions
     from groma.adjustment.covariance_files import write_covariances
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.compilation.time import compilation_time
     from groma.io import check_target, read_scene, structures_of, write_scene
-    from groma.viz.report.page import PageContents, write_report
-    from groma.viz.report.tables import contributions_card
 
     before = read_scene(source)
     if wanted.output is not None:
@@ -60,7 +57,11 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     console.announce_compilation()
     with compilation_time() as compilation, console.progress() as progress:
         result = adjust(before, options, progress)
-    entries = contributions(before, options, true) if wanted.contributions else ()
+    entries = ()
+    if wanted.contributions:
+        from groma.adjustment.contributions import contributions  # with evaluation, half a second to import
+
+        entries = contributions(before, options, true)
     diagnosis = try_diagnosis(result.diagnose, before.num_images, console, wanted.diagnosis)
     numbers = result.summary(diagnosis, entries)
     numbers["seconds"]["compilation"] = compilation.seconds
@@ -68,6 +69,9 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     if wanted.output is not None:
         write_scene(result.scene, wanted.output, force=wanted.force, like=structures_of(source))
     if wanted.page is not None:
+        from groma.viz.report.page import PageContents, write_report
+        from groma.viz.report.tables import contributions_card
+
         with _output.atomic_output(wanted.page, wanted.force) as draft:
             write_report(
                 draft,

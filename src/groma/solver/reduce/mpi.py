@@ -21,12 +21,11 @@ from groma.solver.reduce import exact_sums
 from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.contract import Reducer
 
-#: Where launchers say the rank and the number of ranks: MPICH and its kin, PMIx, Open MPI, Slurm's own protocol.
+#: Where launchers say the rank and the number of ranks: MPICH and its kin, Open MPI, srun --mpi=pmix.
 LAUNCHERS = (
     ("PMI_RANK", "PMI_SIZE"),
     ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
-    ("PMIX_RANK", "PMIX_SIZE"),
-    ("MPI_RANK", "MPI_SIZE"),
+    ("PMIX_RANK", "SLURM_STEP_NUM_TASKS"),
 )
 
 

@@ -194,8 +194,8 @@ def join_points(track_map: TrackMap, old: Keyframe, new: Keyframe, first: IntArr
             index = renamed[table.index]
             unique = np.unique(index, return_index=True)[1]
             keyframe.measured = replace(keyframe.measured, points=replace(table, index=index).take(unique))
-        point = keyframe.features.point
-        point[point >= 0] = renamed[point[point >= 0]]
+        linked = np.flatnonzero(keyframe.features.point >= 0)
+        keyframe.features = keyframe.features.linked(linked, renamed[keyframe.features.point[linked]])
     track_map.points.keyframe[keep], track_map.points.pixel[keep] = new.index, new.features.pixel[second][both]
     track_map.points.state[drop] = DEAD
 

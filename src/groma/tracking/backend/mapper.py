@@ -14,7 +14,7 @@ from groma.solver.report import SolveReport
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
 from groma.tracking.backend.loop_closure import LoopSearch, close_loop, search_for_loop
 from groma.tracking.backend.stereo_calibration import correct_offset, estimate_offset
-from groma.tracking.backend.submaps import Joint, find_joint, join_maps, search_older_maps
+from groma.tracking.backend.submaps import Joint, find_joint, search_older_maps
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.map.culling import drop_repeating_keyframes, drop_unseen
@@ -130,6 +130,18 @@ class Mapper:
         relative = se3.compose(present.pose[None], se3.inverse(near.pose[None]))[0]
         self.due = _Chosen(data, near.index, relative, present.followed)
 
+    def keep_present(self, present: Present, watch: Stopwatch) -> None:
+        """Make a keyframe of the present frame, unless one stands for it, and take up all that is being worked out."""
+        if self.due is not None:
+            self.make_keyframe(present, watch)
+        if present.frames_since_keyframe > 0:
+            assert present.data is not None
+            self.choose(present, present.data)
+            self.make_keyframe(present, watch)
+        else:
+            with watch("take up"):
+                self.take_up(present, now=True)
+
     def make_keyframe(self, present: Present, watch: Stopwatch) -> None:
         """Make a keyframe of the frame that was chosen."""
         assert self.due is not None
@@ -150,7 +162,7 @@ class Mapper:
             merge_planes(self.map.planes, self.options.gates.planes)
             if self.options.relations:
                 find_lines_on_planes(self.map)
-        present.frames_since_keyframe = 0
+        present.frames_since_keyframe = max(chosen.age - 1, 0)
         with watch("adjust"):
             job = window_job(self.map, self.camera, self.options.window, self.options.relations, self.metric)
             if job is not None:
@@ -198,11 +210,11 @@ class Mapper:
         if search.newest is not self.map.keyframes[search.newest.index]:
             return
         if pairs and not any(pair[0] in self.map.living() for pair in pairs):
-            joint = find_joint(self.maps, self.camera, search.newest, pairs, self.options.gates)
+            joint = find_joint(self.maps, self.camera, self.current, search.newest, pairs, self.options.gates)
             if joint is not None:
                 self.joints[self.current] = joint
-                self.map.pinned.add(joint.newest.index)
-                self.maps[joint.older].pinned.add(joint.keyframe.index)
+                self.map.pinned.add(joint.newest)
+                self.maps[joint.older].pinned.add(joint.keyframe)
             return
         last = self.map.last
         before = last.pose.copy()
@@ -230,18 +242,16 @@ class Mapper:
                 report = job.report
         return report
 
-    def end(self, present: Present) -> dict[int, tuple[int, int]]:
-        """End the threads and join the maps; see :func:`~groma.tracking.backend.submaps.join_maps` for what is
-        returned.
-        """
-        if self.due is not None:
-            self.make_keyframe(present, Stopwatch())
-        self.take_up(present, now=True)
-        for pool in (self._pool, self._workers):
+    def abandon(self) -> None:
+        """Leave what was begun and not taken up."""
+        self.due = self._pending = self._search = None
+
+    def close(self) -> None:
+        """End the threads."""
+        pools, self._pool, self._workers = (self._pool, self._workers), None, None
+        for pool in pools:
             if pool is not None:
-                pool.shutdown(wait=True)
-        self._pool = self._workers = None
-        return join_maps(self.maps, self.joints)
+                pool.shutdown(wait=True, cancel_futures=True)
 
     def adjust_at_end(self, part: int) -> tuple[SolveReport | None, float]:
         """Adjust all keyframes of a map together; return the report and the offset of the right images, pixels."""

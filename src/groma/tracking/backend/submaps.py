@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,112 +36,145 @@ class Part:
 
 @dataclass(frozen=True)
 class Joint:
-    """A keyframe of a newer map that sees what a keyframe of an older map saw."""
+    """A keyframe of one map that sees what a keyframe of another map saw; maps and keyframes by their numbers."""
 
     older: int
-    keyframe: Keyframe
-    newest: Keyframe
+    keyframe: int
+    newer: int
+    newest: int
     #: (7,) pose of the newer camera in terms of the older one.
     keyframe_from_newest: FloatArray
     #: Matched features that agree.
     first: IntArray
     second: IntArray
 
-    def older_from_newer(self) -> FloatArray:
-        """Pose (7,) that moves the world of the newer map into that of the older one, as both stand now."""
-        there = se3.compose(se3.inverse(self.keyframe.pose[None]), self.keyframe_from_newest[None])
-        return se3.compose(there, self.newest.pose[None])[0]
+
+@dataclass(frozen=True)
+class Places:
+    """Maps, some of them put into others."""
+
+    maps: tuple[TrackMap, ...]
+    #: For each map that was begun: the map that holds it, and what was added to the numbers of its keyframes.
+    where: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def apart(cls, maps: Sequence[TrackMap]) -> Places:
+        """Return maps of which each is on its own."""
+        return cls(tuple(maps), tuple((k, 0) for k in range(len(maps))))
+
+    def joined(self, joint: Joint) -> Places:
+        """Put the map of one side of a joint into that of the other; where both are in one map, it is a loop."""
+        (root, before), (other, after) = self.where[joint.older], self.where[joint.newer]
+        old, new, relative = before + joint.keyframe, after + joint.newest, joint.keyframe_from_newest
+        first, second = joint.first, joint.second
+        if other < root:
+            root, other, old, new, first, second = other, root, new, old, second, first
+            relative = se3.inverse(relative[None])[0]
+        if root == other:
+            joined, where = self.maps[root].copy(), self.where
+        else:
+            here, there = self.maps[root].keyframes[old], self.maps[other].keyframes[new]
+            moved = se3.compose(se3.inverse(here.pose[None]), relative[None])
+            joined = joined_map(self.maps[root], self.maps[other], se3.compose(moved, there.pose[None])[0])
+            shift = len(self.maps[root].keyframes)
+            where = tuple((root, number + shift) if held == other else (held, number) for held, number in self.where)
+            new += shift
+        joined.loops.append((old, new, relative))
+        join_points(joined, joined.keyframes[old], joined.keyframes[new], first, second)
+        return Places((*self.maps[:root], joined, *self.maps[root + 1 :]), where)
 
 
 def search_older_maps(maps: list[TrackMap], newest: Keyframe, gates: TrackingGates) -> LoopSearch | None:
     """Return the search for the newest keyframe in all maps but the last, or None if there are no keyframes."""
-    keyframes = [keyframe for older in maps[:-1] for keyframe in older.living()]
-    if not keyframes:
-        return None
-    chosen = np.unique(np.linspace(0, len(keyframes) - 1, 2 * gates.loops.compared).astype(int))
-    return LoopSearch(newest, [keyframes[k] for k in chosen], gates)
+    keyframes = _evenly([keyframe for older in maps[:-1] for keyframe in older.living()], 2 * gates.loops.compared)
+    return LoopSearch(newest, keyframes, gates) if keyframes else None
 
 
 def find_joint(
-    maps: list[TrackMap],
+    maps: Sequence[TrackMap],
     camera: TrackCamera,
+    newer: int,
     newest: Keyframe,
     pairs: list[tuple[Keyframe, IntArray, IntArray]],
     gates: TrackingGates,
 ) -> Joint | None:
-    """Return how the newest map joins an older one, if what a search found agrees on one pose."""
+    """Return how a keyframe of a map joins it to another, if what a search found agrees on one pose."""
     best: Joint | None = None
     for keyframe, first, second in pairs:
-        older = next(k for k, part in enumerate(maps) if keyframe in part.living())
+        older = next((k for k, part in enumerate(maps) if keyframe in part.living()), newer)
+        if older == newer:
+            continue
         found = agreeing_pose(maps[older], camera, keyframe, newest, first, second, gates)
         if found is not None and (best is None or len(found[1]) > len(best.first)):
             pose, first, second = found
             relative = se3.compose(keyframe.pose[None], se3.inverse(pose[None]))[0]
-            best = Joint(older, keyframe, newest, relative, first, second)
+            best = Joint(older, keyframe.index, newer, newest.index, relative, first, second)
     return best
 
 
-def join_maps(maps: list[TrackMap], joints: dict[int, Joint]) -> dict[int, tuple[int, int]]:
-    """Put each map that has a joint into the older one.
-
-    Returns where each map now is: the map that holds it, and what was added to the numbers of its keyframes.
-    """
-    where = {k: (k, 0) for k in range(len(maps))}
-    for k in sorted(joints):
-        joint = joints[k]
-        root = where[joint.older][0]
-        # The keyframes of the older map may have been moved into another world; the joint looks at where they are now.
-        shift = _absorb(maps[root], maps[k], joint.older_from_newer())
-        where[k] = (root, shift)
-        maps[root].loops.append((joint.keyframe.index, joint.newest.index, joint.keyframe_from_newest))
-        join_points(maps[root], joint.keyframe, joint.newest, joint.first, joint.second)
-    return where
+def best_joint(maps: Sequence[TrackMap], camera: TrackCamera, one: int, two: int, gates: TrackingGates) -> Joint | None:
+    """Return the joint of two maps that most agrees with, over an even choice of the keyframes of both."""
+    older, newer = (_evenly(maps[k].living(), 2 * gates.loops.compared) for k in (one, two))
+    best = None
+    for newest in newer:
+        joint = find_joint(maps, camera, two, newest, LoopSearch(newest, older, gates).run(), gates)
+        if joint is not None and (best is None or len(joint.first) > len(best.first)):
+            best = joint
+    return best
 
 
-def _absorb(track_map: TrackMap, other: TrackMap, here_from_there: FloatArray) -> int:
-    """Add all of another map, moved by a pose; return what was added to the numbers of its keyframes."""
-    shift = len(track_map.keyframes)
+def _evenly(keyframes: list[Keyframe], count: int) -> list[Keyframe]:
+    chosen = np.unique(np.linspace(0, len(keyframes) - 1, count).astype(int))
+    return [keyframes[k] for k in chosen] if keyframes else []
+
+
+def joined_map(track_map: TrackMap, other: TrackMap, here_from_there: FloatArray) -> TrackMap:
+    """Return a map of all that two maps hold; the other is moved by a pose (7,), and its keyframes come last."""
+    out, shift = track_map.copy(), len(track_map.keyframes)
     start = {}
     for kind in ("points", "lines", "planes"):
-        mine, theirs = getattr(track_map, kind), getattr(other, kind)
+        mine, theirs = getattr(out, kind), getattr(other, kind)
         start[kind] = len(mine)
         rows = mine.extend(len(theirs))
         for name in theirs._columns:
             getattr(mine, name)[rows] = getattr(theirs, name)
         for name in ("keyframe", "first_keyframe"):
             if name in theirs._columns:
-                column = getattr(mine, name)
-                column[rows] = _shifted(column[rows], shift)
+                getattr(mine, name)[rows] = _shifted(getattr(theirs, name), shift)
     points, lines, planes = (slice(start[kind], None) for kind in ("points", "lines", "planes"))
-    track_map.points.xyz[points] = into(here_from_there, track_map.points.xyz[points])
-    alive = np.flatnonzero(track_map.lines.alive[lines]) + start["lines"]
+    out.points.xyz[points] = into(here_from_there, other.points.xyz)
+    alive = np.flatnonzero(other.lines.alive)
     if len(alive):
-        moved = Lines.through(into(here_from_there, track_map.lines.segment[alive]))
-        track_map.lines.segment[alive], track_map.lines.plucker[alive] = moved.segments, moved.plucker
-    track_map.lines.plane[lines] = _shifted(track_map.lines.plane[lines], start["planes"])
-    track_map.planes.hesse[planes] = planes_into(here_from_there, track_map.planes.hesse[planes])
-    track_map.planes.samples[planes] = into(here_from_there, track_map.planes.samples[planes])
-    track_map.planes.merged_into[planes] = _shifted(track_map.planes.merged_into[planes], start["planes"])
+        moved = Lines.through(into(here_from_there, other.lines.segment[alive]))
+        rows = alive + start["lines"]
+        out.lines.segment[rows], out.lines.plucker[rows] = moved.segments, moved.plucker
+    out.lines.plane[lines] = _shifted(other.lines.plane, start["planes"])
+    out.planes.hesse[planes] = planes_into(here_from_there, other.planes.hesse)
+    out.planes.samples[planes] = into(here_from_there, other.planes.samples)
+    out.planes.merged_into[planes] = _shifted(other.planes.merged_into, start["planes"])
     there_from_here = se3.inverse(here_from_there[None])
-    for keyframe in other.keyframes:
-        keyframe.pose = se3.compose(keyframe.pose[None], there_from_here)[0]
-        keyframe.index += shift
-        keyframe.parent = keyframe.parent + shift if keyframe.parent >= 0 else -1
-        measured = keyframe.measured
-        keyframe.measured = replace(
-            measured,
-            **{
-                kind: replace(getattr(measured, kind), index=getattr(measured, kind).index + start[kind])
-                for kind in ("points", "lines", "planes")
-            },
-        )
-        keyframe.features.point[:] = _shifted(keyframe.features.point, start["points"])
-    track_map.loops += [(one + shift, two + shift, pose) for one, two, pose in other.loops]
-    track_map.keyframes += other.keyframes
-    return shift
+    out.keyframes += [_moved(keyframe, there_from_here, shift, start) for keyframe in other.keyframes]
+    out.loops += [(one + shift, two + shift, pose) for one, two, pose in other.loops]
+    out.pinned |= {index + shift for index in other.pinned}
+    return out
 
 
-def about_parts(breaks: list[tuple[float, float]], where: dict[int, tuple[int, int]], others: list[int]) -> list[str]:
+def _moved(keyframe: Keyframe, there_from_here: FloatArray, shift: int, start: dict[str, int]) -> Keyframe:
+    """Return a keyframe in the world of another map, under its numbers there."""
+    tables = {kind: getattr(keyframe.measured, kind) for kind in start}
+    measured = {kind: replace(table, index=table.index + start[kind]) for kind, table in tables.items()}
+    features = keyframe.features
+    return replace(
+        keyframe,
+        index=keyframe.index + shift,
+        parent=keyframe.parent + shift if keyframe.parent >= 0 else -1,
+        pose=se3.compose(keyframe.pose[None], there_from_here)[0],
+        measured=replace(keyframe.measured, **measured),
+        features=replace(features, point=_shifted(features.point, start["points"])),
+    )
+
+
+def about_parts(breaks: list[tuple[float, float]], where: Sequence[tuple[int, int]], others: list[int]) -> list[str]:
     """Say where a track broke, and what became of its maps.
 
     Parameters
@@ -148,12 +182,12 @@ def about_parts(breaks: list[tuple[float, float]], where: dict[int, tuple[int, i
     breaks
         Times of losses, and of the new maps.
     where
-        Of :func:`join_maps`.
+        Of :class:`Places`.
     others
         Number of frames of each part that is not the longest.
     """
     out = [f"The track was lost at {since:.3f} s; a new map was begun at {until:.3f} s." for since, until in breaks]
-    joined = sum(root != part for part, (root, _) in where.items())
+    joined = sum(root != part for part, (root, _) in enumerate(where))
     if joined:
         out.append(f"Joined to an older map, where a place was recognised: {counted(joined, 'new maps')}.")
     if others:
@@ -168,4 +202,4 @@ def _shifted(index: IntArray, by: int) -> IntArray:
     return np.where(index >= 0, index + by, -1)
 
 
-__all__ = ["Joint", "Part", "about_parts", "find_joint", "join_maps", "search_older_maps"]
+__all__ = ["Joint", "Part", "Places", "about_parts", "best_joint", "find_joint", "joined_map", "search_older_maps"]

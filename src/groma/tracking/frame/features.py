@@ -26,15 +26,15 @@ from groma.tracking.frame.depth import (
 from groma.tracking.frame.planes import FramePlanes, frame_planes
 from groma.tracking.frame.sparse_depth import fill_sparse
 from groma.tracking.frame.stereo import Disparities, dense_disparities, match_columns
-from groma.tracking.gates import DEFAULT, DepthGates
+from groma.tracking.gates import DEFAULT, DepthGates, FeatureGates
 from groma.tracking.options import TrackOptions
 
 Descriptors = npt.NDArray[np.uint8]
 
 
-@dataclass
+@dataclass(frozen=True)
 class Features:
-    """Described features (ORB) of a frame."""
+    """Described features (ORB) of a frame. The arrays are never written to: frames and keyframes share them."""
 
     #: (N, 2) pixels, (N,) response, (N,) size of a pixel of the image in the pyramid where each was found, pixels.
     pixel: FloatArray
@@ -46,6 +46,23 @@ class Features:
     depth: FloatArray
     #: (N,) the map's point at this feature, or -1.
     point: IntArray
+
+    def __post_init__(self) -> None:
+        point = self.point.view()
+        point.flags.writeable = False
+        object.__setattr__(self, "point", point)
+
+    @classmethod
+    def none(cls) -> Features:
+        """Return no features."""
+        none = np.zeros(0)
+        return cls(np.zeros((0, 2)), none, none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
+
+    def linked(self, rows: IntArray, points: IntArray) -> Features:
+        """Return the features with points of the map at some of them."""
+        point = self.point.copy()
+        point[rows] = points
+        return replace(self, point=point)
 
 
 @dataclass(frozen=True)
@@ -68,7 +85,7 @@ class FrameFeatures:
     @cached_property
     def features(self) -> Features:
         """ORB features over several scales."""
-        return describe(self.gray, self.options.num_features, self.depths, self.options.gates.features.fast_threshold)
+        return describe(self.gray, self.options.num_features, self.depths, self.options.gates.features)
 
     @cached_property
     def detected(self) -> DetectedSegments:
@@ -188,19 +205,42 @@ def grid_shape(camera: TrackCamera, gates: DepthGates = DEFAULT.depth) -> tuple[
 
 
 def describe(
-    gray: npt.NDArray[np.uint8], count: int, depths: Callable[[FloatArray], FloatArray], fast_threshold: int
+    gray: npt.NDArray[np.uint8],
+    count: int,
+    depths: Callable[[FloatArray], FloatArray],
+    gates: FeatureGates = DEFAULT.features,
 ) -> Features:
-    """Find and describe ORB features."""
-    orb = cv2.ORB.create(nfeatures=count, fastThreshold=fast_threshold)
-    keypoints, descriptor = orb.detectAndCompute(gray, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    """Find and describe ORB features, in all parts of the image rather than where contrast is strongest."""
+    finder = cv2.ORB.create(nfeatures=gates.candidates * count, fastThreshold=gates.fast_threshold)
+    keypoints = finder.detect(gray, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    response = np.array([keypoint.response for keypoint in keypoints])
+    octave = np.array([keypoint.octave for keypoint in keypoints], np.int64)
+    pixel = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64).reshape(-1, 2)
+    keypoints = [keypoints[row] for row in _in_turn(pixel, response, octave, count, gates)]
+    keypoints, descriptor = finder.compute(gray, keypoints)
     if not keypoints:
-        none = np.zeros(0)
-        return Features(np.zeros((0, 2)), none, none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
+        return Features.none()
     pixel = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64) + 0.5
     response = np.array([keypoint.response for keypoint in keypoints])
-    scale = orb.getScaleFactor() ** np.array([keypoint.octave for keypoint in keypoints], np.float64)
+    scale = finder.getScaleFactor() ** np.array([keypoint.octave for keypoint in keypoints], np.float64)
     none = np.full(len(pixel), -1)
     return Features(pixel, response, scale, np.asarray(descriptor, np.uint8), depths(pixel), none)
+
+
+def _in_turn(pixel: FloatArray, response: FloatArray, octave: IntArray, count: int, gates: FeatureGates) -> IntArray:
+    """Rows of the chosen: the strongest of each cell, then the second of each, ..., on each scale by its share."""
+    if len(pixel) <= count:
+        return np.arange(len(pixel))
+    at = (pixel // gates.cell).astype(np.int64)
+    cell = (octave * (at[:, 1].max() + 1) + at[:, 1]) * (at[:, 0].max() + 1) + at[:, 0]
+    order = np.lexsort((-response, cell))
+    start = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    turn = np.empty(len(order), np.int64)
+    turn[order] = np.arange(len(order)) - np.repeat(start, np.diff(start, append=len(order)))
+    order = np.lexsort((-response, turn, octave))
+    of = np.bincount(octave)
+    place = np.arange(len(order)) - np.repeat(np.cumsum(of) - of, of)
+    return np.sort(order[place < count / len(order) * of[octave[order]]])
 
 
 __all__ = ["Descriptors", "DetectedSegments", "Features", "FrameFeatures", "grid_pixels", "grid_shape", "segment_noise"]

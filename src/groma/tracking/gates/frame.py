@@ -118,6 +118,8 @@ class FeatureGates:
     """Described features."""
 
     fast_threshold: int = gate(7, "grey levels", "contrast of a corner (FAST)", SEQUENCES)
+    candidates: int = gate(4, "ratio", "features found for each that is described", "cost: time per keyframe")
+    cell: int = gate(32, "px", "described features are taken from cells of this side in turn", "chosen on EuRoC V1_01")
     max_bits: int = gate(
         64, "bits", "descriptors of a pair differ in at most so many of 256",
         "derived from chance: unlike descriptors differ in fewer once in 10^15",

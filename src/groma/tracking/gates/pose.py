@@ -84,6 +84,9 @@ class VerificationGates:
     min_kept: float = gate(0.12, "share", "share of what the last keyframe measured", SEQUENCES)
     confirmed_evidence: float = gate(6.0, "score", "points and lines where depth confirms a pose", SEQUENCES)
     min_agreeing: float = gate(0.03, "share", "share of the features in view that agree with a found pose", SEQUENCES)
+    min_seen: float = gate(
+        0.5, "share", "share of the points in view that agree, or features are asked too", "convention: the majority"
+    )
     surprise: float = gate(2.0, "sigma", "a pose farther from the prediction is looked at twice", SEQUENCES)
     wider: float = gate(3.0, "ratio", "the prior of a pose found by features is wider", SEQUENCES)
     jump: float = gate(6.0, "sigma", "distance of a found pose from the prediction", SEQUENCES)

@@ -10,12 +10,13 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.tracking.frame.camera import TrackCamera
-from groma.tracking.frame.features import Features, FrameFeatures
+from groma.tracking.frame.features import Features
 from groma.tracking.frame.measurements import PointMeasurements
 from groma.tracking.map.landmarks import ALIVE, DEAD
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.map.triangulation import triangulate
+from groma.tracking.options import TrackOptions
 
 
 def match_features(first: Features, second: Features, max_bits: int) -> tuple[IntArray, IntArray]:
@@ -51,7 +52,7 @@ def points_of_features(
     points.xyz[new], points.state[new] = places, ALIVE
     points.keyframe[new] = points.first_keyframe[new] = keyframe.index
     points.pixel[new] = points.first_pixel[new] = pixel
-    features.point[rows] = new
+    keyframe.features = features.linked(rows, new)
     unknown = np.full(len(new), np.nan)
     table = PointMeasurements(new, pixel, sigma * features.scale[rows], features.depth[rows], depth_sigma, unknown)
     keyframe.measured = replace(keyframe.measured, points=PointMeasurements.stack([keyframe.measured.points, table]))
@@ -59,9 +60,15 @@ def points_of_features(
 
 
 def place_by_motion(
-    track_map: TrackMap, camera: TrackCamera, keyframe: Keyframe, data: FrameFeatures, pose: FloatArray, taken: IntArray
-) -> PointTracks:
-    """Place features that a keyframe and a frame both see and that have no place yet; return them as followed points.
+    track_map: TrackMap,
+    camera: TrackCamera,
+    keyframe: Keyframe,
+    features: Features,
+    pose: FloatArray,
+    taken: IntArray,
+    options: TrackOptions,
+) -> tuple[PointTracks, Features]:
+    """Place features that a keyframe and a frame both see and that have no place yet.
 
     Parameters
     ----------
@@ -69,22 +76,29 @@ def place_by_motion(
         The map and its camera.
     keyframe
         An earlier keyframe.
-    data, pose
-        The frame, and its pose (7,).
+    features, pose
+        Those of the frame, linked to the points that it is known to show, and its pose (7,).
     taken : (n,)
         Points that are followed already.
+    options
+        Those of the track.
+
+    Returns
+    -------
+    PointTracks, Features
+        The points as they are followed from now on, and the features linked to them.
     """
-    points, features, own = track_map.points, data.features, keyframe.features
-    first, second = match_features(own, features, data.options.gates.features.max_bits)
+    points, own = track_map.points, keyframe.features
+    first, second = match_features(own, features, options.gates.features.max_bits)
     index = own.point[first]
     placed = index >= 0
     placed[placed] = points.state[index[placed]] == ALIVE
     free = ~placed & (features.point[second] < 0)
     first, second = first[free], second[free]
     if not len(first):
-        return PointTracks.empty()
+        return PointTracks.empty(), features
     poses = np.tile(keyframe.pose, (len(first), 1))
-    places, good = triangulate(camera, poses, own.pixel[first], pose, features.pixel[second], data.options.gates.points)
+    places, good = triangulate(camera, poses, own.pixel[first], pose, features.pixel[second], options.gates.points)
     first, second, places = first[good], second[good], places[good]
     index = own.point[first]
     begun = index >= 0
@@ -92,12 +106,10 @@ def place_by_motion(
     points.xyz[index[begun]], points.state[index[begun]] = places[begun], ALIVE
     fresh = ~begun
     unknown = np.full(int(fresh.sum()), np.nan)
-    sigma = data.options.point_sigma_px
-    index[fresh] = points_of_features(track_map, keyframe, first[fresh], places[fresh], unknown, sigma)
-    features.point[second] = index
+    index[fresh] = points_of_features(track_map, keyframe, first[fresh], places[fresh], unknown, options.point_sigma_px)
     tracks = PointTracks(index, features.pixel[second])
     tracks = tracks.take(np.unique(index, return_index=True)[1])
-    return tracks.take(~np.isin(tracks.index, taken))
+    return tracks.take(~np.isin(tracks.index, taken)), features.linked(second, index)
 
 
 __all__ = ["match_features", "place_by_motion", "points_of_features"]

@@ -14,7 +14,7 @@ from groma.features.point_tracks import corners, spread
 from groma.geometry import se3
 from groma.scene.landmarks import Lines
 from groma.tracking.frame.camera import TrackCamera, back, into
-from groma.tracking.frame.features import FrameFeatures
+from groma.tracking.frame.features import Features, FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.gates import LineGates
 from groma.tracking.map.feature_points import place_by_motion
@@ -83,14 +83,14 @@ def add_keyframe(
 ) -> Followed:
     """Make a keyframe of a frame whose pose is known; return what is followed from now on."""
     index = len(track_map.keyframes)
-    tracks = _add_points(track_map, camera, data, pose, followed.points, index, options)
+    tracks, features = _add_points(track_map, camera, data, pose, followed.points, index, options)
     segments, lines = followed.lines, LineMeasurements.empty()
     if options.lines:
         segments, lines = _add_lines(track_map, camera, data, pose, followed.lines, index, options)
     planes = _add_planes(track_map, data, pose) if data.planes is not None else PlaneMeasurements.empty()
     measured = Measurements(measure_points(data, tracks, options, track_map, pose, camera), lines, planes)
     name, time = data.frame.name, data.frame.timestamp
-    keyframe = Keyframe(index, time, name, pose.copy(), data.gray, measured, data.features, data.depth_grid)
+    keyframe = Keyframe(index, time, name, pose.copy(), data.gray, measured, features, data.depth_grid)
     alive = measured.points.index[track_map.points.alive[measured.points.index]]
     if len(alive):
         keyframe.depth = max(float(np.median(into(pose, track_map.points.xyz[alive])[:, 2])), 1e-6)
@@ -124,7 +124,9 @@ def measure_points(
 # ---------------------------------------------------------------------------------------------------------- points
 
 
-def _add_points(track_map, camera, data, pose, tracks: PointTracks, index: int, options) -> PointTracks:
+def _add_points(
+    track_map, camera, data, pose, tracks: PointTracks, index: int, options
+) -> tuple[PointTracks, Features]:
     """Place followed points whose place has become known, start new ones, and link described features to points."""
     points, gates = track_map.points, options.gates.points
     features = data.features
@@ -137,13 +139,13 @@ def _add_points(track_map, camera, data, pose, tracks: PointTracks, index: int, 
             found = KDTree(features.pixel).query(tracks.pixel, distance_upper_bound=gates.same_feature)
             distance, nearest = np.asarray(found[0]), np.asarray(found[1])
             rows = np.flatnonzero(np.isfinite(distance))
-            free = features.point[nearest[rows]] < 0
-            features.point[nearest[rows[free]]] = tracks.index[rows[free]]
+            features = features.linked(nearest[rows], tracks.index[rows])
         depthless = data.frame.depth is None and data.frame.right is None
         if depthless and track_map.keyframes and points.alive[tracks.index].sum() < gates.few * options.num_points:
             # After a wide step hardly any point was followed, but many features are seen again.
             before = track_map.near
-            tracks = tracks.joined(place_by_motion(track_map, camera, before, data, pose, tracks.index))
+            placed, features = place_by_motion(track_map, camera, before, features, pose, tracks.index, options)
+            tracks = tracks.joined(placed)
         # New points: described features first, then corners where there are none.
         room = max(options.num_points - len(tracks), 0)
         cell = max(12, int(math.sqrt(data.gray.size / options.num_points)))
@@ -162,7 +164,7 @@ def _add_points(track_map, camera, data, pose, tracks: PointTracks, index: int, 
         rows = points.extend(int(pixel_rows.sum()))
         every = np.full(len(pixel), -1, dtype=np.int64)
         every[pixel_rows] = rows
-        features.point[free] = every[: len(free)]
+        features = features.linked(free, every[: len(free)])
         pixel = pixel[pixel_rows]
         points.keyframe[rows], points.pixel[rows] = index, pixel
         points.first_keyframe[rows], points.first_pixel[rows] = index, pixel
@@ -171,7 +173,7 @@ def _add_points(track_map, camera, data, pose, tracks: PointTracks, index: int, 
         points.xyz[rows[known]] = back(pose, camera.bearings(pixel[known]) * depth[known, None])
         points.state[rows[known]] = ALIVE
         tracks = tracks.joined(PointTracks(rows, pixel))
-    return tracks
+    return tracks, features
 
 
 def _place_pending(track_map: TrackMap, camera: TrackCamera, data: FrameFeatures, pose, tracks: PointTracks) -> None:

@@ -8,6 +8,7 @@ after it was culled. Rows are never reused, so an index always means the same la
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -48,6 +49,12 @@ class _Growing:
         rows = np.arange(self.count, need)
         self.count = need
         return rows
+
+    def copy(self) -> Self:
+        """Return a table of its own with the same rows."""
+        out = type(self)()
+        out.count, out._arrays = self.count, {name: array.copy() for name, array in self._arrays.items()}
+        return out
 
     @property
     def alive(self) -> BoolArray:

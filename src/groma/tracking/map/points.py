@@ -12,7 +12,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.point_tracks import follow
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.gates import PointGates
-from groma.tracking.map.track_map import TrackMap
+from groma.tracking.map.track_map import Keyframe, TrackMap
 
 
 @dataclass(frozen=True)
@@ -66,16 +66,36 @@ def follow_points(
     pixel, good = follow(before, now, tracks.pixel, guess)
     rows = np.flatnonzero(good)
     tracks = PointTracks(tracks.index[rows], pixel[rows])
-    keyframe = track_map.near
+    return held_to_patches(track_map, track_map.near, tracks, now, max_correction)
+
+
+def held_to_patches(
+    track_map: TrackMap,
+    keyframe: Keyframe,
+    tracks: PointTracks,
+    now: npt.NDArray[np.uint8],
+    max_correction: float,
+) -> PointTracks:
+    """Move points whose patch is in a keyframe to where it is in an image, if that is not far."""
+    points = track_map.points
     own = np.flatnonzero(points.keyframe[tracks.index] == keyframe.index)
-    if keyframe.gray is not None and len(own):
-        patch = points.pixel[tracks.index[own]]
-        pixel, good = follow(keyframe.gray, now, patch, tracks.pixel[own], levels=0, round_trip=None)
-        good &= np.linalg.norm(pixel - tracks.pixel[own], axis=1) < max_correction
-        held = tracks.pixel.copy()
-        held[own[good]] = pixel[good]
-        tracks = PointTracks(tracks.index, held)
-    return tracks
+    if keyframe.gray is None or not len(own):
+        return tracks
+    patch = points.pixel[tracks.index[own]]
+    pixel, good = follow(keyframe.gray, now, patch, tracks.pixel[own], levels=0, round_trip=None)
+    good &= np.linalg.norm(pixel - tracks.pixel[own], axis=1) < max_correction
+    held = tracks.pixel.copy()
+    held[own[good]] = pixel[good]
+    return PointTracks(tracks.index, held)
+
+
+def agreeing(
+    track_map: TrackMap, camera: TrackCamera, tracks: PointTracks, pose: FloatArray, max_distance: float
+) -> PointTracks:
+    """Return the followed points that are where a pose (7,) says, to within a distance in pixels."""
+    points = track_map.points
+    away = camera.project(into(pose, points.xyz[tracks.index])) - tracks.pixel
+    return tracks.take(points.alive[tracks.index] & (np.linalg.norm(away, axis=1) < max_distance))
 
 
 def find_again(
@@ -120,4 +140,4 @@ def find_again(
     return found
 
 
-__all__ = ["PointTracks", "find_again", "follow_points"]
+__all__ = ["PointTracks", "agreeing", "find_again", "follow_points", "held_to_patches"]

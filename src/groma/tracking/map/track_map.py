@@ -15,7 +15,7 @@ from groma.tracking.frame.measurements import Measurements
 from groma.tracking.map.landmarks import ALIVE, DEAD, LineTable, MapView, PlaneTable, PointTable
 
 
-@dataclass
+@dataclass(eq=False)
 class Keyframe:
     """A frame that stays: its image for patches, what it measures, and its described features."""
 
@@ -40,8 +40,7 @@ class Keyframe:
         """Let go of everything but the pose."""
         self.gray = None
         self.measured = Measurements.empty()
-        none = np.zeros(0)
-        self.features = Features(np.zeros((0, 2)), none, none, np.zeros((0, 32), np.uint8), none, np.zeros(0, np.int64))
+        self.features = Features.none()
         self.depth_grid = np.full(len(self.depth_grid), np.nan)
 
 
@@ -74,6 +73,12 @@ class TrackMap:
     def near(self) -> Keyframe:
         """The keyframe whose patches are followed."""
         return self.keyframes[self.reference]
+
+    def copy(self) -> TrackMap:
+        """Return a map that can be changed without changing this one; images and other values are shared."""
+        tables = {kind: getattr(self, kind).copy() for kind in ("points", "lines", "planes")}
+        keyframes = [replace(keyframe, pose=keyframe.pose.copy()) for keyframe in self.keyframes]
+        return replace(self, keyframes=keyframes, loops=list(self.loops), pinned=set(self.pinned), **tables)
 
     def visit(self, keyframe: Keyframe) -> None:
         """Follow the patches of a keyframe from now on."""

@@ -42,6 +42,8 @@ _SOLVER = SolverOptions(
 )
 #: Types of factors that tell which points, lines and planes agree.
 _TELLING = (("point_reprojection", "stereo_point"), ("line_reprojection",), ("plane_observation",))
+#: The order in which three arrays are multiplied that numpy finds by itself.
+_ORDER = ["einsum_path", (0, 1), (0, 1)]
 _NAMES = ("x", "y", "z", "turn about x", "turn about y", "turn about z")
 
 
@@ -102,8 +104,7 @@ def estimate_pose(
     )
     problem = assemble(scene, _ASSEMBLY).problem
     for loss in _LOSSES:
-        staged = Problem(problem.variables, [with_loss(factor, loss) for factor in problem.factors])
-        problem = solve(staged, _SOLVER).problem
+        problem = solve(with_loss(problem, loss), _SOLVER).problem
     every = problem.factors[:-1]  # all but the prior
     pose = problem.variables["frames"].state[0]
     kept = [
@@ -152,7 +153,7 @@ def pose_information(problem: Problem, factors: Sequence[Factor]) -> FloatArray:
         record = _whitened(problem, factor, columns, 7)
         weight = 1.0 / (1.0 + (record[..., 6] ** 2).sum(axis=1) / GATE**2) ** 2
         J = record[..., :6]
-        total += np.einsum("n,nij,nik->jk", weight, J, J, optimize=True)
+        total += np.einsum("n,nij,nik->jk", weight, J, J, optimize=_ORDER)
     return total
 
 

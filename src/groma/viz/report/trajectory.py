@@ -297,6 +297,8 @@ def _scores(scores: TrajectoryScores | None) -> str:
     caption = f"{scores.num_poses:,} poses over {scores.path_length:.4g}; aligned: {words[scores.alignment]}"
     if scores.alignment == "sim3":
         caption += f" ({scores.similarity.scale:.4g})"
+    if scores.by_orientations:
+        caption += ", by positions and orientations, since the positions alone do not determine the rotation"
     if scores.drift_percent is not None:
         caption += f". Drift {scores.drift_percent:.3g} %, {scores.drift_deg_per_metre:.3g} degrees per unit"
     return _page_tables.table("Against the reference", caption + ".", ["error", "rms", "median", "largest"], rows)

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The end of a track: last keyframe, joints of its maps, the adjustment of all keyframes, and what is returned.
+
+A step that fails, or that Ctrl-C interrupts, is left out and named in a warning. The maps are then as they were before
+it, so that nothing that was found is lost to a failure at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+from typing import TypeVar
+
+import numpy as np
+
+from groma.io.trajectories import Trajectory
+from groma.solver.report import SolveReport
+from groma.tracking.backend.mapper import Mapper, Present
+from groma.tracking.backend.submaps import Joint, Part, Places, best_joint
+from groma.tracking.map.track_map import TrackMap
+from groma.tracking.outcome import History
+from groma.tracking.result import map_to_scene
+from groma.tracking.stopwatch import Stopwatch
+
+T = TypeVar("T")
+
+
+class Ending:
+    """The steps at the end of a track, and what became of them."""
+
+    def __init__(self, mapper: Mapper, history: History) -> None:
+        self._mapper, self._history = mapper, history
+        self._interrupted = False
+        #: What was left out, for the reader.
+        self.warnings: list[str] = []
+
+    def attempt(self, what: str, step: Callable[[], T], otherwise: T) -> T:
+        """Return what a step gives; where it fails, the maps are as before and ``otherwise`` is returned."""
+        if self._interrupted:
+            return otherwise
+        mapper = self._mapper
+        kept, current = [track_map.copy() for track_map in mapper.maps], mapper.current
+        try:
+            return step()
+        except KeyboardInterrupt:
+            self._interrupted = True
+            self.warnings.append(f"Interrupted at the end of the track: {what}. This and what follows was left out.")
+        except Exception as error:
+            self.warnings.append(_left_out(what, error))
+        mapper.abandon()
+        mapper.maps, mapper.current = kept, current
+        return otherwise
+
+    def settle(self, present: Present) -> None:
+        """Make the keyframe that was chosen last, take up what threads worked out, and end them."""
+        mapper = self._mapper
+        if mapper.due is not None:
+            self.attempt("the last keyframe", lambda: mapper.make_keyframe(present, Stopwatch()), None)
+        self.attempt("the last adjustment of a window", lambda: mapper.take_up(present, now=True), None)
+        self.attempt("the end of the threads", mapper.close, None)
+
+    def join(self) -> tuple[tuple[int, int], ...]:
+        """Join maps that saw the same place; return for each the map that holds it, and the shift of its keyframes."""
+        mapper = self._mapper
+        places = Places.apart(mapper.maps)
+        for joint in mapper.joints.values():
+            places = self._joined(places, joint)
+        if mapper.metric and mapper.options.close_loops:
+            for one, two in combinations(range(len(mapper.maps)), 2):
+                if places.where[one][0] != places.where[two][0]:
+                    places = self._searched(places, one, two)
+        mapper.maps = list(places.maps)
+        self._history.joined(places.where)
+        return places.where
+
+    def _searched(self, places: Places, one: int, two: int) -> Places:
+        """Look for places that two maps have in common."""
+        mapper = self._mapper
+        joint = self.attempt(
+            f"the search for places common to maps {one + 1} and {two + 1}",
+            lambda: best_joint(mapper.maps, mapper.camera, one, two, mapper.options.gates),
+            None,
+        )
+        return places if joint is None else self._joined(places, joint)
+
+    def _joined(self, places: Places, joint: Joint) -> Places:
+        what = f"joining maps {joint.older + 1} and {joint.newer + 1}"
+        return self.attempt(what, lambda: places.joined(joint), places)
+
+    def adjust(self, part: int) -> tuple[SolveReport | None, float]:
+        """Adjust all keyframes of a map; return the report and the offset of the right images, pixels."""
+        report, offset = self.attempt(
+            "the adjustment of all keyframes", lambda: self._mapper.adjust_at_end(part), (None, 0.0)
+        )
+        if report is not None and not report.converged:
+            self.warnings.append(
+                f"The adjustment of all keyframes did not converge in {report.iterations} steps "
+                f"({report.termination.key}). groma adjust on scene.npz continues it."
+            )
+        return report, offset
+
+    def part(self, root: int) -> Part:
+        """Return the trajectory and the scene of a map."""
+        mapper = self._mapper
+        track_map, relations = mapper.maps[root], mapper.options.relations
+        stamps = np.array([keyframe.timestamp for keyframe in track_map.living()])
+        trajectory = self._built("the trajectory", lambda: self._history.trajectory(track_map, root), Trajectory())
+        nothing = map_to_scene(TrackMap(), mapper.camera)
+        scene = self._built("the scene", lambda: map_to_scene(track_map, mapper.camera, relations), nothing)
+        return Part(trajectory, scene, stamps[: scene.num_images])
+
+    def _built(self, what: str, step: Callable[[], T], otherwise: T) -> T:
+        """Return what a step gives, also after an interruption."""
+        try:
+            return step()
+        except KeyboardInterrupt:
+            return step()
+        except Exception as error:
+            self.warnings.append(_left_out(what, error))
+            return otherwise
+
+
+def _left_out(what: str, error: Exception) -> str:
+    return (
+        f"Left out at the end of the track: {what}, which failed ({type(error).__name__}: {error}). Please report it."
+    )
+
+
+__all__ = ["Ending"]

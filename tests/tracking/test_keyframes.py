@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Keyframes: each is another frame, whatever failed on the way; described features in all parts of an image."""
+
+import _room
+import numpy as np
+import pytest
+
+from groma.geometry import se3
+from groma.tracking import Tracker, TrackOptions
+from groma.tracking.backend.mapper import Mapper
+from groma.tracking.frame.camera import TrackCamera
+from groma.tracking.frame.features import describe
+from groma.tracking.map.landmarks import ALIVE
+from groma.tracking.map.points import PointTracks
+from groma.tracking.map.track_map import TrackMap
+from groma.tracking.pose.estimate import PoseEstimate
+from groma.tracking.pose.verification import PoseVerification
+
+OPTIONS = TrackOptions(num_points=250, num_features=500)
+
+
+def _wide(count: int) -> np.ndarray:
+    """Steps of 12 degrees there and back, each other than the one before: constant velocity is wrong every time."""
+    twist = np.zeros((count, 6))
+    twist[:, 4] = np.radians(12.0) * np.array([0, 1, 3, 2, 0, 2, 1, 3, 4, 2, 3, 1])[:count]
+    twist[:, 0] = 0.03 * np.arange(count)
+    return se3.inverse(se3.exp(twist))
+
+
+@pytest.mark.parametrize("kind", ["rgbd", "stereo"])
+def test_each_keyframe_is_another_frame(kind, monkeypatch):
+    """Frames are searched all the time, so that keyframes are made at once and again."""
+    searched = []
+    keep = Mapper.keep_present
+    monkeypatch.setattr(Mapper, "keep_present", lambda self, *more: (searched.append(1), keep(self, *more)))
+    monkeypatch.setattr(PoseVerification, "is_surprised", lambda self, *_: True)
+    frames = _room.frames(kind, _wide(12))
+    tracker = Tracker(_room.camera(_room.BASELINE if kind == "stereo" else None), OPTIONS)
+    rows = [tracker.process(frame) for frame in frames]
+    assert len(searched) >= 8
+    assert {row.status for row in rows} <= {"tracked", "found"}
+    times = [keyframe.timestamp for keyframe in tracker.map.keyframes]
+    assert len(times) == len(set(times))
+    result = tracker.finish()
+    names = result.scene.images.names
+    assert set(names) <= {frame.name for frame in frames}
+    assert len(set(names)) == len(names)
+    seen = result.scene.point_observations
+    # A photograph shows a point once, and every point is seen in two photographs at least.
+    pairs = np.column_stack([seen.image_idx, seen.point_idx])
+    assert len(np.unique(pairs, axis=0)) == len(pairs)
+    assert np.bincount(pairs[:, 1], minlength=result.scene.num_points).min() >= 2
+    assert _room.position_error(result.trajectory, _wide(12)) < 0.02
+
+
+def test_what_is_worked_out_is_taken_up_before_a_frame_is_searched():
+    """A frame that is a keyframe already is not made one again; its window is adjusted before the next is found."""
+    tracker = Tracker(_room.camera(), OPTIONS)
+    for frame in _room.frames("rgbd", _room.poses(14)):
+        tracker.process(frame)
+    mapper, present = tracker._mapper, tracker._present
+    mapper.keep_present(present, _NoWatch())
+    made = len(tracker.map.keyframes)
+    assert tracker.map.last.timestamp == present.data.frame.timestamp
+    assert mapper.busy
+    mapper.keep_present(present, _NoWatch())
+    assert len(tracker.map.keyframes) == made
+    assert not mapper.busy
+    tracker.finish()
+
+
+class _NoWatch:
+    def __call__(self, _stage):
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_error):
+        return None
+
+
+def test_features_are_described_in_all_parts_of_an_image():
+    """Bars of high contrast on the left would take all features; what is on the right has a tenth of their contrast."""
+    rng = np.random.default_rng(3)
+    image = np.full((240, 320), 128.0)
+    image[:, :100] = 60 + 140 * rng.integers(0, 2, (60, 25)).repeat(4, axis=0).repeat(4, axis=1)
+    image[:, 120:] += 14 * rng.integers(-1, 2, (40, 34)).repeat(6, axis=0).repeat(6, axis=1)[:, :200]
+    features = describe(image.astype(np.uint8), 300, lambda pixels: np.full(len(pixels), np.nan))
+    assert 250 <= len(features.pixel) <= 310
+    right = features.pixel[:, 0] > 120
+    # Two thirds of the image are there; by contrast alone it would have none.
+    assert right.mean() > 0.25
+    columns, rows = (
+        np.histogram(features.pixel[right, k], 4, limits)[0] for k, limits in ((0, (120, 320)), (1, (0, 240)))
+    )
+    assert columns.min() > 0 and rows.min() > 0
+
+
+def test_a_pose_that_most_points_do_not_agree_with_is_in_doubt():
+    camera, track_map = TrackCamera.of(_room.camera()), TrackMap()
+    rows = track_map.points.extend(40)
+    pixel = np.random.default_rng(2).uniform(20, 220, (40, 2))
+    track_map.points.xyz[rows] = 2.0 * camera.bearings(pixel)
+    track_map.points.state[rows] = ALIVE
+    before, verification = PointTracks(rows, pixel), PoseVerification(camera, OPTIONS)
+    none = np.zeros(0, bool)
+    for agree, doubt in ((15, True), (25, False)):
+        estimate = PoseEstimate(se3.identity(), np.arange(40) < agree, none, none, np.eye(6), ())
+        assert verification.misses_much(track_map, before, estimate) is doubt
+    # Points that leave the view are not missed.
+    away = se3.exp(np.array([[0, 0, 0, 0, 1.2, 0.0]]))[0]
+    estimate = PoseEstimate(away, np.arange(40) < 1, none, none, np.eye(6), ())
+    assert not verification.misses_much(track_map, before, estimate)
