@@ -70,6 +70,9 @@ def test_other_cameras_and_idle_ranks_are_told_once(parts, tmp_path):
     assert said.returncode == 0, said.stderr
     assert said.stderr.strip() == "warning: There are 1 parts for 2 ranks: 1 have nothing to do."
     groma.write_scene(synthetic.corridor(13).start, only.parent / "part-00001.npz")
+    said = mpiexec(*[adjust(only.parent, "-o", tmp_path / "z", "--loss-scale", "-1", "--loss", "huber")] * 2)
+    assert said.returncode == 1
+    assert len(said.stderr.splitlines()) == 1 and "must be a positive number" in said.stderr
     said = mpiexec(*[adjust(only.parent, "-o", tmp_path / "x")] * 2)
     assert said.returncode == 1
     assert len(said.stderr.splitlines()) == 1 and "other images or cameras" in said.stderr

@@ -202,7 +202,7 @@ class Together:
 
 def of_process(problem, shards):
     """The variables of a process with some of the shards, and these: landmarks of others it does not have."""
-    names = {name for shard in shards for name in shard.landmarks}
+    names = shards[0].landmarks if shards else ()
     variables = {
         name: group for name, group in problem.variables.items() if group.manifold.kind not in ("point", "line")
     }

@@ -159,7 +159,7 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
         if unknown := sorted(used - cameras.keys()):
             raise InputError(f"Parts cannot share these variables: {', '.join(unknown)}. Leave their options out.")
     variables = {name: group for name, group in cameras.items() if name in used}
-    variables |= {name: _joined(own) for name, own in groups.items()}
+    variables |= {name: _joined(groups[name]) for name in LANDMARKS if name in groups}
     return OpenParts(tuple(paths), tuple(parts), variables, options, near, ordered, head.num_images)
 
 

@@ -165,14 +165,15 @@ def adjust(
     from groma.cli.shared.adjusting import Wanted, adjust_and_write
     from groma.cli.shared.console import Console
     from groma.cli.shared.input import check_inputs
-    from groma.cli.shared.parts import adjust_parts_and_write, has_company, is_parts
+    from groma.cli.shared.parts import PartsWanted, adjust_parts_and_write, has_company, is_parts
     from groma.cli.shared.pose_graph import adjust_graph_and_write, is_pose_graph
 
     if linear_solver != "auto":
         _check_linear_solver(linear_solver)
     console = Console(quiet, verbose, json_target, threads)
     in_parts = has_company() or is_parts(source)
-    _output.check_outputs(force, None if in_parts else output, page, covariance, json_target=json_target)
+    if not in_parts:
+        _output.check_outputs(force, output, page, covariance, json_target=json_target)
     if covariance is not None and covariance.suffix not in (".npz", ".json"):
         raise InputError(f"--covariance must end in .npz or .json; got {covariance}.")
     if not 0.0 < sigma0 < float("inf"):
@@ -206,9 +207,7 @@ def adjust(
         refused = {
             "--report": page, "--covariance": covariance, "--contributions": contributions, "--diagnosis": diagnosis,
         }  # fmt: skip
-        told = adjust_parts_and_write(source, output, console, force, options, refused, keep)
-        if told is not None:
-            _output.write_json(json_target, told, force)
+        adjust_parts_and_write(source, console, options, PartsWanted(output, json_target, force, keep), refused)
         return
     wanted = Wanted(
         output, page, covariance, covariance_gauge, sigma0, diagnosis, contributions, truth, json_target, force

@@ -8,11 +8,13 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+from groma.cli.shared import output as _output
 from groma.cli.shared.console import Console
 from groma.errors import GromaError, InputError
 
@@ -33,45 +35,52 @@ def is_parts(path: Path) -> bool:
     return path.is_dir() and next(path.glob("part-*.npz"), None) is not None
 
 
+@dataclass(frozen=True)
+class PartsWanted:
+    """What comes out of ``groma adjust`` of parts."""
+
+    #: Folder of the adjusted parts.
+    output: Path | None
+    #: Value of --json, and whether files may be replaced.
+    json_target: str | None = None
+    force: bool = False
+    #: Whether parts stay in memory: ``auto``, ``always``, ``never``.
+    keep: str = "auto"
+
+
 def adjust_parts_and_write(
-    source: Path,
-    output: Path | None,
-    console: Console,
-    force: bool,
-    options: AdjustOptions,
-    refused: dict[str, Any],
-    keep: str = "auto",
-) -> dict[str, Any] | None:
-    """Adjust the parts in a folder, write them, say how it went and return the numbers; None where rank 0 does.
+    source: Path, console: Console, options: AdjustOptions, wanted: PartsWanted, refused: dict[str, Any]
+) -> None:
+    """Adjust the parts in a folder and write what is wanted; rank 0 says how it went.
 
     Parameters
     ----------
-    source, output : Path
-        Folders of parts.
+    source : Path
+        The folder of the parts.
     console : Console
         Where rank 0 speaks.
-    force : bool
-        Replace what is there.
     options : AdjustOptions
         How to adjust.
+    wanted : PartsWanted
+        What to write.
     refused : dict
         Options of the command that mean nothing for parts, and their values.
-    keep : str
-        Whether parts stay in memory: ``auto``, ``always``, ``never``.
     """
     with _one_voice() as reducer:
-        return _adjust(source, output, console, (force, keep), options, refused, reducer)
+        numbers = _adjust(source, console, options, wanted, refused, reducer)
+        if reducer.rank == 0:
+            _output.write_json(wanted.json_target, numbers, wanted.force)
 
 
 def _adjust(
     source: Path,
-    output: Path | None,
     console: Console,
-    choices: tuple[bool, str],
     options: AdjustOptions,
+    wanted: PartsWanted,
     refused: dict[str, Any],
     reducer: Reducer,
-) -> dict[str, Any] | None:
+) -> dict[str, Any]:
+    """Adjust, and return the numbers."""
     from groma.adjustment.parts import adjust_parts, parts_of
     from groma.adjustment.parts.settings import settings_of
     from groma.adjustment.parts.together import agreed
@@ -81,10 +90,9 @@ def _adjust(
 
     speaks = reducer.rank == 0
     with agreed(reducer):
-        _check(source, output, refused)
+        output = _checked(source, wanted, refused, reducer.rank)
         paths = parts_of(source)
         losses, solver, assembly = settings_of(paths[0], options)
-    assert output is not None
     if speaks:
         console.announce_compilation()
         idle = reducer.size - len(paths)
@@ -97,10 +105,10 @@ def _adjust(
         result = adjust_parts(
             paths, output, losses, solver,
             (lambda record: line(Progress(record.iteration, options.max_iterations, record.cost))) if speaks else None,
-            force=choices[0], keep=choices[1], reducer=reducer, **assembly,
+            force=wanted.force, keep=wanted.keep, reducer=reducer, **assembly,
         )  # fmt: skip
     if not speaks:
-        return None
+        return {}
     numbers = {**result.adjustment.to_dict(), "warnings": list(result.warnings), "ranks": reducer.size}
     numbers |= {"parts": len(paths), "bytes_per_step": getattr(reducer, "bytes_per_sum", 0)}
     numbers["seconds"] |= {"compilation": compilation.seconds, "total": time.perf_counter() - began}
@@ -113,7 +121,9 @@ def _adjust(
     return numbers
 
 
-def _check(source: Path, output: Path | None, refused: dict[str, Any]) -> None:
+def _checked(source: Path, wanted: PartsWanted, refused: dict[str, Any], rank: int) -> Path:
+    """Refuse early what cannot be done; return where parts are written."""
+    output = wanted.output
     for name, value in refused.items():
         if value:
             raise InputError(f"{name} is for whole scenes; {source} is a folder of parts. Leave it out.")
@@ -132,6 +142,9 @@ def _check(source: Path, output: Path | None, refused: dict[str, Any]) -> None:
         raise InputError(f"{output} is a file; parts are written into a folder. Choose another name.")
     if not output.absolute().parent.is_dir():
         raise InputError(f"Cannot write {output}: the folder {output.absolute().parent} does not exist. Make it first.")
+    if rank == 0:
+        _output.check_outputs(wanted.force, None, json_target=wanted.json_target)
+    return output
 
 
 @contextmanager
@@ -161,4 +174,4 @@ def _one_voice() -> Iterator[Reducer]:
         raise
 
 
-__all__ = ["adjust_parts_and_write", "has_company", "is_parts"]
+__all__ = ["PartsWanted", "adjust_parts_and_write", "has_company", "is_parts"]
