@@ -10,8 +10,8 @@ by :func:`groma.adjustment.parts.adjust_parts` in a process of its own; 50 milli
 Reported are CPU time per step, peak memory of the process, bytes per observation, and the exponent of growth.
 
 With ``--ranks`` the same parts are adjusted by so many processes together (``mpiexec`` must be at hand), in turn, for
-so many rounds. Reported are ratios to the first number, medians over the rounds: wall time per step, peak memory of a
-rank; the bytes that a rank puts into a sum; and the time foreseen for many ranks. That assumes: work on parts divides
+so many rounds. Reported are ratios to the first number, medians over the rounds: wall time per step, CPU time of all
+ranks, peak memory of a rank; the bytes that a rank puts into a sum; and the time foreseen for many ranks. That assumes: work on parts divides
 evenly, the shared system is solved by each, and a sum takes two passes of its bytes at ``BANDWIDTH`` and two latencies
 per doubling of ranks.
 """
@@ -154,14 +154,18 @@ def compare_ranks(folder: Path, observations: int, arguments: argparse.Namespace
             found.append(started(folder, arguments, ranks))
     first = rows[arguments.ranks[0]]
     print(f"{observations:,} observations, {arguments.rounds} rounds in turn, --keep {arguments.keep}\n")
-    print("| ranks | step, ratio | peak memory of a rank, ratio | bytes of a sum | final cost |")
-    print("|--:|--:|--:|--:|--:|")
+    print(
+        "| ranks | step, ratio | CPU time of all, ratio | peak memory of a rank, ratio | bytes of a sum | final cost |"
+    )
+    print("|--:|--:|--:|--:|--:|--:|")
     for ranks, found in rows.items():
-        step, peak = (
+        step, spent, peak = (
             np.median([own[key] / base[key] for own, base in zip(found, first, strict=True)])
-            for key in ("step_s", "peak_mib")
+            for key in ("step_s", "cpu_s", "peak_mib")
         )
-        print(f"| {ranks} | {step:.2f} | {peak:.2f} | {found[0]['bytes']:,} | {found[0]['final_cost']:.17g} |")
+        print(
+            f"| {ranks} | {step:.2f} | {spent:.2f} | {peak:.2f} | {found[0]['bytes']:,} | {found[0]['final_cost']:.17g} |"
+        )
     alone, num_bytes = rows[min(rows)][0], max(row["bytes"] for found in rows.values() for row in found)
     solve = alone["seconds"]["solve"] / (alone["steps"] + 1)
     parts = float(np.median([row["step_s"] for row in rows[min(rows)]])) * min(rows) - solve

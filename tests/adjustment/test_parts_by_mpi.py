@@ -55,6 +55,14 @@ def test_a_rank_is_killed_and_all_go_on(parts, tmp_path):
 
 
 @needs_mpi
+def test_a_rank_that_fails_ends_all(parts, tmp_path):
+    """In the middle of the work, while the other waits for its sum."""
+    said = mpiexec(*[[__file__, parts, tmp_path / "out", "fail"]] * 2)
+    assert said.returncode != 0
+    assert "groma: rank 1 of 2: the disk is gone" in said.stderr and "Traceback" not in said.stderr
+
+
+@needs_mpi
 def test_what_one_rank_cannot_see_is_told_once(parts, tmp_path):
     said = mpiexec(adjust(parts, "-o", tmp_path / "x"), adjust(tmp_path / "nowhere", "-o", tmp_path / "x"))
     assert said.returncode == 1
@@ -121,6 +129,16 @@ if __name__ == "__main__":
     from groma.solver.reduce.mpi import Ranks
 
     ranks = Ranks()
+
+    if sys.argv[3:] == ["fail"]:
+        import groma.adjustment.parts.run as module
+
+        def solve_shards(*_, **__):
+            raise OSError("the disk is gone")
+
+        if ranks.rank == 1:
+            module.solve_shards = solve_shards
+        sys.exit(run(["adjust", sys.argv[1], "-o", sys.argv[2]]))
 
     def die(record):
         if ranks.rank == 1 and record.iteration == 3 and sys.argv[3:] != ["on"]:
