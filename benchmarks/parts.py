@@ -11,9 +11,9 @@ Reported are CPU time per step, peak memory of the process, bytes per observatio
 
 With ``--ranks`` the same parts are adjusted by so many processes together (``mpiexec`` must be at hand), in turn, for
 so many rounds. Reported are ratios to the first number, medians over the rounds: wall time per step, CPU time of all
-ranks, peak memory of a rank; the bytes that a rank puts into a sum; and the time foreseen for many ranks. That assumes: work on parts divides
-evenly, the shared system is solved by each, and a sum takes two passes of its bytes at ``BANDWIDTH`` and two latencies
-per doubling of ranks.
+ranks, peak memory of a rank; the bytes that a rank puts into a sum; and the time foreseen for many ranks. That assumes:
+work on parts divides evenly, the shared system is solved by each, and a sum takes two passes of its bytes at
+``BANDWIDTH`` and two latencies per doubling of ranks.
 """
 
 import argparse
@@ -154,9 +154,7 @@ def compare_ranks(folder: Path, observations: int, arguments: argparse.Namespace
             found.append(started(folder, arguments, ranks))
     first = rows[arguments.ranks[0]]
     print(f"{observations:,} observations, {arguments.rounds} rounds in turn, --keep {arguments.keep}\n")
-    print(
-        "| ranks | step, ratio | CPU time of all, ratio | peak memory of a rank, ratio | bytes of a sum | final cost |"
-    )
+    print("| ranks | step, ratio | CPU of all, ratio | memory of a rank, ratio | bytes of a sum | final cost |")
     print("|--:|--:|--:|--:|--:|--:|")
     for ranks, found in rows.items():
         step, spent, peak = (

@@ -86,3 +86,58 @@ def test_ctrl_c_while_mapping_says_how_to_go_on(tmp_path, monkeypatch, capsys):
     assert said.startswith("groma: interrupted; finished stages are kept in") and said.count("\n") == 1
     assert "the same command goes on from there" in said
     assert os.listdir(tmp_path) == ["photos"]
+
+
+EARLY = """
+import os, signal, sys
+import groma.cli.main as main
+
+class Loader:
+    def find_spec(self, name, path=None, target=None):
+        if name == "{package}":
+            try:
+                os.kill(os.getpid(), signal.{number})
+            except KeyboardInterrupt:
+                raise {error}("Cannot import the backend") from None
+
+sys.meta_path.insert(0, Loader())
+sys.argv = ["groma", "adjust", sys.argv[1], "-o", "out.npz"]
+main.main()
+"""
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize(
+    ("package", "error"),
+    [("typer", "ImportError"), ("numpy", "ImportError"), ("numba", "RuntimeError"), ("pycolmap", "RuntimeError")],
+)
+def test_a_signal_while_a_package_is_imported_is_an_interrupt(tmp_path, number, package, error):
+    from groma.io import write_scene
+    from groma.scene import synthetic
+
+    (tmp_path / "in").mkdir()
+    write_scene(synthetic.holistic(6, seed=0).start.points_only(), tmp_path / "in" / "model")
+    finished = subprocess.run(
+        [sys.executable, "-c", EARLY.format(number=number, package=package, error=error), str(tmp_path / "in/model")],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    assert (finished.returncode, finished.stderr) == (130, "groma: interrupted; nothing is left half written.\n")
+    assert os.listdir(tmp_path) == ["in"]
+
+
+def test_sigterm_after_pycolmap_is_loaded_is_an_interrupt():
+    program = (
+        "import os, signal, time\n"
+        "from groma.io.colmap.load import load_pycolmap\n"
+        "def end(number, frame): print('mine', flush=True); os._exit(3)\n"
+        "signal.signal(signal.SIGTERM, end)\n"
+        "load_pycolmap()\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+        "time.sleep(5)\n"
+    )
+    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    assert (finished.returncode, finished.stdout, finished.stderr) == (3, "mine\n", "")

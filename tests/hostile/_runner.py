@@ -23,9 +23,11 @@ from pathlib import Path
 from random import Random
 
 sys.path.insert(0, str(Path(__file__).parent))
+# Threads do not survive a fork.
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
-#: A case may take so many seconds, and so many bytes more than the library itself.
-SECONDS, MEMORY = 10, 1 << 30
+#: A case may take so many seconds of the processor, so many of the clock, and so many bytes more than the library.
+SECONDS, PATIENCE, MEMORY = 10, 60, 1 << 30
 OUTCOMES = ("ok", "refused", "traceback", "crash", "too slow", "too large")
 #: Of the scenes that are read, one in so many is adjusted, and written as a page.
 ADJUST_EVERY = 25
@@ -33,8 +35,10 @@ ADJUST_EVERY = 25
 
 def run(first: int, last: int, seed: int, keep: Path | None = None) -> tuple[collections.Counter, list[str]]:
     """Run the cases ``first`` to ``last - 1``; return the counts of outcomes and a line for each that is bad."""
+    import cv2
     from _targets import targets
 
+    cv2.setNumThreads(1)
     base = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     home = Path(tempfile.mkdtemp(prefix="groma-hostile-", dir=base))
     counts: collections.Counter = collections.Counter()
@@ -82,7 +86,7 @@ def _worker(all_targets: list, first: int, last: int, seed: int) -> Iterator[tup
     status = os.waitpid(child, 0)[1]
     if done + 1 < last:
         ended_by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
-        outcome = {signal.SIGALRM: "too slow", signal.SIGKILL: "too large"}.get(ended_by, "crash")
+        outcome = "too slow" if ended_by in (signal.SIGALRM, signal.SIGPROF) else "crash"
         yield done + 1, outcome, f"ended by signal {ended_by}, status {status}"
 
 
@@ -92,12 +96,15 @@ def _work(all_targets: list, first: int, last: int, seed: int, pipe: int) -> Non
     os.dup2(sink, 2)
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY + (256 << 20), resource.RLIM_INFINITY))
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    for number in (signal.SIGALRM, signal.SIGPROF):
+        signal.signal(number, signal.SIG_DFL)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for number in range(first, last):
-        signal.alarm(SECONDS)
+        signal.alarm(PATIENCE)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
         outcome, words = _case(all_targets[number % len(all_targets)], Random(f"{seed} {number}"))
         signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10
         if grown > MEMORY:
             outcome, words = "too large", f"{grown >> 20} MB ({outcome})"

@@ -32,7 +32,7 @@ from groma.mapping.checkpoint_files import LINE_MAP, SEGMENTS
 from groma.mapping.photographs import read_gray
 from groma.scene import Scene, synthetic
 from groma.viz.pictures import read_picture
-from groma.viz.report.page import write_report
+from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.saved import saved_report
 from groma.viz.viewer.live import read_frames
 
@@ -173,9 +173,8 @@ PAGE_SCENE = synthetic.holistic(4, seed=1).start.points_only()
 def _page(folder: Path) -> object:
     report = saved_report(folder)
     if report is not None:
-        write_report(
-            folder / "page.html", None, PAGE_SCENE, report, outcomes=report.outcomes, explanation=report.explanation
-        )
+        contents = PageContents(report.outcomes, report.explanation)
+        write_report(folder / "page.html", None, PAGE_SCENE, report, contents=contents)
     return report
 
 

@@ -2,8 +2,11 @@
 """The HTML page: self-contained, well-formed, safe against hostile names, and it holds the numbers it was given."""
 
 import base64
+import hashlib
 import json
 import re
+import shutil
+import subprocess
 from html.parser import HTMLParser
 from types import SimpleNamespace
 
@@ -260,9 +263,12 @@ def test_the_summary_of_a_map_stands_in_the_page(tmp_path):
         assert words in text
     assert [bool(entry["photo"]) for entry in _data(text)["images"]] == [True, False]
     assert run(["report", str(tmp_path / "map"), "-o", str(page), "-f", "--images", str(tmp_path / "none")]) != 0
-    for content in ("no json", "[]", '{"history": []}'):
+    for content in ("no json", "[]"):
         (tmp_path / "map" / "summary.json").write_text(content)
-        assert saved_report(tmp_path / "map") is None
+        with pytest.warns(UserWarning, match="summary.json is damaged"):
+            assert saved_report(tmp_path / "map") is None
+    (tmp_path / "map" / "summary.json").write_text('{"history": []}')
+    assert saved_report(tmp_path / "map") is None
 
 
 def test_a_place_that_cannot_be_written(tmp_path):
@@ -306,3 +312,73 @@ def test_the_first_image_is_the_one_with_most_lines(tmp_path):
         {"photo": photo, "lines_seen": n, "points_seen": 0} for photo, n in (("", 9), ("data:", 2), ("data:", 3))
     ]
     assert _page_images._first(entries) == 2
+
+
+# ------------------------------------------------------------------------------------------------ Strangers' files
+
+
+def _pictures(folder, *names):
+    import cv2
+
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / name), np.full((480, 640), 90, np.uint8))
+
+
+@pytest.mark.parametrize("name", ["../secret.jpg", "a/../../secret.jpg", "ABSOLUTE", "in/../../secret.jpg"])
+def test_photographs_outside_the_folder_are_not_embedded(tmp_path, name):
+    _pictures(tmp_path, "secret.jpg", "photos/second.jpg")
+    name = str(tmp_path / "secret.jpg") if name == "ABSOLUTE" else name
+    scene = exact_scene((name, "second.jpg"))
+    with pytest.warns(UserWarning, match=r"1 images of the scene are not shown.*secret\.jpg"):
+        write_report(tmp_path / "page.html", None, scene, images=tmp_path / "photos")
+    shown = {entry["name"]: entry["photo"] for entry in _data((tmp_path / "page.html").read_text())["images"]}
+    assert shown[name] == "" and shown["second.jpg"].startswith("data:image/jpeg")
+
+
+def test_the_page_may_run_its_own_script_and_nothing_else(tmp_path):
+    write_report(tmp_path / "page.html", None, exact_scene())
+    text = (tmp_path / "page.html").read_text()
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text)[1]
+    script = re.search(r"<script>(.*?)</script>", text, re.DOTALL)[1]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert policy.startswith(f"default-src 'none'; script-src 'sha256-{digest}'; ")
+    assert "http" not in policy and "unsafe-eval" not in policy
+    assert not re.search(r"<[^>]* on[a-z]+=", text.partition("<script>")[0])  # the policy would not let them run
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
+def test_the_page_draws_in_a_browser_without_complaints(tmp_path):
+    _pictures(tmp_path, "photos/first.jpg")
+    write_report(tmp_path / "page.html", None, exact_scene(("first.jpg", "second.jpg")), images=tmp_path / "photos")
+    finished = subprocess.run(
+        ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
+         f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=3000", "--dump-dom",
+         f"file://{tmp_path / 'page.html'}"],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert "CONSOLE" not in finished.stderr
+    # The script has filled the list of images.
+    assert re.search(r"<select id=\"image\".*<option[^>]*>[^<]*first.jpg", finished.stdout, re.DOTALL)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: "[" * 100_000,
+        lambda text: text[: len(text) // 2],
+        lambda text: text.replace('"iterations": ', '"iterations": "<script>", "x": '),
+        lambda text: text.replace('"held": ', '"held": NaN, "x": '),
+        lambda text: text.replace('"history": ', '"history": 5, "x": '),
+        lambda text: text.replace('"initial_cost": ', '"initial_cost": 1e-300, "x": '),
+    ],
+)
+def test_a_damaged_summary_is_left_out_and_told(tmp_path, damage):
+    from groma.adjustment.adjust import AdjustOptions, adjust
+
+    good = json.dumps(adjust(holistic(4, seed=1).start, AdjustOptions(max_iterations=1)).summary())
+    (tmp_path / "summary.json").write_text(good)
+    assert saved_report(tmp_path) is not None
+    (tmp_path / "summary.json").write_text(damage(good))
+    with pytest.warns(UserWarning, match="summary.json is damaged"):
+        assert saved_report(tmp_path) is None

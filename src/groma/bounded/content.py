@@ -23,7 +23,7 @@ class ReadingGates:
     ratio: int = gate(
         40, "1", "and so many times its size on top", "cost: memory; numbers as text shrink by 3 to 6, arrays by 16"
     )
-    pipe: int = gate(1 << 30, "bytes", "largest content of what is no regular file, such as a pipe", "cost: memory")
+    pipe: int = gate(256 << 20, "bytes", "largest content of what is no regular file, such as a pipe", "cost: memory")
     line: int = gate(1 << 20, "characters", "longest line of a text file of numbers", "cost: memory and time")
     pixels: int = gate(1 << 26, "px", "largest image of any file", "cost: memory")
     pixel_ratio: int = gate(

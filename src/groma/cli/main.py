@@ -8,31 +8,40 @@ import os
 import sys
 from io import TextIOWrapper
 
-from groma.cli.shared.interrupt import INTERRUPTED
+from groma.cli.shared.interrupt import INTERRUPTED, PROCESS, answer_signals, ignore_signals
 
 
 def run(arguments: list[str] | None = None) -> int:
     """Run the command line with ``arguments`` (default: those of the process) and return the exit code."""
+    PROCESS.asked = PROCESS.told = False
     try:
         from groma.cli.app import app
 
         app(args=arguments, prog_name="groma")
     except SystemExit as exit_request:
         code = exit_request.code
+        if code == INTERRUPTED and PROCESS.asked:
+            PROCESS.tell()  # between the lines of the command line itself
         return code if isinstance(code, int) else int(code is not None)
-    except KeyboardInterrupt:
-        sys.stderr.write("groma: interrupted; nothing is left half written.\n")
-        return INTERRUPTED
+    except (KeyboardInterrupt, Exception) as error:
+        if not (isinstance(error, KeyboardInterrupt) or PROCESS.explains(error)):
+            raise
+        return PROCESS.tell()
     return 0
 
 
 def main() -> None:
     """Run as a process."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            # A name that the terminal cannot show is shown by its numbers; it is no reason to end.
-            stream.reconfigure(errors="backslashreplace")
-    code = run()
+    try:
+        answer_signals()
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, TextIOWrapper):
+                # A name that the terminal cannot show is shown by its numbers; it is no reason to end.
+                stream.reconfigure(errors="backslashreplace")
+        code = run()
+        ignore_signals()
+    except KeyboardInterrupt:  # a second time, while the first is answered
+        code = PROCESS.tell()
     if code == INTERRUPTED:
         # Worker threads may still be inside a compiled kernel; the normal exit would wait for them.
         sys.stderr.flush()

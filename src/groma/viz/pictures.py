@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from groma.bounded.images import decoded
+from groma.bounded.names import outside, stays_inside
 from groma.errors import FileFormatError
 
 Picture = npt.NDArray[np.uint8]
@@ -20,14 +22,27 @@ ImageFiles = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
 
 
 def image_file(images: ImageFiles | None, name: str) -> Path | None:
-    """Return the file of an image, or None where there is none."""
+    """Return the file of an image; None where there is none, and where the name leads out of the folder."""
     if images is None:
         return None
     if isinstance(images, Mapping):
         path = Path(images[name]) if name in images else None
     else:
-        path = Path(images) / name
+        path = Path(images) / name if stays_inside(name) else None
     return path if path is not None and path.is_file() else None
+
+
+def warn_of_names_outside(images: ImageFiles | None, names: Iterable[str]) -> None:
+    """Warn of images that are not shown because their names lead out of the folder of photographs."""
+    if images is None or isinstance(images, Mapping):
+        return
+    if wrong := outside(names):
+        shown = ", ".join(repr(name[:200]) for name in wrong[:3]) + (", ..." if len(wrong) > 3 else "")
+        warnings.warn(
+            f"{len(wrong)} images of the scene are not shown: their names lead out of {os.fspath(images)} ({shown}). "
+            "Rename them, or link to them from the folder.",
+            stacklevel=3,
+        )
 
 
 def read_picture(path: str | os.PathLike[str], max_size: int | None = None) -> Picture | None:

@@ -172,6 +172,8 @@ def _result(run: Run, output: Path, solved: Solved, after: Squares) -> PartsResu
         num_planes=0,
         num_observations=opened.total("observations"),
         rmse_px={kind: {"before": _rms(before, kind), "after": _rms(after, kind)} for kind in _kinds(before)},
+        inliers={},
+        sigma0=None,
         solve=solved.report,
         warnings=warnings,
         stages=solved.stages,

@@ -11,6 +11,7 @@ import numpy as np
 
 from groma.adjustment.adjust import LAST_SCALE_SIGMAS, damping_after, stage_tolerance
 from groma.adjustment.assemble import disassemble
+from groma.adjustment.fit import MEDIAN_SQUARE
 from groma.adjustment.parts.checkpoint import Checkpoint, Progressed, reports_of
 from groma.adjustment.parts.opened import LANDMARKS, OpenParts
 from groma.adjustment.parts.together import agreed, exchange
@@ -152,13 +153,12 @@ class Run:
         for part in self.opened.parts:
             squares = squared_residuals_px(self.opened.assembled(part, states)[1], weighted=True)
             for values in squares.values():
-                logarithm = np.clip(np.log2(np.maximum(values, 2.0 ** BIN_RANGE[0])), *BIN_RANGE)
+                logarithm = np.clip(np.log2(values[values > 0.0]), *BIN_RANGE)  # what cannot be evaluated is zero
                 count += np.histogram(logarithm, BINS, BIN_RANGE)[0]
         count = np.sum(exchange(self.reducer, count.tolist()), axis=0)
         middle = int(np.searchsorted(np.cumsum(count), 0.5 * count.sum()))
         median = 2.0 ** (BIN_RANGE[0] + (middle + 0.5) * (BIN_RANGE[1] - BIN_RANGE[0]) / BINS)
-        # the median of the squared norm of two Gaussian coordinates is 1.386 variances
-        return max(loss.scale, LAST_SCALE_SIGMAS * float(np.sqrt(median / 1.386)))
+        return max(loss.scale, LAST_SCALE_SIGMAS * float(np.sqrt(median / MEDIAN_SQUARE)))
 
     def write(self, solved: Solved, output: Path) -> Squares:
         """Write the parts of this process; return the squared residuals of all parts."""

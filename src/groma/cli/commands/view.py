@@ -55,7 +55,7 @@ def view(
     scene = read_scene(source)
     console.say(sentence_of(scene))
     # Once the page is there, Ctrl-C is the way to end and no accident.
-    with serving(scene, images, port) as shown, contextlib.suppress(KeyboardInterrupt):
+    with serving(scene, images, port, say=console.warn) as shown, contextlib.suppress(KeyboardInterrupt):
         address = f"http://localhost:{shown.server.get_port()}"
         if images is not None and shown.num_pictures == 0:
             console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[0]!r}.")
@@ -84,7 +84,7 @@ def _follow(output: Path, port: int, browser: bool, console: "Console", json_tar
             return f"There is nothing in {output} yet; waiting for groma track SEQUENCE -o {output}."
         return f"The track of {output} is {state}."
 
-    with following(output, port) as shown, contextlib.suppress(KeyboardInterrupt):
+    with following(output, port, say=console.warn) as shown, contextlib.suppress(KeyboardInterrupt):
         shown.refresh()
         address = f"http://localhost:{shown.server.get_port()}"
         console.say(f"Open {address} in a browser. Ctrl-C ends.")

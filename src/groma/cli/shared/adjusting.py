@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from groma._counted import counted
 from groma.cli.shared import output as _output
 from groma.errors import ProblemError
 
 if TYPE_CHECKING:
     from groma.adjustment.adjust import AdjustOptions
     from groma.cli.shared.console import Console
+    from groma.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     Raises
     ------
     ProblemError
-        If covariances are wanted that do not exist, after everything else was written and said.
+        If covariances are wanted that do not exist, after everything else was written and said. Where the images fall
+        into groups a warning says so instead.
     """
     from groma.adjustment.adjust import adjust
     from groma.adjustment.covariance_files import write_covariances
@@ -92,10 +95,12 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
             _output.check_output(wanted.covariance, wanted.force)
             write_covariances(wanted.covariance, result.scene, found, wanted.force)
             numbers["uncertainty"] = found.to_dict()
-        except ProblemError as error:  # raised at the end, when all else is written and said
-            failure = error
+        except ProblemError as error:
+            reasons = why_no_covariances(result.scene, wanted.covariance)
+            numbers["warnings"] += reasons
+            failure = None if reasons else error  # raised at the end, when all else is written and said
     _say(console, numbers, compilation.compiled)
-    for path in (wanted.output, wanted.page, wanted.covariance if failure is None else None):
+    for path in (wanted.output, wanted.page, wanted.covariance if "uncertainty" in numbers else None):
         if path is not None:
             console.say(f"Wrote {path}")
     if all(place is None for place in (wanted.output, wanted.page, wanted.covariance, wanted.json_target)):
@@ -103,6 +108,26 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     _output.write_json(wanted.json_target, numbers, wanted.force)
     if failure is not None:
         raise failure
+
+
+def why_no_covariances(scene: Scene, path: Path) -> list[str]:
+    """Say that images which share nothing have no covariances together, and which they are; nothing if they do."""
+    from groma.scene.connections import connected_images
+
+    groups = connected_images(scene)
+    if len(groups) < 2:
+        return []
+    names = [[scene.images.names[image] for image in group[:3]] for group in groups[:4]]
+    parts = [
+        f"{counted(len(group), 'images')} ({', '.join(some)}{', ...' if len(group) > 3 else ''})"
+        for group, some in zip(groups, names, strict=False)
+    ]
+    more = [f"and {len(groups) - 4} more"] if len(groups) > 4 else []
+    return [
+        f"{path} was not written: the images fall into {len(groups)} groups that share nothing, and how certain one is "
+        f"relative to another is not defined: {', '.join(parts + more)}. Add matches between them, or adjust each "
+        "group as a scene of its own."
+    ]
 
 
 def _say(console: Console, numbers: dict[str, Any], compiled: bool) -> None:

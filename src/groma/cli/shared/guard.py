@@ -9,7 +9,7 @@ from typing import ParamSpec
 
 import typer
 
-from groma.cli.shared.interrupt import INTERRUPTED
+from groma.cli.shared.interrupt import PROCESS
 from groma.errors import GromaError
 from groma.plugins import load_plugins
 
@@ -29,24 +29,35 @@ def guard(command: Callable[P, None]) -> Callable[P, None]:
                 else:
                     warnings.simplefilter("ignore")
                 load_plugins()
+                if PROCESS.asked:  # while a plugin was imported, which is then said to be broken
+                    raise KeyboardInterrupt
                 command(*args, **kwargs)
             if sys.stdout is not None:  # a process may be started without one
                 sys.stdout.flush()
-        except KeyboardInterrupt:
-            _fail("interrupted; nothing is left half written.", INTERRUPTED)
         except BrokenPipeError:
             # The reader of a pipe has gone (``groma ... | head``). Nothing more can be said to it.
             sys.stdout = None  # type: ignore[assignment]
             raise typer.Exit(1) from None
-        except GromaError as error:
-            _fail(str(error), 1)
-        except OSError as error:
-            place = f"{error.filename}: " if error.filename else ""
-            _fail(f"{place}{error.strerror or error}", 1)
-        except MemoryError:
-            _fail("the memory of this machine is not enough for this input.", 1)
+        except (typer.Exit, typer.BadParameter):
+            raise
+        except (KeyboardInterrupt, Exception) as error:
+            if isinstance(error, KeyboardInterrupt) or PROCESS.explains(error):
+                raise typer.Exit(PROCESS.tell()) from None
+            _explain(error)
+            raise
 
     return guarded
+
+
+def _explain(error: Exception) -> None:
+    """End with a line for an error that is known."""
+    if isinstance(error, GromaError):
+        _fail(str(error), 1)
+    if isinstance(error, OSError):
+        place = f"{error.filename}: " if error.filename else ""
+        _fail(f"{place}{error.strerror or error}", 1)
+    if isinstance(error, MemoryError):
+        _fail("the memory of this machine is not enough for this input.", 1)
 
 
 def _show(message: Warning | str, category: type[Warning], *_where: object) -> None:

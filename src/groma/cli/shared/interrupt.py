@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Ctrl-C and a polite request to end (SIGTERM), in work that calls into libraries that mishandle them.
+"""Ctrl-C and a polite request to end (SIGTERM), from the first moment of a command to its last.
 
-A signal that arrives while a compiler calls back into Python is swallowed, or comes out as an error of the compiler.
-What was asked for is therefore remembered, and looked up when an error comes, and at the next progress.
+A signal that arrives while a package is imported or a compiler calls back into Python is swallowed, or comes out as
+an error of the package or the compiler. What was asked for is therefore remembered, and looked up when an error comes,
+and at the next progress.
 """
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +22,8 @@ class Interruption:
 
     def __init__(self) -> None:
         self.asked = False
+        #: Whether the user was told that the command ends.
+        self.told = False
 
     def handle(self, number: int, frame: FrameType | None) -> None:
         """Remember a signal, and interrupt."""
@@ -36,12 +40,47 @@ class Interruption:
 
         return checked
 
+    def tell(self, words: str = "nothing is left half written.") -> int:
+        """Say once that the command was interrupted, and return its exit code."""
+        if not self.told:
+            self.told = True
+            print(f"groma: interrupted; {words}", file=sys.stderr, flush=True)
+        return INTERRUPTED
+
+    def explains(self, error: BaseException) -> bool:
+        """Whether an error may be what an interrupt became on its way: any but a plain one of groma or the system."""
+        if not self.asked:
+            return False
+        kinds = {type(one).__module__.partition(".")[0] for one in _chain(error)}
+        return kinds != {"groma"} and not isinstance(error, OSError)
+
+
+#: Of the process, from the start of the command line on.
+PROCESS = Interruption()
+
+
+def answer_signals() -> None:
+    """Let Ctrl-C and SIGTERM interrupt the process from now on; those that it was told to ignore it ignores."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            signal.signal(number, _end_process)
+
+
+def ignore_signals() -> None:
+    """Let nothing interrupt what is left: the command is done, and Python tidies up."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _end_process(number: int, frame: FrameType | None) -> None:
+    # Objects of libraries that were interrupted while they were made complain when they are thrown away.
+    sys.unraisablehook = lambda unraisable: None
+    PROCESS.handle(number, frame)
+
 
 @contextmanager
 def interruptible() -> Iterator[Interruption]:
     """Turn Ctrl-C and SIGTERM inside the block into KeyboardInterrupt, whatever they become on their way."""
-    import pycolmap  # noqa: F401 - takes SIGTERM when it is loaded, and answers it with a page of addresses
-
     state = Interruption()
     mine = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, state.handle) for number in (signal.SIGINT, signal.SIGTERM) if mine}
@@ -56,4 +95,11 @@ def interruptible() -> Iterator[Interruption]:
             signal.signal(number, handler)
 
 
-__all__ = ["INTERRUPTED", "Interruption", "interruptible"]
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error and what it came from."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+__all__ = ["INTERRUPTED", "PROCESS", "Interruption", "answer_signals", "ignore_signals", "interruptible"]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,7 @@ import typer
 
 from groma._counted import counted
 from groma.cli.shared import output as _output
-from groma.cli.shared.interrupt import INTERRUPTED
+from groma.cli.shared.interrupt import PROCESS
 from groma.errors import OutputError
 
 if TYPE_CHECKING:
@@ -43,12 +42,8 @@ def run_map(
         with interruptible() as interruption, console.stages() as stages:
             return map_images(images, work, model, options, interruption.checking(stages), line_matches)
     except KeyboardInterrupt:
-        print(
-            f"groma: interrupted; finished stages are kept in {work}: the same command goes on from there.",
-            file=sys.stderr,
-            flush=True,
-        )
-        raise typer.Exit(INTERRUPTED) from None
+        words = f"finished stages are kept in {work}: the same command goes on from there."
+        raise typer.Exit(PROCESS.tell(words)) from None
 
 
 def write_map(result: MapResult, output: Path, work: Path, force: bool, **how: Any) -> None:
@@ -72,14 +67,17 @@ def say_map(console: Console, result: MapResult, numbers: dict[str, Any], explai
     Without ``explain`` the last two are said only with --verbose.
     """
     from groma.cli.shared.diagnosis import say_diagnosis
-    from groma.cli.shared.sentences import describe_contributions, describe_relations
+    from groma.cli.shared.sentences import (
+        describe_contributions,
+        describe_inliers,
+        describe_pose_uncertainty,
+        describe_relations,
+    )
 
     kinds = ("images", "points", "lines", "planes", "directions")
     console.say(", ".join(counted(getattr(result.scene, f"num_{kind}"), kind) for kind in kinds))
-    for kind, rmse in result.report.rmse_px.items():
-        console.say(f"  {kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms, outliers included)")
-    if any(rmse["after"] > rmse["before"] for rmse in result.report.rmse_px.values()):
-        console.say("  The rms includes outliers, so it may grow while the robust cost falls.")
+    for line in (*describe_inliers(result.report.inliers), *describe_pose_uncertainty(numbers.get("pose_uncertainty"))):
+        console.say(line)
     for line in describe_relations(result.report.relations):
         console.detail(line)
     for line in describe_contributions(numbers.get("contributions", [])):

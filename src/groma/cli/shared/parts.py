@@ -115,6 +115,8 @@ def _adjust(
     sentence = result.report.termination.sentence
     for text in describe(numbers, sentence, verbose=console.verbose, compiled=compilation.compiled):
         console.say(text)
+    for kind, rmse in numbers["rmse_px"].items() if not console.verbose else ():
+        console.say(f"  rms of all {kind}, outliers included: {rmse['before']:.3f} px -> {rmse['after']:.3f} px")
     for text in result.warnings:
         console.warn(text)
     console.say(f"Wrote {output}")

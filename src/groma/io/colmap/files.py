@@ -122,6 +122,15 @@ def check_binary_model(folder: Path, num_params: Mapping[int, int]) -> None:
             raise FileFormatError(f"{path} is damaged: it {what} for its counts. Fetch or export it again.")
 
 
+def check_text_rows(folder: Path, counts: Mapping[str, int]) -> None:
+    """Raise when a text file of a model has not so many lines, apart from comments, each with an end."""
+    for name, count in counts.items():
+        content = (folder / name).read_bytes()
+        found = sum(not line.startswith(b"#") for line in content.split(b"\n")[:-1])
+        if found != count or not content.endswith(b"\n"):
+            raise FileFormatError(f"{folder / name} is incomplete: it has {found} rows of {count}.")
+
+
 def damage_in_text(folder: Path) -> str:
     """Return where the text files of a model are damaged, in words, or "" where their rows look as they should.
 

@@ -12,7 +12,6 @@ to images and points by identifier, so they survive changes made to the model by
 from __future__ import annotations
 
 import os
-import zlib  # noqa: F401 - must be loaded before pycolmap, whose wheel (4.2) otherwise breaks it: heap corruption
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,9 +20,10 @@ import numpy.typing as npt
 
 from groma import cameras as camera_models
 from groma._typing import FloatArray
-from groma.errors import FileFormatError, InputError
+from groma.errors import FileFormatError, InputError, OutputError
 from groma.io.atomic import atomic_output
-from groma.io.colmap.files import check_binary_model, damage_in_text, find_model, is_model
+from groma.io.colmap.files import check_binary_model, check_text_rows, damage_in_text, find_model, is_model
+from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.quiet import quiet
 from groma.io.colmap.to_pycolmap import colmap_camera, to_pycolmap
 from groma.io.limap.structures import Structures, read_beside, write_beside
@@ -58,9 +58,8 @@ def read_colmap(path: str | os.PathLike[str]) -> Scene:
     InputError
         If a camera model is not one of groma's.
     """
-    import pycolmap
-
     folder, form = find_model(path)
+    pycolmap = load_pycolmap()
     with reading(folder, _KIND), quiet(pycolmap):
         reconstruction = pycolmap.Reconstruction()
         if form == "binary":
@@ -293,7 +292,25 @@ def write_colmap(
     with atomic_output(path, force) as draft:
         draft.mkdir()
         (reconstruction.write_binary if form == "binary" else reconstruction.write_text)(str(draft))
+        _check_written(draft, form, reconstruction, path)
         write_beside(scene, draft, form, like)
+
+
+def _check_written(
+    draft: Path, form: Literal["binary", "text"], reconstruction: pycolmap.Reconstruction, path: str | os.PathLike[str]
+) -> None:
+    """Raise OutputError if a file is incomplete: pycolmap does not notice when a disk is full."""
+    try:
+        if form == "binary":
+            check_binary_model(draft, _num_params_by_number(load_pycolmap()))
+        else:
+            check_text_rows(draft, {
+                "cameras.txt": reconstruction.num_cameras(),
+                "images.txt": 2 * reconstruction.num_reg_images(),
+                "points3D.txt": reconstruction.num_points3D(),
+            })  # fmt: skip
+    except FileFormatError as error:
+        raise OutputError(f"Cannot write {path}: a file of the model came out incomplete. Is the disk full?") from error
 
 
 def check_colmap(scene: Scene, form: Literal["binary", "text"] = "binary") -> None:

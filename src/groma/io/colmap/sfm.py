@@ -15,7 +15,6 @@ import math
 import os
 import shutil
 import tempfile
-import zlib  # noqa: F401 - must be loaded before pycolmap, see groma.io.colmap.model
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from typing import Any
 from groma import cameras as camera_models
 from groma._counted import counted
 from groma.errors import GromaError, InputError, OutputError
+from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.model import from_pycolmap
 from groma.io.colmap.quiet import quiet
 from groma.scene import Scene
@@ -116,8 +116,7 @@ def reconstruct_points(
     OutputError
         If there is no room in ``work``, or pycolmap fails otherwise.
     """
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     options = options or PointModelOptions()
     say = progress or (lambda stage, done, total: None)
     folder, names = Path(work), sorted(names)

@@ -12,6 +12,7 @@ from groma import cameras as camera_models
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.io._numbering import numbered_keypoints
+from groma.io.colmap.load import load_pycolmap
 from groma.scene import Cameras, Scene, Sensors
 from groma.scene.camera import CAMERA
 
@@ -21,8 +22,7 @@ if TYPE_CHECKING:
 
 def to_pycolmap(scene: Scene) -> pycolmap.Reconstruction:
     """Return a :class:`pycolmap.Reconstruction` of cameras, rigs, frames, images and points of a scene."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     reconstruction = pycolmap.Reconstruction()
     for row, number in enumerate(scene.cameras.ids.tolist()):
         name, params = colmap_camera(scene.cameras, row)

@@ -11,7 +11,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.viz.pack import pack, thin
-from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture
+from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture, warn_of_names_outside
 from groma.viz.report.overlays import is_straight, projected_segments
 
 if TYPE_CHECKING:
@@ -133,6 +133,7 @@ def _frame(scene: Drawable, index: int) -> tuple[float, float, float, float]:
 def _photographs(names: Sequence[str], images: ImageFiles | None) -> list[str]:
     """Return the photographs as data addresses, smaller the more there are; empty where there is none."""
     found = ["" for _ in names]
+    warn_of_names_outside(images, names)
     files = {place: path for place, name in enumerate(names) if (path := image_file(images, name)) is not None}
     chosen = np.array(list(files))[thin(len(files), MAX_PHOTOS)].tolist() if files else []
     budget = PHOTO_BUDGET // max(len(chosen), 1)

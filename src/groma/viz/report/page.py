@@ -8,6 +8,8 @@ Arrays travel as base64 float32, less a common offset, so that far away coordina
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import html
 import os
 import re
@@ -125,6 +127,7 @@ def write_report(
         diagnosis = numbers.get("diagnosis")
     page = files("groma.viz.report").joinpath("_page.html").read_text(encoding="utf-8")
     parts = {
+        "POLICY": _policy(page),
         "TITLE": html.escape(title),
         "LEAD": _lead(scene_after, after, report),
         "TILES": _page_tables.tiles(scene_after, before, after, numbers) if said.tiles is None else said.tiles,
@@ -143,6 +146,16 @@ def write_report(
         Path(path).write_text(page, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}. Choose another place.") from error
+
+
+def _policy(page: str) -> str:
+    """Return what a browser lets the page do: run the script that groma wrote, show what lies in the page, no more."""
+    script = page.rpartition("<script>")[2].partition("</script>")[0]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return (
+        f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
 
 
 def _same_shape(first: Drawable, second: Drawable) -> bool:

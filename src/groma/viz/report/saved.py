@@ -4,13 +4,37 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from groma.bounded.text import read_text
+
 #: Without these it is the summary of something else.
 _NEEDED = ("initial_cost", "final_cost", "iterations", "seconds", "history", "termination_sentence")
+
+
+_ANY = "*"
+#: Sizes of numbers, other than zero, that charts can show; and of counts.
+_LEAST, _MOST, _MOST_COUNTED = 1e-100, 1e100, 10**15
+_OBSERVED = {"determined": int, "weak": int, "undetermined": int}
+#: What the page works with: types by name; a star stands for any name, a question mark for what may be missing.
+_FORM = {
+    "initial_cost": float,
+    "final_cost": float,
+    "iterations": int,
+    "seconds": {_ANY: float},
+    "history": [{"iteration": int, "cost?": float, "accepted": bool, "stage?": int}],
+    "termination_sentence": str,
+    "warnings?": [str],
+    "stages?": [{"loss": str, "initial_cost": float, "first_step": int}],
+    "relations?": {_ANY: {"held": int, "dropped": int}},
+    "segments?": {_ANY: int},
+    "explanation?": str,
+    "diagnosis?": {"findings": [{"severity": str, "sentence": str}], "observability?": {_ANY: _OBSERVED}},
+}
 
 
 @dataclass(frozen=True)
@@ -57,11 +81,41 @@ class SavedReport:
 
 
 def saved_report(folder: Path) -> SavedReport | None:
-    """Return the report that ``summary.json`` in a folder holds; None where there is none that can be used."""
+    """Return the report that ``summary.json`` in a folder holds; None where there is none that can be used.
+
+    One that is damaged is told in a warning.
+    """
+    path = folder / "summary.json"
     try:
-        numbers = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        numbers = json.loads(read_text(path))
+    except FileNotFoundError:
         return None
-    if not isinstance(numbers, dict) or any(numbers.get(name) is None for name in _NEEDED):
+    except (OSError, ValueError, RecursionError):  # other than groma writes it
+        numbers = None
+    if isinstance(numbers, dict) and any(numbers.get(name) is None for name in _NEEDED):
+        return None  # of a track, or of another program
+    if not isinstance(numbers, dict) or not _has_form(numbers, _FORM) or "total" not in numbers["seconds"]:
+        warnings.warn(f"{path} is damaged; the page is made without it.", stacklevel=2)
         return None
     return SavedReport(numbers)
+
+
+def _has_form(value: Any, form: Any) -> bool:
+    """Whether a value from a file is what the page works with; see :data:`_FORM`."""
+    if isinstance(form, list):
+        return isinstance(value, list) and all(_has_form(one, form[0]) for one in value)
+    if isinstance(form, dict):
+        if not isinstance(value, dict):
+            return False
+        if _ANY in form:
+            return all(_has_form(one, form[_ANY]) for one in value.values())
+        present = {name: inner for name, inner in form.items() if value.get(name.rstrip("?")) is not None}
+        missing = [name for name in form if name not in present and not name.endswith("?")]
+        return not missing and all(_has_form(value[name.rstrip("?")], inner) for name, inner in present.items())
+    if isinstance(value, bool) or form is bool:
+        return form is bool and isinstance(value, bool)
+    if form is float:
+        return isinstance(value, int | float) and (value == 0 or _LEAST <= abs(value) <= _MOST)
+    if form is int:
+        return isinstance(value, int) and 0 <= value <= _MOST_COUNTED
+    return isinstance(value, form)

@@ -11,7 +11,7 @@ import contextlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from groma.scene.patches import patch_groups, plane_patches, triangle_fans
 from groma.viz import colours as _colours
 from groma.viz.pack import thin
 from groma.viz.viewer import arrays as _view_arrays
-from groma.viz.viewer.scene import silenced, stop_server
+from groma.viz.viewer.server import Say, start_server, stop_server
 
 if TYPE_CHECKING:
     import viser
@@ -200,12 +200,9 @@ def read_frames(path: Path) -> FloatArray:
 
 
 @contextlib.contextmanager
-def following(output: Path, port: int = 8080, host: str = "127.0.0.1") -> Iterator[LiveView]:
+def following(output: Path, port: int = 8080, host: str = "127.0.0.1", say: Say | None = None) -> Iterator[LiveView]:
     """Serve a running track inside a ``with`` block; call :meth:`LiveView.refresh` now and then."""
-    import viser
-
-    with silenced():
-        server: Any = viser.ViserServer(host=host, port=port, label="groma", verbose=False)
+    server = start_server(host, port, say)
     try:
         yield LiveView(server, output)
     finally:

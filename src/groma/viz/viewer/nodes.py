@@ -13,7 +13,7 @@ from groma._typing import BoolArray
 from groma.scene.patches import patch_groups, triangle_fans
 from groma.viz import colours as _colours
 from groma.viz.pack import thin
-from groma.viz.pictures import ImageFiles, image_file, read_picture
+from groma.viz.pictures import ImageFiles, image_file, read_picture, warn_of_names_outside
 from groma.viz.viewer import arrays as _view_arrays
 from groma.viz.viewer import messages as _view_words
 from groma.viz.viewer.content import LINE_MODES, REACH, ViewContent
@@ -194,6 +194,7 @@ class SceneView:
         self._pictures: list[Any] = []
         many = len(self._camera_images) > _MANY_CAMERAS
         self._camera_scale = _view_arrays.camera_scale(content.camera_centers)
+        warn_of_names_outside(self.images, content.scene.images.names)
         for image in self._camera_images:
             name = content.scene.images.names[image]
             path = image_file(self.images, name)

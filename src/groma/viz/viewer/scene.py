@@ -8,24 +8,28 @@ The page is served by viser from this machine; nothing is fetched from elsewhere
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import threading
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from groma.errors import InputError
 from groma.viz.pictures import ImageFiles
 from groma.viz.viewer.content import view_content
 from groma.viz.viewer.nodes import SceneView
+from groma.viz.viewer.server import Say, start_server, stop_server
 
 if TYPE_CHECKING:
-    import viser
-
     from groma.scene import Scene
 
 
-def open_viewer(scene: Scene, images: ImageFiles | None = None, port: int = 8080, host: str = "127.0.0.1") -> SceneView:
+def open_viewer(
+    scene: Scene,
+    images: ImageFiles | None = None,
+    port: int = 8080,
+    host: str = "127.0.0.1",
+    say: Say | None = None,
+) -> SceneView:
     """Serve a scene to the browser and return at once.
 
     Parameters
@@ -38,6 +42,9 @@ def open_viewer(scene: Scene, images: ImageFiles | None = None, port: int = 8080
         Port to listen on, or the next free one; 0 takes any.
     host : str
         Address to listen on; by default only this machine can connect. "0.0.0.0" lets every machine in the network.
+        Pages of other places are refused in any case (:mod:`groma.viz.viewer.server`).
+    say : callable, optional
+        Called with a sentence when a connection is refused, from another thread.
 
     Returns
     -------
@@ -49,15 +56,12 @@ def open_viewer(scene: Scene, images: ImageFiles | None = None, port: int = 8080
     InputError
         If there is nothing to draw, or ``images`` is not a folder.
     """
-    import viser
-
     if not (scene.num_images or scene.num_points or scene.num_lines):
         raise InputError("The scene has no images, points or lines: there is nothing to look at.")
     if isinstance(images, str | os.PathLike) and not os.path.isdir(images):
         raise InputError(f"{os.fspath(images)} is not a folder of images. Check --images.")
     content = view_content(scene)
-    with silenced():
-        server = viser.ViserServer(host=host, port=port, label="groma", verbose=False)
+    server = start_server(host, port, say)
     try:
         return SceneView(server, content, images)
     except BaseException:
@@ -67,10 +71,14 @@ def open_viewer(scene: Scene, images: ImageFiles | None = None, port: int = 8080
 
 @contextlib.contextmanager
 def serving(
-    scene: Scene, images: ImageFiles | None = None, port: int = 8080, host: str = "127.0.0.1"
+    scene: Scene,
+    images: ImageFiles | None = None,
+    port: int = 8080,
+    host: str = "127.0.0.1",
+    say: Say | None = None,
 ) -> Iterator[SceneView]:
     """Serve a scene inside a ``with`` block; parameters are those of :func:`open_viewer`."""
-    view = open_viewer(scene, images, port, host)
+    view = open_viewer(scene, images, port, host, say)
     try:
         yield view
     finally:
@@ -82,16 +90,6 @@ def wait_for_interrupt() -> None:
     never = threading.Event()
     while not never.wait(0.5):  # a wait without end cannot be interrupted on every system
         pass
-
-
-def silenced() -> contextlib.AbstractContextManager[Any]:
-    """Keep what the server says of itself, whatever it was told about talking, off standard output."""
-    return contextlib.redirect_stdout(io.StringIO())
-
-
-def stop_server(server: viser.ViserServer) -> None:
-    with silenced():
-        server.stop()
 
 
 __all__ = ["SceneView", "open_viewer", "serving", "wait_for_interrupt"]
