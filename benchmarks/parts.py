@@ -161,10 +161,10 @@ def compare_ranks(folder: Path, observations: int, arguments: argparse.Namespace
             np.median([own[key] / base[key] for own, base in zip(found, first, strict=True)])
             for key in ("step_s", "cpu_s", "peak_mib")
         )
-        print(
-            f"| {ranks} | {step:.2f} | {spent:.2f} | {peak:.2f} | {found[0]['bytes']:,} | {found[0]['final_cost']:.17g} |"
-        )
-    alone, num_bytes = rows[min(rows)][0], max(row["bytes"] for found in rows.values() for row in found)
+        cost, size = found[0]["final_cost"], found[0]["bytes"]
+        print(f"| {ranks} | {step:.2f} | {spent:.2f} | {peak:.2f} | {size:,} | {cost:.17g} |")
+    alone = rows[min(rows)][0]
+    num_bytes = max(row["bytes"] for found in rows.values() for row in found)
     solve = alone["seconds"]["solve"] / (alone["steps"] + 1)
     parts = float(np.median([row["step_s"] for row in rows[min(rows)]])) * min(rows) - solve
     print(f"\nOf a step of {parts + solve:.2f} s on one rank {solve:.3f} s solve the shared system. Foreseen:")

@@ -27,7 +27,7 @@ from groma.adjustment.parts.memory import room_for_parts
 from groma.adjustment.parts.opened import open_parts
 from groma.adjustment.parts.run import Run, Solved, Squares
 from groma.adjustment.parts.together import agreed
-from groma.adjustment.report import AdjustReport
+from groma.adjustment.report import AdjustReport, not_converged
 from groma.errors import InputError, OutputError
 from groma.factors.losses import Loss, Trivial
 from groma.solver.options import SolverOptions
@@ -164,7 +164,7 @@ def _result(run: Run, output: Path, solved: Solved, after: Squares) -> PartsResu
         for name, count in fact["measurements"].items():
             if name not in COUNTED_OTHERWISE and count:
                 measurements[name] = measurements.get(name, 0) + count
-    warnings = (*sorted({note for fact in opened.facts for note in fact["notes"]}), *solved.report.warnings)
+    warnings = (*sorted({note for fact in opened.facts for note in fact["notes"]}), *not_converged(solved.report))
     adjustment = AdjustReport(
         num_images=opened.num_images,
         num_points=opened.total("points"),
