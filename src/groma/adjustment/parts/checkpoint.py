@@ -82,7 +82,8 @@ class Checkpoint:
         self.progressed = Progressed(told["stage"], told["scale"], [(a, _history(b)) for a, b in told["earlier"]])
         standing = Standing(told["initial_cost"], told["fell"], tuple(_history(told["history"])), _ended(told["ended"]))
         self.begin = Waypoint(standing, told["damping"], told["last_ratio"], told["curvature"])
-        states: dict[str, FloatArray] = {**{n: g.state.copy() for n, g in self._opened.variables.items()}, **arrays}
+        states: dict[str, FloatArray] = {**{n: g.state.copy() for n, g in self._opened.variables.items()}}
+        states |= {name: array for name, array in arrays.items() if name in states}
         for part in self._opened.parts:
             arrays = _load(self._file(part.path, self._slot))
             for name, rows in part.rows.items():

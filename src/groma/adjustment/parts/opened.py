@@ -40,6 +40,8 @@ from groma.solver.steps import States
 
 #: Groups of landmarks.
 LANDMARKS = ("points", "lines")
+#: These and the groups of cameras, by the first part of their names.
+GROUPS = (*LANDMARKS, "frames", "sensors", "intrinsics")
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,7 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
         near = local_frame(head)
     owner = _owners(sizes, reducer.size)
     groups: dict[str, list[Variables]] = {}
+    held: dict[str, Variables] = {}
     parts, facts = [], {}
     with agreed(reducer):
         for number in np.flatnonzero(owner == reducer.rank).tolist():
@@ -146,6 +149,7 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
                     rows[name] = slice(begin, begin + len(group))
                     groups[name].append(group)
             parts.append(Part(paths[number], rows))
+            held |= {name: made.problem.variables[name] for name in _held_besides(made)}
             facts[number] = _facts(scene, options, made)
     told = {int(number): fact for own in exchange(reducer, facts) for number, fact in own.items()}
     ordered = tuple(told[number] for number in sorted(told))
@@ -158,7 +162,7 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
     with agreed(reducer):
         if unknown := sorted(used - cameras.keys()):
             raise InputError(f"Parts cannot share these variables: {', '.join(unknown)}. Leave their options out.")
-    variables = {name: group for name, group in cameras.items() if name in used}
+    variables = {name: group for name, group in cameras.items() if name in used} | held
     variables |= {name: _joined(groups[name]) for name in LANDMARKS if name in groups}
     return OpenParts(tuple(paths), tuple(parts), variables, options, near, ordered, head.num_images)
 
@@ -176,12 +180,18 @@ def _facts(scene: Scene, options: AssemblyOptions, made: Assembly) -> dict[str, 
         "lines": scene.num_lines if "lines" in made.problem.variables else 0,
         "observations": sum(len(group.factor) for group in made.groups if group.observes),
         "measurements": made.num_measurements,
-        "kept": sorted(made.problem.variables.keys() - set(LANDMARKS)),
+        "kept": sorted(made.problem.variables.keys() - set(LANDMARKS) - _held_besides(made)),
         "priors": len(scene.pose_priors) > 0,
         "gauge": gauge_of(scene, options) if options.gauge == "auto" else options.gauge,
         "squares": {kind: [float(values.sum()), len(values)] for kind, values in squares.items()},
         "notes": list(made.notes),
     }
+
+
+def _held_besides(made: Assembly) -> set[str]:
+    """Return the groups that a term adds and that do not move, such as the places of second cameras of stereo pairs."""
+    groups = made.problem.variables.items()
+    return {name for name, group in groups if group.is_constant and name.partition("/")[0] not in GROUPS}
 
 
 def _gauge(options: AssemblyOptions, facts: Sequence[dict[str, Any]]) -> str:
