@@ -78,6 +78,7 @@ class Run:
             if moved and last:
                 reports[-1] = replace(report, final_cost=self._evaluate(states, losses[number]).final_cost)
         report, loss = one_after_another(reports), losses[len(reports) - 1]
+        report = replace(report, initial_cost=reports[0].initial_cost)
         if loss != losses[0]:  # costs under different losses cannot be compared
             report = replace(report, initial_cost=self._evaluate(start, loss).initial_cost)
         return Solved(states, report, stage_entries(losses, reports))
