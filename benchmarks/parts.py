@@ -1,20 +1,29 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A scene larger than memory: time and memory of an adjustment in parts, by the number of observations.
+"""A scene larger than memory: time and memory of an adjustment in parts, by observations and by ranks.
 
-    python benchmarks/parts.py [--millions 1 4 16 50] [--steps 5] [--threads 2] [--work FOLDER]
+    python benchmarks/parts.py [--millions 1 4 16 50] [--steps 5] [--threads 2] [--work FOLDER] [--keep auto]
+    python benchmarks/parts.py --ranks 1 2 --rounds 5 --threads 1 [--millions 4]
 
 The scene is an aerial block: photographs straight down on a grid, each point of the ground in about ten of them, 9 000
 points in a photograph, 0.5 px of noise. It is written part by part, so that it never is in memory. Every size is solved
 by :func:`groma.adjustment.parts.adjust_parts` in a process of its own; 50 million observations take 2 GB of disk.
 Reported are CPU time per step, peak memory of the process, bytes per observation, and the exponent of growth.
+
+With ``--ranks`` the same parts are adjusted by so many processes together (``mpiexec`` must be at hand), in turn, for
+so many rounds. Reported are ratios to the first number, medians over the rounds: wall time per step, CPU time of all
+ranks, peak memory of a rank; the bytes that a rank puts into a sum; and the time foreseen for many ranks. That assumes:
+work on parts divides evenly, the shared system is solved by each, and a sum takes two passes of its bytes at
+``BANDWIDTH`` and two latencies per doubling of ranks.
 """
 
 import argparse
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import time
 from pathlib import Path
@@ -29,11 +38,13 @@ NOISE_PX = 0.5
 DENSITY = 9000 / (WIDTH * HEIGHT * (ALTITUDE / FOCAL) ** 2)
 PER_IMAGE = 9000
 PART = 1_000_000
+#: Network between ranks: bytes per second and seconds per message, as of 25-gigabit Ethernet.
+BANDWIDTH, LATENCY = 2.5e9, 30e-6
 #: Start: standard deviations of rotations (radians), of camera centres and points (metres).
 START = (0.002, 0.3, 0.3)
 
 
-def make(folder: Path, observations: float, seed: int = 0) -> int:
+def make(folder: Path, observations: float, part: int = PART, seed: int = 0) -> int:
     """Write an aerial block in parts; return its number of observations."""
     from groma.geometry import quaternion, se3
     from groma.io.archive import write_archive
@@ -57,7 +68,7 @@ def make(folder: Path, observations: float, seed: int = 0) -> int:
     names = [f"{i:03d}_{j:03d}.jpg" for i, j in grid]
     empty = Scene.from_images(camera, names, np.zeros(len(names), np.int64), start)
     extent = np.array([along - 1, across - 1]) * SPACING
-    strips = max(1, round(observations / PART))
+    strips = max(1, round(observations / part))
     reach = np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3), indexing="ij"), axis=-1).reshape(-1, 2)
     total = 0
     for number in range(strips):
@@ -81,7 +92,7 @@ def make(folder: Path, observations: float, seed: int = 0) -> int:
         image_idx, point_idx, pixels = np.concatenate(image), np.concatenate(point), np.concatenate(pixel)
         order = np.argsort(point_idx, kind="stable")
         ids = np.arange(len(xyz)) + 1
-        part = empty.replace(
+        cut = empty.replace(
             points=Points(
                 ids, xyz + rng.normal(0, START[2], xyz.shape), np.zeros((len(xyz), 3), np.uint8), np.zeros(len(xyz))
             ),
@@ -89,34 +100,79 @@ def make(folder: Path, observations: float, seed: int = 0) -> int:
                 image_idx[order], point_idx[order], pixels[order], np.full(len(order), -1)
             ),
         )
-        write_archive(part, folder / f"part-{number:05d}.npz", force=True)
+        write_archive(cut, folder / f"part-{number:05d}.npz", force=True)
         total += len(order)
     return total
 
 
-def run(folder: Path, steps: int, threads: int) -> dict:
-    """Adjust the parts of a folder in this process."""
-    from groma.adjustment.parts import adjust_parts
+def run(folder: Path, steps: int, threads: int, keep: str, output: Path) -> dict:
+    """Adjust the parts of a folder in this process, and in all that were started with it."""
+    from groma.adjustment.parts import adjust_parts, parts_of
     from groma.solver.options import SolverOptions
+    from groma.solver.reduce.mpi import reducer_of_launcher
 
     options = SolverOptions(
         max_iterations=steps, threads=threads, function_tolerance=0.0, gradient_tolerance=0.0, step_tolerance=0.0
     )
+    reducer = reducer_of_launcher()
     began = time.process_time(), time.perf_counter()
-    with tempfile.TemporaryDirectory(dir=folder.parent) as output:
-        report = adjust_parts(sorted(folder.glob("part-*.npz")), output, options=options).report
+    result = adjust_parts(parts_of(folder), output, options=options, keep=keep, reducer=reducer, force=True)
+    report, peak = result.report, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return {
-        "cpu_s": time.process_time() - began[0],
+        "rank": reducer.rank,
+        "cpu_s": sum(map(float, reducer.gather(str(time.process_time() - began[0])))),
         "wall_s": time.perf_counter() - began[1],
         "steps": report.iterations,
+        "step_s": (report.history[-1].seconds - report.history[0].seconds) / max(1, report.iterations - 1),
+        "seconds": report.seconds,
         "initial_cost": report.initial_cost,
         "final_cost": report.final_cost,
         "residuals": report.num_residuals,
         "unknowns": report.num_unknowns,
         "solver": report.linear_solver,
-        "seconds": report.seconds,
-        "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "bytes": getattr(reducer, "bytes_per_sum", 0),
+        "peak_mib": max(map(float, reducer.gather(str(peak)))),
     }
+
+
+def started(folder: Path, arguments: argparse.Namespace, ranks: int = 1) -> dict:
+    """Adjust the parts of a folder in processes of their own; return what rank 0 reports."""
+    own = [sys.executable, __file__, "--run", folder, "--steps", arguments.steps, "--threads", arguments.threads]
+    own += ["--keep", arguments.keep]
+    if ranks > 1:
+        launcher = shutil.which("mpiexec", path=sysconfig.get_path("scripts")) or "mpiexec"
+        own = [launcher, "-n", ranks, *own]
+    done = subprocess.run([str(word) for word in own], check=True, capture_output=True, env=os.environ)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def compare_ranks(folder: Path, observations: int, arguments: argparse.Namespace) -> None:
+    """Adjust the parts with each number of ranks in turn, and print ratios."""
+    rows: dict[int, list[dict]] = {ranks: [] for ranks in arguments.ranks}
+    for _ in range(arguments.rounds):
+        for ranks, found in rows.items():
+            found.append(started(folder, arguments, ranks))
+    first = rows[arguments.ranks[0]]
+    print(f"{observations:,} observations, {arguments.rounds} rounds in turn, --keep {arguments.keep}\n")
+    print("| ranks | step, ratio | CPU of all, ratio | memory of a rank, ratio | bytes of a sum | final cost |")
+    print("|--:|--:|--:|--:|--:|--:|")
+    for ranks, found in rows.items():
+        step, spent, peak = (
+            np.median([own[key] / base[key] for own, base in zip(found, first, strict=True)])
+            for key in ("step_s", "cpu_s", "peak_mib")
+        )
+        cost, size = found[0]["final_cost"], found[0]["bytes"]
+        print(f"| {ranks} | {step:.2f} | {spent:.2f} | {peak:.2f} | {size:,} | {cost:.17g} |")
+    alone = rows[min(rows)][0]
+    num_bytes = max(row["bytes"] for found in rows.values() for row in found)
+    solve = alone["seconds"]["solve"] / (alone["steps"] + 1)
+    parts = float(np.median([row["step_s"] for row in rows[min(rows)]])) * min(rows) - solve
+    print(f"\nOf a step of {parts + solve:.2f} s on one rank {solve:.3f} s solve the shared system. Foreseen:")
+    for ranks in (1, 16, 64, 256):
+        message = (2 * num_bytes / BANDWIDTH + 2 * LATENCY * np.log2(ranks)) if ranks > 1 else 0.0
+        print(
+            f"  {ranks:4d} ranks: {parts / ranks + solve + message:.3f} s a step, of which {message:.4f} s for the sum"
+        )
 
 
 def main() -> None:
@@ -125,10 +181,24 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--work", type=Path, help="folder for the parts; default: a temporary one")
+    parser.add_argument("--keep", default="never", help="keep parts in memory: auto, always, never")
+    parser.add_argument("--ranks", type=int, nargs="+", help="compare numbers of processes")
+    parser.add_argument("--part", type=int, default=PART, help="observations of a part")
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--run", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.run is not None:
-        print(json.dumps(run(arguments.run, arguments.steps, arguments.threads)))
+        output = arguments.run.parent / f"{arguments.run.name}-adjusted"
+        row = run(arguments.run, arguments.steps, arguments.threads, arguments.keep, output)
+        if row["rank"] == 0:
+            print(json.dumps(row))
+        return
+    if arguments.ranks is not None:
+        with tempfile.TemporaryDirectory(dir=arguments.work) as work:
+            for million in arguments.millions:
+                folder = Path(work) / f"{million:g}"
+                folder.mkdir()
+                compare_ranks(folder, make(folder, 1e6 * million, arguments.part), arguments)
         return
     print(
         "| observations | parts | unknowns | solver | steps | CPU s per step | wall s | peak MiB | reduced chi-square |"
@@ -139,19 +209,8 @@ def main() -> None:
         for million in arguments.millions:
             folder = Path(work) / f"{million:g}"
             folder.mkdir()
-            observations = make(folder, 1e6 * million)
-            command = [
-                sys.executable,
-                __file__,
-                "--run",
-                folder,
-                "--steps",
-                arguments.steps,
-                "--threads",
-                arguments.threads,
-            ]
-            done = subprocess.run([str(part) for part in command], check=True, capture_output=True, env=os.environ)
-            row = json.loads(done.stdout.splitlines()[-1])
+            observations = make(folder, 1e6 * million, arguments.part)
+            row = started(folder, arguments)
             rows.append((observations, row))
             chi = 2 * row["final_cost"] / NOISE_PX**2 / (row["residuals"] - row["unknowns"])
             per_step = row["cpu_s"] / (row["steps"] + 1)
@@ -160,8 +219,8 @@ def main() -> None:
                 f"{per_step:.1f}", f"{row['wall_s']:.0f}", f"{row['peak_mib']:.0f}", f"{chi:.4f}",
             )  # fmt: skip
             print("| " + " | ".join(map(str, cells)) + " |", flush=True)
-            for path in folder.iterdir():
-                path.unlink()
+            for used in Path(work).iterdir():
+                shutil.rmtree(used)
     if len(rows) > 1:
         size = np.log([observations for observations, _ in rows])
         slope = np.polyfit(size, np.log([row["cpu_s"] for _, row in rows]), 1)[0]

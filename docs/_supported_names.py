@@ -46,6 +46,7 @@ ROOMS: Rooms = (
             "groma.solver.options": ("SolverOptions",),
             "groma.solver.report": ("Iteration", "SolveReport"),
             "groma.solver.termination": ("Termination",),
+            "groma.solver.reduce.mpi": ("Ranks",),
             "groma.solver.covariance.marginals": ("Covariances", "Derived"),
             "groma.solver.covariance.quantities": None,
             "groma.solver.observability.diagnosis": None,

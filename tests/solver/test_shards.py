@@ -14,6 +14,7 @@ from groma.factors.contract import Ref
 from groma.factors.losses import Cauchy
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
+from groma.solver.reduce import exact_sums
 from groma.solver.reduce.shards import Shard, solve_shards
 from groma.solver.solve import solve
 from groma.solver.termination import Termination
@@ -164,45 +165,136 @@ def test_steps_are_longer_under_a_robust_loss(monkeypatch):
 
 
 class Together:
-    """The reducer of several threads that play machines."""
+    """The reducer of several threads that play processes."""
 
     def __init__(self, count):
-        self._barrier, self._given, self._count = threading.Barrier(count), {}, count
-        self.own = threading.local()
+        self._barrier, self._given, self.size = threading.Barrier(count), {}, count
+        self.num_neighbours, self.num_cores = count, 1
+        self._own = threading.local()
+
+    @property
+    def rank(self):
+        return self._own.number
+
+    def play(self, number):
+        self._own.number = number
 
     def _gather(self, values):
-        self._given[self.own.number] = values
+        self._given[self.rank] = values
         self._barrier.wait(60)
-        found = [self._given[number] for number in range(self._count)]
+        found = [self._given[number] for number in range(self.size)]
         self._barrier.wait(60)
         return found
 
     def sum(self, values):
-        return np.sum(self._gather(values), axis=0)
+        total, *others = self._gather(values.copy())[:: -1 if self.rank else 1]
+        total = total.copy()
+        for other in others:
+            exact_sums.add_sums(total, other)
+        return total
 
     def union(self, numbers):
         return np.unique(np.concatenate(self._gather(numbers)))
 
+    def gather(self, text):
+        return self._gather(text)
 
-def test_machines_with_shards_of_their_own_solve_one_problem():
+
+def of_process(problem, shards):
+    """The variables of a process with some of the shards, and these: landmarks of others it does not have."""
+    names = shards[0].landmarks if shards else ()
+    variables = {
+        name: group for name, group in problem.variables.items() if group.manifold.kind not in ("point", "line")
+    }
+    own = [{} for _ in shards]
+    for name in names:
+        rows = [shard.landmarks[name] for shard in shards]
+        group = problem.variables[name]
+        variables[name] = group.with_state(np.concatenate([group.state[part] for part in rows]))
+        ends = np.cumsum([0] + [part.stop - part.start for part in rows])
+        for number in range(len(shards)):
+            own[number][name] = slice(int(ends[number]), int(ends[number + 1]))
+    return variables, [Shard(rows, shard.factors) for rows, shard in zip(own, shards, strict=True)]
+
+
+@pytest.mark.parametrize("linear_solver", ["dense", "pcg"])
+@pytest.mark.parametrize("count", [2, 5])
+def test_processes_with_shards_of_their_own_find_the_same_bits(count, linear_solver):
+    """Five processes for four shards: one has none, and sums with the others."""
     problem = scene_problem(num_cameras=6, num_points=60, num_lines=20, shared_intrinsics=True)
-    shards = cut(problem, 4)
-    alone = solve_shards(problem.variables, shards, TIGHT)
-    reducer = Together(2)
+    shards, options = cut(problem, 4), dataclasses.replace(TIGHT, linear_solver=linear_solver)
+    alone = solve_shards(problem.variables, shards, options)
+    reducer = Together(count)
 
     def work(number):
-        reducer.own.number = number
-        return solve_shards(problem.variables, shards[number::2], TIGHT, reducer=reducer)
+        reducer.play(number)
+        variables, own = of_process(problem, shards[number::count])
+        return solve_shards(variables, own, options, reducer=reducer, room=1e9 if number == 0 else 0.0)
 
-    with ThreadPoolExecutor(2) as pool:
-        first, second = pool.map(work, range(2))
-    for name in ("poses", "intrinsics"):
-        np.testing.assert_array_equal(first.variables[name].state, second.variables[name].state)
-    assert first.report.num_residuals == alone.report.num_residuals
-    np.testing.assert_allclose(first.report.final_cost, alone.report.final_cost, rtol=1e-9)
-    rows = shards[1].landmarks["points"]
-    np.testing.assert_array_equal(first.variables["points"].state[rows], problem.variables["points"].state[rows])
-    assert np.abs(second.variables["points"].state[rows] - problem.variables["points"].state[rows]).min() > 0
+    with ThreadPoolExecutor(count) as pool:
+        found = list(pool.map(work, range(count)))
+    for number, solution in enumerate(found):
+        assert solution.report.final_cost == alone.report.final_cost
+        assert solution.report.num_residuals == alone.report.num_residuals
+        assert solution.report.num_unknowns == alone.report.num_unknowns
+        for name, group in solution.variables.items():
+            whole = alone.variables[name].state
+            if name in shards[0].landmarks:
+                whole = np.concatenate([whole[shard.landmarks[name]] for shard in shards[number::count]])
+            np.testing.assert_array_equal(group.state, whole)
+
+
+class Diary:
+    """Keeps all waypoints."""
+
+    def __init__(self, begin=None):
+        self.begin, self.kept = begin, []
+
+    def keep(self, states, waypoint):
+        self.kept.append(({name: state.copy() for name, state in states.items()}, waypoint))
+
+
+@pytest.mark.parametrize("room", [0.0, 1e9])
+def test_goes_on_where_it_stood(room):
+    """From every accepted step on a solve comes to the same bits, whether shards stay in memory or not."""
+    problem = scene_problem(num_cameras=6, num_points=60, disturb=0.6)
+    options = dataclasses.replace(TIGHT, initial_damping=1e-12, max_iterations=200)
+    shards, diary, calls = cut(problem, 3), Diary(), []
+    counted = [Shard(shard.landmarks, lambda shard=shard: calls.append(1) or shard.factors()) for shard in shards]
+    whole = solve_shards(problem.variables, counted, options, journal=diary, room=room)
+    assert len(calls) == 3 if room else len(calls) > 3 * whole.report.iterations
+    assert len(diary.kept) > 4 and any(not record.accepted for record in whole.report.history)
+    assert diary.kept[-1][1].standing.ended is whole.report.termination
+    for states, waypoint in diary.kept[::5] + diary.kept[-1:]:
+        variables = problem.with_states(states).variables
+        again = solve_shards(variables, shards, options, journal=Diary(waypoint))
+        assert again.report.iterations == whole.report.iterations
+        assert again.report.initial_cost == whole.report.initial_cost
+        assert again.report.termination is whole.report.termination
+        for name, group in whole.variables.items():
+            np.testing.assert_array_equal(again.variables[name].state, group.state)
+
+
+def test_shards_are_the_same_at_every_visit():
+    problem = scene_problem(num_cameras=6, num_points=60)
+    few, all_of_them = cut(problem, 1)[0].factors, iter([True])
+
+    def factors():
+        if next(all_of_them, False):
+            return [dataclasses.replace(f, **first_rows(f)) for f in few()]
+        return few()
+
+    def first_rows(factor):
+        row = {f.name: getattr(factor, f.name) for f in dataclasses.fields(factor)}
+        take = np.flatnonzero(next(ref.index for _, ref in factor.references() if ref.group == "poses") < 2)
+        return {
+            name: Ref(value.group, value.index[take]) if isinstance(value, Ref) else value[take]
+            for name, value in row.items()
+            if isinstance(value, Ref) or (isinstance(value, np.ndarray) and value.ndim and len(value) == len(factor))
+        }
+
+    with pytest.raises(ProblemError, match="same factors every time"):
+        solve_shards(problem.variables, [Shard(cut(problem, 1)[0].landmarks, factors)], TIGHT)
 
 
 def test_gauss_newton_in_shards():

@@ -53,7 +53,7 @@ STAGE_TOLERANCE = 1e-2
 #: the first step that is refused: mostly a single line in a wrong minimum is to blame.
 RESTART_TOLERANCE = 0.3
 #: Terms that a report counts among the observations, and among the relations.
-_COUNTED_OTHERWISE = ("point observations", "line observations", "relations", "relations in pixels")
+COUNTED_OTHERWISE = ("point observations", "line observations", "relations", "relations in pixels")
 
 
 @dataclass(frozen=True)
@@ -184,9 +184,9 @@ def _in_model(
 
 def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
     """Adjust a scene that is near the origin of its world."""
-    stages = _stages(scene, options)
-    relation_loss = _relation_loss(scene, options)
-    assembly = assemble(scene, _assembly_options(scene, options, stages[-1], relation_loss), options.terms)
+    stages = losses_of(scene, options)
+    relation_loss = relation_loss_of(scene, options)
+    assembly = assemble(scene, assembly_options_of(scene, options, stages[-1], relation_loss), options.terms)
     if not assembly.problem.factors:
         raise InputError(
             f"There is nothing to adjust: the scene has {counted(scene.num_images, 'images')}, "
@@ -199,12 +199,12 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         spent = sum(report.iterations for report in reports)
         solver_options = SolverOptions(
             max_iterations=options.max_iterations - spent,
-            function_tolerance=options.function_tolerance if last else _stage_tolerance(loss),
-            start_tolerance=_start_tolerance(scene, options),
+            function_tolerance=options.function_tolerance if last else stage_tolerance(loss),
+            start_tolerance=start_tolerance_of(scene, options),
             linear_solver=options.linear_solver,
             landmark_steps=_landmark_steps(options, loss, problem),
             landmark_groups=("lines",) if isinstance(loss, Trivial) and not _is_coupled(problem) else None,
-            initial_damping=_damping_after(reports, loss),
+            initial_damping=damping_after(reports, loss),
             threads=options.threads,
         )
 
@@ -258,7 +258,7 @@ def _outcome(
         num_lines=scene.num_lines if "lines" in start else 0,
         num_planes=scene.num_planes if "planes" in start else 0,
         num_observations=sum(len(group.factor) for group in assembly.groups if group.observes),
-        num_measurements={name: count for name, count in counts.items() if name not in _COUNTED_OTHERWISE},
+        num_measurements={name: count for name, count in counts.items() if name not in COUNTED_OTHERWISE},
         rmse_px={kind: {"before": _rms(before[kind]), "after": _rms(after[kind])} for kind in before},
         inliers=inliers(before, after, redundancy_of(assembly)),
         sigma0=_sigma0(replace(assembly, problem=problem)),
@@ -273,7 +273,7 @@ def _is_bal(scene: Scene) -> bool:
     return scene.num_cameras > 0 and all(name == "BAL" for name in scene.cameras.models)
 
 
-def _stages(scene: Scene, options: AdjustOptions) -> list[Loss]:
+def losses_of(scene: Scene, options: AdjustOptions) -> list[Loss]:
     """Return the losses to solve with, one after the other."""
     if options.loss == "none" or (options.loss == "auto" and _is_bal(scene)):
         with_lines = options.lines and scene.num_line_observations > 0
@@ -286,12 +286,12 @@ def _stages(scene: Scene, options: AdjustOptions) -> list[Loss]:
     return [make_loss(options.loss, 1.0 if options.loss_scale is None else options.loss_scale)]
 
 
-def _relation_loss(scene: Scene, options: AdjustOptions) -> Loss | None:
+def relation_loss_of(scene: Scene, options: AdjustOptions) -> Loss | None:
     """Return the loss of relations between landmarks, if it does not follow from that of the observations."""
     return METRIC_RELATION_LOSS if options.loss == "auto" and scene.is_metric else None
 
 
-def _start_tolerance(scene: Scene, options: AdjustOptions) -> float:
+def start_tolerance_of(scene: Scene, options: AdjustOptions) -> float:
     """Return what the first step must promise for it to be taken."""
     if options.start_tolerance is not None:
         return options.start_tolerance
@@ -307,11 +307,12 @@ def _wide_enough(loss: Loss, assembly: Assembly) -> Loss:
     return replace(loss, scale=max(loss.scale, LAST_SCALE_SIGMAS * float(sigma)))
 
 
-def _stage_tolerance(loss: Loss) -> float:
+def stage_tolerance(loss: Loss) -> float:
+    """Return the relative decrease of the cost at which a stage that is not the last ends."""
     return RESTART_TOLERANCE if isinstance(loss, Trivial) else STAGE_TOLERANCE
 
 
-def _damping_after(reports: list[SolveReport], loss: Loss) -> float | None:
+def damping_after(reports: list[SolveReport], loss: Loss) -> float | None:
     """Plain least squares goes on as boldly as it ended; another loss begins anew."""
     if not reports or not reports[-1].history or not isinstance(loss, Trivial):
         return None
@@ -334,7 +335,9 @@ def _is_coupled(problem: Problem) -> bool:
     return any(factor.type_name == "point_on_line" for factor in problem.factors)
 
 
-def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss, relation_loss: Loss | None) -> AssemblyOptions:
+def assembly_options_of(
+    scene: Scene, options: AdjustOptions, loss: Loss, relation_loss: Loss | None
+) -> AssemblyOptions:
     """Return the options of the assembly: those of the same name, and what follows from the scene and the stage."""
     is_bal = _is_bal(scene)
     shared = {item.name for item in fields(AssemblyOptions)} & {item.name for item in fields(options)}

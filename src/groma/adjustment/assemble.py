@@ -99,8 +99,8 @@ def assemble(scene: Scene, options: AssemblyOptions, more: Sequence[Term] = ()) 
     """
     notes: list[str] = []
     if options.gauge == "auto":
-        options = replace(options, gauge=_gauge(scene, options))
-    draft = Draft(scene, options, {**_camera_variables(scene, options), **_landmark_variables(scene, options)}, notes)
+        options = replace(options, gauge=gauge_of(scene, options))
+    draft = Draft(scene, options, {**camera_variables(scene, options), **_landmark_variables(scene, options)}, notes)
     made = [(term.name, group) for term in (*TERMS, *more) if term.applies(draft) for group in term.factors(draft)]
     factors = [group.factor for _, group in made]
     used = {ref.group for factor in factors for _, ref in factor.references()}
@@ -109,7 +109,7 @@ def assemble(scene: Scene, options: AssemblyOptions, more: Sequence[Term] = ()) 
     return Assembly(problem, tuple(notes), names, groups, options.reach)
 
 
-def _gauge(scene: Scene, options: AssemblyOptions) -> str:
+def gauge_of(scene: Scene, options: AssemblyOptions) -> str:
     """Whether the first frame must be held; see :attr:`AssemblyOptions.gauge`."""
     if len(scene.pose_priors):
         return "free"
@@ -162,7 +162,8 @@ def at_places_of(problem: Problem, scene: Scene) -> Problem:
 # --------------------------------------------------------------------------------------------------------- cameras
 
 
-def _camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variables]:
+def camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variables]:
+    """Return the groups of frames, sensors and intrinsics, and what of them is held."""
     chart = POSE_CHARTS[options.pose_chart]
     held: bool | BoolArray = not options.refine_poses
     if options.refine_poses and options.gauge == "first_camera":
@@ -263,6 +264,8 @@ __all__ = [
     "AssemblyOptions",
     "assemble",
     "at_places_of",
+    "camera_variables",
     "disassemble",
     "first_camera_gauge",
+    "gauge_of",
 ]

@@ -81,4 +81,4 @@ def inliers(
     return found
 
 
-__all__ = ["FIT", "FitGates", "inliers", "noise_of"]
+__all__ = ["FIT", "MEDIAN_SQUARE", "FitGates", "inliers", "noise_of"]

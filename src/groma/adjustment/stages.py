@@ -58,6 +58,11 @@ def combined(reports: list[SolveReport], start: Problem, stages: list[Loss]) -> 
     loss, first = stages[len(reports) - 1], reports[0]
     if loss != stages[0]:
         first = solve(with_loss(start, loss), SolverOptions(max_iterations=0)).report
+    return replace(one_after_another(reports), initial_cost=first.initial_cost, initial_costs=first.initial_costs)
+
+
+def one_after_another(reports: list[SolveReport]) -> SolveReport:
+    """Return the last report with the steps and the times of all."""
     history: list[Iteration] = []
     for report in reports:
         steps, seconds = len(history), history[-1].seconds if history else 0.0
@@ -65,15 +70,9 @@ def combined(reports: list[SolveReport], start: Problem, stages: list[Loss]) -> 
             replace(record, iteration=record.iteration + steps, seconds=record.seconds + seconds)
             for record in report.history
         ]
-    seconds = {stage: sum(report.seconds[stage] for report in reports) for stage in last.seconds}
-    return replace(
-        last,
-        initial_cost=first.initial_cost,
-        initial_costs=first.initial_costs,
-        iterations=sum(report.iterations for report in reports),
-        history=history,
-        seconds=seconds,
-    )
+    seconds = {stage: sum(report.seconds.get(stage, 0.0) for report in reports) for stage in reports[-1].seconds}
+    steps = sum(report.iterations for report in reports)
+    return replace(reports[-1], iterations=steps, history=history, seconds=seconds)
 
 
 def with_costs_at(report: SolveReport, problem: Problem) -> SolveReport:

@@ -35,6 +35,7 @@ from groma.solver.joint import JointProblem
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
 from groma.solver.report import Iteration, SolveReport, Stopwatch, count_unknowns, note_costs, warn_of_oddities
+from groma.solver.standing import Standing
 from groma.solver.steps import States
 from groma.solver.termination import Criteria, Termination
 
@@ -105,15 +106,27 @@ def minimise(
     report: SolveReport,
     watch: Stopwatch,
     progress: Progress | None = None,
+    standing: Standing | None = None,
+    keep: Callable[[Standing], None] | None = None,
 ) -> Termination:
-    """Step until a criterion is met, and return which; the states are the problem's own."""
+    """Step until a criterion is met, and return which; the states are the problem's own.
+
+    A loop that is given where an earlier one was ``standing`` goes on from there. ``keep`` is called after every
+    accepted step.
+    """
     best = problem.start()
     report.initial_cost = report.final_cost = best.cost
     if not np.isfinite(best.cost):
         return Termination.NOT_FINITE
     if best.num_hidden == problem.num_factors:
         return Termination.NO_FACTOR_COUNTS
-    share, criteria = best.cost / max(1, problem.num_factors), Criteria(options)
+    criteria = Criteria(options)
+    if standing is not None:
+        report.initial_cost, report.history = standing.initial_cost, list(standing.history)
+        report.iterations, criteria.fell = len(standing.history), standing.fell
+        if standing.ended is not None:
+            return standing.ended
+    share = report.initial_cost / max(1, problem.num_factors)
     while report.iterations < options.max_iterations:
         problem.linearize()
         slope, damping = problem.largest_gradient(), problem.damping
@@ -143,6 +156,8 @@ def minimise(
             seconds=watch.elapsed(),
         )
         report.history.append(record)
+        if accepted and keep is not None:
+            keep(Standing(report.initial_cost, criteria.fell, tuple(report.history), ended))
         if progress is not None and progress(record) is False:
             return Termination.STOPPED_BY_CALLER
         if ended is not None:

@@ -124,21 +124,22 @@ class Criteria:
 
     def __init__(self, options: SolverOptions) -> None:
         self._options = options
-        self._fell = 0.0  # relative decrease in the last step, 0 where it was refused
+        #: Relative decrease in the last step, 0 where it was refused.
+        self.fell = 0.0
 
     def after_accepted(self, trial: Trial, best: Trial) -> Termination | None:
         """Return why to stop after a step from ``best`` to ``trial``."""
         if trial.settled is not None:
             return Termination.COST_CONVERGED if trial.settled else None
-        before, self._fell = self._fell, (best.cost - trial.cost) / best.cost
+        before, self.fell = self.fell, (best.cost - trial.cost) / best.cost
         withheld, tolerance = trial.withheld / best.cost, self._options.function_tolerance
-        if cost_converged(self._fell, before, trial.gain_ratio, withheld, tolerance):
+        if cost_converged(self.fell, before, trial.gain_ratio, withheld, tolerance):
             return Termination.COST_CONVERGED
         return Termination.STEP_CONVERGED if trial.relative_length <= self._options.step_tolerance else None
 
     def after_refused(self, trial: Trial, best: Trial) -> Termination | None:
         """Return why to stop after a step that was refused."""
-        self._fell = 0.0
+        self.fell = 0.0
         if trial.settled is not None:
             return Termination.COST_CONVERGED if trial.settled else None
         if trial.promised <= self._options.function_tolerance * best.cost:

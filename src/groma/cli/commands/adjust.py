@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""``groma adjust``: bundle adjustment of a COLMAP model, a BAL file or a groma archive; of a pose graph, too."""
+"""``groma adjust``: bundle adjustment of a COLMAP model, a BAL file or an archive; a pose graph; parts."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,6 +11,7 @@ from groma.errors import InputError
 
 LineResidual = Literal["endpoints", "bearing", "normal"]
 PlaneResidual = Literal["normal_offset", "quaternion"]
+Keep = Literal["auto", "always", "never"]
 CovarianceGauge = Literal["auto", "inner", "held"]
 
 
@@ -145,6 +146,13 @@ def adjust(
             help="Say what the data do not determine. Default: yes up to 300 images.",
         ),
     ] = None,
+    keep: Annotated[
+        Keep,
+        typer.Option(
+            "--keep",
+            help="With a folder of parts: keep them in memory from one step to the next; auto: where they fit.",
+        ),
+    ] = "auto",
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
@@ -158,27 +166,32 @@ def adjust(
 
     Reads a scene, minimises the robust reprojection error over everything in it and writes the scene back. The input
     is never changed. LIMAP's structures beside a COLMAP model are read and written too, with what they hold besides.
-    What the data do not determine is said in words at the end. A pose graph (.g2o, .g2o.gz) is adjusted, too.
+    What the data do not determine is said in words at the end. A pose graph (.g2o, .g2o.gz) is adjusted, too, and so is
+    a folder of parts (groma convert --parts), by one process or by all that mpiexec starts.
     The result is deterministic; --seed is accepted so that scripts can pass it to every command.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.adjusting import Wanted, adjust_and_write
     from groma.cli.shared.console import Console
     from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.parts import PartsWanted, adjust_parts_and_write, has_company, is_parts
     from groma.cli.shared.pose_graph import adjust_graph_and_write, is_pose_graph
 
     if linear_solver != "auto":
         _check_linear_solver(linear_solver)
     console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, page, covariance, json_target=json_target)
+    in_parts = has_company() or is_parts(source)
+    if not in_parts:
+        _output.check_outputs(force, output, page, covariance, json_target=json_target)
     if covariance is not None and covariance.suffix not in (".npz", ".json"):
         raise InputError(f"--covariance must end in .npz or .json; got {covariance}.")
     if not 0.0 < sigma0 < float("inf"):
         raise InputError(f"--sigma0 must be positive; got {sigma0}.")
     if truth is not None and not contributions:
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
-    check_inputs(source, truth)
-    if is_pose_graph(source):
+    if not in_parts:
+        check_inputs(source, truth)
+    if is_pose_graph(source) and not in_parts:
         refused = {
             "--report": page, "--covariance": covariance, "--contributions": contributions, "--gauge": gauge,
             "--line-chart": line_chart, "--refine-intrinsics": refine_intrinsics, "--refine-rigs": refine_rigs,
@@ -200,6 +213,13 @@ def adjust(
         planes=planes, max_iterations=max_iterations, linear_solver=linear_solver, line_chart=line_chart, gauge=gauge,
         line_residual=line_residual, plane_residual=plane_residual, threads=threads,
     ))  # fmt: skip
+    if in_parts:
+        refused = {
+            "--report": page, "--covariance": covariance, "--contributions": contributions, "--diagnosis": diagnosis,
+            "--camera-model": camera_model,
+        }  # fmt: skip
+        adjust_parts_and_write(source, console, options, PartsWanted(output, json_target, force, keep), refused)
+        return
     wanted = Wanted(
         output, page, covariance, covariance_gauge, sigma0, diagnosis, contributions, truth, json_target, force
     )

@@ -67,6 +67,8 @@ def _show(message: Warning | str, category: type[Warning], *_where: object) -> N
 
 
 def _fail(message: str, code: int) -> None:
-    line = " ".join(message.split())
-    print(f"groma: {line}", file=sys.stderr, flush=True)
+    from groma.solver.reduce.mpi import started_as
+
+    if started_as()[0] == 0:  # of processes that mpiexec started together, the first speaks
+        print(f"groma: {' '.join(message.split())}", file=sys.stderr, flush=True)
     raise typer.Exit(code) from None

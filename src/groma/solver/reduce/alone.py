@@ -1,36 +1,28 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a machine adds to the shared system, summed over machines; here there is one machine."""
+"""The reducer of a process that has all shards."""
 
 from __future__ import annotations
 
-from typing import Protocol
-
-from groma._typing import FloatArray, IntArray
-
-
-class Reducer(Protocol):
-    """Combines what machines found that solve one problem together, each with shards of its own.
-
-    All machines call the same methods in the same order, and all get the same results.
-    """
-
-    def sum(self, values: FloatArray) -> FloatArray:
-        """Return the sums over machines of arrays of one shape."""
-        ...
-
-    def union(self, numbers: IntArray) -> IntArray:
-        """Return the numbers that any machine has, sorted; those of one machine are sorted and differ."""
-        ...
+from groma._typing import ComplexArray, IntArray
+from groma.execution import available_cores
 
 
 class Alone:
-    """The reducer of one machine."""
+    """A :class:`groma.solver.reduce.contract.Reducer` that has nobody to ask."""
 
-    def sum(self, values: FloatArray) -> FloatArray:  # noqa: D102
+    rank, size, num_neighbours = 0, 1, 1
+
+    def __init__(self) -> None:
+        self.num_cores = available_cores()
+
+    def sum(self, values: ComplexArray) -> ComplexArray:  # noqa: D102
         return values
 
     def union(self, numbers: IntArray) -> IntArray:  # noqa: D102
         return numbers
 
+    def gather(self, text: str) -> list[str]:  # noqa: D102
+        return [text]
 
-__all__ = ["Alone", "Reducer"]
+
+__all__ = ["Alone"]

@@ -20,20 +20,16 @@ losses make it, the next one is made longer at once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import ProblemError
-from groma.execution import available_cores
-from groma.factors.contract import Factor
-from groma.problem.lay_out import lay_out
-from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
 from groma.problem.parallel import Workers
-from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.damped_problem import Trial
 from groma.solver.levenberg_marquardt import damping_from, predicted_decrease
@@ -41,10 +37,14 @@ from groma.solver.linear.blas import one_blas_thread
 from groma.solver.linear.choice import linear_solver
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.options import SolverOptions, first_damping
-from groma.solver.reduce.alone import Alone, Reducer
-from groma.solver.reduce.shared_system import SharedSystem
+from groma.solver.reduce.alone import Alone
+from groma.solver.reduce.contract import Reducer
+from groma.solver.reduce.journal import Journal, Waypoint
+from groma.solver.reduce.shard import OpenShard, Shard, Shelf
+from groma.solver.reduce.shared_system import NUM_FOUND, SharedSystem
 from groma.solver.report import SolveReport, Stopwatch
 from groma.solver.solve import Progress, minimise
+from groma.solver.standing import Standing
 from groma.solver.steps import States, share_of_states, squares_of_states, squares_of_step
 from groma.solver.termination import Termination
 
@@ -53,17 +53,6 @@ FIRST_DAMPING = 1e-5
 #: How much longer a step is made, at most. Over 24 random scenes under a Cauchy loss shards were visited 1136 times in
 #: all without it, 781 times with it, 907 times with a limit of 3.
 MAX_STRETCH = 2.0
-
-
-@dataclass(frozen=True)
-class Shard:
-    """Landmarks with all their factors."""
-
-    #: Rows of each group of landmarks that are in this shard.
-    landmarks: Mapping[str, slice]
-    #: Makes the factors, for example from memory-mapped files. References to landmarks count from the first row of the
-    #: shard, all others from the first of their group.
-    factors: Callable[[], Sequence[Factor]]
 
 
 @dataclass(frozen=True)
@@ -80,6 +69,8 @@ def solve_shards(
     options: SolverOptions | None = None,
     progress: Progress | None = None,
     reducer: Reducer | None = None,
+    room: float = 0.0,
+    journal: Journal | None = None,
 ) -> ShardedSolution:
     """Minimise the cost of all factors of all shards, as :func:`groma.solver.solve.solve` does for one problem.
 
@@ -95,8 +86,12 @@ def solve_shards(
     progress
         Called with an :class:`Iteration` after every step tried; return False to stop.
     reducer
-        Where several machines solve one problem, each with some of its shards: how they sum what they find. Each
-        returns the new states of its own landmarks; those of others stay. Default: one machine has all shards.
+        Where several processes solve one problem, each with some of its shards and their landmarks: how they sum what
+        they find. Kept variables are the same on all of them. Default: one process has all shards.
+    room
+        Bytes of memory for shards that stay from one visit to the next.
+    journal
+        Where the solve begins, if not at its start, and who keeps where it stands.
 
     Returns
     -------
@@ -112,15 +107,21 @@ def solve_shards(
     _check(variables, shards, reducer)
     report = SolveReport()
     watch = Stopwatch(report)
-    report.threads = options.threads or available_cores()
+    report.threads = options.threads or reducer.num_cores
     workers = Workers(report.threads)
     try:
         with one_blas_thread():
-            problem = ShardedProblem(variables, shards, workers, options, watch, reducer)
-            report.termination = minimise(problem, options, report, watch, progress)
+            problem = ShardedProblem(variables, shards, workers, options, watch, (reducer, Shelf(variables, room)))
+            standing, keep = None, None
+            if journal is not None:
+                keep = partial(problem.keep, journal)
+                if journal.begin is not None:
+                    problem.go_on_from(journal.begin)
+                    standing = journal.begin.standing
+            report.termination = minimise(problem, options, report, watch, progress, standing, keep)
     finally:
         workers.close()
-    report.linear_solver, report.num_unknowns = problem.linear_name, sum(map(_num_free, variables.values()))
+    report.linear_solver, report.num_unknowns = problem.linear_name, problem.num_unknowns
     report.num_factors, report.num_residuals = problem.num_factors, problem.num_residuals
     report.seconds["total"] = watch.elapsed()
     states = problem.states
@@ -146,10 +147,10 @@ class ShardedProblem:
         workers: Workers,
         options: SolverOptions,
         watch: Stopwatch,
-        reducer: Reducer,
+        company: tuple[Reducer, Shelf],
     ) -> None:
         self._variables, self._shards, self._workers, self._options = variables, shards, workers, options
-        self._watch, self._reducer = watch, reducer
+        self._watch, (self._reducer, self._shelf) = watch, company
         self._landmarks = {group for shard in shards for group in shard.landmarks}
         self._kept = {
             name: group for name, group in variables.items() if name not in self._landmarks and not group.is_constant
@@ -161,13 +162,22 @@ class ShardedProblem:
         self._here = ShardedTrial(cost=np.nan, states={name: group.state for name, group in variables.items()})
         #: Whether the shared system is that of the present states and damping.
         self._formed = False
-        self.num_factors = self.num_residuals = self.linear_iterations = 0
+        self.num_factors = self.num_residuals = self.num_unknowns = self.linear_iterations = 0
         self.linear_name = ""
 
     @property
     def states(self) -> States:
         """The present states."""
         return self._here.states
+
+    def go_on_from(self, waypoint: Waypoint) -> None:
+        """Take over what an earlier solve had learnt, at whose states this one begins."""
+        self._damping.value = waypoint.damping
+        self._last_ratio, self._curvature = waypoint.last_ratio, waypoint.curvature
+
+    def keep(self, journal: Journal, standing: Standing) -> None:
+        """Write down where the solve stands."""
+        journal.keep(self.states, Waypoint(standing, self._damping.value, self._last_ratio, self._curvature))
 
     @property
     def damping(self) -> float:  # noqa: D102
@@ -243,23 +253,11 @@ class ShardedProblem:
         """The gain ratio that the next damping follows: that of the step before. It does not raise the damping."""
         return max(self._last_ratio, 0.5)
 
-    def _problem(self, shard: Shard, states: States) -> Problem:
-        """Return a shard as a problem of its own, at given states."""
-        part = {
-            name: Variables(
-                self._variables[name].manifold, states[name][rows], _rows_of(self._variables[name].constant, rows)
-            )
-            for name, rows in shard.landmarks.items()
-        }
-        whole = {name: group.with_state(states[name]) for name, group in self._variables.items() if name not in part}
-        return Problem({**whole, **part}, shard.factors())
-
-    def _open(self, shard: Shard, states: States) -> tuple[Layout, NormalEquations, ReducedSystem, States]:
+    def _open(self, shard: Shard, states: States) -> tuple[OpenShard, NormalEquations, ReducedSystem, States]:
         with self._watch("setup"):
-            problem = self._problem(shard, states)
-            layout = lay_out(problem, tuple(shard.landmarks))
-            equations = NormalEquations(layout, self._workers)
-            return layout, equations, ReducedSystem(equations), to_solver_order(layout)
+            opened = self._shelf.open(shard, states)
+            equations = NormalEquations(opened.layout, self._workers)
+            return opened, equations, ReducedSystem(equations), to_solver_order(opened.layout)
 
     def _linearize(self, equations: NormalEquations, system: ReducedSystem, states: States, damping: float) -> float:
         with self._watch("linearize"):
@@ -272,23 +270,24 @@ class ShardedProblem:
         """Visit all shards to form the shared system; return the cost and the number of degenerate factors."""
         self._sums.clear()
         self._formed = True
-        found = np.zeros(4)
+        free = sum(_num_free(group) for name, group in self._variables.items() if name in self._landmarks)
+        self._sums.find(_found(unknowns=free))
         for shard in self._shards:
-            layout, equations, system, own = self._open(shard, self.states)
+            opened, equations, system, own = self._open(shard, self.states)
             cost = self._linearize(equations, system, own, self.damping)
             with self._watch("schur"):
-                self._sums.add(layout, system)
-            counts = sum(map(len, layout.problem.factors)), layout.problem.num_residuals
-            found += (cost, sum(equations.num_degenerate), *counts)
-        cost, num_hidden, factors, residuals = self._sum_up(found)
+                self._sums.add(opened.layout, system)
+            counts = {"factors": opened.num_factors, "residuals": opened.num_residuals}
+            self._sums.find(_found(cost=cost, hidden=sum(equations.num_degenerate), **counts))
+        cost, num_hidden, factors, residuals, unknowns = self._sum_up()[:5]
         self.num_factors, self.num_residuals = int(factors), int(residuals)
+        self.num_unknowns = int(unknowns) + sum(map(_num_free, self._kept.values()))
         return float(cost), int(num_hidden)
 
-    def _sum_up(self, found: FloatArray) -> FloatArray:
-        """Sum the shared system, and what else was found, over all machines."""
+    def _sum_up(self) -> FloatArray:
+        """Sum the shared system, and what else was found, over all processes."""
         with self._watch("schur"):
-            self._sums.reduce(self._reducer)
-            return self._reducer.sum(found)
+            return self._sums.reduce(self._reducer)
 
     def _advance(self, step: list[FloatArray], factor: float) -> _Visit:
         """Visit all shards to move the states by a multiple of a step, and form the shared system there.
@@ -299,9 +298,9 @@ class ShardedProblem:
         trial = {**states, **self._sums.retract(states, [factor * delta for delta in step])}
         trial |= {name: states[name].copy() for name in self._landmarks}
         self._sums.clear()
-        found = np.zeros(10)
         for shard in self._shards:
-            layout, equations, system, own = self._open(shard, states)
+            opened, equations, system, own = self._open(shard, states)
+            layout, lengths = opened.layout, np.zeros(6)
             self._linearize(equations, system, own, self.damping)
             with self._watch("backsubstitute"):
                 deltas = system.landmark_steps(self._sums.part(layout, step))
@@ -314,16 +313,16 @@ class ShardedProblem:
                 back = to_original_order(layout, moved)
                 for name, rows in shard.landmarks.items():
                     trial[name][rows] = back[name]
-                found[:2] += (system.landmark_squares, system.landmark_slope)
+                model = (system.landmark_squares, system.landmark_slope)
                 for group, delta in zip(layout.eliminated, deltas, strict=True):
-                    found[4:] += self._lengths(group.group, own[group.group], delta)
+                    lengths += self._lengths(group.group, own[group.group], delta)
             cost = self._linearize(equations, system, moved, lower)
-            found[2:4] += (cost, sum(equations.num_degenerate))
             with self._watch("schur"):
                 self._sums.add(layout, system)
-        found = self._sum_up(found)
-        squares, slope, cost, num_hidden = (float(value) for value in found[:4])
-        lengths = found[4:]
+            self._sums.find(np.array([cost, sum(equations.num_degenerate), *model, *lengths]))
+        found = self._sum_up()
+        cost, num_hidden, squares, slope = (float(value) for value in found[:4])
+        lengths = found[4:].copy()
         for name, delta in zip(self._kept, step, strict=True):
             lengths += self._lengths(name, states[name], delta)
         return _Visit(trial, cost, int(num_hidden), lengths[:3], lengths[3:], squares, slope)
@@ -355,7 +354,7 @@ class _Visit:
 
 def _check(variables: Mapping[str, Variables], shards: Sequence[Shard], reducer: Reducer) -> None:
     """Every landmark is in one shard."""
-    if not shards:
+    if not any(map(int, reducer.gather(str(len(shards))))):
         raise ProblemError("There are no shards. Make one or more, each with some landmarks and their factors.")
     times: dict[str, FloatArray] = {}
     for number, shard in enumerate(shards):
@@ -363,8 +362,7 @@ def _check(variables: Mapping[str, Variables], shards: Sequence[Shard], reducer:
             if name not in variables:
                 raise ProblemError(f"Shard {number} names the group {name!r}; there are {sorted(variables)}.")
             times.setdefault(name, np.zeros(len(variables[name])))[rows] += 1
-    for name, own in times.items():
-        seen = reducer.sum(own)
+    for name, seen in times.items():
         wrong = np.flatnonzero(seen != 1)
         if len(wrong):
             raise ProblemError(
@@ -373,8 +371,9 @@ def _check(variables: Mapping[str, Variables], shards: Sequence[Shard], reducer:
             )
 
 
-def _rows_of(constant: bool | np.ndarray, rows: slice) -> bool | np.ndarray:
-    return constant if isinstance(constant, bool | np.bool_) else constant[rows]
+def _found(cost: float = 0.0, hidden: int = 0, factors: int = 0, residuals: int = 0, unknowns: int = 0) -> FloatArray:
+    """Return what a shard adds to the sums besides its system, where the system is formed without a step."""
+    return np.array([cost, hidden, factors, residuals, unknowns] + [0.0] * (NUM_FOUND - 5))
 
 
 def _num_free(group: Variables) -> int:

@@ -7,13 +7,18 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import ComplexArray, FloatArray, IntArray
+from groma.errors import ProblemError
 from groma.problem.layout import KeptClass, Layout, Member
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.solver.linear.schur import MIN_DIAGONAL, ReducedSystem
-from groma.solver.reduce.alone import Reducer
+from groma.solver.reduce import exact_sums
+from groma.solver.reduce.contract import Reducer
 from groma.solver.steps import States, largest_slope
+
+#: Numbers that are summed with the system: the cost and such.
+NUM_FOUND = 10
 
 
 class SharedSystem:
@@ -21,6 +26,9 @@ class SharedSystem:
 
     A shard may merge a camera's intrinsics with its pose, and another one not; so its blocks are cut into those of
     single variables. Blocks off the diagonal are found by number, row * columns + column.
+
+    Which blocks there are is agreed between processes at the first :meth:`reduce`. From then on all sums lie in one
+    buffer, and are reduced in one go.
     """
 
     def __init__(self, kept: Mapping[str, Variables]) -> None:
@@ -28,17 +36,23 @@ class SharedSystem:
         self._variables = kept
         self._sizes = [(len(group), group.manifold.dof) for group in kept.values()]
         self._number: dict[tuple[int, int], IntArray] = {}
+        #: Exact sums, as shards are added: by group the diagonal blocks, curvature, gradient and right-hand side, the
+        #: blocks off the diagonal by pairs of groups, and what else was found.
+        self._sums: dict[tuple[str, int], ComplexArray] = {("found", 0): np.zeros(NUM_FOUND, complex)}
+        for a, (count, dof) in enumerate(self._sizes):
+            self._sums["diagonal", a] = np.zeros((count, dof, dof), complex)
+            self._sums |= {(name, a): np.zeros((count, dof), complex) for name in ("curvature", "gradient", "rhs")}
+        self._buffer: ComplexArray | None = None
+        self._on_diagonal: list[FloatArray] = []
+        self._curvature: list[FloatArray] = []
+        self._gradient: list[FloatArray] = []
+        self._rhs: list[FloatArray] = []
         self._blocks: dict[tuple[int, int], FloatArray] = {}
-        self.clear()
 
     def clear(self) -> None:
-        """Set all sums to zero; the blocks that are there stay."""
-        self._on_diagonal = [np.zeros((count, dof, dof)) for count, dof in self._sizes]
-        self._curvature = [np.zeros((count, dof)) for count, dof in self._sizes]
-        self._gradient = [np.zeros((count, dof)) for count, dof in self._sizes]
-        self._rhs = [np.zeros((count, dof)) for count, dof in self._sizes]
-        for blocks in self._blocks.values():
-            blocks[:] = 0.0
+        """Set all sums to zero; what was reduced before stays until the next :meth:`reduce`."""
+        for sums in self._sums.values():
+            sums[...] = 0.0
 
     def largest_gradient(self) -> float:
         """Return the largest component of the gradient of the kept variables, each over the root of its curvature."""
@@ -47,6 +61,10 @@ class SharedSystem:
     def is_curved(self) -> bool:
         """Whether the cost depends on any kept variable, where there are any."""
         return not self._curvature or any(bool(part.any()) for part in self._curvature)
+
+    def find(self, values: FloatArray) -> None:
+        """Add to what else was found, :data:`NUM_FOUND` numbers."""
+        exact_sums.add(self._sums["found", 0], values)
 
     def add(self, layout: Layout, system: ReducedSystem) -> None:
         """Add the part of a shard."""
@@ -59,13 +77,14 @@ class SharedSystem:
             for member in kept.members:
                 g, block = self._groups.index(member.group), member.blocks(np.arange(self._sizes_of(member)[0]))
                 part = slice(member.offset, member.offset + member.dof)
-                self._curvature[g] += diagonal[block, part]
-                self._gradient[g] += system.equations.g_kept[c].reshape(-1, kept.width)[block, part]
-                self._rhs[g] += system.rhs[c].reshape(-1, kept.width)[block, part]
+                gradient = system.equations.g_kept[c].reshape(-1, kept.width)
+                exact_sums.add(self._sums["curvature", g], diagonal[block, part])
+                exact_sums.add(self._sums["gradient", g], gradient[block, part])
+                exact_sums.add(self._sums["rhs", g], system.rhs[c].reshape(-1, kept.width)[block, part])
         for a, b, rows, columns, blocks in self._cut(layout, system):
             if a == b:
                 same = rows == columns
-                self._on_diagonal[a][rows[same]] += blocks[same]
+                exact_sums.add(self._sums["diagonal", a], blocks[same], rows[same])
                 rows, columns, blocks = rows[~same], columns[~same], blocks[~same]
                 upper = rows < columns
                 blocks = np.where(upper[:, None, None], blocks, blocks.swapaxes(1, 2))
@@ -75,31 +94,60 @@ class SharedSystem:
     def _add_blocks(self, a: int, b: int, number: IntArray, blocks: FloatArray) -> None:
         known = self._number.get((a, b), np.zeros(0, np.int64))
         place = np.searchsorted(known, number)
-        if len(known) == 0 or (known[np.minimum(place, len(known) - 1)] != number).any():
+        if (len(known) == 0 and len(number)) or (known[np.minimum(place, len(known) - 1)] != number).any():
             known = np.union1d(known, number)
             self._grow(a, b, known)
             place = np.searchsorted(known, number)
-        np.add.at(self._blocks[a, b], place, blocks)
+        if len(number):
+            exact_sums.add(self._sums["blocks", self._pair(a, b)], blocks, place)
+
+    def _pair(self, a: int, b: int) -> int:
+        return a * len(self._sizes) + b
 
     def _grow(self, a: int, b: int, number: IntArray) -> None:
         """Make room for the blocks of these numbers, which contain those that are there."""
-        grown = np.zeros((len(number), self._sizes[a][1], self._sizes[b][1]))
+        if self._buffer is not None:
+            raise ProblemError(
+                "A shard couples variables that it did not couple when it was visited first. Shard.factors must make "
+                "the same factors every time."
+            )
+        grown = np.zeros((len(number), self._sizes[a][1], self._sizes[b][1]), complex)
         if (a, b) in self._number:
-            grown[np.searchsorted(number, self._number[a, b])] = self._blocks[a, b]
-        self._number[a, b], self._blocks[a, b] = number, grown
+            grown[np.searchsorted(number, self._number[a, b])] = self._sums["blocks", self._pair(a, b)]
+        self._number[a, b], self._sums["blocks", self._pair(a, b)] = number, grown
 
-    def reduce(self, reducer: Reducer) -> None:
-        """Add the sums of all machines; to be called once, when the shards have been visited."""
-        for sums in (self._on_diagonal, self._curvature, self._gradient, self._rhs):
-            sums[:] = [reducer.sum(part) for part in sums]
+    def reduce(self, reducer: Reducer) -> FloatArray:
+        """Sum over all processes, when the shards have been visited; return what else was found."""
+        if self._buffer is None:
+            self._agree(reducer)
+        assert self._buffer is not None
+        total = exact_sums.rounded(reducer.sum(self._buffer))
+        parts, start = {}, 0
+        for key, sums in self._sums.items():
+            parts[key] = total[start : start + sums.size].reshape(sums.shape)
+            start += sums.size
+        groups = range(len(self._sizes))
+        self._on_diagonal, self._curvature = (
+            [parts["diagonal", a] for a in groups],
+            [parts["curvature", a] for a in groups],
+        )
+        self._gradient, self._rhs = [parts["gradient", a] for a in groups], [parts["rhs", a] for a in groups]
+        self._blocks = {(a, b): parts["blocks", self._pair(a, b)] for a, b in self._number}
+        return parts["found", 0]
+
+    def _agree(self, reducer: Reducer) -> None:
+        """Find which blocks there are on any process; put all sums into one buffer, in the same order everywhere."""
         for a in range(len(self._sizes)):
             for b in range(a, len(self._sizes)):
-                own = self._number.get((a, b), np.zeros(0, np.int64))
-                number = reducer.union(own)
-                if len(number) > len(own):
-                    self._grow(a, b, number)
+                number = reducer.union(self._number.get((a, b), np.zeros(0, np.int64)))
                 if len(number):
-                    self._blocks[a, b] = reducer.sum(self._blocks[a, b])
+                    self._grow(a, b, number)
+        self._number = {pair: self._number[pair] for pair in sorted(self._number)}
+        self._sums = {key: self._sums[key] for key in sorted(self._sums)}
+        self._buffer, start = np.concatenate([sums.reshape(-1) for sums in self._sums.values()]), 0
+        for key, sums in self._sums.items():
+            self._sums[key] = self._buffer[start : start + sums.size].reshape(sums.shape)
+            start += sums.size
 
     def _cut(self, layout: Layout, system: ReducedSystem) -> Iterator[tuple[int, int, IntArray, IntArray, FloatArray]]:
         """Yield the blocks of a shard by pairs of groups a <= b: rows, columns and blocks of single variables."""

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""From parts on disk to variables: each process reads the parts that are its own, and all agree on the cameras.
+
+What a process must know of the parts of others (numbers of landmarks, errors at the start, what holds the scene) is
+told once, as facts by part, and put together in the order of the parts: the same on all processes, and the same for any
+number of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from groma.adjustment.assemble import (
+    Assembly,
+    AssemblyOptions,
+    assemble,
+    camera_variables,
+    gauge_of,
+)
+from groma.adjustment.parts.together import agreed, exchange
+from groma.adjustment.pixel_residuals import squared_residuals_px
+from groma.adjustment.stages import with_loss
+from groma.errors import InputError
+from groma.factors.contract import Factor
+from groma.factors.losses import Loss
+from groma.io.archive import read_archive
+from groma.problem.problem import Problem
+from groma.problem.variables import Variables
+from groma.scene import Scene, Similarity
+from groma.scene.local_frame import local_frame
+from groma.solver.reduce.contract import Reducer
+from groma.solver.reduce.shard import Shard
+from groma.solver.steps import States
+
+#: Groups of landmarks.
+LANDMARKS = ("points", "lines")
+#: These and the groups of cameras, by the first part of their names.
+GROUPS = (*LANDMARKS, "frames", "sensors", "intrinsics")
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of this process."""
+
+    path: Path
+    #: Rows of its landmarks among those of the process.
+    rows: dict[str, slice]
+
+
+@dataclass(frozen=True)
+class OpenParts:
+    """The parts of this process as variables, and facts about all parts."""
+
+    #: All parts of all processes, in order; and those of this one.
+    paths: tuple[Path, ...]
+    parts: tuple[Part, ...]
+    variables: dict[str, Variables]
+    options: AssemblyOptions
+    #: Moves a scene far from the origin of its world near to it.
+    near: Similarity | None
+    #: Of every part: see :func:`_facts`.
+    facts: tuple[dict[str, Any], ...]
+    num_images: int = 0
+
+    @property
+    def has_lines(self) -> bool:
+        """Whether any part has lines."""
+        return any(fact["lines"] for fact in self.facts)
+
+    def read(self, part: Part) -> Scene:
+        """Read a part, near the origin."""
+        return _read(part.path, self.near)
+
+    def assembled(self, part: Part, states: States | None = None, loss: Loss | None = None) -> tuple[Scene, Assembly]:
+        """Return a part as a scene, and as a problem at given states of all variables of this process."""
+        scene = self.read(part)
+        made = assemble(scene, self.options)
+        own = {} if states is None else self.states_of(part, states)
+        variables = {
+            name: replace(group, state=own.get(name, group.state)) for name, group in made.problem.variables.items()
+        }
+        problem = Problem(variables, made.problem.factors)
+        return scene, replace(made, problem=problem if loss is None else with_loss(problem, loss))
+
+    def states_of(self, part: Part, states: States) -> States:
+        """Return the states of the cameras and of the landmarks of a part."""
+        return {
+            name: state[part.rows.get(name, slice(None))]
+            for name, state in states.items()
+            if name in part.rows or name not in LANDMARKS
+        }
+
+    def shards(self, loss: Loss) -> list[Shard]:
+        """Return the parts of this process for a solve under a loss."""
+        return [Shard(part.rows, _Reader(self, part, loss)) for part in self.parts]
+
+    def total(self, name: str) -> int:
+        """Return the sum of a number over all parts."""
+        return sum(int(fact[name]) for fact in self.facts)
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Makes the factors of a part from its file."""
+
+    parts: OpenParts
+    part: Part
+    loss: Loss
+
+    def __call__(self) -> Sequence[Factor]:
+        return self.parts.assembled(self.part, loss=self.loss)[1].problem.factors
+
+
+def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer) -> OpenParts:
+    """Read the parts of this process, and agree with the others on what all share.
+
+    Raises
+    ------
+    InputError
+        On all processes, if one of them cannot read its parts, sees others than the rest, or finds cameras that are
+        not those of the first part; or if there is nothing to adjust.
+    """
+    with agreed(reducer):
+        sizes = [path.stat().st_size for path in paths]
+    _check_same(reducer, [[path.name, size] for path, size in zip(paths, sizes, strict=True)])
+    with agreed(reducer):
+        head = read_archive(paths[0])
+        near = local_frame(head)
+    owner = _owners(sizes, reducer.size)
+    groups: dict[str, list[Variables]] = {}
+    held: dict[str, Variables] = {}
+    parts, facts = [], {}
+    with agreed(reducer):
+        for number in np.flatnonzero(owner == reducer.rank).tolist():
+            scene = _read(paths[number], near)
+            _check_cameras(paths[number], scene, paths[0], head if near is None else head.transformed(near))
+            made = assemble(scene, options)
+            rows = {}
+            for name in LANDMARKS:
+                if name in made.problem.variables:
+                    group = made.problem.variables[name]
+                    begin = sum(map(len, groups.setdefault(name, [])))
+                    rows[name] = slice(begin, begin + len(group))
+                    groups[name].append(group)
+            parts.append(Part(paths[number], rows))
+            held |= {name: made.problem.variables[name] for name in _held_besides(made)}
+            facts[number] = _facts(scene, options, made)
+    told = {int(number): fact for own in exchange(reducer, facts) for number, fact in own.items()}
+    ordered = tuple(told[number] for number in sorted(told))
+    with agreed(reducer):
+        if not any(fact["points"] or fact["lines"] for fact in ordered):
+            raise InputError("There is nothing to adjust: no part has points or lines with observations.")
+    options = replace(options, gauge=_gauge(options, ordered))
+    cameras = camera_variables(head if near is None else head.transformed(near), options)
+    used = {name for fact in ordered for name in fact["kept"]}
+    with agreed(reducer):
+        if unknown := sorted(used - cameras.keys()):
+            raise InputError(f"Parts cannot share these variables: {', '.join(unknown)}. Leave their options out.")
+    variables = {name: group for name, group in cameras.items() if name in used} | held
+    variables |= {name: _joined(groups[name]) for name in LANDMARKS if name in groups}
+    return OpenParts(tuple(paths), tuple(parts), variables, options, near, ordered, head.num_images)
+
+
+def _read(path: Path, near: Similarity | None) -> Scene:
+    scene = read_archive(path)
+    return scene if near is None else scene.transformed(near)
+
+
+def _facts(scene: Scene, options: AssemblyOptions, made: Assembly) -> dict[str, Any]:
+    """Return what all processes must know of a part."""
+    squares = squared_residuals_px(made)
+    return {
+        "points": scene.num_points if "points" in made.problem.variables else 0,
+        "lines": scene.num_lines if "lines" in made.problem.variables else 0,
+        "observations": sum(len(group.factor) for group in made.groups if group.observes),
+        "measurements": made.num_measurements,
+        "kept": sorted(made.problem.variables.keys() - set(LANDMARKS) - _held_besides(made)),
+        "priors": len(scene.pose_priors) > 0,
+        "gauge": gauge_of(scene, options) if options.gauge == "auto" else options.gauge,
+        "squares": {kind: [float(values.sum()), len(values)] for kind, values in squares.items()},
+        "notes": list(made.notes),
+    }
+
+
+def _held_besides(made: Assembly) -> set[str]:
+    """Return the groups that a term adds and that do not move, such as the places of second cameras of stereo pairs."""
+    groups = made.problem.variables.items()
+    return {name for name, group in groups if group.is_constant and name.partition("/")[0] not in GROUPS}
+
+
+def _gauge(options: AssemblyOptions, facts: Sequence[dict[str, Any]]) -> str:
+    """What holds the scene, as one part or another wants it; known poses hold all."""
+    if options.gauge != "auto":
+        return options.gauge
+    free = any(fact["priors"] for fact in facts) or all(fact["gauge"] == "free" for fact in facts)
+    return "free" if free else "first_camera"
+
+
+def _owners(sizes: Sequence[int], count: int) -> np.ndarray:
+    """Return the rank each part belongs to: the largest first, each to who has the least so far."""
+    load, owner = np.zeros(count), np.zeros(len(sizes), int)
+    for number in sorted(range(len(sizes)), key=lambda number: -sizes[number]):
+        owner[number] = int(np.argmin(load))
+        load[owner[number]] += sizes[number]
+    return owner
+
+
+def _check_same(reducer: Reducer, listing: list[list[Any]]) -> None:
+    """All processes see the same files."""
+    told = exchange(reducer, listing)
+    for rank, other in enumerate(told):
+        if other != told[0]:
+            with agreed(reducer):
+                raise InputError(
+                    f"Rank 0 sees {len(told[0])} parts and rank {rank} sees {len(other)}, or files of other sizes. All "
+                    "machines need the same folder, for example on a disk they share."
+                )
+
+
+def _check_cameras(path: Path, scene: Scene, first: Path, head: Scene) -> None:
+    if path != first and _cameras_digest(scene) != _cameras_digest(head):
+        raise InputError(
+            f"{path} has other images or cameras than {first}, or other poses. All parts need the same ones: cut one "
+            "scene with groma convert --parts."
+        )
+
+
+def _cameras_digest(scene: Scene) -> str:
+    state = hashlib.sha256(repr((scene.images.names, scene.cameras.models)).encode())
+    poses = scene.frames.rig_from_world, scene.sensors.cam_from_rig
+    for array in (scene.cameras.params, scene.images.frame_idx, *poses):
+        state.update(np.ascontiguousarray(array).tobytes())
+    return state.hexdigest()
+
+
+def _joined(groups: list[Variables]) -> Variables:
+    return Variables(groups[0].manifold, np.concatenate([group.state for group in groups]))
+
+
+__all__ = ["LANDMARKS", "OpenParts", "Part", "open_parts"]

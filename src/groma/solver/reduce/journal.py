@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where a solve in shards stands, and who keeps it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from groma.solver.standing import Standing
+from groma.solver.steps import States
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """Where a solve in shards stands after an accepted step, besides the states."""
+
+    standing: Standing
+    #: The damping of the next step, and what the last one tells of it: its gain ratio, and the curvature it found.
+    damping: float
+    last_ratio: float
+    curvature: float
+
+
+class Journal(Protocol):
+    """Keeps where a solve stands, so that another one can go on from there."""
+
+    #: Where the solve begins, whose states the variables then have; None: at its start.
+    begin: Waypoint | None
+
+    def keep(self, states: States, waypoint: Waypoint) -> None:
+        """Keep where the solve stands; called by all processes after every accepted step."""
+        ...
+
+
+__all__ = ["Journal", "Waypoint"]

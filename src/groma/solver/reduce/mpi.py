@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Processes on one machine or on many that solve one problem together, by MPI.
+
+A launcher (``mpiexec``, ``srun``) starts the same command several times and tells each process its number, the rank. In
+a step every rank visits its own shards, and one Allreduce of one buffer sums what they found; all then solve the same
+shared system. mpi4py is imported here, and only where there is more than one rank.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from groma._typing import ComplexArray, IntArray
+from groma.errors import InputError
+from groma.execution import available_cores
+from groma.solver.reduce import exact_sums
+from groma.solver.reduce.alone import Alone
+from groma.solver.reduce.contract import Reducer
+
+#: Where launchers say the rank and the number of ranks: MPICH and its kin, Open MPI, srun --mpi=pmix.
+LAUNCHERS = (
+    ("PMI_RANK", "PMI_SIZE"),
+    ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
+    ("PMIX_RANK", "SLURM_STEP_NUM_TASKS"),
+)
+
+
+def started_as(environment: Mapping[str, str] = os.environ) -> tuple[int, int]:
+    """Return rank and number of ranks as a launcher told them; (0, 1) for a process that was started alone."""
+    for rank, size in LAUNCHERS:
+        if environment.get(rank, "").isdigit() and environment.get(size, "").isdigit():
+            return int(environment[rank]), int(environment[size])
+    return 0, 1
+
+
+class Ranks:
+    """The :class:`groma.solver.reduce.contract.Reducer` of all processes that a launcher started together.
+
+    Raises
+    ------
+    InputError
+        If mpi4py is missing, or its MPI is not that of the launcher.
+    """
+
+    def __init__(self) -> None:
+        try:
+            from mpi4py import MPI
+        except ImportError as error:
+            raise InputError(
+                f"{started_as()[1]} processes were started together, and to work together they need MPI: "
+                f'pip install "groma[mpi]" ({error}).'
+            ) from error
+        self._mpi: Any = MPI
+        self._world: Any = MPI.COMM_WORLD
+        self.rank, self.size = int(self._world.rank), int(self._world.size)
+        if self.size != started_as()[1] and started_as()[1] > 1:
+            raise InputError(
+                f"{started_as()[1]} processes were started together, but mpi4py sees {self.size}: the launcher is of "
+                f"another MPI. Use the mpiexec of the one that mpi4py uses, {MPI.Get_library_version()[:30]!r}."
+            )
+        self.num_neighbours, self.num_cores = self._share_of_machine()
+        self._add: Any = MPI.Op.Create(_add, commute=True)
+        #: Bytes that this rank gave to the last sum: what it sends and receives in a step, up to twice.
+        self.bytes_per_sum = 0
+
+    def sum(self, values: ComplexArray) -> ComplexArray:  # noqa: D102
+        self.bytes_per_sum = values.nbytes
+        self._world.Allreduce(self._mpi.IN_PLACE, values, op=self._add)
+        return values
+
+    def union(self, numbers: IntArray) -> IntArray:  # noqa: D102
+        counts = np.array(self._world.allgather(len(numbers)))
+        found = np.empty(int(counts.sum()), np.int64)
+        own = np.ascontiguousarray(numbers, np.int64)
+        self._world.Allgatherv(own, [found, counts])
+        return np.unique(found)
+
+    def gather(self, text: str) -> list[str]:  # noqa: D102
+        return self._world.allgather(text)
+
+    def _share_of_machine(self) -> tuple[int, int]:
+        """Return how many ranks there are on this machine, and how many of its cores this one may use."""
+        machine = self._world.Split_type(self._mpi.COMM_TYPE_SHARED)
+        own = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(available_cores()))
+        there, ranks = set().union(*machine.allgather(own)), int(machine.size)
+        machine.Free()
+        return ranks, max(1, min(len(own), len(there) // ranks))
+
+    def abort(self) -> None:
+        """End all ranks at once: one of them cannot go on, and the others would wait for it."""
+        self._world.Abort(1)
+
+
+def reducer_of_launcher() -> Reducer:
+    """Return the reducer for how this process was started: all ranks of a launcher, or the process alone.
+
+    Raises
+    ------
+    InputError
+        As :class:`Ranks`.
+    """
+    return Ranks() if started_as()[1] > 1 else Alone()
+
+
+def _add(others: Any, sums: Any, _datatype: Any) -> None:
+    """Add exact sums in buffers of MPI, in place."""
+    exact_sums.add_sums(np.frombuffer(sums, np.complex128), np.frombuffer(others, np.complex128))
+
+
+__all__ = ["LAUNCHERS", "Ranks", "reducer_of_launcher", "started_as"]

@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where the loop stands after a step: what it needs to go on later, besides the problem at its states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from groma.solver.report import Iteration
+from groma.solver.termination import Termination
+
+
+@dataclass(frozen=True)
+class Standing:
+    """The loop after an accepted step."""
+
+    initial_cost: float
+    #: Relative decrease of the cost in the step, which the next one is compared with.
+    fell: float
+    #: All steps so far.
+    history: tuple[Iteration, ...]
+    #: Why the loop ended with this step; None if it goes on.
+    ended: Termination | None = None
+
+
+__all__ = ["Standing"]
