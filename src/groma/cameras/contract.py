@@ -227,7 +227,7 @@ class CameraModel:
 
     def pixel_difference(self, params: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
         """Return ``first - second`` (N, 2), in a panorama the short way round; arguments as in :meth:`unproject`."""
-        difference = _rows(first, 2, "first") - _rows(second, 2, "second")
+        difference = as_rows(first, (2,), "first") - as_rows(second, (2,), "second")
         _wrap_all(self.tag, self.check_parameters(params, len(difference)), difference)
         return difference
 
