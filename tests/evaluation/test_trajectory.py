@@ -207,8 +207,9 @@ def test_without_times_lines_belong_together():
 
 
 def test_unrelated_trajectories_are_noticed():
-    """Others agree in nothing; one that is noisy, or badly scaled, is not taken for another."""
+    """Others have other orientations, even where a path is like another; noise and a wrong scale are no other."""
     truth = wander(60, seed=1)
+    assert any("unrelated" in text for text in score_trajectory(wander(60, seed=3), truth, "se3").warnings)
     rng = np.random.default_rng(0)
     turned = truth.world_from_cam.copy()
     turned[:, :4] = quaternion.normalize(rng.normal(size=(60, 4)))

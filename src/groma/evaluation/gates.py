@@ -36,12 +36,6 @@ class ScoreGates:
     )
     time_difference: float = gate(0.01, "s", "times of poses that belong together", "convention: half of TUM's 0.02 s")
     associated: float = gate(0.5, "share", "less of the shorter side in both is warned of", "convention: half")
-    unrelated: float = gate(
-        0.5,
-        "share",
-        "spread of the centres left by the alignment that is warned of",
-        "convention: half of the variance",
-    )
     unrelated_deg: float = gate(
         60.0,
         "deg",

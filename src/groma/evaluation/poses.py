@@ -142,7 +142,7 @@ def score_poses(
 def unrelated(distance: FloatArray, centers: FloatArray, angle_deg: FloatArray) -> str | None:
     """Return a sentence where poses agree no better after alignment than those of different scenes would.
 
-    Unrelated scenes agree in nothing: the alignment leaves most of the spread of the centres, and any angle.
+    A similarity takes any two paths near each other, but not the orientations along them.
 
     Parameters
     ----------
@@ -153,13 +153,13 @@ def unrelated(distance: FloatArray, centers: FloatArray, angle_deg: FloatArray) 
     angle_deg : (N,) float
         Between the orientations.
     """
-    spread = float(np.sum((centers - centers.mean(axis=0)) ** 2))
-    left = float(np.sum(distance**2))
-    if len(distance) < 3 or left <= SCORES.unrelated * spread or float(angle_deg.mean()) <= SCORES.unrelated_deg:
+    if len(distance) < 3 or float(angle_deg.mean()) <= SCORES.unrelated_deg:
         return None
+    spread = float(np.sum((centers - centers.mean(axis=0)) ** 2))
+    left = 100.0 * float(np.sum(distance**2)) / spread if spread > 0.0 else 100.0
     return (
-        f"The alignment leaves {100 * left / spread if spread else 100:.0f} % of the spread of the centres and "
-        f"{angle_deg.mean():.0f} deg on average: the two seem unrelated (another scene, other frames or another world)."
+        f"The alignment leaves {angle_deg.mean():.0f} deg between the orientations on average, and {left:.2g} % of the "
+        "spread of the centres: the two seem unrelated (another scene, other frames), or their cameras have other axes."
     )
 
 

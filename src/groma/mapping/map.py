@@ -180,7 +180,7 @@ def map_images(
     if model is not None and near is not None:
         model = model.transformed(near)
     check_number(folder, names, model, options.lines.min_images)
-    check_cameras((options.camera_model,) if model is None else model.cameras.models)
+    check_cameras((options.point_model().camera_model,) if model is None else model.cameras.models)
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
     with work_with(options.threads), Stages(Path(work), key, options, say) as stages:
