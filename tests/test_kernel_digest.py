@@ -30,7 +30,7 @@ pytestmark = [
 KERNELS = '''
 """Kernels."""
 import numpy as np
-from groma._numba import kernel, loop
+from groma._numba import inline_kernel, kernel, loop
 
 LIMIT = 3.0
 TABLE = np.array([1.0, 2.0])
@@ -44,6 +44,10 @@ def double(x):
 @kernel
 def triple(x):
     return 3.0 * x
+
+@inline_kernel
+def square(x):
+    return x * x
 
 @kernel
 def clip(x):  # at most
@@ -63,7 +67,7 @@ def clip_all(values):
 
 LOOPS = """
 from sample import kernels
-from sample.kernels import double, look
+from sample.kernels import double, look, square
 from sample.special import add_one, half
 from groma._numba import kernel, loop
 
@@ -78,6 +82,10 @@ def through_two(values):
 @loop
 def through_module(values):
     return kernels.triple(values[0])
+
+@loop
+def through_inline(values):
+    return square(values[0])
 
 @loop
 def through_table(values):
@@ -143,7 +151,8 @@ def project_all(model_tag, X, uv):
 """
 
 #: What the functions give for an array of ones; those that are called by others are compiled with them.
-RESULTS = {"kernels.clip_all": 2.0, "loops.through_two": 4.0, "loops.through_module": 3.0, "loops.through_table": 4.0,
+RESULTS = {"kernels.clip_all": 2.0, "loops.through_two": 4.0, "loops.through_module": 3.0,
+           "loops.through_inline": 1.0, "loops.through_table": 4.0,
            "loops.through_intrinsic": 2.0, "loops.through_overload": 0.5, "loops.alone": 1.0}  # fmt: skip
 
 
@@ -211,6 +220,7 @@ def _forget():
 EDITS = [
     ("kernels", "return x + x", "return x * 3.0", {"loops.through_two": 9.0}),
     ("kernels", "return 3.0 * x", "return 4.0 * x", {"loops.through_module": 4.0}),
+    ("kernels", "return x * x", "return x * x + 1.0", {"loops.through_inline": 2.0}),
     ("loops", "double(double(x))", "double(x)", {"loops.through_two": 2.0}),
     ("loops", "return values[0]\n", "return values[0] + 5.0\n", {"loops.alone": 6.0}),
     ("kernels", "LIMIT = 3.0", "LIMIT = 0.25", {"kernels.clip_all": 0.5}),

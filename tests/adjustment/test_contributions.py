@@ -66,7 +66,7 @@ def test_each_entry_is_the_adjustment_itself(scenes, found):
     plain = groma.adjust(
         scenes.start.replace(relations=Relations()), groma.AdjustOptions(loss="none", planes=False, threads=1)
     )
-    assert found[1].rmse_px == {name: values["after"] for name, values in plain.report.rmse_px.items()}
+    assert found[1].rmse_px == {name: told["rmse_px"]["after"] for name, told in plain.report.inliers.items()}
     assert found[1].iterations == plain.report.solve.iterations
 
 

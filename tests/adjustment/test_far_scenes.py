@@ -20,7 +20,7 @@ from groma.mapping.map import MapResult, map_images
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Similarity
-from groma.scene.local_frame import local_frame
+from groma.scene.local_frame import local_frame, usual_frame
 from groma.scene.synthetic.scenes import holistic
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -78,6 +78,16 @@ def test_the_unit_of_length_does_not_matter(start, exponent):
 
 
 @pytest.mark.parametrize("exponent", [-12, 12])
+def test_what_is_known_does_not_depend_on_the_unit_of_length(start, near, exponent):
+    unit = 10.0**exponent
+    there = adjust(start.transformed(Similarity(scale=unit)), OPTIONS)
+    here, far = near.pose_uncertainty(), there.pose_uncertainty()
+    assert far["center"]["median"] == pytest.approx(unit * here["center"]["median"], rel=1e-6)
+    assert far["rotation_deg"]["median"] == pytest.approx(here["rotation_deg"]["median"], rel=1e-6)
+    assert [f.sentence for f in there.diagnose().findings] == [f.sentence for f in near.diagnose().findings]
+
+
+@pytest.mark.parametrize("exponent", [-12, 12])
 def test_the_unit_of_length_ends_no_solve_early(exponent):
     """Two poses and the motion between them, turns held: what is small in numbers is not small for the scene."""
     unit = 10.0**exponent
@@ -129,7 +139,22 @@ def test_points_at_a_great_distance_do_not_end_the_adjustment(start, near):
     assert found.report.solve.iterations >= expected.report.solve.iterations
 
 
-def test_a_map_is_made_near_the_origin_and_moved_back(tmp_path, monkeypatch, start, near):
+@pytest.mark.parametrize("exponent", [-9, -4, 4, 9])
+def test_scenes_of_unusual_size_get_a_unit_of_their_own(start, exponent):
+    assert usual_frame(start) is None
+    scaled = start.transformed(Similarity(scale=10.0**exponent))
+    frame = usual_frame(scaled)
+    assert frame is not None and np.log2(frame.scale) == np.round(np.log2(frame.scale))
+    assert usual_frame(scaled.transformed(frame)) is None
+    np.testing.assert_array_equal(scaled.transformed(frame).transformed(frame.inverse()).points.xyz, scaled.points.xyz)
+    far = scaled.transformed(Similarity(translation=10.0**exponent * TO_UTM.translation))
+    both = usual_frame(far)
+    assert both is not None and both.scale == frame.scale
+    assert local_frame(far.transformed(both)) is None and usual_frame(far.transformed(both)) is None
+
+
+@pytest.mark.parametrize("world", [TO_UTM, Similarity(scale=1e6), Similarity(scale=1e-6)])
+def test_a_map_is_made_near_the_origin_in_a_usual_unit_and_moved_back(tmp_path, monkeypatch, start, near, world):
     """What is between the two is looked at without photographs."""
     seen = []
 
@@ -140,12 +165,12 @@ def test_a_map_is_made_near_the_origin_and_moved_back(tmp_path, monkeypatch, sta
     monkeypatch.setattr(mapping, "map_segments", mapped)
     for name in start.images.names:
         cv2.imwrite(str(tmp_path / name), np.zeros((768, 1024), np.uint8))
-    model = start.points_only().transformed(TO_UTM)
+    model = start.points_only().transformed(world)
     found = map_images(tmp_path, tmp_path / "work", model)
-    assert local_frame(seen[0]) is None
-    move = local_frame(model)
+    assert usual_frame(seen[0]) is None
+    move = usual_frame(model)
     assert move is not None
-    back = move.inverse()
-    np.testing.assert_allclose(found.start.cam_centers_in_world, model.cam_centers_in_world, atol=1e-6)
-    np.testing.assert_allclose(found.scene.points.xyz, back.points(near.scene.points.xyz), atol=1e-6)
-    np.testing.assert_allclose(found.before.lines.segments, back.points(start.lines.segments), atol=1e-6)
+    back, size = move.inverse(), 1e-6 * max(world.scale, 1e-6)
+    np.testing.assert_allclose(found.start.cam_centers_in_world, model.cam_centers_in_world, atol=size)
+    np.testing.assert_allclose(found.scene.points.xyz, back.points(near.scene.points.xyz), atol=size)
+    np.testing.assert_allclose(found.before.lines.segments, back.points(start.lines.segments), atol=size)

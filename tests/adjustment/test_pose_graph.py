@@ -50,7 +50,7 @@ def test_true_poses_come_back(rng, planar):
         se3.log(se3.compose(se3.inverse(truth), result.graph.poses.world_from_body)), 0, atol=1e-6
     )
     assert result.report.converged and result.chi_square.sum() < 1e-6 < result.chi_square_before.sum()
-    assert len(result.doubtful) == 0
+    assert len(result.outliers) == 0
 
 
 def test_poses_of_the_plane_stay_there(rng):
@@ -105,7 +105,7 @@ def test_a_wrong_motion_loses(rng):
     for loss in ("none", "cauchy", "geman_mcclure"):
         result = adjust_pose_graph(wrong, PoseGraphOptions(loss=loss))
         moved[loss] = np.abs(result.graph.poses.world_from_body - without)[:, 4:].max()
-        assert result.doubtful.tolist() == ([] if loss == "none" else [60])
+        assert result.outliers.tolist() == ([] if loss == "none" else [60])
     # robust losses weigh right motions a little, too: the poses would differ by this even without the wrong one
     assert moved["none"] > 0.5 and max(moved["cauchy"], moved["geman_mcclure"]) < 0.05
 
@@ -116,9 +116,17 @@ def test_odometry_keeps_its_weight_unless_told(rng):
     bad = graph.motions.first_from_second.copy()
     bad[4, 4] += 5.0
     graph = graph.replace(motions=graph.motions.replace(first_from_second=bad))
-    doubted = adjust_pose_graph(graph, PoseGraphOptions(loss="geman_mcclure", trust_odometry=False)).doubtful
+    doubted = adjust_pose_graph(graph, PoseGraphOptions(loss="geman_mcclure", trust_odometry=False)).outliers
     assert doubted.tolist() == [4]
-    assert 4 not in adjust_pose_graph(graph, PoseGraphOptions(loss="geman_mcclure")).doubtful
+    assert 4 not in adjust_pose_graph(graph, PoseGraphOptions(loss="geman_mcclure")).outliers
+
+
+def test_a_graph_that_did_not_converge_says_so(rng):
+    start = disturbed(rng, ring(rng, noise=0.02)[1], 0.3)
+    short = adjust_pose_graph(start, PoseGraphOptions(max_iterations=1))
+    assert not short.report.converged and short.warnings[0].startswith("Not converged after 1 step.")
+    assert short.summary()["warnings"] == list(short.warnings)
+    assert adjust_pose_graph(start, PoseGraphOptions(max_iterations=200)).warnings == ()
 
 
 def test_a_graph_without_motions_is_refused():

@@ -74,7 +74,7 @@ def test_force_knows_the_files_of_results_by_name(tmp_path, name):
 
 
 def test_force_replaces_a_track_in_parts(tmp_path):
-    for name in ("part_2", "part_13", "structures"):
+    for name in ("submap_2", "submap_13", "part_2", "structures"):
         (tmp_path / "track" / name).mkdir(parents=True)
     for name in ("trajectory.txt", "scene.npz", "summary.json", "report.html", "rigs.bin", "lines.obj", "planes.ply"):
         (tmp_path / "track" / name).touch()

@@ -498,3 +498,18 @@ def test_the_command_is_one_call(tmp_path, corner, monkeypatch):
         result.write("called")
     result.write("called", force=True)
     assert json.loads(Path("called/summary.json").read_text())["diagnosis"] is None
+
+
+def test_a_map_that_did_not_converge_says_so_and_given_cameras_change(tmp_path, corner, monkeypatch, capsys):
+    """One step of each adjustment is too few; the cameras of the model come out in the model that was asked for."""
+    images, model = corner
+    monkeypatch.chdir(tmp_path)
+    command = ["map", str(images), "-o", "map", "--model", str(images.parent / "model.npz"), "--no-planes"]
+    assert run([*command, "--max-iterations", "1", "--camera-model", "OPENCV", "--no-diagnosis"]) == 0
+    said = capsys.readouterr()
+    assert "warning: Not converged after 1 step" in said.err
+    numbers = json.loads(Path("map/summary.json").read_text())
+    assert not numbers["converged"] and any(text.startswith("Not converged") for text in numbers["warnings"])
+    assert set(read_scene("map/scene.npz").cameras.models) == {"OPENCV"} != set(model.cameras.models)
+    with_params = [*command, "--camera-params", "1,2,3", "--force"]
+    assert run(with_params) == 1 and "--camera-params is for images without a model" in capsys.readouterr().err

@@ -260,9 +260,9 @@ def test_a_new_map_after_a_long_loss_is_joined_when_the_place_is_seen_again():
     lost = statuses.count("lost")
     # Half a second at thirty frames a second.
     assert 10 <= lost <= 18
-    assert rows[9].part == 0
-    assert rows[-1].part == 1
-    assert result.parts == ()
+    assert rows[9].submap == 0
+    assert rows[-1].submap == 1
+    assert result.submaps == ()
     assert len(result.trajectory) == len(poses) - lost
     assert _room.position_error(result.trajectory, poses) < 0.01
     assert any("lost" in sentence for sentence in result.warnings)
@@ -273,13 +273,13 @@ def test_a_new_map_after_a_long_loss_is_joined_when_the_place_is_seen_again():
 def test_maps_that_never_meet_stay_apart():
     poses = _to_the_opposite_wall()[0]
     rows, result = _run(_room.frames("rgbd", poses))
-    lengths = sorted([len(result.trajectory), *(len(part.trajectory) for part in result.parts)])
+    lengths = sorted([len(result.trajectory), *(len(submap.trajectory) for submap in result.submaps)])
     assert len(lengths) == 2
     assert len(result.trajectory) == lengths[-1]
     assert sum(lengths) == sum(row.pose is not None for row in rows)
-    for part in (result, *result.parts):
-        assert _room.position_error(part.trajectory, poses) < 0.01
-        assert part.scene.num_images == len(part.keyframes) >= 1
+    for submap in (result, *result.submaps):
+        assert _room.position_error(submap.trajectory, poses) < 0.01
+        assert submap.scene.num_images == len(submap.keyframes) >= 1
     assert "Not joined" in result.warnings[-1]
 
 

@@ -4,17 +4,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from groma._counted import counted
+from groma._typing import FloatArray
 from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, at_places_of, disassemble
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
-from groma.adjustment.pixel_residuals import squared_residuals_px
+from groma.adjustment.fit import inliers, noise_of
+from groma.adjustment.lens import unmodelled_distortion
+from groma.adjustment.pixel_residuals import redundancy_of, squared_residuals_px
 from groma.adjustment.relation_outcome import drop_failed_relations
-from groma.adjustment.report import AdjustReport, AdjustResult, Progress
+from groma.adjustment.report import AdjustReport, AdjustResult, Progress, not_converged
 from groma.adjustment.rescue.clusters import settle_clusters
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
@@ -66,7 +69,10 @@ class AdjustOptions:
     loss_scale: float | None = None
     #: Move the cameras; False adjusts the landmarks alone.
     refine_poses: bool = True
-    #: Estimate focal lengths and distortion; None: for BAL problems only.
+    #: Change the model of all cameras first, to one that can hold them: PINHOLE to OPENCV, for example. The parameters
+    #: that it adds start at zero.
+    camera_model: str | None = None
+    #: Estimate focal lengths and distortion; None: for BAL problems, and where ``camera_model`` is given.
     refine_intrinsics: bool | None = None
     #: Estimate principal points too, if intrinsics are refined.
     refine_principal_point: bool = False
@@ -109,6 +115,8 @@ class AdjustOptions:
     #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss or with lines (1 where
     #: points are tied to lines and there is no loss), else 0.
     landmark_steps: int | None = None
+    #: Look into the residuals of points for lens distortion that the cameras lack; warnings then say so.
+    check_lens: bool = True
     #: Threads; None takes one for small problems and all cores for large ones.
     threads: int | None = None
 
@@ -148,12 +156,30 @@ def adjust(
             f"adjust takes a groma.Scene; got {type(scene).__name__}. Read one with groma.read_scene(path), or turn a "
             "pycolmap.Reconstruction into one with groma.io.from_pycolmap(reconstruction)."
         )
+    if options.camera_model is not None:
+        scene, options = _in_model(scene, options, options.camera_model, progress)
     near = local_frame(scene)
     if near is None:
         return _adjusted(scene, options, progress)
     result = _adjusted(scene.transformed(near), options, progress)
     back = result.scene.transformed(near.inverse())
     return replace(result, scene=back, problem=result.problem and at_places_of(result.problem, back))
+
+
+def _in_model(
+    scene: Scene, options: AdjustOptions, name: str, progress: Callable[[Progress], bool | None] | None
+) -> tuple[Scene, AdjustOptions]:
+    """Return the scene with its cameras in another model, and the options to adjust it with.
+
+    Segments are turned into rays before a solve, so points settle what they need to know of the lens.
+    """
+    scene = scene.replace(cameras=scene.cameras.with_model(name))
+    refine = True if options.refine_intrinsics is None else options.refine_intrinsics
+    options = replace(options, camera_model=None, refine_intrinsics=refine)
+    if refine and options.points and options.lines and scene.num_line_observations and scene.num_point_observations:
+        settled = adjust(scene, replace(options, lines=False, planes=False), progress).scene
+        scene = scene.replace(cameras=settled.cameras)
+    return scene, options
 
 
 def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
@@ -210,6 +236,8 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
     if any(map(len, moved)):
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
     outcome = _outcome(scene, assembly, problem, report, relations, stage_entries(stages, reports))
+    if options.check_lens and (lens := unmodelled_distortion(problem, options.threads)):
+        outcome = replace(outcome, warnings=(*outcome.warnings, lens))
     return AdjustResult(adjusted, outcome, problem)
 
 
@@ -222,7 +250,7 @@ def _outcome(
     stages: tuple[dict[str, Any], ...],
 ) -> AdjustReport:
     """Say in numbers what an adjustment did: from the problem of the assembly to the one that was solved."""
-    before, after = (_rmse_px(replace(assembly, problem=p)) for p in (assembly.problem, problem))
+    before, after = (squared_residuals_px(replace(assembly, problem=p)) for p in (assembly.problem, problem))
     counts, start = assembly.num_measurements, assembly.problem.variables
     return AdjustReport(
         num_images=scene.num_images,
@@ -231,11 +259,13 @@ def _outcome(
         num_planes=scene.num_planes if "planes" in start else 0,
         num_observations=sum(len(group.factor) for group in assembly.groups if group.observes),
         num_measurements={name: count for name, count in counts.items() if name not in _COUNTED_OTHERWISE},
-        rmse_px={kind: {"before": before[kind], "after": after[kind]} for kind in before},
+        rmse_px={kind: {"before": _rms(before[kind]), "after": _rms(after[kind])} for kind in before},
+        inliers=inliers(before, after, redundancy_of(assembly)),
+        sigma0=_sigma0(replace(assembly, problem=problem)),
         solve=report,
         relations=relations,
         stages=stages,
-        warnings=(*assembly.notes, *report.warnings),
+        warnings=(*assembly.notes, *not_converged(report), *report.warnings),
     )
 
 
@@ -270,12 +300,11 @@ def _start_tolerance(scene: Scene, options: AdjustOptions) -> float:
 
 def _wide_enough(loss: Loss, assembly: Assembly) -> Loss:
     """Return the loss, widened if the residuals are noisier than its scale suggests."""
-    squares = squared_residuals_px(assembly, weighted=True)
-    if not squares or not isinstance(loss, GemanMcClure):
+    if not isinstance(loss, GemanMcClure):
         return loss
-    # the median of the squared norm of two Gaussian coordinates is 1.386 variances
-    sigma = float(np.sqrt(np.median(np.concatenate(list(squares.values()))) / 1.386))
-    return replace(loss, scale=max(loss.scale, LAST_SCALE_SIGMAS * sigma))
+    squares = squared_residuals_px(assembly, weighted=True)
+    sigma = np.nan_to_num(noise_of(np.concatenate(list(squares.values())))) if squares else 0.0
+    return replace(loss, scale=max(loss.scale, LAST_SCALE_SIGMAS * float(sigma)))
 
 
 def _stage_tolerance(loss: Loss) -> float:
@@ -306,31 +335,24 @@ def _is_coupled(problem: Problem) -> bool:
 
 
 def _assembly_options(scene: Scene, options: AdjustOptions, loss: Loss, relation_loss: Loss | None) -> AssemblyOptions:
+    """Return the options of the assembly: those of the same name, and what follows from the scene and the stage."""
     is_bal = _is_bal(scene)
-    refine = is_bal if options.refine_intrinsics is None else options.refine_intrinsics
-    return AssemblyOptions(
-        points=options.points,
-        lines=options.lines,
-        planes=options.planes,
-        refine_poses=options.refine_poses,
-        refine_intrinsics=refine,
-        refine_principal_point=options.refine_principal_point,
-        refine_rigs=options.refine_rigs,
-        line_chart=options.line_chart,
-        gauge=options.gauge,
-        point_sigma_px=options.point_sigma_px,
-        line_sigma_px=options.line_sigma_px,
-        line_end_correlation=options.line_end_correlation,
-        line_residual=options.line_residual,
-        plane_residual=options.plane_residual,
-        structure_form=options.structure_form,
-        structure_sigma_px=options.structure_sigma_px,
-        loss=loss,
-        relation_loss=relation_loss,
-        drop_behind=not is_bal,
-    )
+    shared = {item.name for item in fields(AssemblyOptions)} & {item.name for item in fields(options)}
+    chosen: dict[str, Any] = {name: getattr(options, name) for name in shared}
+    if options.refine_intrinsics is None:
+        chosen["refine_intrinsics"] = is_bal
+    return AssemblyOptions(**chosen | {"loss": loss, "relation_loss": relation_loss, "drop_behind": not is_bal})
 
 
-def _rmse_px(assembly: Assembly) -> dict[str, float]:
-    """Root mean square of the reprojection residuals by kind, unweighted and without the loss, pixels."""
-    return {kind: float(np.sqrt(np.mean(squares))) for kind, squares in squared_residuals_px(assembly).items()}
+def _rms(squares: FloatArray) -> float:
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _sigma0(assembly: Assembly) -> float | None:
+    """Return the noise that the observations show, in units of the noise that was stated."""
+    squares, redundancy = squared_residuals_px(assembly, weighted=True), redundancy_of(assembly)
+    joined = [
+        np.concatenate([part[kind] for kind in squares]) if squares else np.zeros(0) for part in (squares, redundancy)
+    ]
+    sigma = noise_of(*joined)
+    return sigma if np.isfinite(sigma) else None

@@ -39,7 +39,7 @@ class Contribution:
     num_landmarks: int
     num_relations: int
     num_dropped: int
-    #: Root mean square residual by kind, without the loss.
+    #: Root mean square residual of the inliers by kind: see :func:`groma.adjustment.fit.inliers`.
     rmse_px: dict[str, float]
     #: Median distance of the camera centres from those of points alone, after a similarity alignment, and its
     #: percentiles over the images (:data:`PERCENTILES`).
@@ -96,7 +96,7 @@ def contributions(
     InputError
         If the scene has no points to begin with, or no image of the reference.
     """
-    options = options or AdjustOptions()
+    options = replace(options or AdjustOptions(), check_lens=False)
     if not (options.points and scene.num_point_observations):
         raise InputError(
             "Contributions are measured against an adjustment by points alone, and there are no points. "
@@ -143,7 +143,7 @@ def _contribution(kind: str, result: AdjustResult, alone: Scene, reference: Scen
         num_landmarks=report.num_points + report.num_lines + report.num_planes,
         num_relations=sum(outcome["held"] + outcome["dropped"] for outcome in outcomes),
         num_dropped=sum(outcome["dropped"] for outcome in outcomes),
-        rmse_px={name: values["after"] for name, values in report.rmse_px.items()},
+        rmse_px={name: told["rmse_px"]["after"] for name, told in report.inliers.items()},
         moved=0.0 if scene is alone else float(np.median(moved)),
         moved_percentiles=_percentiles(0.0 * moved if scene is alone else moved),
         center_sigma=None if sigma is None else unit * sigma,

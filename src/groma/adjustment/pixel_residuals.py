@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import Assembly
 from groma.problem.residuals import residuals_of
 
@@ -43,6 +43,29 @@ def squared_residuals_px(assembly: Assembly, weighted: bool = False) -> dict[str
     return {kind: np.concatenate(squares) for kind, squares in parts.items()}
 
 
+#: Unknowns of a landmark by kind.
+_UNKNOWNS = {"points": 3, "lines": 4}
+
+
+def redundancy_of(assembly: Assembly) -> dict[str, FloatArray]:
+    """Return by kind, and in the order of :func:`squared_residuals_px`, what share of the noise is left in a residual.
+
+    n observations of two coordinates each leave :math:`1 - d / 2n` of their variance when the d unknowns of their
+    landmark are fitted to them; the cameras, which many observations determine, take up little.
+    """
+    groups = [(g.observes, f) for g, f in zip(assembly.groups, assembly.problem.factors, strict=True) if g.observes]
+    rows: dict[str, list[IntArray]] = {}
+    for kind, factor in groups:
+        if len(factor):
+            rows.setdefault(kind, []).extend(ref.index for _, ref in factor.references() if ref.group == kind)
+    shares = {}
+    for kind, parts in rows.items():
+        index = np.concatenate(parts)
+        fitted = 0.0 if assembly.problem.variables[kind].is_constant else _UNKNOWNS[kind] / 2.0
+        shares[kind] = np.maximum(1.0 - fitted / np.bincount(index)[index], 0.0)
+    return shares
+
+
 def _or_1(pixels: FloatArray | None) -> FloatArray:
     return np.ones(1) if pixels is None else pixels
 
@@ -53,4 +76,4 @@ def at_ends(residual: FloatArray, reach: float) -> FloatArray:
     return np.stack([middle - turn, middle + turn], axis=1)
 
 
-__all__ = ["at_ends", "squared_residuals_px"]
+__all__ = ["at_ends", "redundancy_of", "squared_residuals_px"]

@@ -20,7 +20,7 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.adjustment.report import Progress
+from groma.adjustment.report import Progress, not_converged
 from groma.errors import InputError
 from groma.factors.contract import Ref
 from groma.factors.losses import Loss, Trivial
@@ -72,7 +72,7 @@ class PoseGraphResult:
     chi_square_before: FloatArray
     chi_square: FloatArray
     #: Motions beyond the scale of the loss after the adjustment; none for plain least squares.
-    doubtful: IntArray
+    outliers: IntArray
 
     @property
     def num_parts(self) -> int:
@@ -82,10 +82,10 @@ class PoseGraphResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences for the user."""
+        said = (*not_converged(self.report), *self.report.warnings)
         if self.num_parts == 1:
-            return tuple(self.report.warnings)
-        parts = f"The graph falls into {self.num_parts} parts; each keeps the frame of its held or first pose."
-        return (*self.report.warnings, parts)
+            return said
+        return (*said, f"The graph falls into {self.num_parts} parts; each keeps the frame of its held or first pose.")
 
     def summary(self) -> dict[str, Any]:
         """Return all numbers as plain values, as ``groma adjust --json`` writes them."""
@@ -104,8 +104,8 @@ class PoseGraphResult:
             "linear_solver": report.linear_solver,
             "seconds": dict(report.seconds),
             "chi_square": {"before": float(self.chi_square_before.sum()), "after": float(self.chi_square.sum())},
-            "doubtful_motions": [
-                [int(ids[motions.first_idx[row]]), int(ids[motions.second_idx[row]])] for row in self.doubtful
+            "outlier_motions": [
+                [int(ids[motions.first_idx[row]]), int(ids[motions.second_idx[row]])] for row in self.outliers
             ],
             "warnings": list(self.warnings),
         }
@@ -158,7 +158,7 @@ def adjust_pose_graph(
         report=solution.report,
         chi_square_before=before,
         chi_square=after,
-        doubtful=np.flatnonzero(beyond),
+        outliers=np.flatnonzero(beyond),
     )
 
 

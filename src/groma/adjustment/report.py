@@ -45,6 +45,11 @@ class AdjustReport:
     num_observations: int
     #: Root mean square residual by kind of landmark, pixels: {kind: {before, after}}, without the loss.
     rmse_px: dict[str, dict[str, float]]
+    #: What ends within the noise that the residuals show, by kind of landmark: limit_px, and share and rmse_px, each
+    #: {before, after}; see :func:`groma.adjustment.fit.inliers`. The headline: an rms of all is one of outliers.
+    inliers: dict[str, dict[str, Any]]
+    #: The noise that the observations show, in units of that stated, by the median; None without observations.
+    sigma0: float | None
     #: How the solver got there.
     solve: SolveReport
     #: Sentences for the user.
@@ -63,9 +68,9 @@ class AdjustReport:
         counts |= self.num_measurements
         rows = [", ".join(counted(number, kind) for kind, number in counts.items() if number)]
         rows += [
-            f"{kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms)"
-            for kind, rmse in self.rmse_px.items()
-            if None not in rmse.values()
+            f"{kind}: {told['rmse_px']['before']:.3f} px -> {told['rmse_px']['after']:.3f} px "
+            f"(rms of the inliers, {100 * told['share']['after']:.1f} %)"
+            for kind, told in self.inliers.items()
         ]
         return "\n".join([*rows, str(self.solve), *(f"warning: {sentence}" for sentence in self.warnings)])
 
@@ -108,6 +113,8 @@ class AdjustReport:
             "threads": solve.threads,
             "seconds": dict(solve.seconds),
             "rmse_px": self.rmse_px,
+            "inliers": self.inliers,
+            "sigma0": self.sigma0,
             "relations": self.relations,
             "stages": list(self.stages),
             "num_degenerate": solve.num_degenerate,
@@ -137,13 +144,19 @@ class AdjustResult:
 
         return uncertainty(self.scene, gauge=gauge, sigma0=sigma0, problem=self.problem)
 
+    def pose_uncertainty(self) -> dict[str, Any] | None:
+        """Return how well the cameras are known, at the noise that the observations show."""
+        from groma.adjustment.uncertainty import pose_uncertainty
+
+        return None if self.problem is None else pose_uncertainty(self.scene, self.problem, self.report.sigma0 or 1.0)
+
     def summary(self, diagnosis: Diagnosis | None = None, contributions: Sequence[Contribution] = ()) -> dict[str, Any]:
         """Return all numbers as plain values, as ``groma adjust --json`` writes them.
 
         Parameters
         ----------
         diagnosis : Diagnosis, optional
-            What the data determine: :meth:`diagnose`.
+            What the data determine: :meth:`diagnose`. With it, how well the cameras are known is told too.
         contributions : sequence of Contribution
             The same adjustment with fewer kinds of landmarks: :func:`groma.contributions`.
         """
@@ -151,8 +164,16 @@ class AdjustResult:
         if contributions:
             numbers["contributions"] = [entry.to_dict() for entry in contributions]
         numbers["diagnosis"] = None if diagnosis is None else diagnosis.to_dict()
+        numbers["pose_uncertainty"] = None if diagnosis is None else self.pose_uncertainty()
         numbers["warnings"] = [*self.report.warnings, *why_steps_ran_out(numbers)]
         return numbers
+
+
+def not_converged(solve: SolveReport) -> list[str]:
+    """Return a sentence for an adjustment that did not converge; none where only the start was to be evaluated."""
+    if solve.converged or (solve.termination is Termination.MAX_ITERATIONS and solve.iterations == 0):
+        return []
+    return [f"Not converged after {counted(solve.iterations, 'steps')}. {solve.termination.sentence}"]
 
 
 def why_steps_ran_out(numbers: Mapping[str, Any]) -> list[str]:
@@ -173,4 +194,4 @@ def why_steps_ran_out(numbers: Mapping[str, Any]) -> list[str]:
     ]
 
 
-__all__ = ["AdjustReport", "AdjustResult", "Progress", "why_steps_ran_out"]
+__all__ = ["AdjustReport", "AdjustResult", "Progress", "not_converged", "why_steps_ran_out"]

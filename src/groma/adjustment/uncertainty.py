@@ -10,7 +10,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble, at_places_of, first_camera_gauge
-from groma.errors import InputError
+from groma.errors import InputError, ProblemError
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene
@@ -49,25 +49,16 @@ class SceneUncertainty:
 
     def to_dict(self) -> dict[str, Any]:
         """Return medians and worst cases of the standard deviations as plain numbers, for JSON."""
-
-        def summary(values: FloatArray) -> dict[str, Any]:
-            finite = values[np.isfinite(values)]
-            return {
-                "median": float(np.median(finite)) if len(finite) else None,
-                "largest": float(finite.max()) if len(finite) else None,
-                "undetermined": int((~np.isfinite(values)).sum()),
-            }
-
         turn = np.sqrt(np.einsum("nii->n", self.poses[:, 3:, 3:]))
         return {
             "gauge": self.gauge,
             "sigma0": self.sigma0,
-            "center": summary(position_sigma(self.centers)),
-            "rotation_deg": summary(np.rad2deg(turn)),
-            "point": summary(position_sigma(self.points)),
-            "segment_end": summary(position_sigma(self.segment_ends.reshape(-1, 3, 3))),
-            "line_direction_deg": summary(np.rad2deg(position_sigma(self.lines[:, 3:, 3:]))),
-            "plane_normal_deg": summary(np.rad2deg(position_sigma(self.planes[:, :3, :3]))),
+            "center": _summary(position_sigma(self.centers)),
+            "rotation_deg": _summary(np.rad2deg(turn)),
+            "point": _summary(position_sigma(self.points)),
+            "segment_end": _summary(position_sigma(self.segment_ends.reshape(-1, 3, 3))),
+            "line_direction_deg": _summary(np.rad2deg(position_sigma(self.lines[:, 3:, 3:]))),
+            "plane_normal_deg": _summary(np.rad2deg(position_sigma(self.planes[:, :3, :3]))),
             "undetermined": {kind: ids.tolist() for kind, ids in self.undetermined.items()},
         }
 
@@ -131,17 +122,8 @@ def _uncertainty(
     scene: Scene, options: AssemblyOptions, gauge: str, sigma0: float, problem: Problem | None
 ) -> SceneUncertainty:
     """Return the covariances of a scene that is near the origin of its world."""
-    if gauge == "auto":
-        metric = options.planes and len(scene.relations) > 0 and options.structure_form == "metric"
-        gauge = "held" if metric or scene.is_metric else "inner"
-    if problem is None:
-        held = "first_camera" if gauge == "held" else "free"
-        problem = assemble(scene, replace(options, gauge=held)).problem
-    else:
-        problem = _in_gauge(problem, scene, gauge)
-    datum = {"frames": [1, 1, 1, 0, 0, 0]} if gauge == "inner" and _free_cameras(problem) > 2 else None
-    covariances = Covariances(problem, gauge=gauge, datum=datum)
-    factor = sigma0**2
+    gauge, covariances = _covariances(scene, options, gauge, problem)
+    problem, factor = covariances.problem, sigma0**2
 
     def coordinates(name: str, size: int, count: int) -> FloatArray:
         if name not in problem.variables:
@@ -174,6 +156,56 @@ def _uncertainty(
         undetermined=_undetermined(covariances, scene),
         covariances=covariances,
     )
+
+
+def pose_uncertainty(scene: Scene, problem: Problem, sigma0: float = 1.0, gauge: str = "auto") -> dict[str, Any] | None:
+    """Return how well the cameras alone are known: ``gauge``, ``sigma0``, ``center`` and ``rotation_deg``.
+
+    The entries are those of :meth:`SceneUncertainty.to_dict`; for the parameters see :func:`uncertainty`. None where
+    all cameras are held, or are not determined.
+    """
+    if "frames" not in problem.variables or _free_cameras(problem) == 0:
+        return None
+    near = local_frame(scene)
+    if near is not None:
+        scene = scene.transformed(near)
+        problem = at_places_of(problem, scene)
+    try:
+        gauge, covariances = _covariances(scene, AssemblyOptions(), gauge, problem)
+        poses = covariances.of_coordinates("frames") * sigma0**2
+    except ProblemError:
+        return None
+    return {
+        "gauge": gauge,
+        "sigma0": sigma0,
+        "center": _summary(position_sigma(poses[:, :3, :3])),
+        "rotation_deg": _summary(np.rad2deg(position_sigma(poses[:, 3:, 3:]))),
+    }
+
+
+def _covariances(
+    scene: Scene, options: AssemblyOptions, gauge: str, problem: Problem | None
+) -> tuple[str, Covariances]:
+    """Return the gauge that was chosen, and the covariances in it."""
+    if gauge == "auto":
+        metric = options.planes and len(scene.relations) > 0 and options.structure_form == "metric"
+        gauge = "held" if metric or scene.is_metric else "inner"
+    if problem is None:
+        held = "first_camera" if gauge == "held" else "free"
+        problem = assemble(scene, replace(options, gauge=held)).problem
+    else:
+        problem = _in_gauge(problem, scene, gauge)
+    datum = {"frames": [1, 1, 1, 0, 0, 0]} if gauge == "inner" and _free_cameras(problem) > 2 else None
+    return gauge, Covariances(problem, gauge=gauge, datum=datum)
+
+
+def _summary(values: FloatArray) -> dict[str, Any]:
+    finite = values[np.isfinite(values)]
+    return {
+        "median": float(np.median(finite)) if len(finite) else None,
+        "largest": float(finite.max()) if len(finite) else None,
+        "undetermined": int((~np.isfinite(values)).sum()),
+    }
 
 
 def _undetermined(covariances: Covariances, scene: Scene) -> dict[str, IntArray]:
@@ -231,4 +263,4 @@ def _hat(v: FloatArray) -> FloatArray:
     return np.cross(v[:, None, :], np.eye(3)[None]).swapaxes(1, 2)
 
 
-__all__ = ["SceneUncertainty", "position_sigma", "uncertainty"]
+__all__ = ["SceneUncertainty", "pose_uncertainty", "position_sigma", "uncertainty"]

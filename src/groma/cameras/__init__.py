@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From ray to pixel and back, each with its derivative: one file per family of camera models."""
 
+from groma.cameras.change import in_model
 from groma.cameras.contract import CameraModel
 from groma.cameras.fisheye import OPENCV_FISHEYE
 from groma.cameras.opencv import FULL_OPENCV, OPENCV
@@ -20,6 +21,7 @@ __all__ = [
     "SIMPLE_RADIAL",
     "CameraModel",
     "Rig",
+    "in_model",
     "model",
     "models",
     "register_camera",

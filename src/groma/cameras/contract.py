@@ -25,6 +25,7 @@ from groma.cameras.dispatch import (
     unproject,
 )
 from groma.errors import InputError, ShapeError
+from groma.geometry.algebra import as_rows
 
 # --------------------------------------------------------------------------------------------------------- Kernels
 
@@ -132,7 +133,7 @@ class CameraModel:
         -----
         Perspective models also give a pixel for z < 0, the one of the opposite point.
         """
-        points = _rows(points_in_cam, 3, "points_in_cam")
+        points = as_rows(points_in_cam, (3,), "points_in_cam")
         pixels = np.empty((len(points), 2))
         _project_all(self.tag, self.check_parameters(params, len(points)), points, pixels)
         return pixels
@@ -151,7 +152,7 @@ class CameraModel:
         pixels_wrt_params : (N, 2, k) float64
             All NaN where the model has no value.
         """
-        points = _rows(points_in_cam, 3, "points_in_cam")
+        points = as_rows(points_in_cam, (3,), "points_in_cam")
         count = len(points)
         pixels, by_point = np.empty((count, 2)), np.empty((count, 2, 3))
         by_params = np.empty((count, 2, self.num_parameters))
@@ -174,7 +175,7 @@ class CameraModel:
             Unit bearings in the camera frame; rows of NaN where the pixel lies beyond the radius up to which the
             distortion is monotone, so that no bearing, or more than one, would fit.
         """
-        rows = _rows(pixels, 2, "pixels")
+        rows = as_rows(pixels, (2,), "pixels")
         bearings = np.empty((len(rows), 3))
         _unproject_all(self.tag, self.check_parameters(params, len(rows)), rows, bearings)
         return bearings
@@ -319,14 +320,6 @@ class CameraModel:
                 f"got an array of shape {params.shape}. Pass them along the last axis, in this order."
             )
         return params
-
-
-def _rows(array: FloatArray, columns: int, name: str) -> FloatArray:
-    rows = np.ascontiguousarray(array, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != columns:
-        hint = f" Did you mean {name}.T?" if rows.ndim == 2 and rows.shape[0] == columns else ""
-        raise ShapeError(f"{name} must have shape (N, {columns}); got {rows.shape}.{hint}")
-    return rows
 
 
 __all__ = [

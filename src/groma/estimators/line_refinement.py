@@ -52,6 +52,15 @@ class _Chart:
         return out
 
 
+#: Why a line has no maximum, the first that applies: too few observations, no finite line, singular, not converged.
+_FAILURES = [
+    TriangulationStatus.TOO_FEW_VIEWS,
+    TriangulationStatus.INVALID,
+    TriangulationStatus.DEGENERATE_BASELINE,
+    TriangulationStatus.NOT_CONVERGED,
+]
+
+
 def refine_lines(
     line: FloatArray,
     cameras: FloatArray,
@@ -130,16 +139,6 @@ def refine_lines(
     largest = eigenvalues[:, -1]
     determined = np.sqrt(np.clip(ratio(eigenvalues[:, 0], largest, largest > 0.0, 0.0), 0.0, 1.0))
     singular = determined < 1e-7
-    status = np.select(
-        [~enough, ~valid, singular, ~found.converged],
-        [
-            TriangulationStatus.TOO_FEW_VIEWS,
-            TriangulationStatus.INVALID,
-            TriangulationStatus.DEGENERATE_BASELINE,
-            TriangulationStatus.NOT_CONVERGED,
-        ],
-        TriangulationStatus.OK,
-    )
     known = enough & valid
     covariance = None
     if with_covariance:
@@ -148,7 +147,7 @@ def refine_lines(
         line=np.where(known[:, None], refined, 0.0),
         sine=np.where(known, determined, 0.0),
         residual=np.sqrt(found.cost / np.maximum(2.0 * count, 1.0)),
-        status=status,
+        status=np.select([~enough, ~valid, singular, ~found.converged], _FAILURES, TriangulationStatus.OK),
         covariance=covariance,
         iterations=found.steps,
     )

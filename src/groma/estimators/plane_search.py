@@ -199,16 +199,18 @@ def _extract(
             labels[grown.taken] = len(found)
             found.append(grown)
         if len(rows):
-            # Candidates that would end at the same plane are not tried again.
             around = np.unique(features.neighbours[rows])
             left = at[_ranges(first_at[around], first_at[around + 1])]
             left = left[alive[left]]
-            some = features.places[rows[:: max(1, len(rows) // 64)]]
-            alive[left] = _median_above(
-                np.abs(some @ candidates[left, :3].T + candidates[left, 3]),
-                PLANE_SEARCH.same * float(np.median(features.spread(plane[:3], rows))),
-            )
+            alive[left] = _are_other_planes(features, candidates[left], plane, rows)
     return found
+
+
+def _are_other_planes(features: Features, candidates: FloatArray, plane: FloatArray, rows: IntArray) -> BoolArray:
+    """Tell which candidates would not end at a plane that was found, and are worth a try."""
+    some = features.places[rows[:: max(1, len(rows) // 64)]]
+    height = np.abs(some @ candidates[:, :3].T + candidates[:, 3])
+    return _median_above(height, PLANE_SEARCH.same * float(np.median(features.spread(plane[:3], rows))))
 
 
 class _Growth:

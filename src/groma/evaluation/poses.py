@@ -37,7 +37,7 @@ class PoseScores:
     num_images: int
     #: Number of images of the reference that the estimate lacks; their pairs count as wrong in ``auc``.
     num_missing: int
-    #: Sentences about what makes the scores doubtful.
+    #: Sentences about what makes the scores unreliable.
     warnings: tuple[str, ...] = ()
     #: ``reference_from_estimate``: the alignment that was applied.
     alignment: Similarity = field(default_factory=Similarity, repr=False, compare=False)

@@ -88,7 +88,7 @@ class TrajectoryScores:
     num_reference: int
     #: ``time``, or ``line`` where one side has no times and both have as many lines.
     association: Literal["time", "line"]
-    #: Sentences about what makes the scores doubtful.
+    #: Sentences about what makes the scores unreliable.
     warnings: tuple[str, ...]
     #: Length of the path of the reference over the compared poses.
     path_length: float

@@ -37,6 +37,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import ShapeError
 from groma.features.images import GrayImage
 from groma.gates import gate, numbers
+from groma.geometry.algebra import as_rows
 
 RADIUS = 7  # of the template, pixels
 SIZE = 2 * RADIUS + 3  # side of a template: the patch and one pixel more for its gradient
@@ -330,7 +331,7 @@ def cut_templates(smooth_image: npt.NDArray[np.float32], pixels: FloatArray) -> 
 
     The template is copied, not interpolated; the keypoint lies between its pixels.
     """
-    pixels = _rows(pixels, (2,), "pixels")
+    pixels = as_rows(pixels, (2,), "pixels")
     templates = np.zeros((len(pixels), SIZE, SIZE), np.float32)
     fractions = np.zeros((len(pixels), 2))
     _cut_all(smooth_image, pixels, templates, fractions)
@@ -372,7 +373,7 @@ def align_templates(
     ShapeError
         If an array has another shape.
     """
-    pixels, shapes = _rows(pixels, (2,), "pixels"), _rows(shapes, (2, 2), "shapes")
+    pixels, shapes = as_rows(pixels, (2,), "pixels"), as_rows(shapes, (2, 2), "shapes")
     index = np.ascontiguousarray(template_index, dtype=np.int64)
     if not len(index) == len(pixels) == len(shapes):
         raise ShapeError(
@@ -385,13 +386,6 @@ def align_templates(
         correlation,
     )  # fmt: skip
     return Alignment(found, covariance, correlation)
-
-
-def _rows(array: FloatArray, row: tuple[int, ...], name: str) -> FloatArray:
-    rows = np.ascontiguousarray(array, dtype=np.float64)
-    if rows.shape[1:] != row:
-        raise ShapeError(f"{name} must have shape (N, {', '.join(map(str, row))}); got {rows.shape}.")
-    return rows
 
 
 __all__ = ["Alignment", "PatchGates", "Templates", "align_templates", "cut_templates", "smoothed"]

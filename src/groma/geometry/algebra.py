@@ -12,13 +12,25 @@ from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError, ShapeError
 
 
-def vectors(value: npt.ArrayLike, size: int, name: str) -> FloatArray:
-    """``value`` as float64, refused with a ShapeError unless its last axis has ``size`` entries."""
+def vectors(value: npt.ArrayLike, size: int, name: str, what: str = "") -> FloatArray:
+    """``value`` as float64, refused with a ShapeError unless its last axis has ``size`` entries, which are ``what``."""
     array = np.asarray(value, dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] != size:
-        hint = f" Did you mean {name}.T?" if array.ndim == 2 and array.shape[0] == size else ""
-        raise ShapeError(f"{name} must have shape (..., {size}); got {array.shape}. Pass one row per item.{hint}")
+        turned = array.ndim == 2 and array.shape[0] == size and name.isidentifier()
+        hint = f" Did you mean {name}.T?" if turned else ""
+        wanted = f"(..., {size}), {what}" if what else f"(..., {size})"
+        raise ShapeError(f"{name} must have shape {wanted}; got {array.shape}. Pass one row per item.{hint}")
     return array
+
+
+def as_rows(array: npt.ArrayLike, row: tuple[int, ...], name: str) -> FloatArray:
+    """``array`` as contiguous float64 of shape (N, *row), refused with a ShapeError otherwise."""
+    rows = np.ascontiguousarray(array, dtype=np.float64)
+    if rows.shape[1:] != row:
+        hints = {row + rows.shape[1:]: f"{name}.T", row: f"{name}[None]"}
+        hint = f" Did you mean {hints[rows.shape]}?" if rows.shape in hints else ""
+        raise ShapeError(f"{name} must have shape (N, {', '.join(map(str, row))}); got {rows.shape}.{hint}")
+    return rows
 
 
 def matrices(value: npt.ArrayLike, rows: int, columns: int, name: str) -> FloatArray:

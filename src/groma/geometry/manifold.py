@@ -46,6 +46,9 @@ class Manifold(ABC):
     factor_columns: int
     dof: int
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"
+
     @abstractmethod
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move states (N, state_size) by increments (N, dof); a zero increment changes nothing."""

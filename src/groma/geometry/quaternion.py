@@ -22,7 +22,8 @@ import numpy as np
 
 from groma._numba import kernel
 from groma._typing import FloatArray
-from groma.errors import InputError, ShapeError
+from groma.errors import InputError
+from groma.geometry.algebra import matrices, vectors
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 
@@ -86,17 +87,7 @@ def log_kernel(q, w):
 
 
 def _quaternions(q: FloatArray) -> FloatArray:
-    q = np.asarray(q, dtype=np.float64)
-    if q.ndim == 0 or q.shape[-1] != 4:
-        raise ShapeError(f"A quaternion must have shape (..., 4), order x, y, z, w; got {q.shape}.")
-    return q
-
-
-def _vectors(vector: FloatArray) -> FloatArray:
-    vector = np.asarray(vector, dtype=np.float64)
-    if vector.ndim == 0 or vector.shape[-1] != 3:
-        raise ShapeError(f"A vector must have shape (..., 3); got {vector.shape}.")
-    return vector
+    return vectors(q, 4, "A quaternion", "order x, y, z, w")
 
 
 def multiply(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -132,7 +123,7 @@ def normalize(q: FloatArray) -> FloatArray:
 
 def rotate(q: FloatArray, vector: FloatArray) -> FloatArray:
     """Vectors (..., 3) turned by unit quaternions (..., 4); both broadcast."""
-    q, v = _quaternions(q), _vectors(vector)
+    q, v = _quaternions(q), vectors(vector, 3, "A vector")
     t = 2.0 * np.cross(q[..., :3], v)
     return v + q[..., 3:] * t + np.cross(q[..., :3], t)
 
@@ -165,9 +156,7 @@ def from_matrix(rotation: FloatArray) -> FloatArray:
     ----------
     Shepperd, *Quaternion from Rotation Matrix*, Journal of Guidance and Control, 1978.
     """
-    R = np.asarray(rotation, dtype=np.float64)
-    if R.shape[-2:] != (3, 3):
-        raise ShapeError(f"A rotation must have shape (..., 3, 3); got {R.shape}.")
+    R = matrices(rotation, 3, 3, "A rotation")
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     squares = np.stack([1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz], axis=-1)
     s01, s02, s12 = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
@@ -189,7 +178,7 @@ def from_matrix(rotation: FloatArray) -> FloatArray:
 
 def exp(omega: FloatArray) -> FloatArray:
     """Unit quaternion (..., 4) of a rotation vector (..., 3) in radians; w >= 0 for angles up to pi."""
-    omega = _vectors(omega)
+    omega = vectors(omega, 3, "A vector")
     theta = np.linalg.norm(omega, axis=-1, keepdims=True)
     scale = 0.5 * np.sinc(theta / (2 * np.pi))
     return np.concatenate([scale * omega, np.cos(theta / 2)], axis=-1)

@@ -30,6 +30,7 @@ from groma._numba import kernel
 from groma._typing import FloatArray
 from groma.errors import ShapeError
 from groma.geometry import quaternion, so3
+from groma.geometry.algebra import matrices, vectors
 from groma.geometry.so3 import exp_kernel as rotation_exp_kernel
 from groma.geometry.so3 import left_jacobian_kernel
 
@@ -62,17 +63,11 @@ def compose_kernel(A, B, out):
 
 
 def _poses(pose: FloatArray) -> FloatArray:
-    pose = np.asarray(pose, dtype=np.float64)
-    if pose.ndim == 0 or pose.shape[-1] != 7:
-        raise ShapeError(f"A pose must have shape (..., 7), quaternion x y z w then translation; got {pose.shape}.")
-    return pose
+    return vectors(pose, 7, "A pose", "quaternion x y z w then translation")
 
 
 def _twists(xi: FloatArray) -> FloatArray:
-    xi = np.asarray(xi, dtype=np.float64)
-    if xi.ndim == 0 or xi.shape[-1] != 6:
-        raise ShapeError(f"A twist must have shape (..., 6), translation then rotation; got {xi.shape}.")
-    return xi
+    return vectors(xi, 6, "A twist", "translation then rotation")
 
 
 def identity(*batch: int) -> FloatArray:
@@ -130,9 +125,7 @@ def hat(xi: FloatArray) -> FloatArray:
 
 def vee(matrix: FloatArray) -> FloatArray:
     """Twist (..., 6) of a matrix (..., 4, 4); the inverse of :func:`hat`."""
-    matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape[-2:] != (4, 4):
-        raise ShapeError(f"The matrix of a twist must have shape (..., 4, 4); got {matrix.shape}.")
+    matrix = matrices(matrix, 4, 4, "The matrix of a twist")
     return np.concatenate([matrix[..., :3, 3], so3.vee(matrix[..., :3, :3])], axis=-1)
 
 

@@ -30,6 +30,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, so3
+from groma.geometry.algebra import matrices, vectors
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
@@ -53,10 +54,7 @@ def _similarities(similarity: FloatArray) -> FloatArray:
 
 
 def _tangents(zeta: FloatArray) -> FloatArray:
-    zeta = np.asarray(zeta, dtype=np.float64)
-    if zeta.ndim == 0 or zeta.shape[-1] != 7:
-        raise ShapeError(f"A tangent of Sim(3) must have shape (..., 7), rho, omega, sigma; got {zeta.shape}.")
-    return zeta
+    return vectors(zeta, 7, "A tangent of Sim(3)", "rho, omega, sigma")
 
 
 def identity(*batch: int) -> FloatArray:
@@ -140,9 +138,7 @@ def hat(zeta: FloatArray) -> FloatArray:
 
 def vee(matrix: FloatArray) -> FloatArray:
     """Tangent vector (..., 7) of a matrix (..., 4, 4); the inverse of :func:`hat`."""
-    matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape[-2:] != (4, 4):
-        raise ShapeError(f"The matrix of a tangent must have shape (..., 4, 4); got {matrix.shape}.")
+    matrix = matrices(matrix, 4, 4, "The matrix of a tangent")
     block = matrix[..., :3, :3]
     sigma = np.trace(block, axis1=-2, axis2=-1)[..., None] / 3
     return np.concatenate([matrix[..., :3, 3], so3.vee(block), sigma], axis=-1)

@@ -39,8 +39,8 @@ import numpy as np
 
 from groma._numba import kernel
 from groma._typing import FloatArray
-from groma.errors import ShapeError
 from groma.geometry import quaternion
+from groma.geometry.algebra import matrices, vectors
 
 #: Below this squared angle the coefficients are summed from their series.
 _SERIES = 4.0
@@ -137,17 +137,11 @@ def coefficients(theta2: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray
 
 
 def _vectors(omega: FloatArray) -> FloatArray:
-    omega = np.asarray(omega, dtype=np.float64)
-    if omega.ndim == 0 or omega.shape[-1] != 3:
-        raise ShapeError(f"A rotation vector must have shape (..., 3); got {omega.shape}.")
-    return omega
+    return vectors(omega, 3, "A rotation vector")
 
 
 def _matrices(matrix: FloatArray) -> FloatArray:
-    matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape[-2:] != (3, 3):
-        raise ShapeError(f"A matrix on 3-vectors must have shape (..., 3, 3); got {matrix.shape}.")
-    return matrix
+    return matrices(matrix, 3, 3, "A matrix on 3-vectors")
 
 
 def _quadratic(omega: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:

@@ -49,7 +49,7 @@ from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.unused import without_unused
 from groma.scene import Scene
-from groma.scene.local_frame import local_frame
+from groma.scene.local_frame import usual_frame
 
 
 @dataclass(frozen=True)
@@ -104,17 +104,23 @@ class MapOptions:
     find_planes: bool = True
     #: Move the poses; without, only landmarks are adjusted.
     refine_poses: bool = True
-    #: Estimate focal lengths and distortion too.
-    refine_intrinsics: bool = False
+    #: Estimate focal lengths and distortion too; None: where ``camera_model`` changes the given cameras.
+    refine_intrinsics: bool | None = None
     threads: int | None = None
-    #: How points are reconstructed where there is no model: camera model, its parameters if they are known, seed.
-    camera_model: str = "SIMPLE_RADIAL"
+    #: Most steps of each adjustment.
+    max_iterations: int = 50
+    #: The camera model: where points are reconstructed, of all cameras (None: SIMPLE_RADIAL); else the model that the
+    #: given cameras are changed to (None: they keep theirs), and what it adds is estimated with the calibration.
+    camera_model: str | None = None
+    #: Where points are reconstructed: the parameters of the cameras if they are known, seed.
     camera_params: tuple[float, ...] | None = None
     seed: int = 0
 
     def point_model(self, threads: bool = True) -> PointModelOptions:
         """How points are reconstructed, with or without the number of threads, on which no result depends."""
-        return PointModelOptions(self.camera_model, self.camera_params, self.seed, self.threads if threads else None)
+        return PointModelOptions(
+            self.camera_model or "SIMPLE_RADIAL", self.camera_params, self.seed, self.threads if threads else None
+        )
 
 
 def map_images(
@@ -160,7 +166,10 @@ def map_images(
     files = image_files(folder)
     names = [path.relative_to(folder).as_posix() for path in files]
     model = None if model is None else model.points_only()  # lines and planes of a finished map are found anew
-    near = None if model is None else local_frame(model)
+    if model is not None and options.camera_model is not None:
+        model = model.replace(cameras=model.cameras.with_model(options.camera_model))
+        options = dataclasses.replace(options, refine_intrinsics=options.refine_intrinsics is not False)
+    near = None if model is None else usual_frame(model)
     if model is not None and near is not None:
         model = model.transformed(near)
     check_number(folder, names, model, options.lines.min_images)
@@ -236,7 +245,7 @@ def find_start(
     return reconstruct_points(folder, place("sfm"), names, options.point_model(), say) if model is None else model
 
 
-@stage("points", SCENE, lambda options: (options.refine_poses, options.refine_intrinsics))
+@stage("points", SCENE, lambda options: (options.refine_poses, options.refine_intrinsics, options.max_iterations))
 def adjust_points(start: Scene, options: MapOptions, say: StageProgress) -> Scene:
     """A model whose poses and points are adjusted with robust losses."""
     return _adjusted(start, _robust(options), options, say, "adjusting points").scene
@@ -304,7 +313,11 @@ def adjust_everything(scene: Scene, weighted: AdjustOptions, options: MapOptions
 
 # -------------------------------------------------------------------------------------------------------------- helpers
 def _robust(options: MapOptions) -> AdjustOptions:
-    return AdjustOptions(refine_intrinsics=options.refine_intrinsics, threads=options.threads)
+    return AdjustOptions(
+        refine_intrinsics=bool(options.refine_intrinsics),
+        max_iterations=options.max_iterations,
+        threads=options.threads,
+    )
 
 
 def _weighted(scene: Scene, options: MapOptions) -> AdjustOptions:

@@ -15,8 +15,10 @@ from groma.adjustment.contributions import Contribution, contributions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.report import AdjustReport
 from groma.adjustment.stages import with_loss
+from groma.adjustment.uncertainty import pose_uncertainty
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
+from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.solver.observability.diagnosis import Diagnosis
 from groma.viz.pictures import ImageFiles
@@ -48,17 +50,11 @@ class MapResult:
 
     def diagnose(self) -> Diagnosis:
         """Say in words what the observations determine, at the noise and with the loss of the last adjustment."""
-        told = self.adjusted_with
-        assembly = AssemblyOptions(
-            point_sigma_px=told.point_sigma_px,
-            line_sigma_px=told.line_sigma_px,
-            line_end_correlation=told.line_end_correlation,
-            structure_sigma_px=told.structure_sigma_px,
-            refine_poses=told.refine_poses,
-            refine_intrinsics=bool(told.refine_intrinsics),
-        )
-        problem, ended_with = assemble(self.scene, assembly).problem, last_loss(told)
-        return diagnose_scene(self.scene, problem=with_loss(problem, ended_with))
+        return diagnose_scene(self.scene, problem=_problem_of(self.scene, self.adjusted_with))
+
+    def pose_uncertainty(self) -> dict[str, Any] | None:
+        """Return how well the cameras are known, at the noise that the observations show."""
+        return pose_uncertainty(self.scene, _problem_of(self.scene, self.adjusted_with), self.report.sigma0 or 1.0)
 
     def contributions(self, reference: Scene | None = None) -> tuple[Contribution, ...]:
         """Repeat the last adjustment by points alone, with lines, with planes: :func:`groma.contributions`."""
@@ -78,6 +74,7 @@ class MapResult:
             "explanation": self.explanation,
             "warnings": list(self.warnings),
             "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
+            "pose_uncertainty": None if diagnosis is None else self.pose_uncertainty(),
         }
         if contributions:
             numbers["contributions"] = [entry.to_dict() for entry in contributions]
@@ -134,6 +131,20 @@ class MapResult:
                 ),
             )
             (draft / "summary.json").write_text(json_text(numbers), encoding="utf-8")
+
+
+def _problem_of(scene: Scene, told: AdjustOptions) -> Problem:
+    """Return the problem of the last adjustment at its solution."""
+    assembly = AssemblyOptions(
+        point_sigma_px=told.point_sigma_px,
+        line_sigma_px=told.line_sigma_px,
+        line_end_correlation=told.line_end_correlation,
+        structure_sigma_px=told.structure_sigma_px,
+        refine_poses=told.refine_poses,
+        refine_intrinsics=bool(told.refine_intrinsics),
+    )
+    problem, ended_with = assemble(scene, assembly).problem, last_loss(told)
+    return with_loss(problem, ended_with)
 
 
 def last_loss(told: AdjustOptions) -> Loss:

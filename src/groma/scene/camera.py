@@ -61,6 +61,21 @@ class Cameras(Table):
         models = np.array(self.models, dtype=object)
         return {str(name): np.flatnonzero(models == name) for name in dict.fromkeys(models)}
 
+    def with_model(self, name: str) -> Cameras:
+        """Return the same cameras in another model that can hold them; parameters that it adds are zero.
+
+        Raises
+        ------
+        InputError
+            If there is no such model, or a camera would see the world at other pixels.
+        """
+        new, size = camera_models.model(name), np.stack([self.width, self.height], axis=1).astype(float)
+        rows = [
+            camera_models.in_model(self.params_of(row), camera_models.model(old), new, size[row])
+            for row, old in enumerate(self.models)
+        ]
+        return self.replace(models=(new.name,) * len(self), params=np.array(rows).reshape(-1, new.num_parameters))
+
     def params_of(self, camera_idx: int) -> FloatArray:
         """Return the parameters of one camera, without padding."""
         return self.params[camera_idx, : self.num_params[camera_idx]].copy()

@@ -9,16 +9,19 @@ Whatever is computed is therefore computed near the scene, and its result moved 
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from groma._typing import FloatArray
 from groma.scene.similarity import Similarity
 
 if TYPE_CHECKING:
     from groma.scene.scene import Scene
 
-#: A scene is far from the origin if that is so many times as far as half of its cameras and points from their middle.
+#: A scene is far from the origin if that is so many times as far as half of its cameras and points from their middle;
+#: and of unusual size if these are so many units, or so many of them a unit, from there.
 FAR = 1000.0
 
 
@@ -36,14 +39,32 @@ def local_frame(scene: Scene) -> Similarity | None:
     Similarity or None
         For :meth:`groma.scene.Scene.transformed`; scale and axes stay.
     """
-    places = np.concatenate([scene.cam_centers_in_world, scene.points.xyz])
-    if len(places) == 0:
-        return None
-    middle = np.median(places, axis=0)
-    extent = float(np.median(np.linalg.norm(places - middle, axis=1)))
+    middle, extent = _middle_and_extent(scene)
     if float(np.linalg.norm(middle)) <= FAR * extent or extent == 0.0:
         return None
     return Similarity(translation=-middle)
 
 
-__all__ = ["FAR", "local_frame"]
+def usual_frame(scene: Scene) -> Similarity | None:
+    """Return :func:`local_frame` in a unit of length that suits the scene; None where it is usual as it is.
+
+    For what searches: bins, trees and guards of searches are made for scenes of a usual size. The unit is a power of
+    two, so that nothing is rounded.
+    """
+    near, (_, extent) = local_frame(scene), _middle_and_extent(scene)
+    if extent == 0.0 or not np.isfinite(extent) or 1.0 / FAR <= extent <= FAR:
+        return near
+    scale = 2.0 ** -round(math.log2(extent))
+    return Similarity(scale, translation=np.zeros(3) if near is None else scale * near.translation)
+
+
+def _middle_and_extent(scene: Scene) -> tuple[FloatArray, float]:
+    """Return the middle coordinates of cameras and points, and how far half of them are from there at most."""
+    places = np.concatenate([scene.cam_centers_in_world, scene.points.xyz])
+    if len(places) == 0:
+        return np.zeros(3), 0.0
+    middle = np.median(places, axis=0)
+    return middle, float(np.median(np.linalg.norm(places - middle, axis=1)))
+
+
+__all__ = ["FAR", "local_frame", "usual_frame"]

@@ -85,12 +85,9 @@ class Scene:
 
     def __post_init__(self) -> None:
         for name, column, side, target in references(Scene):
-            index = getattr(getattr(self, name), column)
-            if not len(index):
-                continue
-            where = f"{name}.{column}" if side is None else f"{name}.{column}[:, {side}]"
-            index = index if side is None else index[:, side]
-            check_index(where, index, len(getattr(self, target)), target.replace("_", " "))
+            if len(index := getattr(getattr(self, name), column)):
+                where, index = (column, index) if side is None else (f"{column}[:, {side}]", index[:, side])
+                check_index(f"{name}.{where}", index, len(getattr(self, target)), target.replace("_", " "))
         is_camera = self.sensors.kind == CAMERA
         check_index("sensors.camera_idx", self.sensors.camera_idx[is_camera], len(self.cameras), "cameras")
         check_quaternions("frames.rig_from_world", self.frames.rig_from_world)
@@ -346,10 +343,8 @@ class Scene:
         """
         chosen = rows_of("image_idx", image_idx, self.num_images, "images")
         kept_frames, frame_idx = np.unique(self.images.frame_idx[chosen], return_inverse=True)
-        tables = {
-            "frames": self.frames.take(kept_frames),
-            "images": self.images.take(chosen).replace(frame_idx=frame_idx),
-        }
+        images = self.images.take(chosen).replace(frame_idx=frame_idx)
+        tables = {"frames": self.frames.take(kept_frames), "images": images}
         new_index = {
             "frames": new_index_of(kept_frames, self.num_frames),
             "images": new_index_of(chosen, self.num_images),

@@ -17,7 +17,7 @@ from groma.solver.linear.schur import ReducedSystem
 from groma.solver.options import SolverOptions, first_damping
 from groma.solver.refinement import landmark_refiner
 from groma.solver.report import SolveReport, Stopwatch, note_costs
-from groma.solver.steps import States, Step, landmark_slopes, largest_slope, relative_length, retract
+from groma.solver.steps import States, Step, landmark_slopes, largest_slope, relative_length, retract, sizes_of
 from groma.solver.termination import Termination
 from groma.solver.trial import JointTrial, evaluated
 
@@ -40,6 +40,7 @@ class JointProblem:
         self._damping = damping_from(first_damping(layout.problem.variables, options))
         inputs = self.equations.prepare(states)
         self._at_start: list[float] = []
+        self._sizes = sizes_of(layout, states)
         self._here = JointTrial(cost=np.nan, states=states, inputs=inputs, costs=[], hidden=[])
 
     @property
@@ -93,7 +94,7 @@ class JointProblem:
             found = evaluated(self.equations, moved)
         ratio = (self._here.cost - found["cost"]) / promised if promised > 0 else 0.0
         found |= {"gain_ratio": float(ratio), "promised": promised, "length": step.norm(), "withheld": withheld}
-        found["relative_length"] = relative_length(self._layout, self._here.states, step)
+        found["relative_length"] = relative_length(self._layout, self._sizes, step)
         return JointTrial(**found, step=step)
 
     def stretch(self, trial: JointTrial, factor: float) -> JointTrial:  # noqa: D102

@@ -89,12 +89,19 @@ def share_of_states(step: FloatArray, states: FloatArray) -> float:
     return float(np.sqrt(np.max(step[moved] / np.maximum(states[moved], np.finfo(float).tiny))))
 
 
-def relative_length(layout: Layout, states: States, step: Step) -> float:
-    """Return :func:`share_of_states` of a step of all free variables."""
-    squares, sizes = np.zeros(3), np.zeros(3)
-    for manifold, name, delta in parts_of(layout, step):
+def sizes_of(layout: Layout, states: States) -> FloatArray:
+    """Return :func:`squares_of_states` of all free variables together."""
+    members = [member.group for kept in layout.kept for member in kept.members]
+    names = [*members, *(group.group for group in layout.eliminated)]
+    variables = layout.problem.variables
+    return sum((squares_of_states(variables[name].manifold, states[name]) for name in names), np.zeros(3))
+
+
+def relative_length(layout: Layout, sizes: FloatArray, step: Step) -> float:
+    """Return :func:`share_of_states` of a step of all free variables, for states of these :func:`sizes_of`."""
+    squares = np.zeros(3)
+    for manifold, _, delta in parts_of(layout, step):
         squares += squares_of_step(manifold, delta)
-        sizes += squares_of_states(manifold, states[name])
     return share_of_states(squares, sizes)
 
 
@@ -123,8 +130,8 @@ def largest_slope(gradient: FloatArray, curvature: FloatArray) -> float:
 
 def landmark_slopes(equations: NormalEquations) -> list[float]:
     """Return :func:`largest_slope` of each group of landmarks."""
-    groups = equations.layout.eliminated
-    curvatures = [
-        np.einsum("nii->ni", V.reshape(e.count, e.dof, e.dof)) for e, V in zip(groups, equations.V, strict=True)
-    ]
-    return [largest_slope(g, c.reshape(-1)) for g, c in zip(equations.g_landmarks, curvatures, strict=True)]
+    slopes = []
+    for group, V, gradient in zip(equations.layout.eliminated, equations.V, equations.g_landmarks, strict=True):
+        curvature = V.reshape(group.count, group.dof**2)[:, :: group.dof + 1]
+        slopes.append(largest_slope(gradient.reshape(group.count, group.dof), curvature))
+    return slopes

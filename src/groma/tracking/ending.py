@@ -57,7 +57,7 @@ class Ending:
         if mapper.due is not None:
             self.attempt("the last keyframe", lambda: mapper.make_keyframe(present, Stopwatch()), None)
         self.attempt("the last adjustment of a window", lambda: mapper.take_up(present, now=True), None)
-        self.attempt("the end of the threads", mapper.close, None)
+        self._built("the end of the threads", mapper.close, None)
 
     def join(self) -> tuple[tuple[int, int], ...]:
         """Join maps that saw the same place; return for each the map that holds it, and the shift of its keyframes."""
@@ -99,7 +99,7 @@ class Ending:
             )
         return report, offset
 
-    def part(self, root: int) -> Part:
+    def submap(self, root: int) -> Part:
         """Return the trajectory and the scene of a map."""
         mapper = self._mapper
         track_map, relations = mapper.maps[root], mapper.options.relations
@@ -110,7 +110,7 @@ class Ending:
         return Part(trajectory, scene, stamps[: scene.num_images])
 
     def _built(self, what: str, step: Callable[[], T], otherwise: T) -> T:
-        """Return what a step gives, also after an interruption."""
+        """Return what a step gives that is needed after an interruption too."""
         try:
             return step()
         except KeyboardInterrupt:

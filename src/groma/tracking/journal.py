@@ -34,7 +34,7 @@ class Journal:
     def frame(self, frame: TrackedFrame) -> None:
         """Note a frame that has a pose."""
         if frame.pose is not None:
-            self._append("frames.txt", frame, str(frame.part))
+            self._append("frames.txt", frame, str(frame.submap))
 
     def _append(self, name: str, frame: TrackedFrame, *more: str) -> None:
         assert frame.pose is not None

@@ -41,14 +41,14 @@ class TrackedFrame:
     #: Its name in the sequence.
     name: str = ""
     #: The map that the pose refers to: 0, or more after the track was lost for long and a new map was begun.
-    part: int = 0
+    submap: int = 0
 
 
 @dataclass(frozen=True)
 class TrackResult:
     """Outcome of a track."""
 
-    #: Poses of all frames that have one, world_from_cam; of the longest part, if parts could not be joined.
+    #: Poses of all frames that have one, world_from_cam; of the longest submap, if submaps could not be joined.
     trajectory: Trajectory
     #: Keyframes with points, lines and planes.
     scene: Scene
@@ -56,8 +56,8 @@ class TrackResult:
     keyframes: FloatArray
     statistics: dict
     warnings: tuple[str, ...] = ()
-    #: The other parts.
-    parts: tuple[Part, ...] = ()
+    #: The other submaps.
+    submaps: tuple[Part, ...] = ()
 
 
 @dataclass
@@ -68,7 +68,7 @@ class Entry:
     keyframe: int
     cam_from_keyframe: FloatArray
     #: The map of the keyframe.
-    part: int = 0
+    submap: int = 0
 
 
 @dataclass
@@ -85,21 +85,21 @@ class History:
         for stage, value in (seconds or {}).items():
             self.seconds.setdefault(stage, []).append(value)
 
-    def note_pose(self, track_map: TrackMap, timestamp: float, pose: FloatArray, part: int = 0) -> None:
+    def note_pose(self, track_map: TrackMap, timestamp: float, pose: FloatArray, submap: int = 0) -> None:
         """Keep a pose in terms of the keyframe that is followed."""
         keyframe = track_map.near
         relative = se3.compose(pose[None], se3.inverse(keyframe.pose[None]))[0]
-        self.entries.append(Entry(timestamp, keyframe.index, relative, part))
+        self.entries.append(Entry(timestamp, keyframe.index, relative, submap))
 
     def joined(self, where: Sequence[tuple[int, int]]) -> None:
         """Take note of maps that were put into others."""
         for entry in self.entries:
-            entry.part, shift = where[entry.part]
+            entry.submap, shift = where[entry.submap]
             entry.keyframe += shift
 
-    def trajectory(self, track_map: TrackMap, part: int = 0) -> Trajectory:
+    def trajectory(self, track_map: TrackMap, submap: int = 0) -> Trajectory:
         """Return the poses in one map as its keyframes stand now."""
-        entries = [entry for entry in self.entries if entry.part == part]
+        entries = [entry for entry in self.entries if entry.submap == submap]
         if not entries:
             return Trajectory()
         entries.sort(key=lambda entry: entry.timestamp)

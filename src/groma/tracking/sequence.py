@@ -72,7 +72,7 @@ class SequenceResult(TrackResult):
         """Write everything that ``groma track`` writes to a folder, whole or not at all.
 
         ``trajectory.txt`` (TUM), the keyframes as a COLMAP model with lines and planes beside it (``structures``),
-        ``scene.npz``, ``summary.json`` and ``report.html``; further maps in ``part_2``, ``part_3``, ...
+        ``scene.npz``, ``summary.json`` and ``report.html``; further maps in ``submap_2``, ``submap_3``, ...
 
         Parameters
         ----------
@@ -93,11 +93,11 @@ class SequenceResult(TrackResult):
             draft.mkdir(exist_ok=True)
             write_scene(self.scene, draft / "scene.npz")
             write_tum(self.trajectory, draft / "trajectory.txt")
-            for number, part in enumerate(self.parts, start=2):
-                place = draft / f"part_{number}"
+            for number, submap in enumerate(self.submaps, start=2):
+                place = draft / f"submap_{number}"
                 place.mkdir()
-                write_scene(part.scene, place / "scene.npz")
-                write_tum(part.trajectory, place / "trajectory.txt")
+                write_scene(submap.scene, place / "scene.npz")
+                write_tum(submap.trajectory, place / "trajectory.txt")
             page = draft / "report.html"
             report = _failure(page.name, lambda: write_track_report(page, self, self.frames, self.scores, title=title))
             failed = tuple(sentence for sentence in (model, report) if sentence)
@@ -155,9 +155,9 @@ def track(
             f"No frame of {name or 'the sequence'} could be tracked: {' '.join(warnings)} Check the camera and the "
             "depth scale."
         )
-    if result.parts:
-        folders = ", ".join(f"part_{number}" for number in range(2, len(result.parts) + 2))
-        warnings.append(f"Only the longest part is in trajectory.txt and the report; see also {folders}.")
+    if result.submaps:
+        folders = ", ".join(f"submap_{number}" for number in range(2, len(result.submaps) + 2))
+        warnings.append(f"Only the longest submap is in trajectory.txt and the report; see also {folders}.")
     scores, not_compared = _compared(result, sequence)
     tracked: dict[str, Any] = {item.name: getattr(result, item.name) for item in fields(result)}
     tracked["warnings"] = tuple(warnings)

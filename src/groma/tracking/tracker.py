@@ -24,14 +24,14 @@ from groma.io.trajectories import Trajectory
 from groma.scene import Scene
 from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
-from groma.tracking.backend.submaps import about_parts
+from groma.tracking.backend.submaps import about_submaps
 from groma.tracking.ending import Ending
 from groma.tracking.frame.camera import TrackCamera, back
 from groma.tracking.frame.checks import FrameChecks
 from groma.tracking.frame.coarse_alignment import turned, turned_prediction
 from groma.tracking.frame.features import FrameFeatures, grid_pixels
 from groma.tracking.map.keyframes import Followed, keyframe_nearby, wants_keyframe
-from groma.tracking.map.points import agreeing, find_again
+from groma.tracking.map.points import find_again
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.outcome import (
@@ -46,7 +46,7 @@ from groma.tracking.outcome import (
     TrackedFrame,
     TrackResult,
 )
-from groma.tracking.pose.estimate import GATE, PoseEstimate
+from groma.tracking.pose.estimate import PoseEstimate
 from groma.tracking.pose.following import Attempt, follow_frame
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
@@ -171,27 +171,23 @@ class Tracker:
 
     def _search(self, data: FrameFeatures, attempt: Attempt, watch: Stopwatch) -> tuple[Attempt, Found | None]:
         """Find a frame that could not be followed by described features, or keep the pose that was in doubt."""
-        present, mapper, doubtful = self._present, self._mapper, attempt.doubtful
+        present, mapper, unconfirmed = self._present, self._mapper, attempt.unconfirmed
         before = present.pose
         if self._lost_for == 0:
             # The frame before is the nearest there is to look for.
             mapper.keep_present(present, watch)
         with watch("find"):
-            found = self._find(data, attempt.predicted, attempt.prior_sigma, doubtful)
+            found = self._find(data, attempt.predicted, attempt.prior_sigma, unconfirmed)
         if found is not None and not (
-            attempt.trusted and doubtful is not None and self._verification.score(doubtful) >= found.score
+            attempt.trusted and unconfirmed is not None and self._verification.score(unconfirmed) >= found.score
         ):
-            pose, most = found.estimate.pose, GATE * self.options.point_sigma_px
-            points = agreeing(self.map, self.camera, attempt.followed.points, pose, most)
-            more = promote(self.map, found, data)
-            points = points.joined(more.take(~np.isin(more.index, points.index)))
-            followed = Followed(points, found.lines)
+            followed = Followed(promote(self.map, found, data), found.lines)
             return replace(attempt, estimate=found.estimate, followed=followed), found
-        if doubtful is not None and (attempt.trusted or self._verification.confirms(self.map, data, doubtful)):
+        if unconfirmed is not None and (attempt.trusted or self._verification.confirms(self.map, data, unconfirmed)):
             # The new keyframe may have moved the map.
             moved = se3.compose(se3.inverse(before[None]), present.pose[None])
-            pose = se3.compose(doubtful.pose[None], moved)[0]
-            return replace(attempt, estimate=replace(doubtful, pose=pose)), None
+            pose = se3.compose(unconfirmed.pose[None], moved)[0]
+            return replace(attempt, estimate=replace(unconfirmed, pose=pose)), None
         return attempt, None
 
     def _with_turn(self, data: FrameFeatures, predicted: FloatArray, prior_sigma: FloatArray):
@@ -223,10 +219,10 @@ class Tracker:
         pixel = grid_pixels(self.camera, self.options.gates.depth)[known]
         return pixel, back(pose, self.camera.bearings(pixel) * data.depth_grid[known, None])
 
-    def _find(self, data, predicted, prior_sigma, doubtful: PoseEstimate | None) -> Found | None:
+    def _find(self, data, predicted, prior_sigma, unconfirmed: PoseEstimate | None) -> Found | None:
         """Find a pose by described features: near the last keyframes first, then anywhere."""
         if self._lost_for <= self._gates.lost_frames:
-            guesses = [predicted, self._present.pose] + ([doubtful.pose] if doubtful is not None else [])
+            guesses = [predicted, self._present.pose] + ([unconfirmed.pose] if unconfirmed is not None else [])
             found = self._verification.find_near(self.map, data, guesses, predicted, prior_sigma)
             if found is not None:
                 return found
@@ -326,7 +322,7 @@ class Tracker:
             frame.timestamp, self._present.pose.copy() if has_pose else None, status,
             estimate.counts if estimate is not None else {}, timings,
             estimate.weak if estimate is not None else (), keyframe=is_keyframe, name=frame.name,
-            part=self._mapper.current,
+            submap=self._mapper.current,
         )  # fmt: skip
 
     # ------------------------------------------------------------------------------------------------------ results
@@ -350,18 +346,18 @@ class Tracker:
         ending.settle(self._present)
         where = ending.join()
         roots = sorted({root for root, _ in where if mapper.maps[root].keyframes}) or [0]
-        count = {root: sum(entry.part == root for entry in history.entries) for root in roots}
+        count = {root: sum(entry.submap == root for entry in history.entries) for root in roots}
         main = max(roots, key=lambda root: count[root])
         others = [root for root in roots if root != main]
         for root in others:
             ending.adjust(root)
         statistics = self.statistics(*ending.adjust(main))
-        whole, *parts = [ending.part(root) for root in (main, *others)]
+        whole, *submaps = [ending.submap(root) for root in (main, *others)]
         warnings = [*self._checks.warnings, *ending.warnings]
         if not history.entries:
             warnings.append("No map was made: no frame could be used, or the camera did not move enough to start.")
-        warnings += about_parts(self._breaks, where, [count[root] for root in others])
-        return TrackResult(whole.trajectory, whole.scene, whole.keyframes, statistics, tuple(warnings), tuple(parts))
+        warnings += about_submaps(self._breaks, where, [count[root] for root in others])
+        return TrackResult(whole.trajectory, whole.scene, whole.keyframes, statistics, tuple(warnings), tuple(submaps))
 
     def statistics(self, report: SolveReport | None = None, right_offset_px: float = 0.0) -> dict:
         """Return counts and times so far as plain numbers."""
@@ -372,7 +368,7 @@ class Tracker:
             "lines": int(self.map.lines.alive.sum()),
             "planes": int(self.map.planes.alive.sum()),
             "loops": self._mapper.loops,
-            "maps": max(sum(bool(part.keyframes) for part in self._mapper.maps), 1),
+            "maps": max(sum(bool(submap.keyframes) for submap in self._mapper.maps), 1),
             "maps_joined": len(self._mapper.joints),
             "metric": self._mapper.metric,
             "milliseconds": self._history.milliseconds(),

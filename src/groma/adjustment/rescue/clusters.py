@@ -48,15 +48,15 @@ def settle_clusters(scene: Scene, problem: Problem, threads: int | None = None) 
     cluster, count = _clusters(ties, variables)
     factors = [factor for factor in problem.factors if len(factor)]
     labels = [_label_of(factor, cluster) for factor in factors]
-    doubtful = _doubtful(factors, labels, count, variables)
-    chosen = {group: np.flatnonzero(doubtful[label]) for group, label in cluster.items()}
+    ill_fitting = _ill_fitting(factors, labels, count, variables)
+    chosen = {group: np.flatnonzero(ill_fitting[label]) for group, label in cluster.items()}
     lines = chosen["lines"]
     if len(lines) == 0:
         return problem, nothing
     triangulated, found = triangulated_anew(with_cameras(scene, problem), lines)
     second = {group: variables[group].state[members] for group, members in chosen.items()}
     second["lines"][found] = variables["lines"].manifold.from_ambient(triangulated[found])
-    rows = [np.flatnonzero(doubtful[label]) for label in labels]
+    rows = [np.flatnonzero(ill_fitting[label]) for label in labels]
     doubled = [_doubled(factor, mine, chosen) for factor, mine in zip(factors, rows, strict=True) if len(mine)]
     starts = {
         name: _joined(group, chosen[name], second[name]) if name in chosen else replace(group, constant=True)
@@ -104,7 +104,7 @@ def _label_of(factor: Factor, cluster: dict[str, IntArray]) -> IntArray:
     return np.max(labels, axis=0) if labels else np.full(len(factor), -1)
 
 
-def _doubtful(factors, labels: list[IntArray], count: int, variables: Mapping[str, Variables]) -> BoolArray:
+def _ill_fitting(factors, labels: list[IntArray], count: int, variables: Mapping[str, Variables]) -> BoolArray:
     """Return which clusters cost far more per observation than usual, (count + 1,); the last stands for no cluster."""
     cost, views = np.zeros(count + 1), np.zeros(count + 1)
     for factor, label in zip(factors, labels, strict=True):

@@ -48,11 +48,20 @@ def adjust(
         float | None,
         typer.Option(metavar="S", help="Scale of the loss, in units of the noise (pixels for images). Default: 1."),
     ] = None,
+    camera_model: Annotated[
+        str | None,
+        typer.Option(
+            "--camera-model",
+            metavar="NAME",
+            help="Change the lens model of all cameras first (PINHOLE to OPENCV, ...); what it adds starts at 0 and is "
+            "estimated.",
+        ),
+    ] = None,
     refine_intrinsics: Annotated[
         bool | None,
         typer.Option(
             "--refine-intrinsics/--fix-intrinsics",
-            help="Estimate the calibration too. Default: yes for BAL files, no otherwise.",
+            help="Estimate the calibration too. Default: for BAL files and with --camera-model.",
         ),
     ] = None,
     refine_principal_point: Annotated[
@@ -173,6 +182,7 @@ def adjust(
         refused = {
             "--report": page, "--covariance": covariance, "--contributions": contributions, "--gauge": gauge,
             "--line-chart": line_chart, "--refine-intrinsics": refine_intrinsics, "--refine-rigs": refine_rigs,
+            "--camera-model": camera_model,
         }  # fmt: skip
         graph_options = _chosen(
             loss="none" if loss == "auto" else loss, loss_scale=loss_scale, linear_solver=linear_solver,
@@ -185,7 +195,7 @@ def adjust(
     from groma.adjustment.adjust import AdjustOptions
 
     options = AdjustOptions(**_chosen(
-        loss=loss, loss_scale=loss_scale, refine_intrinsics=refine_intrinsics,
+        loss=loss, loss_scale=loss_scale, camera_model=camera_model, refine_intrinsics=refine_intrinsics,
         refine_principal_point=refine_principal_point, refine_rigs=refine_rigs, points=points, lines=lines,
         planes=planes, max_iterations=max_iterations, linear_solver=linear_solver, line_chart=line_chart, gauge=gauge,
         line_residual=line_residual, plane_residual=plane_residual, threads=threads,

@@ -26,8 +26,13 @@ def map_(
         ),
     ] = None,
     camera_model: Annotated[
-        str, typer.Option(metavar="NAME", help="Without --model: lens model to estimate, by COLMAP's name.")
-    ] = "SIMPLE_RADIAL",
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Lens model, by COLMAP's name. Without --model the one to estimate (SIMPLE_RADIAL); with it the one "
+            "that its cameras are changed to, and what it adds is estimated.",
+        ),
+    ] = None,
     camera_params: Annotated[
         str | None,
         typer.Option(metavar="F,CX,CY,...", help="Without --model: the calibration, if it is known; it is then kept."),
@@ -53,8 +58,13 @@ def map_(
         bool, typer.Option("--refine-poses/--fix-poses", help="Move the cameras too, or the landmarks alone.")
     ] = True,
     refine_intrinsics: Annotated[
-        bool, typer.Option("--refine-intrinsics/--fix-intrinsics", help="Estimate the calibration too.")
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--refine-intrinsics/--fix-intrinsics",
+            help="Estimate the calibration too. Default: where --camera-model changes it.",
+        ),
+    ] = None,
+    max_iterations: Annotated[int, typer.Option(min=1, metavar="N", help="Stop each adjustment after N steps.")] = 50,
     refine_points: Annotated[
         bool, typer.Option("--refine-points/--keep-points", help="Measure the points of the model again in the images.")
     ] = False,
@@ -87,8 +97,8 @@ def map_(
     _output.check_outputs(force, output, json_target=json_target)
     check_inputs(images, model, line_matches, truth)
 
-    if model is not None and (camera_params is not None or camera_model != "SIMPLE_RADIAL"):
-        raise InputError("--camera-model and --camera-params are for images without a model. Leave them out.")
+    if model is not None and camera_params is not None:
+        raise InputError("--camera-params is for images without a model. Leave it out.")
 
     if line_matches is not None and line_matcher is not None:
         raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
@@ -110,6 +120,7 @@ def map_(
         refine_points=refine_points,
         refine_poses=refine_poses,
         refine_intrinsics=refine_intrinsics,
+        max_iterations=max_iterations,
         camera_model=camera_model,
         camera_params=_parameters(camera_params),
         threads=threads,

@@ -63,7 +63,7 @@ def track(
     OUT then holds trajectory.txt (TUM format), the keyframes as a COLMAP model with lines and planes beside it
     (structures/), scene.npz, summary.json and report.html. While it runs, OUT.work holds the keyframes that are
     finished (groma view --live OUT shows them); Ctrl-C ends the track early and writes what there is. Where the track
-    was lost for long and no place was recognised later, further maps are in OUT/part_2, part_3, ...
+    was lost for long and no place was recognised later, further maps are in OUT/submap_2, submap_3, ...
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console

@@ -67,14 +67,17 @@ def say_map(console: Console, result: MapResult, numbers: dict[str, Any], explai
     Without ``explain`` the last two are said only with --verbose.
     """
     from groma.cli.shared.diagnosis import say_diagnosis
-    from groma.cli.shared.sentences import describe_contributions, describe_relations
+    from groma.cli.shared.sentences import (
+        describe_contributions,
+        describe_inliers,
+        describe_pose_uncertainty,
+        describe_relations,
+    )
 
     kinds = ("images", "points", "lines", "planes", "directions")
     console.say(", ".join(counted(getattr(result.scene, f"num_{kind}"), kind) for kind in kinds))
-    for kind, rmse in result.report.rmse_px.items():
-        console.say(f"  {kind}: {rmse['before']:.3f} px -> {rmse['after']:.3f} px (rms, outliers included)")
-    if any(rmse["after"] > rmse["before"] for rmse in result.report.rmse_px.values()):
-        console.say("  The rms includes outliers, so it may grow while the robust cost falls.")
+    for line in (*describe_inliers(result.report.inliers), *describe_pose_uncertainty(numbers.get("pose_uncertainty"))):
+        console.say(line)
     for line in describe_relations(result.report.relations):
         console.detail(line)
     for line in describe_contributions(numbers.get("contributions", [])):

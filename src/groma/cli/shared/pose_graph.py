@@ -55,8 +55,8 @@ def adjust_graph_and_write(
     console.say(f"  {'cost':<16}{numbers['initial_cost']:>10.5g}     ->{numbers['final_cost']:>9.5g}")
     time = spent(numbers["seconds"]["total"], compilation.seconds, compilation.compiled)
     console.say(f"  {counted(numbers['iterations'], 'steps')} in {time}. {result.report.termination.sentence}")
-    if len(result.doubtful):
-        console.say(f"  {counted(len(result.doubtful), 'motions')} beyond the scale of the loss")
+    if len(result.outliers):
+        console.say(f"  {counted(len(result.outliers), 'motions')} beyond the scale of the loss")
     for sentence in result.warnings:
         console.warn(sentence)
     console.say(f"Wrote {output}" if output is not None else "No -o given: the adjusted graph was not written.")

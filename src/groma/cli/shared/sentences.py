@@ -14,6 +14,7 @@ _SIGMAS = (
     ("line directions", "line_direction_deg", "°"),
     ("plane normals", "plane_normal_deg", "°"),
 )
+_GAUGES = {"inner": "all camera centres together", "held": "the first camera and the scale"}
 #: Times in reports that are not of one stage.
 _NO_STAGES = ("total", "compilation")
 
@@ -36,21 +37,41 @@ def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, c
     lines = [", ".join(counted(numbers[f"num_{kind}"], kind) for kind in kinds if numbers.get(f"num_{kind}"))]
     if others := numbers.get("num_measurements"):
         lines.append("  also measured: " + ", ".join(f"{count:,} {name}" for name, count in others.items()))
-    for kind, rmse in numbers.get("rmse_px", {}).items():
-        if rmse.get("before") is not None and rmse.get("after") is not None:
-            lines.append(f"  {kind + ' error':<16}{rmse['before']:>10.3f} px  -> {rmse['after']:>9.3f} px   (rms)")
+    lines += describe_inliers(numbers.get("inliers") or {})
     lines.append(f"  {'cost':<16}{numbers['initial_cost']:>10.5g}     -> {numbers['final_cost']:>9.5g}")
-    grew = any((rmse.get("after") or 0) > (rmse.get("before") or 0) for rmse in numbers.get("rmse_px", {}).values())
-    if grew and numbers["final_cost"] < numbers["initial_cost"]:
-        lines.append("  The rms includes outliers, so it may grow although the robust cost fell.")
+    lines += describe_pose_uncertainty(numbers.get("pose_uncertainty"))
     seconds = numbers["seconds"]
     time = spent(seconds["total"], seconds.get("compilation", 0.0), compiled)
     lines.append(f"  {counted(numbers['iterations'], 'steps')} in {time}. {sentence}")
     if verbose:
         lines += describe_relations(numbers.get("relations") or {})
+        for kind, rmse in numbers.get("rmse_px", {}).items():
+            lines.append(f"  rms of all {kind}, outliers included: {rmse['before']:.3f} px -> {rmse['after']:.3f} px")
         stages = ", ".join(f"{name} {value:.3f} s" for name, value in seconds.items() if name not in _NO_STAGES)
         lines.append(f"  stages: {stages} (compiled code included)")
     return lines
+
+
+def describe_inliers(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a line for each kind of landmark, such as ``points  5.201 px -> 0.331 px, rms of 97.4 % inliers ...``."""
+    return [
+        f"  {kind + ' error':<16}{numbers['rmse_px']['before']:>10.3f} px  -> {numbers['rmse_px']['after']:>9.3f} px   "
+        f"(rms of the inliers: {100 * numbers['share']['after']:.1f} % within {numbers['limit_px']:.2g} px, before "
+        f"{100 * numbers['share']['before']:.1f} %)"
+        for kind, numbers in found.items()
+    ]
+
+
+def describe_pose_uncertainty(numbers: Mapping[str, Any] | None) -> list[str]:
+    """Return how well the cameras are known; ``numbers`` is ``pose_uncertainty`` of a report."""
+    if numbers is None or numbers["center"]["median"] is None:
+        return []
+    center, turn = numbers["center"], numbers["rotation_deg"]
+    return [
+        f"  cameras: centres known to {center['median']:.2g} (largest {center['largest']:.2g}), rotations to "
+        f"{turn['median']:.2g}° (largest {turn['largest']:.2g}°): standard deviations relative to "
+        f"{_GAUGES[numbers['gauge']]}"
+    ]
 
 
 def describe_relations(relations: Mapping[str, Mapping[str, int]]) -> list[str]:
@@ -63,7 +84,7 @@ def describe_relations(relations: Mapping[str, Mapping[str, int]]) -> list[str]:
 
 def describe_uncertainty(numbers: Mapping[str, Any]) -> list[str]:
     """Return the usual standard deviations of each kind; ``numbers`` is that of an uncertainty as a dictionary."""
-    gauge = {"inner": "all camera centres together", "held": "the first camera and the scale"}[numbers["gauge"]]
+    gauge = _GAUGES[numbers["gauge"]]
     parts = [
         f"{words} {numbers[key]['median']:.3g}{unit}"
         for words, key, unit in _SIGMAS

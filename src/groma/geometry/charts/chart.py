@@ -27,6 +27,7 @@ from groma._numba import kernel, loop
 from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion
+from groma.geometry.algebra import as_rows
 from groma.geometry.manifold import Manifold
 from groma.geometry.quaternion import exp_kernel, multiply_kernel
 
@@ -59,6 +60,14 @@ def turn_kernel(q, omega, left, step, out):
         out[j] *= k
 
 
+@kernel
+def minus_skew_kernel(x, y, z, row, B):
+    """Write -[v]x, the derivative of a turned vector, to three rows of B from ``row`` on."""
+    B[row, 0], B[row, 1], B[row, 2] = 0.0, z, -y
+    B[row + 1, 0], B[row + 1, 1], B[row + 1, 2] = -z, 0.0, x
+    B[row + 2, 0], B[row + 2, 1], B[row + 2, 2] = y, -x, 0.0
+
+
 @loop
 def turn_and_add_all(state, delta, left, out):
     """Turn the quaternions ``state[:, :4]`` by ``delta[:, :3]``, from the left or the right; add the last numbers."""
@@ -79,18 +88,9 @@ def perpendicular(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     return first, second
 
 
-def as_rows(array: FloatArray, columns: int, name: str) -> FloatArray:
-    """Return contiguous float64 of shape (N, columns), or raise a ShapeError that calls the array ``name``."""
-    rows = np.ascontiguousarray(array, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != columns:
-        hint = f" Did you mean {name}[None]?" if rows.shape == (columns,) else ""
-        raise ShapeError(f"{name} must have shape (N, {columns}); got {rows.shape}.{hint}")
-    return rows
-
-
 def as_steps(state: FloatArray, delta: FloatArray, size: int, dof: int) -> tuple[FloatArray, FloatArray]:
     """Return states (N, size) and increments (N, dof), or raise a ShapeError."""
-    state, delta = as_rows(state, size, "state"), as_rows(delta, dof, "delta")
+    state, delta = as_rows(state, (size,), "state"), as_rows(delta, (dof,), "delta")
     if len(state) != len(delta):
         raise ShapeError(f"state and delta must have as many rows; got {len(state)} and {len(delta)}.")
     return state, delta
@@ -138,11 +138,16 @@ class Chart(Manifold):
         self.ambient_size, self.dof = self._SIZES[self.kind]
         self.factor_columns = self.ambient_size
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
+    def ambient(self, state: FloatArray) -> FloatArray:
+        """Return the state itself, which is what factors read."""
+        return self._checked_state(state)
+
+    def random(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Lines or planes 0.5 to 2 units from the origin."""
+        return self.from_ambient((random_lines if self.kind == "line" else random_planes)(rng, count))
 
     def _checked_state(self, state: FloatArray, name: str = "state") -> FloatArray:
-        return as_rows(state, self.state_size, name)
+        return as_rows(state, (self.state_size,), name)
 
     def _checked_step(self, state: FloatArray, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
         return as_steps(state, delta, self.state_size, self.dof)
@@ -155,7 +160,7 @@ class Chart(Manifold):
 
     def _checked_ambient(self, ambient: FloatArray) -> FloatArray:
         """Rows of finite numbers that are not all zero, scaled so that the largest number of each row is 1."""
-        ambient = as_rows(ambient, self.ambient_size, "ambient")
+        ambient = as_rows(ambient, (self.ambient_size,), "ambient")
         # Scaled first, so that no square underflows or overflows.
         names = "(m, d)" if self.kind == "line" else "(n, w)"
         remedy = f"Drop it, or build the {self.kind} again from other data."

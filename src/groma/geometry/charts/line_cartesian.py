@@ -117,10 +117,6 @@ class CartesianLine(Chart):
         alpha = (b @ (d_other / cosine)[:, :, None])[:, :, 0]
         return np.hstack([alpha, (b @ shift[:, :, None])[:, :, 0]])
 
-    def ambient(self, state: FloatArray) -> FloatArray:
-        """(m, d) with a unit direction: the state itself."""
-        return self._checked_state(state)
-
     def from_ambient(self, ambient: FloatArray) -> FloatArray:
         """State (N, 6) of Plücker lines (m, d) of any scale; of a moment that is not orthogonal to d, the rest is kept.
 

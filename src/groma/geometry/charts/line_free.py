@@ -35,7 +35,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.geometry import quaternion
-from groma.geometry.charts.chart import Chart, random_lines, reject, turn_and_add_all, turn_between
+from groma.geometry.charts.chart import Chart, minus_skew_kernel, reject, turn_and_add_all, turn_between
 from groma.geometry.charts.line_orthonormal import moment_frame
 from groma.geometry.quaternion import to_matrix_kernel
 
@@ -79,15 +79,7 @@ def _basis_left(state, R, B):
         # -v^ with v = m = d_L x2, then d = x1
         w = state[4] if k == 0 else 1.0
         x, y, z = w * R[1 - k], w * R[4 - k], w * R[7 - k]
-        B[3 * k, 0] = 0.0
-        B[3 * k, 1] = z
-        B[3 * k, 2] = -y
-        B[3 * k + 1, 0] = -z
-        B[3 * k + 1, 1] = 0.0
-        B[3 * k + 1, 2] = x
-        B[3 * k + 2, 0] = y
-        B[3 * k + 2, 1] = -x
-        B[3 * k + 2, 2] = 0.0
+        minus_skew_kernel(x, y, z, 3 * k, B)
     for j in range(3):
         B[j, 3] = R[3 * j + 1]
         B[3 + j, 3] = 0.0
@@ -169,10 +161,6 @@ class FreeLineRight(Chart):
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (m, d) with respect to the increment, (N, 6, 4)."""
         return self._basis_by(_basis_all, state, self._left)
-
-    def random(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Lines 0.5 to 2 units from the origin."""
-        return self.from_ambient(random_lines(rng, count))
 
 
 class FreeLineLeft(FreeLineRight):

@@ -43,8 +43,8 @@ from groma._typing import FloatArray, IntArray
 from groma.geometry import quaternion
 from groma.geometry.charts.chart import (
     Chart,
+    minus_skew_kernel,
     perpendicular,
-    random_lines,
     turn_and_add_all,
     turn_between,
     unit,
@@ -93,15 +93,7 @@ def _basis_left(state, R, B):
         # -v^ with v = m, then d
         w = w1 if k == 0 else w2
         x, y, z = w * R[k], w * R[3 + k], w * R[6 + k]
-        B[3 * k, 0] = 0.0
-        B[3 * k, 1] = z
-        B[3 * k, 2] = -y
-        B[3 * k + 1, 0] = -z
-        B[3 * k + 1, 1] = 0.0
-        B[3 * k + 1, 2] = x
-        B[3 * k + 2, 0] = y
-        B[3 * k + 2, 1] = -x
-        B[3 * k + 2, 2] = 0.0
+        minus_skew_kernel(x, y, z, 3 * k, B)
     for j in range(3):
         B[j, 3] = -w2 * R[3 * j]
         B[3 + j, 3] = w1 * R[3 * j + 1]
@@ -192,10 +184,6 @@ class OrthonormalLineRight(Chart):
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (m, d) with respect to the increment, (N, 6, 4)."""
         return self._basis_by(_basis_all, state, self._left)
-
-    def random(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Lines 0.5 to 2 units from the origin."""
-        return self.from_ambient(random_lines(rng, count))
 
 
 class OrthonormalLineLeft(OrthonormalLineRight):

@@ -20,7 +20,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.geometry.charts.chart import Chart, random_planes, reject
+from groma.geometry.charts.chart import Chart, reject
 
 #: Planes nearer to the origin than this (scene units) are refused.
 MINIMUM_DISTANCE = 1e-9
@@ -99,10 +99,6 @@ class ClosestPointPlane(Chart):
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (n, w) with respect to the increment, (N, 4, 3)."""
         return self._basis_by(_basis_all, state)
-
-    def random(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Planes 0.5 to 2 units from the origin."""
-        return self.from_ambient(random_planes(rng, count))
 
 
 __all__ = ["MINIMUM_DISTANCE", "ClosestPointPlane"]

@@ -78,10 +78,6 @@ class NormalOffsetPlane(Chart):
         ratio = np.where(sine > 0.0, angle / np.where(sine > 0.0, sine, 1.0), 1.0)
         return np.column_stack([ratio[:, None] * tangent, goal[:, 3] - state[:, 3]])
 
-    def ambient(self, state: FloatArray) -> FloatArray:
-        """(n, w) with a unit normal: the state itself."""
-        return self._checked_state(state)
-
     def from_ambient(self, ambient: FloatArray) -> FloatArray:
         """State (N, 4) of planes (n, w) of any scale; the orientation is kept.
 

@@ -28,7 +28,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.geometry.charts.chart import Chart, random_planes, turn_between, turn_kernel, unit
+from groma.geometry.charts.chart import Chart, turn_between, turn_kernel, unit
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -81,10 +81,6 @@ class QuaternionPlaneLeft(Chart):
         state, other = self._checked_pair(state, other)
         return turn_between(state, other, self._left)
 
-    def ambient(self, state: FloatArray) -> FloatArray:
-        """(n, w) of unit norm as a 4-vector: the state itself."""
-        return self._checked_state(state)
-
     def from_ambient(self, ambient: FloatArray) -> FloatArray:
         """State (N, 4) of planes (n, w) of any scale; the sign is kept.
 
@@ -98,10 +94,6 @@ class QuaternionPlaneLeft(Chart):
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (n, w) with respect to the increment, (N, 4, 3)."""
         return self._basis_by(_basis_all, state, self._left)
-
-    def random(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Planes 0.5 to 2 units from the origin."""
-        return self.from_ambient(random_planes(rng, count))
 
 
 class QuaternionPlaneRight(QuaternionPlaneLeft):

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.errors import ShapeError
+from groma.geometry.algebra import vectors
 from groma.geometry.charts.point_inverse_depth import InverseDepthPoint
 from groma.geometry.charts.registry import charts_of, register_chart
 from groma.geometry.manifold import Euclidean
@@ -24,17 +24,13 @@ POINT_CHARTS = charts_of("point")
 
 def to_homogeneous(point: FloatArray) -> FloatArray:
     """Homogeneous points (..., 4) with W = 1 of points (..., 3)."""
-    point = np.asarray(point, dtype=np.float64)
-    if point.ndim == 0 or point.shape[-1] != 3:
-        raise ShapeError(f"A point must have shape (..., 3); got {point.shape}.")
+    point = vectors(point, 3, "A point")
     return np.concatenate([point, np.ones((*point.shape[:-1], 1))], axis=-1)
 
 
 def from_homogeneous(point: FloatArray) -> FloatArray:
     """Points (..., 3) of homogeneous points (..., 4), W last; NaN for points at infinity (W = 0)."""
-    point = np.asarray(point, dtype=np.float64)
-    if point.ndim == 0 or point.shape[-1] != 4:
-        raise ShapeError(f"A homogeneous point must have shape (..., 4), W last; got {point.shape}.")
+    point = vectors(point, 4, "A homogeneous point", "W last")
     scale = point[..., 3:]
     return point[..., :3] / np.where(scale == 0, np.nan, scale)
 

@@ -32,7 +32,8 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.geometry import quaternion, se3
-from groma.geometry.charts.chart import as_rows, as_steps, reject
+from groma.geometry.algebra import as_rows
+from groma.geometry.charts.chart import as_steps, reject
 from groma.geometry.charts.registry import charts_of, register_chart
 from groma.geometry.manifold import Manifold
 from groma.geometry.quaternion import exp_kernel, multiply_kernel, to_matrix_kernel
@@ -104,12 +105,9 @@ class _PoseChart(Manifold):
     kind: ClassVar[str] = "pose"
     state_size, ambient_size, factor_columns, dof = 7, 12, 6, 6
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
-
     def ambient(self, state: FloatArray) -> FloatArray:
         """Row-major 3x4 matrices [R | t], (N, 12)."""
-        state = as_rows(state, 7, "state")
+        state = as_rows(state, (7,), "state")
         out = np.empty((len(state), 12))
         _ambient_all(state, out)
         return out
@@ -122,7 +120,7 @@ class _PoseChart(Manifold):
         InputError
             If a 3x3 part is not a rotation matrix to within 1e-6.
         """
-        ambient = as_rows(ambient, 12, "ambient")
+        ambient = as_rows(ambient, (12,), "ambient")
         matrix = ambient.reshape(-1, 3, 4)
         finite = np.isfinite(ambient).min(axis=1)
         R = np.where(finite[:, None, None], matrix[:, :, :3], 0.0)

@@ -19,8 +19,9 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.errors import InputError, ShapeError
-from groma.geometry.charts.chart import as_rows, as_steps, perpendicular, perpendicular_kernel, unit
+from groma.errors import InputError
+from groma.geometry.algebra import as_rows, vectors
+from groma.geometry.charts.chart import as_steps, perpendicular, perpendicular_kernel, unit
 from groma.geometry.charts.registry import charts_of, register_chart
 from groma.geometry.manifold import Manifold
 
@@ -56,30 +57,23 @@ def _retract_all(state, delta, out):
 # ----------------------------------------------------------------------------------------------------------- Public
 
 
-def _vectors(vector: FloatArray) -> FloatArray:
-    vector = np.asarray(vector, dtype=np.float64)
-    if vector.ndim == 0 or vector.shape[-1] != 3:
-        raise ShapeError(f"A direction must have shape (..., 3); got {vector.shape}.")
-    return vector
-
-
 def tangent_basis(direction: FloatArray) -> FloatArray:
     """Two orthonormal vectors (..., 2, 3) perpendicular to unit vectors (..., 3); continuous where z keeps its sign."""
-    direction = _vectors(direction)
+    direction = vectors(direction, 3, "A direction")
     first, second = perpendicular(direction.reshape(-1, 3))
     return np.stack([first, second], axis=1).reshape(*direction.shape[:-1], 2, 3)
 
 
 def exp(direction: FloatArray, tangent: FloatArray) -> FloatArray:
     """Unit vectors (..., 3) reached from ``direction`` along ``tangent`` (..., 3), radians."""
-    u, t = _vectors(direction), _vectors(tangent)
+    u, t = vectors(direction, 3, "A direction"), vectors(tangent, 3, "A direction")
     angle = np.linalg.norm(t, axis=-1, keepdims=True)
     return np.cos(angle) * u + np.sinc(angle / np.pi) * t
 
 
 def log(direction: FloatArray, other: FloatArray) -> FloatArray:
     """Tangent vector (..., 3) that leads from ``direction`` to ``other``; one of length pi if they are opposite."""
-    u, v = _vectors(direction), _vectors(other)
+    u, v = vectors(direction, 3, "A direction"), vectors(other, 3, "A direction")
     cosine = np.sum(u * v, axis=-1, keepdims=True)
     across = v - cosine * u
     across = across - np.sum(across * u, axis=-1, keepdims=True) * u  # exactly tangent, also for opposite vectors
@@ -98,9 +92,6 @@ class Unit3(Manifold):
     name: ClassVar[str] = "sphere"
     kind: ClassVar[str] = "direction"
     state_size, ambient_size, factor_columns, dof = 3, 3, 3, 2
-
-    def __repr__(self) -> str:
-        return "Unit3()"
 
     def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
         """Move unit vectors (N, 3) by angles (N, 2), radians, along the tangent basis."""
@@ -125,7 +116,7 @@ class Unit3(Manifold):
         InputError
             If a vector is zero or not finite.
         """
-        ambient = as_rows(ambient, 3, "ambient")
+        ambient = as_rows(ambient, (3,), "ambient")
         length = np.linalg.norm(ambient, axis=-1)
         if not (length > 0).all() or not np.isfinite(length).all():
             raise InputError("A direction must be a finite vector that is not zero. Drop it, or build it again.")

@@ -165,9 +165,10 @@ def motion(manifold: Manifold, state: FloatArray, middle: FloatArray, distance: 
 
 def weakest(information: FloatArray, J: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Standard deviations (count, dof), largest first, of the motions J delta, and these motions (count, m, dof)."""
-    _, R = np.linalg.qr(J)
+    size = np.linalg.norm(J, axis=1)  # of each increment, whatever its unit
+    _, R = np.linalg.qr(J / np.where(size > 0.0, size, 1.0)[:, None, :])
     good = np.abs(np.einsum("nii->ni", R)).min(axis=1) > 1e-12
-    R = np.where(good[:, None, None], R, np.eye(R.shape[1]))
+    R = np.where(good[:, None, None], R * size[:, None, :], np.eye(R.shape[1]))
     inverse = np.linalg.inv(R)
     scaled = np.swapaxes(inverse, 1, 2) @ information @ inverse
     values, vectors = np.linalg.eigh(0.5 * (scaled + np.swapaxes(scaled, 1, 2)))

@@ -45,8 +45,8 @@ class SharedSystem:
         return max(map(largest_slope, self._gradient, self._curvature), default=0.0)
 
     def is_curved(self) -> bool:
-        """Whether the cost depends on any kept variable."""
-        return any(bool(part.any()) for part in self._curvature)
+        """Whether the cost depends on any kept variable, where there are any."""
+        return not self._curvature or any(bool(part.any()) for part in self._curvature)
 
     def add(self, layout: Layout, system: ReducedSystem) -> None:
         """Add the part of a shard."""

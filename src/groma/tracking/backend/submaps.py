@@ -26,7 +26,7 @@ from groma.tracking.map.track_map import Keyframe, TrackMap
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a track that could not be joined to the longest one; its world is its own."""
+    """A submap of a track that could not be joined to the longest one; its world is its own."""
 
     trajectory: Trajectory
     scene: Scene
@@ -101,7 +101,7 @@ def find_joint(
     """Return how a keyframe of a map joins it to another, if what a search found agrees on one pose."""
     best: Joint | None = None
     for keyframe, first, second in pairs:
-        older = next((k for k, part in enumerate(maps) if keyframe in part.living()), newer)
+        older = next((k for k, submap in enumerate(maps) if keyframe in submap.living()), newer)
         if older == newer:
             continue
         found = agreeing_pose(maps[older], camera, keyframe, newest, first, second, gates)
@@ -174,7 +174,7 @@ def _moved(keyframe: Keyframe, there_from_here: FloatArray, shift: int, start: d
     )
 
 
-def about_parts(breaks: list[tuple[float, float]], where: Sequence[tuple[int, int]], others: list[int]) -> list[str]:
+def about_submaps(breaks: list[tuple[float, float]], where: Sequence[tuple[int, int]], others: list[int]) -> list[str]:
     """Say where a track broke, and what became of its maps.
 
     Parameters
@@ -184,15 +184,15 @@ def about_parts(breaks: list[tuple[float, float]], where: Sequence[tuple[int, in
     where
         Of :class:`Places`.
     others
-        Number of frames of each part that is not the longest.
+        Number of frames of each submap that is not the longest.
     """
     out = [f"The track was lost at {since:.3f} s; a new map was begun at {until:.3f} s." for since, until in breaks]
-    joined = sum(root != part for part, (root, _) in enumerate(where))
+    joined = sum(root != submap for submap, (root, _) in enumerate(where))
     if joined:
         out.append(f"Joined to an older map, where a place was recognised: {counted(joined, 'new maps')}.")
     if others:
         out.append(
-            f"Not joined to the longest part of the track: {counted(len(others), 'parts')} "
+            f"Not joined to the longest submap of the track: {counted(len(others), 'submaps')} "
             f"({', '.join(f'{number:,}' for number in others)} frames), each in a world of its own."
         )
     return out
@@ -202,4 +202,4 @@ def _shifted(index: IntArray, by: int) -> IntArray:
     return np.where(index >= 0, index + by, -1)
 
 
-__all__ = ["Joint", "Part", "Places", "about_parts", "best_joint", "find_joint", "joined_map", "search_older_maps"]
+__all__ = ["Joint", "Part", "Places", "about_submaps", "best_joint", "find_joint", "joined_map", "search_older_maps"]

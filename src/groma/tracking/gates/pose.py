@@ -33,7 +33,13 @@ class StartGates:
     )
     min_points: int = gate(60, "points", "points followed and placed", "chosen on rendered rooms")
     min_inliers: float = gate(0.6, "share", "share of the points in front of both cameras", "chosen on rendered rooms")
-    min_parallax: float = gate(0.02, "rad", "median parallax", "chosen on rendered rooms")
+    depth_sigma: float = gate(
+        0.15, "share", "median standard deviation of the depths of the first points", "convention: depths are known"
+    )
+    max_behind: float = gate(
+        10.0, "nats", "a motion less likely by this than another one is ruled out", "derived from odds of 1 in 20 000"
+    )
+    max_residual: float = gate(3.5, "sigma", "a pixel beyond it disagrees", "derived from normal noise: 1 in 2 000")
     max_error: float = gate(1.0, "px", "distance from an epipolar line", "convention: one pixel")
 
 

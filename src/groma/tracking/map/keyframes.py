@@ -117,7 +117,7 @@ def measure_points(
         z = np.where(track_map.points.alive[tracks.index], into(pose, track_map.points.xyz[tracks.index])[:, 2], np.nan)
         expected = tracks.pixel[:, 0] - camera.fx * camera.baseline / np.where(z > 0, z, np.nan)
         right = data.right_columns(tracks.pixel, expected)
-    sigma = np.full(count, options.point_sigma_px)
+    sigma = tracks.scale * options.point_sigma_px
     return PointMeasurements(tracks.index, tracks.pixel, sigma, depth, data.depth_sigma(depth), right)
 
 
@@ -172,7 +172,7 @@ def _add_points(
         known = np.isfinite(depth)
         points.xyz[rows[known]] = back(pose, camera.bearings(pixel[known]) * depth[known, None])
         points.state[rows[known]] = ALIVE
-        tracks = tracks.joined(PointTracks(rows, pixel))
+        tracks = tracks.joined(PointTracks.fine(rows, pixel))
     return tracks, features
 
 
@@ -340,8 +340,8 @@ def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> P
         grow(track_map.planes, int(k), back(pose, seen.places_of(row)), float(seen.support[row]), gates)
     rest = np.setdiff1d(np.arange(len(seen)), rows)
     # Nothing new beside a plane that is there already but did not agree well enough.
-    _, doubtful = assign_planes(track_map.planes, seen, pose, gates.wide_angle, gates.wide_distance, gates)
-    rest = np.setdiff1d(rest, doubtful)
+    _, ambiguous = assign_planes(track_map.planes, seen, pose, gates.wide_angle, gates.wide_distance, gates)
+    rest = np.setdiff1d(rest, ambiguous)
     index = np.concatenate([index, add_planes(track_map.planes, seen, rest, pose, gates)])
     rows = np.concatenate([rows, rest])
     return PlaneMeasurements(index, seen.plane[rows], seen.sqrt_information[rows])

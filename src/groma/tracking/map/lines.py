@@ -166,7 +166,7 @@ def assign(
     best = np.argmin(score, axis=1)
     rows = np.flatnonzero(np.isfinite(score[np.arange(len(expected)), best]))
     mutual = np.argmin(score, axis=0)[best[rows]] == rows
-    # A rival nearly as good makes the pair doubtful; rivals that continue the same line do not.
+    # A rival nearly as good makes the pair ambiguous; rivals that continue the same line do not.
     rows = rows[mutual]
     return rows, best[rows]
 

@@ -12,7 +12,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.point_tracks import follow
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.gates import PointGates
-from groma.tracking.map.track_map import Keyframe, TrackMap
+from groma.tracking.map.track_map import TrackMap
 
 
 @dataclass(frozen=True)
@@ -22,22 +22,30 @@ class PointTracks:
     #: (n,) landmark, (n, 2) pixel.
     index: IntArray
     pixel: FloatArray
+    #: (n,) size of a pixel where each was found: 1, but for features of coarse scales.
+    scale: FloatArray
 
     def __len__(self) -> int:
         return len(self.index)
 
     def take(self, rows: IntArray | BoolArray) -> PointTracks:
         """Return some of them."""
-        return PointTracks(self.index[rows], self.pixel[rows])
+        return PointTracks(self.index[rows], self.pixel[rows], self.scale[rows])
 
     def joined(self, other: PointTracks) -> PointTracks:
         """Return both together."""
-        return PointTracks(np.concatenate([self.index, other.index]), np.concatenate([self.pixel, other.pixel]))
+        index, pixel = np.concatenate([self.index, other.index]), np.concatenate([self.pixel, other.pixel])
+        return PointTracks(index, pixel, np.concatenate([self.scale, other.scale]))
+
+    @staticmethod
+    def fine(index: IntArray, pixel: FloatArray) -> PointTracks:
+        """Return points that were found on the finest scale."""
+        return PointTracks(index, pixel, np.ones(len(index)))
 
     @staticmethod
     def empty() -> PointTracks:
         """Return none."""
-        return PointTracks(np.zeros(0, np.int64), np.zeros((0, 2)))
+        return PointTracks.fine(np.zeros(0, np.int64), np.zeros((0, 2)))
 
 
 def follow_points(
@@ -65,37 +73,17 @@ def follow_points(
         guess[~known] += np.median(np.where(np.isfinite(moved), moved, 0.0), axis=0)
     pixel, good = follow(before, now, tracks.pixel, guess)
     rows = np.flatnonzero(good)
-    tracks = PointTracks(tracks.index[rows], pixel[rows])
-    return held_to_patches(track_map, track_map.near, tracks, now, max_correction)
-
-
-def held_to_patches(
-    track_map: TrackMap,
-    keyframe: Keyframe,
-    tracks: PointTracks,
-    now: npt.NDArray[np.uint8],
-    max_correction: float,
-) -> PointTracks:
-    """Move points whose patch is in a keyframe to where it is in an image, if that is not far."""
-    points = track_map.points
+    tracks = PointTracks.fine(tracks.index[rows], pixel[rows])
+    keyframe = track_map.near
     own = np.flatnonzero(points.keyframe[tracks.index] == keyframe.index)
-    if keyframe.gray is None or not len(own):
-        return tracks
-    patch = points.pixel[tracks.index[own]]
-    pixel, good = follow(keyframe.gray, now, patch, tracks.pixel[own], levels=0, round_trip=None)
-    good &= np.linalg.norm(pixel - tracks.pixel[own], axis=1) < max_correction
-    held = tracks.pixel.copy()
-    held[own[good]] = pixel[good]
-    return PointTracks(tracks.index, held)
-
-
-def agreeing(
-    track_map: TrackMap, camera: TrackCamera, tracks: PointTracks, pose: FloatArray, max_distance: float
-) -> PointTracks:
-    """Return the followed points that are where a pose (7,) says, to within a distance in pixels."""
-    points = track_map.points
-    away = camera.project(into(pose, points.xyz[tracks.index])) - tracks.pixel
-    return tracks.take(points.alive[tracks.index] & (np.linalg.norm(away, axis=1) < max_distance))
+    if keyframe.gray is not None and len(own):
+        patch = points.pixel[tracks.index[own]]
+        pixel, good = follow(keyframe.gray, now, patch, tracks.pixel[own], levels=0, round_trip=None)
+        good &= np.linalg.norm(pixel - tracks.pixel[own], axis=1) < max_correction
+        held = tracks.pixel.copy()
+        held[own[good]] = pixel[good]
+        tracks = PointTracks.fine(tracks.index, held)
+    return tracks
 
 
 def find_again(
@@ -136,8 +124,8 @@ def find_again(
         points.visible[rows[of]] += 1
         points.misses[rows[of[~good]]] += 1
         points.misses[rows[of[good]]] = 0
-        found = found.joined(PointTracks(rows[of[good]], there[good]))
+        found = found.joined(PointTracks.fine(rows[of[good]], there[good]))
     return found
 
 
-__all__ = ["PointTracks", "agreeing", "find_again", "follow_points", "held_to_patches"]
+__all__ = ["PointTracks", "find_again", "follow_points"]

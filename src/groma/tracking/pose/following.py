@@ -28,7 +28,7 @@ class Attempt:
     predicted: FloatArray
     prior_sigma: FloatArray
     estimate: PoseEstimate | None = None
-    doubtful: PoseEstimate | None = None
+    unconfirmed: PoseEstimate | None = None
     #: Whether enough agrees with the pose.
     trusted: bool = False
     followed: Followed = field(default_factory=Followed.nothing)
@@ -105,7 +105,7 @@ def carry(
     guess = np.where(known[:, None], expected, points.pixel + shift)
     inside = np.flatnonzero(camera.inside(guess, 2.0))
     pixel, good = follow(before.gray, data.gray, points.pixel[inside], guess[inside], levels=2)
-    points = PointTracks(points.index[inside[good]], pixel[good])
+    points = PointTracks.fine(points.index[inside[good]], pixel[good])
     lines = lines.take(~np.isin(lines.index, followed.lines.index))
     if len(lines.index):
         lines = follow_lines(track_map, before, data, lines)

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The beginning of a track: one frame where depth is known, else two frames with enough motion between them.
 
-With one camera alone the relative pose comes from the essential matrix (five points, RANSAC), up to scale: the median
-depth of the first points becomes the unit of length.
+With one camera alone the first and a second frame propose motions (:mod:`groma.tracking.pose.two_views`), up to scale:
+the median depth of the first points becomes the unit of length. Later frames judge them. The map starts when one
+motion is left, explains most points, and their depths are known; if none explains the points, all begins anew.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
 from groma._typing import FloatArray
 from groma.features.point_tracks import follow
-from groma.geometry import quaternion, se3
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.map.keyframes import Followed, add_keyframe
@@ -25,8 +25,7 @@ from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.map.triangulation import triangulate
 from groma.tracking.options import TrackOptions
-
-IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
+from groma.tracking.pose.two_views import IDENTITY, Candidate, adjusted, continued, intersected, likely, motions
 
 
 class Initialiser:
@@ -37,68 +36,75 @@ class Initialiser:
         self.metric = True
         self._first: FrameFeatures | None = None
         self._before: FrameFeatures | None = None
-        self._pixel = np.zeros((0, 2))
-        self._start = np.zeros((0, 2))
+        #: Pixels of the points followed: in the first frame, in that which proposed candidates, and in the last.
+        self._views = [np.zeros((0, 2)), np.zeros((0, 2))]
+        self._candidates: list[Candidate] = []
         self._second: FrameFeatures | None = None
         self._pose = IDENTITY
 
     def try_start(self, data: FrameFeatures) -> FloatArray | None:
         """Return the poses (n, 7) of the frames that make the first map, or None to go on waiting."""
         if data.frame.depth is not None or data.frame.right is not None:
-            known = int(np.isfinite(data.features.depth).sum())
-            if data.options.lines:
-                known += 2 * int(np.isfinite(data.detected.inverse_depth).all(axis=1).sum())
-            if data.planes is not None:
-                known += 5 * len(data.planes)
-            if known < self._gates.min_known:
-                return None
-            self._first = data
-            return IDENTITY[None]
+            return self._start_by_depth(data)
         self.metric = False
-        if self._first is None or not len(self._pixel):
+        if self._first is None or not len(self._views[0]):
             return self._restart(data)
         assert self._before is not None
-        pixel, good = follow(self._before.gray, data.gray, self._pixel)
-        self._start, self._pixel, self._before = self._start[good], pixel[good], data
-        if len(self._pixel) < self._gates.min_points:
+        pixel, good = follow(self._before.gray, data.gray, self._views[-1])
+        self._views = [view[good] for view in self._views[:-1]] + [pixel[good]]
+        self._candidates = [replace(one, places=one.places[good]) for one in self._candidates]
+        self._before = data
+        if good.sum() < self._gates.min_points:
             return self._restart(data)
-        away = float(np.median(np.linalg.norm(self._pixel - self._start, axis=1)))
+        away = float(np.median(np.linalg.norm(self._views[-1] - self._views[0], axis=1)))
         if away < self._gates.min_displacement * self._camera.width:
             return None
-        pose = self._relative_pose()
-        if pose is None:
+        return self._judge(data) if self._candidates else self._propose()
+
+    def _start_by_depth(self, data: FrameFeatures) -> FloatArray | None:
+        known = int(np.isfinite(data.features.depth).sum())
+        if data.options.lines:
+            known += 2 * int(np.isfinite(data.detected.inverse_depth).all(axis=1).sum())
+        if data.planes is not None:
+            known += 5 * len(data.planes)
+        if known < self._gates.min_known:
             return None
-        self._pose, self._second = pose, data
-        return np.stack([IDENTITY, pose])
+        self._first = data
+        return IDENTITY[None]
 
     def _restart(self, data: FrameFeatures) -> None:
         self._first = self._before = data
-        self._pixel = self._start = data.features.pixel.copy()
+        self._candidates = []
+        self._views = [data.features.pixel.copy(), data.features.pixel.copy()]
 
-    def _relative_pose(self) -> FloatArray | None:
-        K, gates = self._camera.matrix_opencv, self._gates
-        one, two = self._start - 0.5, self._pixel - 0.5
-        E, mask = cv2.findEssentialMat(one, two, K, method=cv2.USAC_MAGSAC, prob=0.999, threshold=gates.max_error)
-        if E is None or E.shape != (3, 3):
+    def _propose(self) -> None:
+        """Find the motions that the first and the present frame allow; the next frames will judge them."""
+        one, two = self._views
+        for pose in motions(self._camera, one, two, self._gates):
+            places = intersected(self._camera, one, two, pose)
+            self._candidates.append(Candidate(np.stack([IDENTITY, pose]), places))
+        if self._candidates:
+            self._views = [one, two, two.copy()]
+
+    def _judge(self, data: FrameFeatures) -> FloatArray | None:
+        """Adjust all candidates to the three views; return the poses of the one that is left and good."""
+        gates, sigma, views = self._gates, self._options.point_sigma_px, np.stack(self._views)
+        judged = []
+        for candidate in self._candidates:
+            if len(candidate.poses) < len(views):
+                two = adjusted(self._camera, candidate, views[:2], sigma, gates.max_residual)
+                candidate = continued(self._camera, two, views[2], gates.max_residual * sigma)
+            judged.append(adjusted(self._camera, candidate, views, sigma, gates.max_residual))
+        left = likely(judged, gates.max_behind)
+        best = left[0]
+        if best.agrees.sum() < max(gates.min_points, gates.min_inliers * len(best.agrees)):
+            return self._restart(data)
+        self._candidates = left
+        known = math.sqrt(2.0) * sigma / (self._camera.fx * gates.depth_sigma)
+        if len(left) > 1 or np.median(best.parallax()[best.agrees]) < known:
             return None
-        count, R, t, mask = cv2.recoverPose(E, one, two, K, mask=mask)
-        if count < gates.min_points or count < gates.min_inliers * len(one):
-            return None
-        pose = np.concatenate([quaternion.from_matrix(np.asarray(R, np.float64)), np.asarray(t, np.float64).ravel()])
-        first = np.tile(IDENTITY, (len(one), 1))
-        placing = replace(self._options.gates.points, min_parallax=gates.min_parallax / 2)
-        places, good = triangulate(self._camera, first, self._start, pose, self._pixel, placing)
-        if good.sum() < gates.min_points:
-            return None
-        ray1 = places[good] / np.linalg.norm(places[good], axis=1, keepdims=True)
-        center = se3.inverse(pose[None])[0, 4:]
-        ray2 = places[good] - center
-        ray2 /= np.linalg.norm(ray2, axis=1, keepdims=True)
-        parallax = np.arccos(np.clip((ray1 * ray2).sum(axis=1), -1, 1))
-        if np.median(parallax) < gates.min_parallax:
-            return None
-        pose[4:] /= float(np.median(places[good, 2]))
-        return pose
+        self._pose, self._second = best.poses[-1], data
+        return np.stack([IDENTITY, self._pose])
 
     def make_map(self, track_map: TrackMap) -> tuple[Followed, FloatArray]:
         """Fill an empty map; return what is followed from now on, and the pose of the newest frame."""
@@ -110,9 +116,10 @@ class Initialiser:
         followed = add_keyframe(track_map, camera, self._first, IDENTITY, Followed.nothing(), options)
         # The points of the first frame, followed once more to the second.
         tracks = followed.points
-        guess = tracks.pixel + _shift_near(self._start, self._pixel - self._start, tracks.pixel)
+        start, end = self._views[0], self._views[-1]
+        guess = tracks.pixel + _shift_near(start, end - start, tracks.pixel)
         pixel, good = follow(self._first.gray, self._second.gray, tracks.pixel, guess)
-        tracks = PointTracks(tracks.index[good], pixel[good])
+        tracks = PointTracks.fine(tracks.index[good], pixel[good])
         first = np.tile(IDENTITY, (len(tracks), 1))
         places, placed = triangulate(
             camera, first, track_map.points.first_pixel[tracks.index], self._pose, tracks.pixel, options.gates.points

@@ -25,7 +25,7 @@ from groma.tracking.map.feature_points import match_features, points_of_features
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.lines import FollowedSegments, assign, expected_segments
 from groma.tracking.map.planes import assign_planes
-from groma.tracking.map.points import PointTracks, held_to_patches
+from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
 
@@ -288,13 +288,9 @@ def promote(track_map: TrackMap, found: Found, data: FrameFeatures) -> PointTrac
             new = points_of_features(track_map, keyframe, own[fresh], places, sigma, data.options.point_sigma_px)
             index[fresh], usable[fresh] = new, True
         rows = np.flatnonzero(usable)
-        tracks = tracks.joined(PointTracks(index[rows], features.pixel[here[rows]]))
-    tracks = tracks.take(np.unique(tracks.index, return_index=True)[1])
-    # Features are found to a pixel of their scale; patches tell more.
-    for owner in np.unique(points.keyframe[tracks.index]):
-        keyframe = track_map.keyframes[owner]
-        tracks = held_to_patches(track_map, keyframe, tracks, data.gray, data.options.gates.points.max_correction)
-    return tracks
+        tracks = tracks.joined(PointTracks(index[rows], features.pixel[here[rows]], features.scale[here[rows]]))
+    first = np.unique(tracks.index, return_index=True)[1]
+    return tracks.take(first)
 
 
 def match_lines(

@@ -75,11 +75,12 @@ def tiles(scene: Scene, before: Drawable | None, after: Drawable, numbers: Mappi
     for kind, name in enumerate(after.residual_kinds):
         if len(_known(_of_kind(after, kind))):
             cells.append((summary(_median, kind), f"residual of {name}, median"))
+    for name, told in ((numbers or {}).get("inliers") or {}).items():
+        share = [100.0 * told["share"]["before"]] if before is not None else []
+        share = _digits.short([*share, 100.0 * told["share"]["after"]])
+        cells.append((" <i>→</i> ".join(share) + " %", f"of {name} are inliers, within {told['limit_px']:.2g} px"))
     if numbers is not None:
-        cells += [
-            (change(numbers["initial_cost"], numbers["final_cost"], ""), "robust cost"),
-            (f"{numbers['iterations']}", "steps"),
-        ]
+        cells.append((f"{numbers['iterations']}", "steps"))
     cells += [(f"{count:,}", name) for name, count in counts_of(scene, after) if count][: 5 - len(cells)]
     return "".join(f'<div class="tile"><b>{value}</b><span>{label}</span></div>' for value, label in cells)
 
@@ -214,7 +215,7 @@ def contributions_card(entries: Sequence[Mapping[str, Any]] | None) -> str:
         if against and any(entry["center_sigma"] is not None for entry in shown):
             key = key.removesuffix(".") + ", ring: predicted."
     caption = (
-        "The same scene adjusted by points alone, then by more and more. Residuals: rms, wrong matches in full. Moved: "
+        "The same scene adjusted by points alone, then by more and more. Residuals: rms of the inliers. Moved: "
         "median distance of the camera centres from where points alone put them; predicted: their median standard "
         "deviation, seen from the first camera"
         + ("; error: rms; all in units of the reference." if against else "; in scene units.")

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Lens distortion that the cameras do not model, recognised by what it leaves in the residuals of points.
+
+In come an adjusted problem; out comes a sentence, or none. Two tests, the second where the first finds something:
+
+* Is there anything? The components of the residuals along the radius, averaged over rings of equal area around each
+  principal point, are normal with variance :math:`\sigma^2 / n` if there is nothing but noise, so that
+
+  .. math:: \sum_{\text{rings}} n \bar r^2 / \sigma^2 \sim \chi^2 .
+
+  Poses and points have taken up most of a distortion, but not all, whatever its form.
+* Does a lens explain it, and does it matter? The distortion of a wider camera model is freed, and a few steps are taken
+  from where the adjustment ended: the score test of these parameters, followed to where they lead. What they explain is
+  the share of the variance of the residuals that disappears, by the medians, which outliers do not move.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.adjustment.fit import noise_of
+from groma.cameras import CameraModel, in_model
+from groma.cameras import model as camera_model
+from groma.factors.contract import Factor, Ref
+from groma.factors.observations.point_reprojection import PointReprojection
+from groma.gates import chi_square_gate, gate
+from groma.geometry.manifold import Euclidean
+from groma.problem.problem import Problem
+from groma.problem.residuals import residuals_of
+from groma.problem.variables import Variables
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
+
+#: The model that a camera may lack, by the model that it has.
+WIDER: dict[str, str] = dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "OPENCV")
+
+
+@dataclass(frozen=True)
+class LensGates:
+    """When residuals show a lens."""
+
+    false_alarm: float = gate(
+        1e-6, "probability", "of rings of radial residuals that noise alone exceeds", "convention: five sigma"
+    )
+    outlier: float = gate(
+        3e-3, "probability", "of a residual that noise exceeds; others are left out", "convention: 3 sigma"
+    )
+    share: float = gate(
+        0.1,
+        "share",
+        "of the residuals' variance that distortion explains and that is told",
+        "convention: a tenth",
+    )
+    rings: int = gate(16, "rings", "of equal area around the principal point", "convention: as many as a histogram has")
+    most: int = gate(200_000, "observations", "that a lens is estimated from", "cost: more tell no more")
+    steps: int = gate(4, "steps", "with free distortion", "cost: the first brings most")
+
+
+LENS = LensGates()
+
+
+def unmodelled_distortion(problem: Problem, threads: int | None = None, gates: LensGates = LENS) -> str | None:
+    """Return a sentence on distortion that the cameras of an adjusted problem lack, and its remedy; None where none is.
+
+    Parameters
+    ----------
+    problem : Problem
+        At its minimum.
+    threads : int, optional
+        For the few steps of the second test.
+    gates : LensGates
+        What counts.
+    """
+    groups = {f.intrinsics.group: f.camera for f in problem.factors if isinstance(f, PointReprojection) and len(f)}
+    groups = {name: model for name, model in groups.items() if _may_lack(problem.variables[name], model)}
+    seen = [f for f in problem.factors if isinstance(f, PointReprojection) and f.intrinsics.group in groups]
+    if not any(radial_field(f, problem, gates) for f in seen):
+        return None
+    options = SolverOptions(max_iterations=gates.steps, threads=threads)
+    begun = _of_points(problem, gates.most)
+    if begun.num_residuals < problem.num_residuals:  # a part of the measurements finds another minimum
+        begun = solve(begun, options).problem
+    freed = solve(_with_free_lens(begun, groups), options).problem
+    before, after = (_median_px([f for f in p.factors if isinstance(f, PointReprojection)], p) for p in (begun, freed))
+    if not before > 0.0 or 1.0 - (after / before) ** 2 < gates.share:
+        return None
+    return _sentence(groups, begun, freed, before, after)
+
+
+def radial_field(factor: PointReprojection, problem: Problem, gates: LensGates = LENS) -> bool:
+    """Whether the residuals of points along the radius are not those of noise alone; see the formula above."""
+    model, residual = factor.camera, residuals_of(factor, problem.variables)
+    params = problem.variables[factor.intrinsics.group].state
+    center = (
+        params[:, list(model.principal_point_indices)] if model.principal_point_indices else np.zeros((len(params), 2))
+    )
+    away = factor.pixels - center[factor.intrinsics.index]
+    radius = np.sqrt(np.einsum("ni,ni->n", away, away))
+    along = np.einsum("ni,ni->n", residual, away) / np.maximum(radius, 1e-12)
+    square = np.einsum("ni,ni->n", residual, residual)
+    limit = chi_square_gate(gates.outlier, 2) * noise_of(square) ** 2
+    counts: BoolArray = (square < limit) & (square > 0.0)
+    if not counts.any():
+        return False
+    ring = _rings(factor.intrinsics.index[counts], radius[counts], len(params), gates.rings)
+    number, total = np.bincount(ring), np.bincount(ring, weights=along[counts])
+    used = number > 0
+    statistic = float(np.sum(total[used] ** 2 / number[used]) / np.mean(along[counts] ** 2))
+    return statistic > chi_square_gate(gates.false_alarm, int(used.sum()))
+
+
+def _rings(camera: IntArray, radius: FloatArray, cameras: int, rings: int) -> IntArray:
+    """Number of the ring of equal area of each observation, counted on from camera to camera."""
+    largest = np.zeros(cameras)
+    np.maximum.at(largest, camera, radius)
+    share = (radius / np.maximum(largest, 1e-12)[camera]) ** 2
+    return camera.astype(np.int64) * rings + np.minimum((share * rings).astype(np.int64), rings - 1)
+
+
+def _may_lack(group: Variables, model: CameraModel) -> bool:
+    """Whether a wider model would free something that is not free already."""
+    wider = WIDER.get(model.name)
+    free = group.free_coordinates()
+    return wider is not None and (wider != model.name or (free is not None and not free.any()))
+
+
+def _of_points(problem: Problem, most: int) -> Problem:
+    """Return the problem without what refers to lines, planes and directions, and with as many points as are enough."""
+    kinds = {name: group.manifold.kind for name, group in problem.variables.items()}
+    kept = [
+        factor for factor in problem.factors
+        if not any(kinds[ref.group] in ("line", "plane", "direction") for _, ref in factor.references())
+    ]  # fmt: skip
+    stride = -(-sum(map(len, kept)) // most)
+    if stride > 1:
+        for number, factor in enumerate(kept):
+            for _, ref in factor.references():
+                if kinds[ref.group] == "point":
+                    kept[number] = factor.take(np.flatnonzero(ref.index % stride == 0))
+    return Problem(problem.variables, kept)
+
+
+def _with_free_lens(problem: Problem, groups: dict[str, CameraModel]) -> Problem:
+    """Return the problem with cameras in a wider model, of which the distortion may move besides what moves already."""
+    variables = dict(problem.variables)
+    for name, model in groups.items():
+        wider, old = camera_model(WIDER[model.name]), problem.variables[name]
+        state = np.array([in_model(row, model, wider) for row in old.state])
+        free, constant = old.free_coordinates(), np.ones(state.shape, bool)
+        constant[:, list(wider.extra_indices)] = False
+        if free is None or free[:, list(model.focal_indices)].any():
+            constant[:, list(wider.focal_indices)] = False
+        variables[_wide(name)] = Variables(Euclidean(wider.num_parameters, "intrinsics"), state, constant)
+    return Problem(variables, [_in_wider_model(factor, groups) for factor in problem.factors])
+
+
+def _in_wider_model(factor: Factor, groups: dict[str, CameraModel]) -> Factor:
+    if not isinstance(factor, PointReprojection) or factor.intrinsics.group not in groups:
+        return factor
+    intrinsics = Ref(_wide(factor.intrinsics.group), factor.intrinsics.index)
+    return replace(factor, intrinsics=intrinsics, camera_model=camera_model(WIDER[factor.camera.name]))
+
+
+def _wide(group: str) -> str:
+    return f"{group}, free lens"
+
+
+def _median_px(factors: list[PointReprojection], problem: Problem) -> float:
+    squares = [np.einsum("ni,ni->n", r, r) for r in (residuals_of(f, problem.variables) for f in factors)]
+    return float(np.sqrt(np.median(np.concatenate(squares))))
+
+
+def _sentence(groups: dict[str, CameraModel], begun: Problem, freed: Problem, before: float, after: float) -> str:
+    names = ", ".join(sorted({model.name for model in groups.values()}))
+    wider = sorted({WIDER[model.name] for model in groups.values()} - {model.name for model in groups.values()})
+    remedy = f"--camera-model {wider[0]}" if wider else "--refine-intrinsics"
+    return (
+        f"The residuals show lens distortion that the cameras ({names}) do not have: with it the median residual of "
+        f"points would fall from {before:.2f} to {after:.2f} px. Repeat with {remedy}, or undistort the photographs."
+    )
+
+
+__all__ = ["LENS", "LensGates", "radial_field", "unmodelled_distortion"]

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""How a camera may have moved between two frames, and what later frames say of it.
+
+In come pixels of the same points. Two views of a plane allow two motions that explain them equally well, and an
+essential matrix of such points is either of them by chance. So all that the essential matrix and the homography allow
+are kept as candidates; each is adjusted with the points in all views so far, under a loss, and judged by its cost
+
+.. math:: c = \tfrac12 \sum \min(\|r\|^2 / \sigma^2,\, g^2),
+
+where a pixel that disagrees, and a point behind a camera, counts as an outlier at the gate g. The true noise of points
+that were followed is not known, and what one point errs in several views is much the same; so N points tell about two
+candidates
+
+.. math:: \tfrac{N}{2} \ln \frac{c_1}{c_2}
+
+nats, the ratio of their likelihoods at the noise that suits each best. A candidate is ruled out when another one is
+better by ``max_behind``.
+
+Reference: O. Faugeras, F. Lustman, *Motion and structure from motion in a piecewise planar environment*, 1988.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray
+from groma.adjustment.assemble import assemble
+from groma.factors.losses import Cauchy
+from groma.geometry import quaternion, se3
+from groma.scene import Cameras, PointObservations, Points, Scene
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
+from groma.tracking.frame.camera import PINHOLE, TrackCamera, into
+from groma.tracking.gates import StartGates
+from groma.tracking.map.map_scene import TRACKING
+
+_ASSEMBLY = replace(TRACKING, gauge="first_camera", loss=Cauchy(1.5))
+_SOLVER = SolverOptions(max_iterations=50, function_tolerance=1e-5, threads=1)
+#: Depth, in units of the usual one, beyond which a point tells little of a position.
+FAR = 50.0
+#: Cost of a point that no measurement undercuts: a hundredth of the standard deviation.
+SMALL = 1e-4
+IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A motion, and the points it gives."""
+
+    #: (V, 7) cam_from_world of the views; the first is at the origin.
+    poses: FloatArray
+    #: (N, 3) points.
+    places: FloatArray
+    #: Negative log-likelihood of the pixels.
+    cost: float = np.inf
+    #: (N,) which points agree with all views.
+    agrees: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+
+    def parallax(self) -> FloatArray:
+        """(N,) angle between the rays of the first and of the last view, radians."""
+        center = se3.inverse(self.poses[-1:])[0, 4:]
+        one, two = self.places, self.places - center
+        cosine = (one * two).sum(axis=1) / (np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1))
+        return np.arccos(np.clip(cosine, -1.0, 1.0))
+
+
+def motions(camera: TrackCamera, one: FloatArray, two: FloatArray, gates: StartGates) -> list[FloatArray]:
+    """Return the motions, cam_from_world (7,) with a translation of length one, that two views may show.
+
+    Parameters
+    ----------
+    camera
+        Of both views.
+    one, two : (N, 2) float64
+        Pixels of the same points, with outliers.
+    gates
+        How near points are to epipolar lines, and to where a homography takes them.
+    """
+    K, found = camera.matrix_opencv, []
+    first, second = one - 0.5, two - 0.5
+    E, mask = cv2.findEssentialMat(first, second, K, method=cv2.USAC_MAGSAC, prob=0.999, threshold=gates.max_error)
+    if E is not None and E.shape == (3, 3):
+        _, R, t, _ = cv2.recoverPose(E, first, second, K, mask=mask)
+        found.append((np.asarray(R), np.asarray(t)))
+    H, mask = cv2.findHomography(first, second, cv2.USAC_MAGSAC, gates.max_error)
+    if H is not None:
+        on_plane = camera.bearings(one[mask.ravel() > 0])
+        for R, t, normal in zip(*cv2.decomposeHomographyMat(H, K)[1:], strict=True):
+            if np.mean(on_plane @ np.asarray(normal).ravel() > 0.0) > 0.5 and np.linalg.norm(t) > 0.0:
+                found.append((np.asarray(R), np.asarray(t)))
+    return [
+        np.concatenate([quaternion.from_matrix(R.astype(np.float64)), t.ravel() / np.linalg.norm(t)]) for R, t in found
+    ]
+
+
+def intersected(camera: TrackCamera, one: FloatArray, two: FloatArray, pose: FloatArray) -> FloatArray:
+    """Points (N, 3) in front of the first camera, nearest to the rays of two views, at most far away."""
+    ray1, rotation = camera.bearings(one), quaternion.to_matrix(pose[:4])
+    ray2, center = camera.bearings(two) @ rotation, -rotation.T @ pose[4:]
+    a, b, c = (ray1 * ray1).sum(1), (ray1 * ray2).sum(1), (ray2 * ray2).sum(1)
+    inverse = (a * c - b * b) / np.where((d := c * (ray1 @ center) - b * (ray2 @ center)) != 0.0, d, 1e-300)
+    return ray1 / np.clip(inverse, 1e-3 / np.linalg.norm(center), None)[:, None]
+
+
+def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigma: float, gate: float) -> Candidate:
+    """Adjust a candidate to its views.
+
+    Parameters
+    ----------
+    camera, candidate
+        The camera, and where to begin.
+    pixels : (V, N, 2) float64
+        Pixels of the points in every view.
+    sigma : float
+        Their standard deviation, pixels.
+    gate : float
+        A pixel beyond so many standard deviations disagrees.
+    """
+    views, count = len(pixels), len(candidate.places)
+    image, point = np.repeat(np.arange(views), count), np.tile(np.arange(count), views)
+    cameras = Cameras(
+        np.array([1]), (PINHOLE,), camera.params[None], np.array([camera.width]), np.array([camera.height])
+    )
+    scene = Scene.from_images(
+        cameras,
+        [str(view) for view in range(views)],
+        np.zeros(views, int),
+        candidate.poses,
+        points=Points(np.arange(count) + 1, candidate.places, np.full((count, 3), 128, np.uint8), np.zeros(count)),
+        point_observations=PointObservations.numbered(image, point, pixels.reshape(-1, 2), np.full(len(image), sigma)),
+    )
+    solution = solve(assemble(scene, _ASSEMBLY).problem, _SOLVER)
+    poses, places = solution["frames"], solution["points"]
+    # The first camera is the world, and the usual depth the unit.
+    places = into(poses[0], places)
+    poses = se3.compose(poses, np.tile(se3.inverse(poses[:1]), (views, 1)))
+    scale = float(np.median(np.abs(places[:, 2])))
+    poses[:, 4:] /= scale
+    places = places / scale
+    squared = np.array([_squared(camera, p, places, seen) for p, seen in zip(poses, pixels, strict=True)]) / sigma**2
+    cost = 0.5 * float(np.minimum(squared, gate**2).sum())
+    return Candidate(poses, places, cost, np.asarray((squared < gate**2).all(axis=0)))
+
+
+def continued(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, max_error: float) -> Candidate:
+    """Return a candidate with the pose of one more view: from where it shows the candidate's points, or the last one.
+
+    Points too far away to tell a position are left out; their numbers would spoil a closed form.
+    """
+    near = candidate.agrees & (candidate.places[:, 2] < FAR)
+    poses = [candidate.poses[-1]]
+    if near.sum() >= 4:
+        places, seen, flags = candidate.places[near], pixels[near] - 0.5, cv2.SOLVEPNP_SQPNP
+        found, turn, shift, _ = cv2.solvePnPRansac(
+            places, seen, camera.matrix_opencv, np.zeros(0), reprojectionError=max_error, flags=flags
+        )
+        pose = (
+            np.concatenate([quaternion.exp(np.asarray(turn, np.float64).ravel()), np.ravel(shift)])
+            if found
+            else poses[0]
+        )
+        poses += [pose] if np.isfinite(pose).all() else []
+    costs = [np.minimum(_squared(camera, pose, candidate.places, pixels), max_error**2).sum() for pose in poses]
+    return replace(candidate, poses=np.concatenate([candidate.poses, poses[int(np.argmin(costs))][None]]))
+
+
+def _squared(camera: TrackCamera, pose: FloatArray, places: FloatArray, pixels: FloatArray) -> FloatArray:
+    """(N,) squared distances of points from their pixels; infinite behind the camera."""
+    away = camera.project(into(pose, places)) - pixels
+    return np.nan_to_num((away**2).sum(axis=-1), nan=np.inf)
+
+
+def likely(candidates: list[Candidate], max_behind: float) -> list[Candidate]:
+    """Return the candidates that are not ruled out, the best first, each motion once."""
+    kept: list[Candidate] = []
+    for candidate in sorted(candidates, key=lambda one: one.cost):
+        count = len(candidate.places)
+        if (
+            kept
+            and 0.5 * count * np.log((candidate.cost + SMALL * count) / (kept[0].cost + SMALL * count)) > max_behind
+        ):
+            break
+        if not any(_same(candidate.poses[-1], other.poses[-1]) for other in kept):
+            kept.append(candidate)
+    return kept
+
+
+def _same(one: FloatArray, two: FloatArray) -> bool:
+    """Whether two poses are one but for what an adjustment leaves."""
+    turn = 2.0 * np.arccos(min(1.0, abs(float(one[:4] @ two[:4]))))
+    return turn < 0.01 and bool(np.linalg.norm(one[4:] - two[4:]) < 0.1 * np.linalg.norm(one[4:]))
+
+
+__all__ = ["IDENTITY", "Candidate", "adjusted", "continued", "intersected", "likely", "motions"]
