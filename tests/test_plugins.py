@@ -84,7 +84,7 @@ from groma.geometry.charts import charts_of
 from groma.scene import Lines, Scene
 
 rng = np.random.default_rng(0)
-checks.check_camera(cameras.model("FOV"), np.array([300.0, 310.0, 320.0, 240.0, 0.9]), rng)
+checks.check_camera(cameras.model("EQUISOLID"), np.array([300.0, 320.0, 240.0]), rng, half_angle=2.5)
 checks.check_factor(factors.registered()["gravity"])
 checks.check_loss(factors.loss("welsch", 1.7))
 checks.check_manifold(charts_of("line")["centimetres"])
@@ -119,12 +119,12 @@ from groma.scene.synthetic.scenes import holistic
 load_plugins()
 # Points seen through a lens that groma does not have; the focal length starts 2 % off.
 truth = holistic(8, seed=0).truth
-model, params = cameras.model("FOV"), np.array([700.0, 700.0, 512.0, 384.0, 0.8])
+model, params = cameras.model("EQUISOLID"), np.array([700.0, 512.0, 384.0])
 seen = truth.point_observations
 points = se3.transform_points(truth.cam_from_world[seen.image_idx], truth.points.xyz[seen.point_idx])
 pixels = model.project(params, points)
 one = np.ones(1, int)
-lens = Cameras(one, ("FOV",), (params * [0.98, 0.98, 1.0, 1.0, 1.03])[None], 1024 * one, 768 * one)
+lens = Cameras(one, ("EQUISOLID",), (params * [0.98, 1.0, 1.0])[None], 1024 * one, 768 * one)
 scene = Scene.from_images(
     lens, list(truth.images.names), np.zeros(8, int), truth.cam_from_world,
     points=Points.at(truth.points.xyz + 0.01),
@@ -135,7 +135,7 @@ result = groma.adjust(scene, options)
 assert result.report.rmse_px["points"]["after"] < 1e-3, result.report.rmse_px
 np.testing.assert_allclose(result.scene.cameras.params_of(0), params, rtol=1e-4)
 groma.write_scene(result.scene, "lens.npz")
-assert groma.read_scene("lens.npz").cameras.models == ("FOV",)
+assert groma.read_scene("lens.npz").cameras.models == ("EQUISOLID",)
 
 # Down, as an accelerometer measures it, turns a pose upright and leaves its heading alone.
 from groma_plugin_example.gravity import Gravity

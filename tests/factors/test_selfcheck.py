@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from groma import cameras
 from groma.errors import InputError
 from groma.factors import contract as _factor
 from groma.factors import registered, selfcheck
@@ -27,7 +28,10 @@ def two_factors(monkeypatch):
 def test_covers_every_factor_and_block():
     report = selfcheck(seed=3)
     assert report.passed
-    assert {row.factor for row in report.rows} == set(registered())
+    lenses = {f"camera {model.name}" for model in cameras.models() if model.colmap_name}
+    assert {row.factor for row in report.rows} == {*registered(), *lenses}
+    assert len(lenses) == 18
+    assert all({row.block for row in report.rows if row.factor == name} == {"point", "parameters"} for name in lenses)
     for name, cls in registered().items():
         blocks = {row.block.split(" ")[0] for row in report.rows if row.factor == name}
         assert blocks == {slot.name for slot, _ in cls.example(np.random.default_rng(3)).factor.references()}

@@ -16,6 +16,7 @@ import pytest
 from _comparison import equal, near
 from _models import rig_scene
 
+from groma import cameras
 from groma.errors import FileFormatError, GromaError, InputError, OutputError
 from groma.geometry import quaternion, se3
 from groma.io import (
@@ -136,14 +137,44 @@ def test_images_without_pose_are_left_out():
     assert isinstance(model, pycolmap.Reconstruction)
 
 
-def test_unknown_camera_model_is_named():
+def test_unknown_camera_model_is_named(monkeypatch):
     import pycolmap
+
+    known = tuple(model for model in cameras.models() if model.name != "FOV")
+    monkeypatch.setattr("groma.cameras.models", lambda: known)
 
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "FOV", 500.0, 640, 480)
     model.add_camera_with_trivial_rig(camera)
     with pytest.raises(InputError, match="FOV"):
         from_pycolmap(model)
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_every_camera_model_of_colmap_goes_there_and_back(tmp_path, form):
+    """Models are numbered, named and filled as pycolmap does; parameters come back to the last digit."""
+    import pycolmap
+
+    rng = np.random.default_rng(0)
+    model = pycolmap.Reconstruction()
+    kinds = [kind for name, kind in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]
+    for number, kind in enumerate(kinds, 1):
+        camera = pycolmap.Camera.create_from_model_id(number, kind, 500.0, 640, 480)
+        camera.params = camera.params + rng.uniform(0.0, 0.1, len(camera.params))
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=f"{number}.png", camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    (tmp_path / "theirs").mkdir()
+    (model.write_binary if form == "binary" else model.write_text)(str(tmp_path / "theirs"))
+    scene = read_colmap(tmp_path / "theirs")
+    assert len(scene.cameras) == 18
+    write_colmap(scene, tmp_path / "ours", form)
+    back = pycolmap.Reconstruction(str(tmp_path / "ours"))
+    for number, kind in enumerate(kinds, 1):
+        assert back.cameras[number].model == kind
+        np.testing.assert_array_equal(back.cameras[number].params, model.cameras[number].params)
+        assert scene.cameras.models[number - 1] == kind.name
+        np.testing.assert_array_equal(scene.cameras.params_of(number - 1), model.cameras[number].params)
 
 
 def test_bal_cameras_go_to_colmap_and_back(tmp_path):

@@ -20,7 +20,7 @@ def quiet(*_):
 
 def straightener(extra, name="SIMPLE_RADIAL"):
     model = cameras.model(name)
-    focal = [300.0, 300.0] if name in ("OPENCV", "OPENCV_FISHEYE") else [300.0]
+    focal = [300.0] * len(model.focal_indices)
     params = np.array([*focal, 160.0, 120.0, *extra])
     return Straightener.of(model, params, 320, 240), model, params
 
@@ -32,7 +32,19 @@ def test_a_lens_that_bends_nothing_is_left_alone():
 
 
 @pytest.mark.parametrize(
-    ("name", "extra"), [("SIMPLE_RADIAL", [-0.3]), ("SIMPLE_RADIAL", [0.2]), ("OPENCV_FISHEYE", [0.1, 0.02, 0.0, 0.0])]
+    ("name", "extra"),
+    [
+        ("SIMPLE_RADIAL", [-0.3]),
+        ("SIMPLE_RADIAL", [0.2]),
+        ("OPENCV_FISHEYE", [0.1, 0.02, 0.0, 0.0]),
+        ("SIMPLE_FISHEYE", []),
+        ("RADIAL_FISHEYE", [0.05, -0.01]),
+        ("THIN_PRISM_FISHEYE", [0.05, -0.01, 0.001, -0.002, 0.0, 0.0, 0.003, -0.001]),
+        ("FOV", [0.9]),
+        ("SIMPLE_DIVISION", [-0.3]),
+        ("DIVISION", [0.2]),
+        ("EUCM", [0.6, 1.1]),
+    ],
 )
 def test_end_points_come_back_to_the_image(name, extra):
     made, model, params = straightener(extra, name)

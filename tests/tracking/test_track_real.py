@@ -78,7 +78,7 @@ def test_a_flight_in_uneven_steps(shared_data):
     """Pairs 0.05 to 7.3 s apart: steps of up to 1.2 m and 59 degrees, past a radiator whose bars repeat."""
     statuses, result, scores = _track(shared_data / "stereo_euroc_v101_keyframes", max_frames=30)
     assert set(statuses) == {"tracked"}
-    assert result.parts == ()
+    assert result.submaps == ()
     assert scores.ate.rmse < 0.03
 
 

@@ -177,9 +177,12 @@ def _camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Varia
         model = camera_model(name)
         state = scene.cameras.params[members, : model.num_parameters]
         constant: bool | BoolArray = not options.refine_intrinsics
-        if options.refine_intrinsics and model.principal_point_indices and not options.refine_principal_point:
+        known = [*model.known_indices]
+        if not options.refine_principal_point:
+            known += model.principal_point_indices
+        if options.refine_intrinsics and known:
             constant = np.zeros(state.shape, dtype=bool)
-            constant[:, list(model.principal_point_indices)] = True
+            constant[:, known] = True
         variables[f"intrinsics/{name}"] = Variables(Euclidean(model.num_parameters, "intrinsics"), state, constant)
     return variables
 

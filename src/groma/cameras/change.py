@@ -32,7 +32,7 @@ def in_model(params: FloatArray, old: CameraModel, new: CameraModel, size: Float
     """
     values = {_word(name): value for name, value in zip(old.parameter_names, params, strict=True)}
     found = np.array([values.get(_word(name), 0.0) for name in new.parameter_names])
-    focals = params[list(old.focal_indices)]
+    focals = params[list(old.focal_indices)] if old.focal_indices else np.ones(1)
     found[list(new.focal_indices)] = focals if len(new.focal_indices) == len(focals) else focals.mean()
     center = params[list(old.principal_point_indices)] if old.principal_point_indices else np.zeros(2)
     if new.principal_point_indices:

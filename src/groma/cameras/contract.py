@@ -23,6 +23,7 @@ from groma.cameras.dispatch import (
     project,
     project_jacobian,
     unproject,
+    wrap,
 )
 from groma.errors import InputError, ShapeError
 from groma.geometry.algebra import as_rows
@@ -57,6 +58,13 @@ def _unproject_all(model_tag, params, pixels, bearings):
 
 
 @loop
+def _wrap_all(model_tag, params, differences):
+    stride = 1 if params.shape[0] > 1 else 0
+    for i in range(differences.shape[0]):
+        wrap(model_tag, params[i * stride], differences[i])
+
+
+@loop
 def _pinhole_parameters_all(model_tag, params, K):
     for i in range(params.shape[0]):
         pinhole_parameters(model_tag, params[i], K[i])
@@ -76,15 +84,16 @@ class CameraModel:
     name: str
     #: Names of the k parameters, in order.
     parameter_names: tuple[str, ...]
-    #: Which parameters are focal lengths in pixels: one, or two (x, y).
+    #: Which parameters are focal lengths in pixels: one, or two (x, y); none in a panorama.
     focal_indices: tuple[int, ...]
     #: Which parameters are the principal point in pixels: two (x, y), or none where it is fixed at (0, 0).
     principal_point_indices: tuple[int, ...]
-    #: Which parameters are distortion coefficients.
+    #: Which parameters are distortion coefficients. Parameters of no kind, such as the size of a panorama, are known.
     extra_indices: tuple[int, ...]
     #: COLMAP's name of the same model, or None.
     colmap_name: str | None = None
-    #: Whether points at and behind the image plane have an image of their own (fisheye), so that z > 0 is no test.
+    #: Whether points at and behind the image plane may have an image of their own (fisheyes, panoramas), so that z > 0
+    #: is no test: what the model projects is seen.
     sees_behind: bool = False
     #: Given by :func:`register_camera`, which sets it; it selects the kernels when loops are compiled.
     number: int = -1
@@ -103,6 +112,17 @@ class CameraModel:
                 "groma.cameras.register_camera returns."
             )
         return (0,) * (self.number + 1)
+
+    @property
+    def known_indices(self) -> tuple[int, ...]:
+        """Which parameters are known and never estimated: those of no kind, the width and height of a panorama."""
+        estimated = {*self.focal_indices, *self.principal_point_indices, *self.extra_indices}
+        return tuple(j for j in range(self.num_parameters) if j not in estimated)
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether the view can be shown in a plane, at least around its axis: all models but panoramas."""
+        return bool(self.focal_indices)
 
     @property
     def has_pinhole_parameters(self) -> bool:
@@ -205,13 +225,38 @@ class CameraModel:
                 f"Use the bearing factor for lines under distortion, or undistort the segments first."
             )
 
+    def pixel_difference(self, params: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+        """Return ``first - second`` (N, 2), in a panorama the short way round; arguments as in :meth:`unproject`."""
+        difference = as_rows(first, (2,), "first") - as_rows(second, (2,), "second")
+        _wrap_all(self.tag, self.check_parameters(params, len(difference)), difference)
+        return difference
+
     def focal_length(self, params: FloatArray) -> FloatArray:
-        """Mean focal length in pixels, shape () or (N,) for ``params`` (k,) or (N, k)."""
-        return self._as_params(params)[..., list(self.focal_indices)].mean(axis=-1)
+        """Mean focal length in pixels, shape () or (N,) for ``params`` (k,) or (N, k).
+
+        Of a panorama, the pixels of a radian around its axis, where it looks like a camera of that focal length.
+        """
+        params = self._as_params(params)
+        if self.is_planar:
+            return params[..., list(self.focal_indices)].mean(axis=-1)
+        rows = self.check_parameters(params)
+        _, by_point, _ = self.project_jacobian(rows, np.tile([0.0, 0.0, 1.0], (len(rows), 1)))
+        return (0.5 * (by_point[:, 0, 0] + by_point[:, 1, 1])).reshape(params.shape[:-1])
 
     def camera_matrix(self, params: FloatArray) -> FloatArray:
-        r"""Return :math:`K = [f_x, 0, c_x;\ 0, f_y, c_y;\ 0, 0, 1]`, shape (3, 3) or (N, 3, 3), distortion left out."""
+        r"""Return :math:`K = [f_x, 0, c_x;\ 0, f_y, c_y;\ 0, 0, 1]`, shape (3, 3) or (N, 3, 3), distortion left out.
+
+        Raises
+        ------
+        InputError
+            If the model is a panorama, which no plane can hold.
+        """
         params = self._as_params(params)
+        if not self.is_planar:
+            raise InputError(
+                f"A camera matrix needs a focal length; {self.name} has none, no plane holds its view. "
+                "Work with bearings (unproject), or cut the panoramas into perspective views."
+            )
         K = np.zeros((*params.shape[:-1], 3, 3))
         K[..., 0, 0] = params[..., self.focal_indices[0]]
         K[..., 1, 1] = params[..., self.focal_indices[-1]]
@@ -329,4 +374,5 @@ __all__ = [
     "project",
     "project_jacobian",
     "unproject",
+    "wrap",
 ]

@@ -13,10 +13,13 @@ pointer, and Numba's disk cache works. Without the compiler the same names are p
         for i in range(points.shape[0]):
             project(model_tag, params[i], points[i], pixels[i])
 
-The kernels return False, and write zeros, where the model has no value.
+The kernels return False, and write zeros, where the model has no value. Residuals in pixels are passed through
+:func:`wrap`, which does nothing but in panoramas whose left and right border are the same place.
 
 **Cheirality.** Perspective models evaluate their formula as written for z < 0 too and refuse only
 :math:`|z| \le 10^{-12} (|x| + |y| + |z|)`. Whether a point behind the camera may take part is the caller's decision.
+Models that see behind the image plane (:attr:`groma.cameras.CameraModel.sees_behind`) decide themselves: what they
+project is seen.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ from collections.abc import Callable
 
 from numba.extending import overload
 
+from groma._numba import kernel
 from groma._numba_digest import ByLength
 
 # --------------------------------------------------------------------------------------------------------- Kernels
@@ -36,6 +40,7 @@ _PROJECT_JACOBIAN: ByLength[Callable[..., bool]] = ByLength()
 _UNPROJECT: ByLength[Callable[..., bool]] = ByLength()
 _PINHOLE: ByLength[Callable[..., None]] = ByLength()
 _PINHOLE_JACOBIAN: ByLength[Callable[..., None]] = ByLength()
+_WRAP: ByLength[Callable[..., None]] = ByLength()
 
 
 def project(model_tag, params, X, uv):
@@ -61,6 +66,11 @@ def pinhole_parameters(model_tag, params, K):
 def pinhole_parameters_jacobian(model_tag, params, J):
     """Write ``J`` (4, k), the derivative of fx, fy, cx, cy by the parameters of a model without distortion."""
     _PINHOLE_JACOBIAN[len(model_tag)](params, J)
+
+
+def wrap(model_tag, params, difference):
+    """Take a ``difference`` (2,) of two pixels the short way, where borders of the image are the same place."""
+    _WRAP[len(model_tag)](params, difference)
 
 
 @overload(project)
@@ -93,6 +103,17 @@ def _pinhole_parameters_jacobian(model_tag, params, J):
     return lambda model_tag, params, J: kernel(params, J)
 
 
+@overload(wrap)
+def _wrap(model_tag, params, difference):
+    kernel = _WRAP[model_tag.count]
+    return lambda model_tag, params, difference: kernel(params, difference)
+
+
+@kernel
+def _leave(params, difference):
+    """Wrap nothing: every border of the image is a place of its own."""
+
+
 # ---------------------------------------------------------------------------------------------------------- Public
 
 
@@ -103,8 +124,10 @@ def set_kernels(
     unproject: Callable[..., bool],
     pinhole_parameters: Callable[..., None] | None = None,
     pinhole_parameters_jacobian: Callable[..., None] | None = None,
+    wrap: Callable[..., None] | None = None,
 ) -> None:
     """Say which kernels a tag of ``length`` selects."""
+    _WRAP[length] = _leave if wrap is None else wrap
     _PROJECT[length], _PROJECT_JACOBIAN[length], _UNPROJECT[length] = project, project_jacobian, unproject
     if pinhole_parameters is not None and pinhole_parameters_jacobian is not None:
         _PINHOLE[length], _PINHOLE_JACOBIAN[length] = pinhole_parameters, pinhole_parameters_jacobian
@@ -129,4 +152,5 @@ __all__ = [
     "project_jacobian",
     "set_kernels",
     "unproject",
+    "wrap",
 ]

@@ -8,7 +8,8 @@ r"""Equidistant fisheye with polynomial distortion: OPENCV_FISHEYE (fx, fy, cx, 
 .. math:: (u, v) = (f_x\,\theta_d\,x/r + c_x,\ f_y\,\theta_d\,y/r + c_y)
 
 Defined for every direction, those behind the image plane included, except straight backwards (r = 0, z < 0), where the
-image of one direction is a whole circle. Names and parameter order are COLMAP's.
+image of one direction is a whole circle. Names and parameter order are COLMAP's. Models with fewer parameters
+(:mod:`groma.cameras.simple_fisheye`) call the kernels below with a tuple of the eight.
 
 **Derivative.** With :math:`h = \theta_d / r` and :math:`\rho^2 = r^2 + z^2`,
 
@@ -40,7 +41,7 @@ WALK_STEPS = 128
 
 
 @kernel
-def _has_image(X):
+def has_fisheye_image(X):
     """Whether the point is of representable size and not straight behind."""
     r = abs(X[0]) + abs(X[1])
     norm = r + abs(X[2])
@@ -62,7 +63,7 @@ def _distorted_angle_slope(params, theta):
 @kernel
 def opencv_fisheye_project(params, X, uv):
     """Project with (fx, fy, cx, cy, k1, k2, k3, k4)."""
-    if not _has_image(X):
+    if not has_fisheye_image(X):
         uv[:] = 0.0
         return False
     r = math.sqrt(X[0] * X[0] + X[1] * X[1])
@@ -72,11 +73,11 @@ def opencv_fisheye_project(params, X, uv):
 
 
 @kernel
-def opencv_fisheye_project_jacobian(params, X, uv, J_point, J_params):
-    """Project with (fx, fy, cx, cy, k1, k2, k3, k4) and differentiate."""
-    clear(uv, J_point, J_params)
-    if not _has_image(X):
-        return False
+def fisheye_point_jacobian(params, X, uv, J_point):
+    """Write pixel and point derivative; return h, theta^3 / r and theta^2, from which those by the parameters follow.
+
+    The point must have an image.
+    """
     fx, fy, x, y, z = params[0], params[1], X[0], X[1], X[2]
     squared = x * x + y * y
     r = math.sqrt(squared)
@@ -94,10 +95,20 @@ def opencv_fisheye_project_jacobian(params, X, uv, J_point, J_params):
     uv[0], uv[1] = fx * h * x + params[2], fy * h * y + params[3]
     J_point[0, 0], J_point[0, 1], J_point[0, 2] = fx * (h + gradient * x * x), fx * gradient * x * y, -fx * slope * x
     J_point[1, 0], J_point[1, 1], J_point[1, 2] = fy * gradient * x * y, fy * (h + gradient * y * y), -fy * slope * y
-    J_params[0, 0], J_params[0, 2] = h * x, 1.0
-    J_params[1, 1], J_params[1, 3] = h * y, 1.0
+    return h, power, square
+
+
+@kernel
+def opencv_fisheye_project_jacobian(params, X, uv, J_point, J_params):
+    """Project with (fx, fy, cx, cy, k1, k2, k3, k4) and differentiate."""
+    clear(uv, J_point, J_params)
+    if not has_fisheye_image(X):
+        return False
+    h, power, square = fisheye_point_jacobian(params, X, uv, J_point)
+    J_params[0, 0], J_params[0, 2] = h * X[0], 1.0
+    J_params[1, 1], J_params[1, 3] = h * X[1], 1.0
     for j in range(4, 8):
-        J_params[0, j], J_params[1, j] = fx * x * power, fy * y * power
+        J_params[0, j], J_params[1, j] = params[0] * X[0] * power, params[1] * X[1] * power
         power *= square
     return True
 

@@ -23,6 +23,7 @@ def register_camera(
     unproject: Callable[..., bool],
     pinhole_parameters: Callable[..., None] | None = None,
     pinhole_parameters_jacobian: Callable[..., None] | None = None,
+    wrap: Callable[..., None] | None = None,
 ) -> CameraModel:
     """Make a camera model known by name, and its kernels to compiled loops.
 
@@ -35,6 +36,8 @@ def register_camera(
         the tag.
     pinhole_parameters, pinhole_parameters_jacobian : callable, optional
         For models without distortion only.
+    wrap : callable, optional
+        For panoramas, of which opposite borders are the same place.
 
     Returns
     -------
@@ -53,7 +56,7 @@ def register_camera(
             "Choose another name."
         )
     camera = _MODELS[camera.name] = replace(camera, number=next(_NUMBERS))
-    kernels = project, project_jacobian, unproject, pinhole_parameters, pinhole_parameters_jacobian
+    kernels = project, project_jacobian, unproject, pinhole_parameters, pinhole_parameters_jacobian, wrap
     set_kernels(camera.number + 1, *kernels)
     return camera
 

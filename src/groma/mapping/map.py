@@ -42,7 +42,14 @@ from groma.mapping.image_segments import detect_segments, given_segments
 from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider, explain, map_lines
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
-from groma.mapping.photographs import check_images, check_number, image_files, image_reader, images_left_out
+from groma.mapping.photographs import (
+    check_cameras,
+    check_images,
+    check_number,
+    image_files,
+    image_reader,
+    images_left_out,
+)
 from groma.mapping.refine_points import PointRefinementOptions, refine_points
 from groma.mapping.result import MapResult
 from groma.mapping.structure.find import StructureOptions, find_structure
@@ -173,6 +180,7 @@ def map_images(
     if model is not None and near is not None:
         model = model.transformed(near)
     check_number(folder, names, model, options.lines.min_images)
+    check_cameras((options.camera_model,) if model is None else model.cameras.models)
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
     with work_with(options.threads), Stages(Path(work), key, options, say) as stages:

@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 
 from groma.bounded.images import decoded
+from groma.cameras import model as camera_model
 from groma.errors import FileFormatError, GromaError, InputError
 from groma.execution import map_work
 from groma.features.images import GrayImage, to_gray
@@ -126,6 +127,17 @@ def check_number(folder: Path, names: Sequence[str], model: Scene | None, min_im
     check_names(folder, names, model)
 
 
+def check_cameras(models: Sequence[str]) -> None:
+    """Check that a plane can hold the view of every camera, as segments are found in such images."""
+    for name in models:
+        if not camera_model(name).is_planar:
+            raise InputError(
+                f"groma map finds lines in images that are flat, and {name} images are panoramas. Cut each into "
+                "perspective views that are held in a rig (as COLMAP's panorama_sfm.py does) and map those; groma "
+                "adjust takes panoramas as they are, with lines."
+            )
+
+
 def images_left_out(names: Sequence[str], used: Sequence[str], model_given: bool) -> list[str]:
     """Say which images of the folder have no pose, in at most one sentence."""
     left = sorted(set(names) - set(used))
@@ -194,4 +206,13 @@ def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
     return {name: of_camera[camera] for name, camera in zip(model.images.names, model.images.camera_idx, strict=True)}
 
 
-__all__ = ["check_images", "check_names", "check_number", "image_files", "image_reader", "images_left_out", "read_gray"]
+__all__ = [
+    "check_cameras",
+    "check_images",
+    "check_names",
+    "check_number",
+    "image_files",
+    "image_reader",
+    "images_left_out",
+    "read_gray",
+]

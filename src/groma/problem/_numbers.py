@@ -20,7 +20,7 @@ from groma.problem.variables import Variables
 
 
 def refuse_unusable_numbers(factor: Factor, variables: Mapping[str, Variables]) -> None:
-    """Raise ProblemError if a measurement or its noise is not finite, or a focal length is not positive."""
+    """Raise ProblemError if a measurement or its noise is not finite, or a focal length or size not positive."""
     for field in dataclasses.fields(factor):
         value = getattr(factor, field.name)
         if isinstance(value, np.ndarray | float) and np.asarray(value).dtype.kind == "f":
@@ -50,15 +50,16 @@ def _refuse_focal_lengths(factor: Factor, slot: str, group: str, parameters: Flo
     model = getattr(factor, "camera_model", None)
     if not isinstance(model, CameraModel):
         return
-    focals = parameters[:, list(model.focal_indices)]
+    focals = parameters[:, [*model.focal_indices, *model.known_indices]]
     if (focals > 0.0).all():
         return
     bad = int(np.argwhere(~(focals > 0.0))[0, 0])
     row = int(np.argmax({s.name: r for s, r in factor.references()}[slot].index == bad))
+    what, whole = ("focal lengths", "focal length") if model.is_planar else ("width and height", "size")
     raise ProblemError(
-        f"Slot {slot!r} of factor {factor.type_name!r} needs positive focal lengths; those of variable {bad} of group "
+        f"Slot {slot!r} of factor {factor.type_name!r} needs positive {what}; those of variable {bad} of group "
         f"{group!r} ({model.name}) are {focals[bad].tolist()} (factor {row}). "
-        "Give the camera its focal length in pixels."
+        f"Give the camera its {whole} in pixels."
     )
 
 

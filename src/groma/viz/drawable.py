@@ -145,9 +145,10 @@ def _point_residuals(scene: Scene, poses: FloatArray) -> FloatArray:
     in_cam = _transform(poses[seen.image_idx], scene.points.xyz[seen.point_idx])
 
     def residual(model: CameraModel, params: FloatArray, rows: IntArray) -> FloatArray:
-        predicted = model.project(params, in_cam[rows]) - seen.pixel[rows]
-        predicted[in_cam[rows, 2] <= 0] = np.nan
-        return predicted
+        residual = model.pixel_difference(params, model.project(params, in_cam[rows]), seen.pixel[rows])
+        if not model.sees_behind:
+            residual[in_cam[rows, 2] <= 0] = np.nan
+        return residual
 
     return _by_camera(scene, seen.image_idx, residual)
 
@@ -170,7 +171,7 @@ def _line_residuals(scene: Scene, poses: FloatArray) -> tuple[FloatArray, FloatA
         predicted = model.project(params, onto)
         tangent = model.project(params, onto + _STEP * np.cross(across, onto)) - predicted
         tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
-        way = predicted - places[rows]
+        way = model.pixel_difference(params, predicted, places[rows])
         return way - np.einsum("ni,ni->n", way, tangent)[:, None] * tangent
 
     return _by_camera(scene, np.repeat(seen.image_idx, 2), residual), places

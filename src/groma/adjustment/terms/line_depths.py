@@ -38,10 +38,12 @@ def _of_baseline(draft: Draft, name: str, rows: IntArray, intrinsics: Ref, basel
     table, seen = draft.scene.line_depths, draft.scene.line_observations
     of = table.observation_idx[rows]
     image, ends = seen.image_idx[of], seen.segment[of]
-    params, focals = draft.params(name, image), list(camera_model(name).focal_indices)
+    params, model = draft.params(name, image), camera_model(name)
     way = np.abs(ends[:, 2:] - ends[:, :2])
     flat: BoolArray = np.asarray(way[:, 0] > way[:, 1])  # displaced along y, else along x
-    focal = np.where(flat, params[:, focals[-1]], params[:, focals[0]])
+    focal = model.focal_length(params)
+    if model.is_planar:
+        focal = np.where(flat, params[:, model.focal_indices[-1]], params[:, model.focal_indices[0]])
     noise = focal[:, None] * baseline * table.sigma[rows]
     noise = np.sqrt(noise**2 + line_sigma_px(draft)[of, None] ** 2)
     common = {
@@ -51,7 +53,7 @@ def _of_baseline(draft: Draft, name: str, rows: IntArray, intrinsics: Ref, basel
         "loss": draft.options.loss,
     }
     shift, axis = baseline * table.inverse_depth[rows], np.where(flat, 1, 0)
-    if camera_model(name).has_pinhole_parameters:
+    if model.has_pinhole_parameters:
         shift = focal[:, None] * baseline * table.inverse_depth[rows]
         every, ends = np.arange(len(rows)), ends.copy()
         ends[every, axis] -= shift[:, 0]
@@ -59,7 +61,6 @@ def _of_baseline(draft: Draft, name: str, rows: IntArray, intrinsics: Ref, basel
         return LineReprojection(
             intrinsics=intrinsics, camera_model=name, segments=ends, sqrt_information=_diagonal(1.0 / noise), **common
         )
-    model = camera_model(name)
     bearings = [_shifted(model.unproject(params, ends[:, k : k + 2]), axis, shift[:, k // 2]) for k in (0, 2)]
     return LineBearing(
         start_bearings=bearings[0],

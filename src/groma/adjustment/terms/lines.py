@@ -94,23 +94,25 @@ def _rays(draft: Draft, name: str, rows: IntArray) -> _Rays:
     first, second = _nearer(first[good], second[good], reach)
     if reach != 1.0:
         first, second = unit(first), unit(second)
-    pixels = params[good][:, list(model.focal_indices)].mean(axis=1)
-    if draft.options.line_residual != "endpoints":
-        pixels = _pixels_across(model, params[good], first, second, table.segment[rows[good]])
+    pixels = model.focal_length(params[good])
+    if draft.options.line_residual != "endpoints" or model.sees_behind:
+        pixels = _pixels_across(model, params[good], first, second)
     return _Rays(rows[good], first, second, pixels)
 
 
-def _pixels_across(
-    model: CameraModel, params: FloatArray, first: FloatArray, second: FloatArray, segment: FloatArray
-) -> FloatArray:
-    """How many pixels the ends of a segment move across it (n, 2) as their rays leave its plane, per radian."""
+def _pixels_across(model: CameraModel, params: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """How many pixels the ends of a segment move across it (n, 2) as their rays leave its plane, per radian.
+
+    Across the image of the line there: under distortion it is a curve.
+    """
     normal = unit(np.cross(first, second))
-    along = unit(segment[:, 2:] - segment[:, :2])
-    moved = [
-        np.einsum("nij,nj->ni", model.project_jacobian(params, np.ascontiguousarray(ray))[1], normal)
-        for ray in (first, second)
-    ]
-    return np.stack([np.abs(along[:, 0] * m[:, 1] - along[:, 1] * m[:, 0]) for m in moved], axis=1)
+    across = []
+    for ray in (first, second):
+        by_ray = model.project_jacobian(params, np.ascontiguousarray(ray))[1]
+        moved = np.einsum("nij,nj->ni", by_ray, normal)
+        along = unit(np.einsum("nij,nj->ni", by_ray, np.cross(normal, ray)))
+        across.append(np.abs(along[:, 0] * moved[:, 1] - along[:, 1] * moved[:, 0]))
+    return np.stack(across, axis=1)
 
 
 def _sines(draft: Draft, rays: _Rays, sigma: FloatArray) -> Group:

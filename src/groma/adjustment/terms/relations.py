@@ -62,7 +62,7 @@ def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
         )  # fmt: skip
     focal_of = np.array(
         [
-            scene.cameras.params_of(c)[list(camera_model(name).focal_indices)].mean()
+            float(camera_model(name).focal_length(scene.cameras.params_of(c)))
             for c, name in enumerate(scene.cameras.models)
         ]
     )

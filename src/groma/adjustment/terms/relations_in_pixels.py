@@ -87,6 +87,8 @@ def _points_on_lines(draft: Draft) -> Iterator[Group]:
     of, point = _join(lines.line_idx, pairs[:, ::-1], scene.num_lines)
     image_lines = segment2.to_line(lines.segment[of])
     for name, rows, intrinsics in draft.by_model(lines.image_idx[of]):
+        if not camera_model(name).is_planar:  # the chord of a curve is no image of the line, not even nearly
+            continue
         yield Group(
             PointToImageLine(
                 point=Ref("points", point[rows]),

@@ -57,10 +57,10 @@ def _check_derivatives(console: "Console", golden: Path | None, seed: int) -> tu
     from groma.factors import selfcheck as run_selfcheck
 
     outcome = run_selfcheck(golden, seed)
-    console.say(f"{'factor':<28}{'block':<34}{'against':<12}{'cases':>6}{'worst / allowed':>18}")
+    console.say(f"{'factor':<36}{'block':<34}{'against':<12}{'cases':>6}{'worst / allowed':>18}")
     for row in outcome.rows:
         mark = "" if row.passed else "   FAILED"
-        console.say(f"{row.factor:<28}{row.block:<34}{row.against:<12}{row.cases:>6}{row.worst:>18.2e}{mark}")
+        console.say(f"{row.factor:<36}{row.block:<34}{row.against:<12}{row.cases:>6}{row.worst:>18.2e}{mark}")
     failures = sum(not row.passed for row in outcome.rows)
     console.say(f"{counted(len(outcome.rows), 'comparisons')}, {failures:,} failed.")
     return outcome.passed, outcome.to_dict()

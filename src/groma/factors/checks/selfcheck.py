@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from groma.cameras import models
+from groma.cameras.check import derivative_errors
 from groma.errors import InputError
 from groma.factors.checks.check import compare_jacobians
 from groma.factors.contract import registered
@@ -19,13 +21,13 @@ from groma.factors.contract import registered
 class SelfCheckRow:
     """One comparison."""
 
-    #: Registered name of the factor, or of the reference file.
+    #: Registered name of the factor, of the reference file, or ``camera`` and the name of a camera model.
     factor: str
     #: Jacobian block, with the chart in brackets where there are several.
     block: str
     #: ``differences`` or ``golden``.
     against: str
-    #: Factors compared.
+    #: Factors, or points of a camera, compared.
     cases: int
     #: Largest deviation divided by the allowed one.
     worst: float
@@ -54,7 +56,9 @@ class SelfCheckReport:
 
 
 def selfcheck(golden: Path | None = None, seed: int = 0) -> SelfCheckReport:
-    """Compare the Jacobians of every registered factor with differences, and with reference values if given.
+    """Compare the Jacobians of every registered factor and of COLMAP's camera models with differences.
+
+    Those of factors also with reference values, if given.
 
     Parameters
     ----------
@@ -77,6 +81,10 @@ def selfcheck(golden: Path | None = None, seed: int = 0) -> SelfCheckReport:
             block = f"{check.block} ({check.chart})"
             ratio = check.deviation / check.tolerance
             rows.append(SelfCheckRow(name, block, "differences", check.cases, ratio, check.passed))
+    for model in models():
+        if model.colmap_name is not None:
+            for block, ratio in derivative_errors(model, np.random.default_rng(seed)).items():
+                rows.append(SelfCheckRow(f"camera {model.name}", block, "differences", 50, ratio, ratio <= 1.0))
     if golden is not None:
         if not Path(golden).is_dir():
             raise InputError(

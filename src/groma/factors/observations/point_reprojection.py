@@ -26,7 +26,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.cameras.dispatch import project, project_jacobian
+from groma.cameras.dispatch import project, project_jacobian, wrap
 from groma.factors._examples import indices
 from groma.factors._pixels import PixelFactor, load_row, pixel_example, put_parameters
 from groma.factors._rig import EXTRINSICS, POSE, clear_record, put_point, put_point_pose, transform_point
@@ -35,10 +35,11 @@ from groma.factors.contract import Example, Ref, Slot, register
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel
-def _difference(uv, pixels, i):
-    """Subtract the measured pixel from ``uv``; False if the result is not a number, or infinite."""
+def _difference(model_tag, params, uv, pixels, i):
+    """Subtract the measured pixel from ``uv``, the short way in a panorama; False if the result is not finite."""
     uv[0] -= pixels[i, 0]
     uv[1] -= pixels[i, 1]
+    wrap(model_tag, params, uv)
     return abs(uv[0]) + abs(uv[1]) < math.inf
 
 
@@ -52,7 +53,11 @@ def _residual_all(
     for i in range(begin, end):
         camera = load_row(intrinsics, intrinsics_index[i], camera, params)
         transform_point(poses, pose_index[i], points, point_index[i], P)
-        if P[2] > smallest_depth and project(model_tag, params, P, uv) and _difference(uv, pixels, i):
+        if (
+            P[2] > smallest_depth
+            and project(model_tag, params, P, uv)
+            and _difference(model_tag, params, uv, pixels, i)
+        ):
             out[i - begin, 0], out[i - begin, 1] = uv[0], uv[1]
         else:
             out[i - begin, 0], out[i - begin, 1] = 0.0, 0.0
@@ -75,7 +80,7 @@ def _linearize_all(
         if (
             P[2] > smallest_depth
             and project_jacobian(model_tag, params, P, uv, A, J_params)
-            and _difference(uv, pixels, i)
+            and _difference(model_tag, params, uv, pixels, i)
         ):
             record[k, 0, last], record[k, 1, last] = uv[0], uv[1]
             if pose_column >= 0:
@@ -108,7 +113,7 @@ class PointReprojection(PixelFactor):
     #: (N, 2) measured pixels.
     pixels: FloatArray
     #: Leave out points with z <= 0 in a perspective camera. False evaluates the formula there as it is written, which
-    #: is the habit of most bundle adjusters. Fisheye models see behind themselves and are not concerned.
+    #: is the habit of most bundle adjusters. Models that see behind themselves are not concerned.
     require_in_front: bool = True
 
     slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), Slot("intrinsics", "intrinsics"), EXTRINSICS)

@@ -38,7 +38,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.cameras.dispatch import project_jacobian
+from groma.cameras.dispatch import project_jacobian, wrap
 from groma.factors._examples import indices
 from groma.factors._pixels import PixelFactor, load_row, pixel_example
 from groma.factors._record import set_rows
@@ -65,6 +65,15 @@ def _into_camera(poses, p, c, P):
     P[0] = poses[p, 0] * c[0] + poses[p, 1] * c[1] + poses[p, 2] * c[2] + poses[p, 3]
     P[1] = poses[p, 4] * c[0] + poses[p, 5] * c[1] + poses[p, 6] * c[2] + poses[p, 7]
     P[2] = poses[p, 8] * c[0] + poses[p, 9] * c[1] + poses[p, 10] * c[2] + poses[p, 11]
+
+
+@kernel
+def _difference(model_tag, params, uv, other):
+    """Subtract a pixel from ``uv``, the short way in a panorama; False if the result is not finite."""
+    uv[0] -= other[0]
+    uv[1] -= other[1]
+    wrap(model_tag, params, uv)
+    return abs(uv[0]) + abs(uv[1]) < math.inf
 
 
 @kernel
@@ -167,12 +176,12 @@ def _linearize_all(
                     and Q[2] > smallest_depth
                     and project_jacobian(model_tag, params, P, uv_P, A, J_P)
                     and project_jacobian(model_tag, params, Q, uv_Q, B, J_Q)
-                    and abs(uv_P[0] - uv_Q[0]) + abs(uv_P[1] - uv_Q[1]) < math.inf
+                    and _difference(model_tag, params, uv_P, uv_Q)
                 )
                 if not good:
                     break
             coordinate = row % 2
-            record[k, row, last] = uv_P[coordinate] - uv_Q[coordinate]
+            record[k, row, last] = uv_P[coordinate]
             if last == 0:
                 continue
             _into_world(A, coordinate, poses, p, a)

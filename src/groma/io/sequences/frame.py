@@ -74,6 +74,11 @@ def checked_params(model: str, params: npt.ArrayLike, source: str) -> FloatArray
             f"{source}: {model} takes {known.num_parameters} finite numbers ({', '.join(known.parameter_names)}); "
             f"got {numbers.tolist()}."
         )
+    if not known.is_planar:
+        raise InputError(
+            f"{source}: frames are followed in images that a plane can hold, and {model} images are panoramas. Cut a "
+            "perspective view out of each, and pass its camera."
+        )
     if not (numbers[list(known.focal_indices)] > 0).all():
         raise InputError(f"{source}: focal lengths must be positive; got {numbers.tolist()}.")
     return numbers

@@ -101,7 +101,7 @@ def point_noise(scene: Scene, sigma_px: float | None = None) -> PointNoise:
     """Return the covariances of the points; ``sigma_px`` None estimates it from the residuals."""
     table = scene.point_observations
     pixels, by_world = project_points(scene, table.image_idx, scene.points.xyz[table.point_idx])
-    residual = pixels - table.pixel
+    residual = pixel_differences(scene, table.image_idx, pixels, table.pixel)
     good = np.asarray(np.isfinite(residual).all(axis=1) & np.isfinite(by_world).all(axis=(1, 2)))
     weight = good / table.sigma
     residual = np.where(good[:, None], residual, 0.0) * weight[:, None]
@@ -128,7 +128,7 @@ def line_noise(scene: Scene, sigma_px: float | None = None) -> LineNoise:
         pixels, by_world = project_points(scene, table.image_idx, place)
         tangent = unit(apply(by_world, direction[line]))
         normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
-        residual = dot(normal, pixels - measured)
+        residual = dot(normal, pixel_differences(scene, table.image_idx, pixels, measured))
         row = np.einsum("nk,nki,nai->na", normal, by_world, across[line])
         row = np.hstack([(1.0 - share)[:, None] * row, share[:, None] * row])
         good = np.isfinite(residual) & np.isfinite(row).all(axis=1)
@@ -153,6 +153,14 @@ def project_points(scene: Scene, image_idx: IntArray, places: FloatArray) -> tup
         pixels[front], by_cam, _ = model.project_jacobian(chosen, np.ascontiguousarray(in_cam[front]))
         by_world[front] = by_cam @ quaternion.to_matrix(poses[front, :4])
     return pixels, by_world
+
+
+def pixel_differences(scene: Scene, image_idx: IntArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """Differences (N, 2) of pixels, in panoramas the short way round."""
+    difference = first - second
+    for name, rows, params in _by_model(scene, image_idx):
+        difference[rows] = camera_model(name).pixel_difference(params, first[rows], second[rows])
+    return difference
 
 
 def _share_on_line(scene: Scene, image_idx: IntArray, measured: FloatArray, ends: FloatArray) -> FloatArray:

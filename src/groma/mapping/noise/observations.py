@@ -93,7 +93,10 @@ def line_end_correlation(scene: Scene) -> float:
     ends = [np.zeros((0, 2))]
     for factor in problem.factors:
         told = images[factor.line.index] >= GATES.min_views  # type: ignore[attr-defined]
-        ends.append((residuals_of(factor, problem.variables) * np.asarray(factor.sqrt_information)[:, None])[told])
+        residual, unit = residuals_of(factor, problem.variables), np.asarray(factor.sqrt_information)
+        # Where a camera sees behind itself, each end has a weight of its own.
+        weighted = residual * unit[:, None] if unit.ndim == 1 else np.einsum("nij,nj->ni", unit, residual)
+        ends.append(weighted[told])
     first, second = np.concatenate(ends).T
     if len(first) < GATES.min_landmarks:
         return 0.0

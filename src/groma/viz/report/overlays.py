@@ -142,12 +142,17 @@ def projected_segments(scene: Scene, image_idx: int, line_idx: IntArray) -> list
     ends = scene.lines.segments[line_idx] @ pose[:3, :3].T + pose[:3, 3]
     depth = ends[..., 2]
     near = 1e-3 * np.abs(depth).max(axis=1, initial=1e-12)
+    if model.sees_behind:
+        near = np.full_like(near, -np.inf)
     # Where a segment passes through the camera's plane only the part before it is seen.
     share = np.clip((near[:, None] - depth) / np.where(depth == depth[:, ::-1], 1.0, depth[:, ::-1] - depth), 0.0, 1.0)
     ends = np.where((depth < near[:, None])[..., None], ends + share[..., None] * (ends[:, ::-1] - ends), ends)
     steps = np.linspace(0.0, 1.0, 2 if is_straight(model.name) else _SAMPLES)[None, :, None]
     places = ends[:, :1] * (1.0 - steps) + ends[:, 1:] * steps
     pixels = model.project(params, np.ascontiguousarray(places.reshape(-1, 3))).reshape(*places.shape[:2], 2)
+    if not model.is_planar:  # on across the border rather than back through the image
+        ways = model.pixel_difference(params, pixels[:, 1:].reshape(-1, 2), pixels[:, :-1].reshape(-1, 2))
+        pixels[:, 1:] = pixels[:, :1] + np.cumsum(ways.reshape(len(pixels), -1, 2), axis=1)
     good = np.isfinite(pixels).all(axis=2) & (depth.max(axis=1) > near)[:, None]
     return [row[kept] for row, kept in zip(pixels, good, strict=True)]
 
