@@ -54,6 +54,9 @@ def test_images_larger_than_their_file_can_hold_are_refused():
     content[16:24] = struct.pack(">II", 20_000, 20_000)
     with pytest.raises(FileFormatError, match="promises 20000x20000 pixels"):
         decoded(bytes(content), cv2.IMREAD_GRAYSCALE)
+    content = bytearray(cv2.imencode(".png", GRAY)[1])
+    content[33:37] = struct.pack(">I", 1 << 30)  # of the first chunk of pixels
+    assert decoded(bytes(content), cv2.IMREAD_GRAYSCALE) is None
     assert decoded(b"GIF89a" + bytes(100), cv2.IMREAD_GRAYSCALE) is None  # a kind that groma does not take
     assert decoded(b"", cv2.IMREAD_GRAYSCALE) is None
 

@@ -84,7 +84,7 @@ def _worker(all_targets: list, first: int, last: int, seed: int) -> Iterator[tup
             done = int(number)
             yield done, outcome, words
     status = os.waitpid(child, 0)[1]
-    if done + 1 < last:
+    if status and done + 1 < last:
         ended_by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
         outcome = "too slow" if ended_by in (signal.SIGALRM, signal.SIGPROF) else "crash"
         yield done + 1, outcome, f"ended by signal {ended_by}, status {status}"

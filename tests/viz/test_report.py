@@ -330,7 +330,7 @@ def test_photographs_outside_the_folder_are_not_embedded(tmp_path, name):
     _pictures(tmp_path, "secret.jpg", "photos/second.jpg")
     name = str(tmp_path / "secret.jpg") if name == "ABSOLUTE" else name
     scene = exact_scene((name, "second.jpg"))
-    with pytest.warns(UserWarning, match=r"1 images of the scene are not shown.*secret\.jpg"):
+    with pytest.warns(UserWarning, match=r"1 image of the scene not shown.*secret\.jpg"):
         write_report(tmp_path / "page.html", None, scene, images=tmp_path / "photos")
     shown = {entry["name"]: entry["photo"] for entry in _data((tmp_path / "page.html").read_text())["images"]}
     assert shown[name] == "" and shown["second.jpg"].startswith("data:image/jpeg")

@@ -139,8 +139,7 @@ def _header(stream: IO[bytes], where: str) -> Header:
         shape, fortran, dtype = _HEADERS[version](stream, max_header_size=_HEADER_LIMIT)
     except Exception as error:  # of NumPy, of Python's tokenizer and parser, of zlib, and KeyError for other versions
         raise FileFormatError(
-            f"{where} has no header of an array ({' '.join(str(error).split()) or type(error).__name__}). Save it with "
-            "numpy.savez."
+            f"{where} has no header of an array, or a damaged one. Save it with numpy.savez."
         ) from error
     if dtype.kind not in _KINDS or any(size < 0 for size in shape):
         raise FileFormatError(

@@ -68,7 +68,16 @@ def image_size(content: bytes) -> tuple[int, int] | None:
     return None
 
 
-def _png(content: bytes) -> tuple[int, int]:
+def _png(content: bytes) -> tuple[int, int] | None:
+    """Return the size; None if a chunk is longer than the file, for which the decoder would take memory first."""
+    at = 8
+    while at < len(content):
+        length, kind = struct.unpack_from(">I4s", content, at)
+        if length > len(content) - at - 12:
+            return None
+        if kind == b"IEND":
+            break
+        at += 12 + length
     return struct.unpack_from(">II", content, 16)
 
 

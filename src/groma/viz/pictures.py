@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from groma._counted import counted
 from groma.bounded.images import decoded
 from groma.bounded.names import outside, stays_inside
 from groma.errors import FileFormatError
@@ -38,8 +39,9 @@ def warn_of_names_outside(images: ImageFiles | None, names: Iterable[str]) -> No
         return
     if wrong := outside(names):
         shown = ", ".join(repr(name[:200]) for name in wrong[:3]) + (", ..." if len(wrong) > 3 else "")
+        number = counted(len(wrong), "images")
         warnings.warn(
-            f"{len(wrong)} images of the scene are not shown: their names lead out of {os.fspath(images)} ({shown}). "
+            f"{number} of the scene not shown: names lead out of {os.fspath(images)} ({shown}). "
             "Rename them, or link to them from the folder.",
             stacklevel=3,
         )

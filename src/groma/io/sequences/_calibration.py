@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from groma import cameras
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.bounded.text import finite, read_text, whole
 from groma.errors import FileFormatError, InputError
 from groma.io.reading import reading
@@ -27,6 +27,9 @@ from groma.io.sequences.frame import SequenceCamera, checked_params
 CameraLike = SequenceCamera | Numbers[float] | str | os.PathLike[str]
 #: Names under which a calibration may lie in the folder of a sequence.
 FILE_NAMES = ("cameras.txt", "camera.txt", "calibration.txt", "calib.txt", "intrinsics.txt", "camera-intrinsics.txt")
+
+#: Pixels whose rays are computed at a time.
+_BAND = 1 << 18
 
 _HELP = (
     "expected 'fx fy cx cy', 'fx fy cx cy k1 k2 p1 p2 [k3]', a 3x3 matrix, or a line of COLMAP's cameras.txt "
@@ -80,7 +83,19 @@ def rectification(
 ) -> Rectification:
     """Return the maps from a pinhole camera (4,) of the given size to a calibrated, possibly turned camera."""
     width, height = size
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    # Band by band: rays take ten times the memory of the image.
+    bands = np.array_split(np.arange(height), max(1, width * height // _BAND))
+    pixels = np.concatenate([_pixels_of(calibration, target, width, rows, camera_from_target) for rows in bands])
+    fixed, fraction = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
+    nearest = np.round(pixels).astype(np.int16)
+    return Rectification((np.asarray(fixed, np.int16), np.asarray(fraction, np.uint16)), nearest)
+
+
+def _pixels_of(
+    calibration: Calibration, target: FloatArray, width: int, rows: IntArray, camera_from_target: FloatArray | None
+) -> npt.NDArray[np.float32]:
+    """Return where the pixels of some rows of the target are in the file, (rows, W, 2), as OpenCV counts."""
+    u, v = np.meshgrid(np.arange(width) + 0.5, rows + 0.5)
     directions = np.stack([(u - target[2]) / target[0], (v - target[3]) / target[1], np.ones_like(u)], -1)
     rays: FloatArray = directions.reshape(-1, 3).astype(np.float64)
     if camera_from_target is not None:
@@ -88,10 +103,7 @@ def rectification(
     pixels = cameras.model(calibration.model).project(calibration.params, rays)
     pixels[(rays[:, 2] <= 0) | ~np.isfinite(pixels).all(1)] = -100.0
     # OpenCV counts from the centre of the first pixel.
-    pixels = np.clip(pixels - 0.5, -100.0, 16000.0).reshape(height, width, 2).astype(np.float32)
-    fixed, fraction = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
-    nearest = np.round(pixels).astype(np.int16)
-    return Rectification((np.asarray(fixed, np.int16), np.asarray(fraction, np.uint16)), nearest)
+    return np.clip(pixels - 0.5, -100.0, 16000.0).reshape(len(rows), width, 2).astype(np.float32)
 
 
 def calibration_of(camera: CameraLike) -> Calibration:
