@@ -9,8 +9,7 @@ from groma.geometry import se3
 from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.mapper import Mapper
 from groma.tracking.frame.camera import TrackCamera
-from groma.tracking.frame.features import FrameFeatures, describe
-from groma.tracking.map.keyframes import measure_points
+from groma.tracking.frame.features import describe
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import TrackMap
@@ -43,9 +42,6 @@ def test_each_keyframe_is_another_frame(kind, monkeypatch):
     assert {row.status for row in rows} <= {"tracked", "found"}
     times = [keyframe.timestamp for keyframe in tracker.map.keyframes]
     assert len(times) == len(set(times))
-    # The last frame was found by features, of which those of coarse scales are less certain.
-    sigma = tracker.map.last.measured.points.sigma
-    assert sigma.min() == OPTIONS.point_sigma_px and sigma.max() > 1.4 * OPTIONS.point_sigma_px
     result = tracker.finish()
     names = result.scene.images.names
     assert set(names) <= {frame.name for frame in frames}
@@ -56,15 +52,6 @@ def test_each_keyframe_is_another_frame(kind, monkeypatch):
     assert len(np.unique(pairs, axis=0)) == len(pairs)
     assert np.bincount(pairs[:, 1], minlength=result.scene.num_points).min() >= 2
     assert _room.position_error(result.trajectory, _wide(12)) < 0.02
-
-
-def test_points_found_on_coarse_scales_are_less_certain():
-    camera, track_map = TrackCamera.of(_room.camera()), TrackMap()
-    data = FrameFeatures(_room.frames("rgbd", _room.poses(1))[0], camera, OPTIONS)
-    tracks = PointTracks(track_map.points.extend(2), np.array([[100.0, 80], [200, 120]]), np.array([1.0, 2.5]))
-    for some, sigma in ((tracks, [1.0, 2.5]), (tracks.take(np.array([1])).joined(tracks), [2.5, 1.0, 2.5])):
-        measured = measure_points(data, some, OPTIONS, track_map, se3.identity(), camera)
-        assert measured.sigma.tolist() == [OPTIONS.point_sigma_px * one for one in sigma]
 
 
 def test_what_is_worked_out_is_taken_up_before_a_frame_is_searched():
@@ -106,7 +93,7 @@ def test_a_pose_that_most_points_do_not_agree_with_is_in_doubt():
     pixel = np.random.default_rng(2).uniform(20, 220, (40, 2))
     track_map.points.xyz[rows] = 2.0 * camera.bearings(pixel)
     track_map.points.state[rows] = ALIVE
-    before, verification = PointTracks.fine(rows, pixel), PoseVerification(camera, OPTIONS)
+    before, verification = PointTracks(rows, pixel), PoseVerification(camera, OPTIONS)
     none = np.zeros(0, bool)
     for agree, doubt in ((15, True), (25, False)):
         estimate = PoseEstimate(se3.identity(), np.arange(40) < agree, none, none, np.eye(6), ())

@@ -68,7 +68,7 @@ def test_cabinet_needs_lines_and_planes(shared_data):
 def _assert_photographs(scene, folder):
     """Keyframes are photographs on disk, each once; every point is seen in two of them."""
     assert len(set(scene.images.names)) == scene.num_images
-    assert all((folder / name).is_file() for name in scene.images.names)
+    assert all((folder / "rgb" / name).is_file() for name in scene.images.names)
     seen = np.unique(np.column_stack([scene.point_observations.image_idx, scene.point_observations.point_idx]), axis=0)
     assert len(seen) == len(scene.point_observations)
     assert np.bincount(seen[:, 1], minlength=scene.num_points).min() >= 2

@@ -107,7 +107,7 @@ def place_by_motion(
     fresh = ~begun
     unknown = np.full(int(fresh.sum()), np.nan)
     index[fresh] = points_of_features(track_map, keyframe, first[fresh], places[fresh], unknown, options.point_sigma_px)
-    tracks = PointTracks.fine(index, features.pixel[second])
+    tracks = PointTracks(index, features.pixel[second])
     tracks = tracks.take(np.unique(index, return_index=True)[1])
     return tracks.take(~np.isin(tracks.index, taken)), features.linked(second, index)
 

@@ -117,7 +117,7 @@ def measure_points(
         z = np.where(track_map.points.alive[tracks.index], into(pose, track_map.points.xyz[tracks.index])[:, 2], np.nan)
         expected = tracks.pixel[:, 0] - camera.fx * camera.baseline / np.where(z > 0, z, np.nan)
         right = data.right_pixels(tracks.pixel, expected)
-    sigma = tracks.scale * options.point_sigma_px
+    sigma = np.full(count, options.point_sigma_px)
     return PointMeasurements(tracks.index, tracks.pixel, sigma, depth, data.depth_sigma(depth), right)
 
 
@@ -172,7 +172,7 @@ def _add_points(
         known = np.isfinite(depth)
         points.xyz[rows[known]] = back(pose, camera.bearings(pixel[known]) * depth[known, None])
         points.state[rows[known]] = ALIVE
-        tracks = tracks.joined(PointTracks.fine(rows, pixel))
+        tracks = tracks.joined(PointTracks(rows, pixel))
     return tracks, features
 
 

@@ -22,30 +22,22 @@ class PointTracks:
     #: (n,) landmark, (n, 2) pixel.
     index: IntArray
     pixel: FloatArray
-    #: (n,) size of a pixel where each was found: 1, but for features of coarse scales.
-    scale: FloatArray
 
     def __len__(self) -> int:
         return len(self.index)
 
     def take(self, rows: IntArray | BoolArray) -> PointTracks:
         """Return some of them."""
-        return PointTracks(self.index[rows], self.pixel[rows], self.scale[rows])
+        return PointTracks(self.index[rows], self.pixel[rows])
 
     def joined(self, other: PointTracks) -> PointTracks:
         """Return both together."""
-        index, pixel = np.concatenate([self.index, other.index]), np.concatenate([self.pixel, other.pixel])
-        return PointTracks(index, pixel, np.concatenate([self.scale, other.scale]))
-
-    @staticmethod
-    def fine(index: IntArray, pixel: FloatArray) -> PointTracks:
-        """Return points that were found on the finest scale."""
-        return PointTracks(index, pixel, np.ones(len(index)))
+        return PointTracks(np.concatenate([self.index, other.index]), np.concatenate([self.pixel, other.pixel]))
 
     @staticmethod
     def empty() -> PointTracks:
         """Return none."""
-        return PointTracks.fine(np.zeros(0, np.int64), np.zeros((0, 2)))
+        return PointTracks(np.zeros(0, np.int64), np.zeros((0, 2)))
 
 
 def follow_points(
@@ -73,7 +65,7 @@ def follow_points(
         guess[~known] += np.median(np.where(np.isfinite(moved), moved, 0.0), axis=0)
     pixel, good = follow(before, now, tracks.pixel, guess)
     rows = np.flatnonzero(good)
-    tracks = PointTracks.fine(tracks.index[rows], pixel[rows])
+    tracks = PointTracks(tracks.index[rows], pixel[rows])
     keyframe = track_map.near
     own = np.flatnonzero(points.keyframe[tracks.index] == keyframe.index)
     if keyframe.gray is not None and len(own):
@@ -82,7 +74,7 @@ def follow_points(
         good &= np.linalg.norm(pixel - tracks.pixel[own], axis=1) < max_correction
         held = tracks.pixel.copy()
         held[own[good]] = pixel[good]
-        tracks = PointTracks.fine(tracks.index, held)
+        tracks = PointTracks(tracks.index, held)
     return tracks
 
 
@@ -124,7 +116,7 @@ def find_again(
         points.visible[rows[of]] += 1
         points.misses[rows[of[~good]]] += 1
         points.misses[rows[of[good]]] = 0
-        found = found.joined(PointTracks.fine(rows[of[good]], there[good]))
+        found = found.joined(PointTracks(rows[of[good]], there[good]))
     return found
 
 

@@ -105,7 +105,7 @@ def carry(
     guess = np.where(known[:, None], expected, points.pixel + shift)
     inside = np.flatnonzero(camera.inside(guess, 2.0))
     pixel, good = follow(before.gray, data.gray, points.pixel[inside], guess[inside], levels=2)
-    points = PointTracks.fine(points.index[inside[good]], pixel[good])
+    points = PointTracks(points.index[inside[good]], pixel[good])
     lines = lines.take(~np.isin(lines.index, followed.lines.index))
     if len(lines.index):
         lines = follow_lines(track_map, before, data, lines)

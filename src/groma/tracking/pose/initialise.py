@@ -119,7 +119,7 @@ class Initialiser:
         start, end = self._views[0], self._views[-1]
         guess = tracks.pixel + _shift_near(start, end - start, tracks.pixel)
         pixel, good = follow(self._first.gray, self._second.gray, tracks.pixel, guess)
-        tracks = PointTracks.fine(tracks.index[good], pixel[good])
+        tracks = PointTracks(tracks.index[good], pixel[good])
         first = np.tile(IDENTITY, (len(tracks), 1))
         places, placed = triangulate(
             camera, first, track_map.points.first_pixel[tracks.index], self._pose, tracks.pixel, options.gates.points

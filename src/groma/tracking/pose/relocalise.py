@@ -288,7 +288,7 @@ def promote(track_map: TrackMap, found: Found, data: FrameFeatures) -> PointTrac
             new = points_of_features(track_map, keyframe, own[fresh], places, sigma, data.options.point_sigma_px)
             index[fresh], usable[fresh] = new, True
         rows = np.flatnonzero(usable)
-        tracks = tracks.joined(PointTracks(index[rows], features.pixel[here[rows]], features.scale[here[rows]]))
+        tracks = tracks.joined(PointTracks(index[rows], features.pixel[here[rows]]))
     first = np.unique(tracks.index, return_index=True)[1]
     return tracks.take(first)
 
