@@ -15,8 +15,6 @@ from groma.scene import synthetic
 from groma.solver.options import SolverOptions
 from groma.solver.reduce.mpi import started_as
 
-pytestmark = pytest.mark.kernels
-
 
 @pytest.fixture
 def parts(tmp_path):

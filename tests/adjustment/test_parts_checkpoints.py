@@ -17,7 +17,6 @@ from groma.scene.measurements import PosePriors
 from groma.solver.options import SolverOptions
 from groma.solver.reduce.alone import Alone
 
-pytestmark = pytest.mark.kernels
 OPTIONS = SolverOptions(threads=1)
 LOSSES = Cauchy(1.0), GemanMcClure(2.0)
 

@@ -13,8 +13,6 @@ from groma.scene import Cameras, LineObservations, Lines, PointObservations, Poi
 from groma.viz.drawable import drawable
 from groma.viz.report.overlays import projected_segments
 
-pytestmark = pytest.mark.kernels
-
 NOISE = 0.3
 CASES = {
     "EQUIRECTANGULAR": [2000.0, 1000.0],

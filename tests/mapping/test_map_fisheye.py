@@ -3,11 +3,8 @@
 
 import _facade
 import numpy as np
-import pytest
 
 from groma.mapping.map import MapOptions, map_images
-
-pytestmark = pytest.mark.kernels
 
 
 def test_a_fisheye_is_mapped(tmp_path, monkeypatch):
