@@ -16,7 +16,6 @@ from groma.io import read_scene, write_scene
 from groma.scene import Scene
 from groma.scene.synthetic import corridor
 
-pytestmark = pytest.mark.kernels
 POINTS = groma.AdjustOptions(lines=False, planes=False, check_lens=False)
 
 
