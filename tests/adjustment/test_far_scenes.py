@@ -26,7 +26,6 @@ from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.solver.termination import Termination
 
-pytestmark = pytest.mark.kernels
 #: Where a scene lies in the coordinates of UTM, metres.
 TO_UTM = Similarity(translation=np.array([4e5, 5.4e6, 200.0]))
 OPTIONS = AdjustOptions(loss="none")

@@ -14,8 +14,6 @@ from groma.geometry import se3
 from groma.io import write_scene
 from groma.scene.synthetic import corridor
 
-pytestmark = pytest.mark.kernels
-
 
 def test_inliers_of_known_residuals():
     """Nine tenths of noise and a tenth of outliers: the noise, its share and its rms, however far outliers lie."""
