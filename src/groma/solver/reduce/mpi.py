@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -89,6 +91,12 @@ class Ranks:
         there, ranks = set().union(*machine.allgather(own)), int(machine.size)
         machine.Free()
         return ranks, max(1, min(len(own), len(there) // ranks))
+
+    def others_as_executor(self) -> AbstractContextManager[Executor | None]:
+        """Return a context: on rank 0 an executor of which all others are the workers, on these None, at its end."""
+        from mpi4py.futures import MPICommExecutor
+
+        return MPICommExecutor(self._world, root=0)
 
     def abort(self) -> None:
         """End all ranks at once: one of them cannot go on, and the others would wait for it."""
