@@ -13,10 +13,10 @@ Reported are CPU time per step, peak memory of the process, bytes per observatio
 
 With ``--ranks`` the same parts are adjusted by so many processes together (``mpiexec`` must be at hand), in turn, for
 so many rounds. Reported are ratios to the first number, medians over the rounds: wall time per step, CPU time per step
-of the busiest rank (it waits actively), peak memory of a rank; the bytes that a rank puts into a sum; and the time
-foreseen for many ranks. That assumes: work on parts divides evenly, the shared system is solved by each, and a sum
-takes two passes of its bytes at ``BANDWIDTH`` and two latencies per doubling of ranks. ``--corridor`` takes a walk
-round a corridor in place of the block: points, lines, planes, and what lies on them.
+of the busiest rank (it waits actively), peak memory of a rank; the bytes that a rank puts into the sums of a step; and
+the time foreseen for many ranks. That assumes: work on parts divides evenly, the shared system is solved by each, and
+a sum takes two passes of its bytes at ``BANDWIDTH`` and two latencies per doubling of ranks. ``--corridor`` takes a
+walk round a corridor in place of the block: points, lines, planes, and what lies on them.
 
 With ``--plain-sums`` one process adjusts in turn with sums of twice the digits, as always, and with plain ones.
 
@@ -113,19 +113,20 @@ def make(folder: Path, observations: float, part: int = PART, seed: int = 0) -> 
     return total
 
 
-def run(folder: Path, steps: int, threads: int, keep: str, output: Path) -> dict:
+def run(folder: Path, arguments: argparse.Namespace, output: Path) -> dict:
     """Adjust the parts of a folder in this process, and in all that were started with it."""
     from groma.adjustment.parts import adjust_parts, parts_of
     from groma.solver.options import SolverOptions
     from groma.solver.reduce.mpi import reducer_of_launcher
 
     options = SolverOptions(
-        max_iterations=steps, threads=threads, function_tolerance=0.0, gradient_tolerance=0.0, step_tolerance=0.0
-    )
+        max_iterations=arguments.steps, threads=arguments.threads, shared_system=arguments.shared_system,
+        function_tolerance=0.0, gradient_tolerance=0.0, step_tolerance=0.0,
+    )  # fmt: skip
     reducer = reducer_of_launcher()
     began, steps_at = (time.process_time(), time.perf_counter()), []
     result = adjust_parts(
-        parts_of(folder), output, options=options, keep=keep, reducer=reducer, force=True,
+        parts_of(folder), output, options=options, keep=arguments.keep, reducer=reducer, force=True,
         progress=lambda _: steps_at.append(time.process_time()),
     )  # fmt: skip
     report, peak = result.report, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -142,7 +143,7 @@ def run(folder: Path, steps: int, threads: int, keep: str, output: Path) -> dict
         "residuals": report.num_residuals,
         "unknowns": report.num_unknowns,
         "solver": report.linear_solver,
-        "bytes": getattr(reducer, "bytes_per_sum", 0),
+        "bytes": getattr(reducer, "bytes_summed", 0) // (report.iterations + 1),
         "peak_mib": max(map(float, reducer.gather(str(peak)))),
     }
 
@@ -150,7 +151,8 @@ def run(folder: Path, steps: int, threads: int, keep: str, output: Path) -> dict
 def started(folder: Path, arguments: argparse.Namespace, ranks: int = 1, plain: bool = False) -> dict:
     """Adjust the parts of a folder in processes of their own; return what rank 0 reports."""
     own = [sys.executable, __file__, "--run", folder, "--steps", arguments.steps, "--threads", arguments.threads]
-    own += ["--keep", arguments.keep, *(["--plain-sums"] if plain else [])]
+    own += ["--keep", arguments.keep, "--shared-system", arguments.shared_system]
+    own += ["--plain-sums"] if plain else []
     if ranks > 1:
         launcher = shutil.which("mpiexec", path=sysconfig.get_path("scripts")) or "mpiexec"
         own = [launcher, "-n", ranks, *own]
@@ -166,7 +168,7 @@ def compare_ranks(folder: Path, observations: int, arguments: argparse.Namespace
             found.append(started(folder, arguments, ranks))
     first = rows[arguments.ranks[0]]
     print(f"{observations:,} observations, {arguments.rounds} rounds in turn, --keep {arguments.keep}\n")
-    print("| ranks | step | CPU of a rank in a step | memory of a rank | MiB | bytes of a sum | final cost |")
+    print("| ranks | step | CPU of a rank in a step | memory of a rank | MiB | bytes of a step | final cost |")
     print("|--:|--:|--:|--:|--:|--:|--:|")
     for ranks, found in rows.items():
         step, spent, peak = (
@@ -300,6 +302,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--corridor", action="store_true", help="points, lines and planes in place of a block")
     parser.add_argument("--plain-sums", action="store_true", help="compare exact sums with plain ones")
+    parser.add_argument("--shared-system", default="auto", help="formed, or products of conjugate gradients")
     parser.add_argument("--states", type=int, metavar="IMAGES", help="compare states with those of a solve at once")
     parser.add_argument("--run", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--run-states", type=Path, help=argparse.SUPPRESS)
@@ -315,7 +318,7 @@ def main() -> None:
         if arguments.plain_sums:
             sum_plainly()
         output = arguments.run.parent / f"{arguments.run.name}-adjusted"
-        row = run(arguments.run, arguments.steps, arguments.threads, arguments.keep, output)
+        row = run(arguments.run, arguments, output)
         if row["rank"] == 0:
             print(json.dumps(row))
         return

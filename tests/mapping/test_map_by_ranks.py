@@ -14,7 +14,7 @@ pytestmark = pytest.mark.kernels
 
 @needs_mpi
 def test_ranks_map_what_one_process_maps(corner, tmp_path):
-    folder, scene = corner
+    folder = corner[0]
     arguments = ["map", str(folder), "--model", str(folder.parent / "model.npz"), "--no-diagnosis", "--threads", "1"]
     assert run([*arguments, "-o", str(tmp_path / "one"), "-q"]) == 0
     said = mpiexec(*[["-m", "groma", *arguments, "-o", tmp_path / "three"]] * 3)
@@ -28,7 +28,7 @@ def test_ranks_map_what_one_process_maps(corner, tmp_path):
 
 @needs_mpi
 def test_what_goes_wrong_is_told_once_and_all_end(corner, tmp_path):
-    folder, _ = corner
+    folder = corner[0]
     output = ["-o", tmp_path / "x"]
     for arguments, words in (
         ([folder.parent / "nowhere", *output], "Cannot read"),

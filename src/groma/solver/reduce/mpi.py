@@ -66,11 +66,14 @@ class Ranks:
             )
         self.num_neighbours, self.num_cores = self._share_of_machine()
         self._add: Any = MPI.Op.Create(_add, commute=True)
-        #: Bytes that this rank gave to the last sum: what it sends and receives in a step, up to twice.
-        self.bytes_per_sum = 0
+        #: Bytes that this rank gave to the largest sum, and to all: what it sends and receives, up to twice.
+        self.bytes_per_sum = self.bytes_summed = 0
 
     def sum(self, values: ComplexArray) -> ComplexArray:  # noqa: D102
-        self.bytes_per_sum = values.nbytes
+        self.bytes_per_sum, self.bytes_summed = (
+            max(self.bytes_per_sum, values.nbytes),
+            self.bytes_summed + values.nbytes,
+        )
         self._world.Allreduce(self._mpi.IN_PLACE, values, op=self._add)
         return values
 
@@ -96,7 +99,8 @@ class Ranks:
         """Return a context: on rank 0 an executor of which all others are the workers, on these None, at its end."""
         from mpi4py.futures import MPICommExecutor
 
-        return MPICommExecutor(self._world, root=0)
+        context: Any = MPICommExecutor(self._world, root=0)
+        return context
 
     def abort(self) -> None:
         """End all ranks at once: one of them cannot go on, and the others would wait for it."""
