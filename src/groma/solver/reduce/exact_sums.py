@@ -42,7 +42,11 @@ def add_sums(sums: ComplexArray, others: ComplexArray) -> None:
 
 def rounded(sums: ComplexArray) -> FloatArray:
     """Return sums as plain floats."""
-    return np.where(np.isfinite(sums.imag), sums.real + sums.imag, sums.real)
+    total = sums.real + sums.imag
+    lost = ~np.isfinite(sums.imag)
+    if lost.any():
+        total[lost] = sums.real[lost]
+    return total
 
 
 __all__ = ["add", "add_sums", "rounded"]

@@ -30,6 +30,9 @@ LAUNCHERS = (
     ("PMIX_RANK", "SLURM_STEP_NUM_TASKS"),
 )
 
+#: Numbers in one message, because MPI makes copies of it; and numbers added at once.
+SUMMED_AT_ONCE, ADDED_AT_ONCE = 1 << 19, 1 << 14
+
 
 def started_as(environment: Mapping[str, str] = os.environ) -> tuple[int, int]:
     """Return rank and number of ranks as a launcher told them; (0, 1) for a process that was started alone."""
@@ -74,7 +77,9 @@ class Ranks:
             max(self.bytes_per_sum, values.nbytes),
             self.bytes_summed + values.nbytes,
         )
-        self._world.Allreduce(self._mpi.IN_PLACE, values, op=self._add)
+        flat = values.reshape(-1)
+        for first in range(0, len(flat), SUMMED_AT_ONCE):
+            self._world.Allreduce(self._mpi.IN_PLACE, flat[first : first + SUMMED_AT_ONCE], op=self._add)
         return values
 
     def union(self, numbers: IntArray) -> IntArray:  # noqa: D102
@@ -119,8 +124,11 @@ def reducer_of_launcher() -> Reducer:
 
 
 def _add(others: Any, sums: Any, _datatype: Any) -> None:
-    """Add exact sums in buffers of MPI, in place."""
-    exact_sums.add_sums(np.frombuffer(sums, np.complex128), np.frombuffer(others, np.complex128))
+    """Add exact sums in buffers of MPI, in place; piece by piece, so that they stay in cache."""
+    total, more = np.frombuffer(sums, np.complex128), np.frombuffer(others, np.complex128)
+    for first in range(0, len(total), ADDED_AT_ONCE):
+        part = slice(first, first + ADDED_AT_ONCE)
+        exact_sums.add_sums(total[part], more[part])
 
 
 __all__ = ["LAUNCHERS", "Ranks", "reducer_of_launcher", "started_as"]
