@@ -181,8 +181,8 @@ def compare_ranks(folder: Path, observations: int, arguments: argparse.Namespace
     alone = rows[min(rows)][0]
     num_bytes = max(row["bytes"] for found in rows.values() for row in found)
     solve = alone["seconds"]["solve"] / (alone["steps"] + 1)
-    parts = float(np.median([row["step_s"] for row in rows[min(rows)]])) * min(rows) - solve
-    print(f"\nOf a step of {parts + solve:.2f} s on one rank {solve:.3f} s solve the shared system. Foreseen:")
+    parts = float(np.median([row["step_cpu_s"] for row in rows[min(rows)]])) * min(rows) - solve
+    print(f"\nOf {parts + solve:.2f} s of CPU time for a step of one rank {solve:.3f} s solve the system. Foreseen:")
     for ranks in (1, 16, 64, 256):
         message = (2 * num_bytes / BANDWIDTH + 2 * LATENCY * np.log2(ranks)) if ranks > 1 else 0.0
         print(
