@@ -206,8 +206,8 @@ def sum_plainly() -> None:
     """Let sums forget their rounding errors, as plain ones do."""
     from groma.solver.reduce import exact_sums
 
-    def add(sums: np.ndarray, values: np.ndarray, where: object = ...) -> None:
-        sums.real[where] += values
+    def add(sums: np.ndarray, values: np.ndarray, rows: np.ndarray | None = None) -> None:
+        sums.real[... if rows is None else rows] += values
 
     exact_sums.add = add
 
