@@ -75,7 +75,9 @@ def match_near(
         return np.zeros((0, 2), np.int64)
     near = KDTree(expected[rows]).sparse_distance_matrix(tree, radius, output_type="ndarray")
     first, second = rows[near["i"]], near["j"]
-    bits = np.bitwise_count(known.descriptor[first] ^ features.descriptor[second]).sum(axis=1, dtype=np.int64)
+    # eight bytes at a time
+    one, two = (np.ascontiguousarray(table).view(np.uint64) for table in (known.descriptor, features.descriptor))
+    bits = np.bitwise_count(one[first] ^ two[second]).sum(axis=1, dtype=np.int64)
     alike = np.flatnonzero(bits <= max_bits)
     # Nearest in the image among equals.
     alike = alike[np.lexsort((near["v"][alike], bits[alike]))]
@@ -111,7 +113,7 @@ def pose_from_matches(
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
             np.ascontiguousarray(places), np.ascontiguousarray(pixel - 0.5), camera.matrix_opencv, np.zeros(0),
-            iterationsCount=500, reprojectionError=max_error, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
+            iterationsCount=500, reprojectionError=max_error, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
     except cv2.error:  # its last step asserts that the inliers, not known before, are spread well
         return None
