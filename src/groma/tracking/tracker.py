@@ -18,6 +18,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import InputError
+from groma.execution import work_with
 from groma.geometry import se3
 from groma.io.sequences.frame import Frame, SequenceCamera
 from groma.io.trajectories import Trajectory
@@ -89,6 +90,9 @@ class Tracker:
         self._guess = np.zeros((0, 0), np.uint8), self._present.pose
         #: What happened to the track between its maps, for the reader.
         self._breaks: list[tuple[float, float]] = []
+        #: The frame after the present one, if it was known, and whether the frame before had to be searched.
+        self._ahead: FrameFeatures | None = None
+        self._searched = False
         self._finished = False
 
     @property
@@ -107,8 +111,16 @@ class Tracker:
 
     # ------------------------------------------------------------------------------------------------- each frame
 
-    def process(self, frame: Frame) -> TrackedFrame:
+    def process(self, frame: Frame, following: Frame | None = None) -> TrackedFrame:
         """Track one frame; frames must come in order of time.
+
+        Parameters
+        ----------
+        frame
+            The frame.
+        following
+            The frame after it, if it is known already: what is found in one image is found meanwhile. The result is
+            the same.
 
         Returns
         -------
@@ -129,12 +141,16 @@ class Tracker:
         if reason:
             return self._skip(frame, reason, began)
         present, mapper = self._present, self._mapper
-        data = FrameFeatures(frame, self.camera, self.options, mapper.right)
+        data = self._features_of(frame)
         mapper.advance(present, watch)
+        if following is not None:
+            self._ahead = FrameFeatures(following, self.camera, self.options, mapper.right)
+            mapper.look_ahead(self._ahead, self._searched)
         if not self.map.keyframes:
             return self._start(data, began, watch)
         attempt, found = self._follow(data, watch), None
-        if attempt.estimate is None:
+        self._searched = attempt.estimate is None
+        if self._searched:
             attempt, found = self._search(data, attempt, watch)
         estimate, followed = attempt.estimate, attempt.followed
         if estimate is None:
@@ -163,6 +179,13 @@ class Tracker:
                 mapper.make_keyframe(present, watch)
         return self._report(frame, status, estimate, is_keyframe, began, watch)
 
+    def _features_of(self, frame: Frame) -> FrameFeatures:
+        """Return what was found in a frame ahead, or nothing yet."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None and ahead.frame is frame:
+            return ahead
+        return FrameFeatures(frame, self.camera, self.options, self._mapper.right)
+
     def _follow(self, data: FrameFeatures, watch: Stopwatch) -> Attempt:
         """Predict the pose and follow the frame before, if that is not long ago."""
         present = self._present
@@ -173,7 +196,8 @@ class Tracker:
         with watch("turn"):
             predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
         estimate, followed = follow_frame(
-            self.map, present.data, data, present.followed, present.pose, predicted, prior_sigma, watch
+            self.map, present.data, data, present.followed, present.pose, predicted, prior_sigma, watch,
+            self._mapper.frame_pool,
         )
         if estimate is None:
             return Attempt(predicted, prior_sigma, followed=followed)
@@ -190,7 +214,7 @@ class Tracker:
         if self._lost_for == 0:
             # The frame before is the nearest there is to look for.
             mapper.keep_present(present, watch)
-        with watch("find"):
+        with watch("find"), work_with(None if mapper.threaded else 1):
             found = self._find(data, attempt.predicted, attempt.prior_sigma, unconfirmed)
         if found is not None and not (
             attempt.trusted and unconfirmed is not None and self._verification.score(unconfirmed) >= found.score

@@ -87,6 +87,8 @@ class Mapper:
         self.due: _Chosen | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="groma-adjust") if options.threaded else None
         self._workers = ThreadPoolExecutor(2, thread_name_prefix="groma-detect") if options.threaded else None
+        #: For what belongs to a frame, which keyframes must not hold up.
+        self.frame_pool = ThreadPoolExecutor(1, thread_name_prefix="groma-frame") if options.threaded else None
         self._pending: _Pending | None = None
         self._search: tuple[LoopSearch, Future] | None = None
 
@@ -123,6 +125,11 @@ class Mapper:
             self.take_up(present)
         if self.due is not None and self.due.is_ready(DELAY if self.metric else 1):
             self.make_keyframe(present, watch)
+
+    def look_ahead(self, data: FrameFeatures, searched: bool) -> None:
+        """Begin with the frame after the present one; ``searched``: the present one could not be followed."""
+        if self.frame_pool is not None:
+            data.prepare_ahead(self.frame_pool, self._workers if searched else None)
 
     def adjust_start(self, present: Present) -> None:
         """Adjust the first keyframes of a single camera."""
@@ -284,7 +291,8 @@ class Mapper:
 
     def close(self) -> None:
         """End the threads."""
-        pools, self._pool, self._workers = (self._pool, self._workers), None, None
+        pools = self._pool, self._workers, self.frame_pool
+        self._pool = self._workers = self.frame_pool = None
         for pool in pools:
             if pool is not None:
                 pool.shutdown(wait=True, cancel_futures=True)

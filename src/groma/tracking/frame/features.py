@@ -6,7 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
-from functools import cached_property
+from threading import RLock
+from typing import Any, Generic, TypeVar, overload
 
 import cv2
 import numpy as np
@@ -38,6 +39,31 @@ from groma.tracking.gates import DEFAULT, DepthGates, FeatureGates
 from groma.tracking.options import TrackOptions
 
 Descriptors = npt.NDArray[np.uint8]
+_Found = TypeVar("_Found")
+
+
+class _FoundOnce(Generic[_Found]):
+    """A property that is worked out by whichever thread asks first, while others that ask wait for it."""
+
+    def __init__(self, find: Callable[[Any], _Found]) -> None:
+        self._find, self._name, self.__doc__ = find, find.__name__, find.__doc__
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> _FoundOnce[_Found]: ...
+
+    @overload
+    def __get__(self, instance: FrameFeatures, owner: type) -> _Found: ...
+
+    def __get__(self, instance: FrameFeatures | None, owner: type) -> _FoundOnce[_Found] | _Found:
+        if instance is None:
+            return self
+        found = vars(instance)  # what is found lies there under the same name, and is taken from there afterwards
+        with instance.lock_of(self._name):
+            if self._name not in found:
+                found[self._name] = self._find(instance)
+            return found[self._name]
+
+
 
 
 @dataclass(frozen=True)
@@ -93,43 +119,52 @@ class FrameFeatures:
         self._right_camera = right_camera or RightCamera(camera, options.gates.rectification, options.gates.features)
         self._turn = np.zeros(3)
         self._work: list[Future] = []
+        self._locks: dict[str, Any] = {}
 
-    @cached_property
+    @_FoundOnce
     def features(self) -> Features:
         """ORB features over several scales."""
         return describe(self.gray, self.options.num_features, self.depths, self.options.gates.features)
 
-    @cached_property
+    @_FoundOnce
     def detected(self) -> DetectedSegments:
         """Segments by the chosen detector."""
         segments = self.options.make_detector().detect(self.gray)
         inverse, sigma = self.inverse_depths(segments.ends)
         return DetectedSegments(segments, inverse, sigma)
 
+    def lock_of(self, name: str) -> Any:
+        """Return the lock of one thing to be found."""
+        return self._locks.setdefault(name, RLock())
+
     def prepare(self, pool: Executor) -> None:
         """Begin with what a keyframe needs, in other threads; :meth:`wait` ends it."""
-        if self._work:
+        wanted = ("features", "detected") if self.options.lines else ("features",)
+        self._work += [pool.submit(getattr, self, name) for name in wanted if name not in vars(self)]
+
+    def prepare_ahead(self, pool: Executor, searching: Executor | None = None) -> None:
+        """Begin in other threads with what depends on this image alone; with what a search needs where one is given."""
+        if self.frame.right is not None:  # how that camera is turned may become known better meanwhile
             return
-        # Both kinds ask for depths, which are found first, once.
-        first = pool.submit(lambda: self.disparities if self.frame.depth is None else self.depth)
-        self._work.append(first)
-        self._work.append(pool.submit(lambda: (first.result(), self.features)))
-        if self.options.lines:
-            self._work.append(pool.submit(lambda: (first.result(), self.detected)))
+        pool.submit(getattr, self, "planes")
+        if searching is not None:
+            self.prepare(searching)
 
     def wait(self) -> None:
-        """Wait for what :meth:`prepare` began."""
+        """Wait for what :meth:`prepare` began; what nobody has begun yet is found when it is asked for."""
         for future in self._work:
-            future.result()
+            if not future.cancel():
+                future.result()
+        self._work.clear()
 
-    @cached_property
+    @_FoundOnce
     def planes(self) -> FramePlanes | None:
         """Planes of the depth image; None without one."""
         if self.depth is None or not self.options.planes:
             return None
         return frame_planes(self.camera, self.depth, self.options.max_depth, self.options.gates)
 
-    @cached_property
+    @_FoundOnce
     def depth(self) -> DepthImage | None:
         """The depth image; small holes are filled where most of it is missing."""
         if self.frame.depth is None:
@@ -149,7 +184,7 @@ class FrameFeatures:
             return np.where((depth > 0) & (depth < far), depth, np.nan)
         return np.full(len(pixels), np.nan)
 
-    @cached_property
+    @_FoundOnce
     def right(self) -> GrayImage | None:
         """The right image of a pair, its rows moved to those of the left image."""
         if self.frame.right is None:
@@ -177,7 +212,7 @@ class FrameFeatures:
             self.detected = replace(self.detected, inverse_depth=inverse)
         self._turn = new
 
-    @cached_property
+    @_FoundOnce
     def disparities(self) -> Disparities | None:
         """Dense disparities of a pair of images."""
         if self.right is None:
@@ -208,7 +243,7 @@ class FrameFeatures:
             lambda p: retargeted(self.camera, p, none, turn),
         )
 
-    @cached_property
+    @_FoundOnce
     def depth_grid(self) -> FloatArray:
         """Depths at :func:`grid_pixels`; NaN where unknown."""
         return self.depths(grid_pixels(self.camera, self.options.gates.depth))

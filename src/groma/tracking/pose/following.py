@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -43,10 +45,13 @@ def follow_frame(
     predicted: FloatArray,
     prior_sigma: FloatArray,
     watch,
+    pool: Executor | None = None,
 ) -> tuple[PoseEstimate | None, Followed]:
-    """Return the pose of a frame that follows another, and what is still followed."""
+    """Return the pose of a frame that follows another, and what is still followed; lines beside points in a pool."""
     camera, options, gates = data.camera, data.options, data.options.gates
     tracks, segments = followed.points, followed.lines
+    of_lines = partial(follow_lines, track_map, before, data, segments)
+    following = pool.submit(of_lines) if pool is not None and options.lines and len(segments.index) else None
     with watch("points"):
         tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
         if options.points:
@@ -61,7 +66,8 @@ def follow_frame(
     with watch("lines"):
         lines = LineMeasurements.empty()
         if options.lines and len(segments.index):
-            segments = follow_lines(track_map, before, data, segments)
+            # What no thread has begun yet is done here.
+            segments = of_lines() if following is None or following.cancel() else following.result()
             lines = measure_lines(track_map, data, segments, few_points=len(measured) < gates.lines.few_points)
     with watch("planes"):
         planes = PlaneMeasurements.empty()
