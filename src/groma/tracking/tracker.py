@@ -174,7 +174,7 @@ class Tracker:
         ):
             mapper.choose(present, data)
             is_keyframe = True
-            if found is not None or not mapper.threaded:
+            if found is not None:
                 # What was found by features alone cannot be followed; the next frame needs this one's landmarks.
                 mapper.make_keyframe(present, watch)
         return self._report(frame, status, estimate, is_keyframe, began, watch)

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -58,10 +60,17 @@ class _Chosen:
         return self.age >= delay
 
 
+class _OnDemand:
+    """Stands for a future where there are no threads: the work is done when its result is asked for."""
+
+    def __init__(self, work: Callable[[], Any]) -> None:
+        self.result = work
+
+
 @dataclass
 class _Pending:
     job: AdjustmentJob
-    future: Future | None
+    future: Future | _OnDemand
     due: int
 
 
@@ -90,7 +99,7 @@ class Mapper:
         #: For what belongs to a frame, which keyframes must not hold up.
         self.frame_pool = ThreadPoolExecutor(1, thread_name_prefix="groma-frame") if options.threaded else None
         self._pending: _Pending | None = None
-        self._search: tuple[LoopSearch, Future] | None = None
+        self._search: tuple[LoopSearch, Future | _OnDemand] | None = None
 
     @property
     def map(self) -> TrackMap:
@@ -185,22 +194,18 @@ class Mapper:
         with watch("adjust"):
             job = window_job(self.map, self.camera, self.options.window, self.options.relations, self.metric)
             if job is not None:
-                if self._pool is None:
-                    job.solve()
-                    self.apply(present, job)
-                else:
-                    self._pending = _Pending(job, self._pool.submit(job.solve), DELAY)
+                self._pending = _Pending(job, self._begin(job.solve), DELAY)
         with watch("loop"):
             search = self._what_to_search() if self.options.close_loops else None
-            if search is not None:
-                if self._pool is None:
-                    self._close_loop(present, search, search.run())
-                elif self._search is None:
-                    self._search = (search, self._pool.submit(search.run))
+            if search is not None and self._search is None:
+                self._search = (search, self._begin(search.run))
         with watch("culling"):
             drop_unseen(self.map, self.options.gates.points.max_misses)
             busy = self._pending.job.keyframes if self._pending else []
             drop_repeating_keyframes(self.map, busy, self.options.gates.culling)
+
+    def _begin(self, work: Callable[[], Any]) -> Future | _OnDemand:
+        return _OnDemand(work) if self._pool is None else self._pool.submit(work)
 
     def take_up(self, present: Present, now: bool = False) -> None:
         """Take up the result of the thread when it is due."""
@@ -209,7 +214,6 @@ class Mapper:
             if self._pending.due > 0 and not now:
                 return
             pending, self._pending = self._pending, None
-            assert pending.future is not None
             pending.future.result()
             self.apply(present, pending.job)
 
