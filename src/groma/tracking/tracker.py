@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -196,7 +197,14 @@ class Tracker:
         with watch("turn"):
             predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
         estimate, followed = follow_frame(
-            self.map, present.data, data, present.followed, present.pose, predicted, prior_sigma, watch,
+            self.map,
+            present.data,
+            data,
+            present.followed,
+            present.pose,
+            predicted,
+            prior_sigma,
+            watch,
             self._mapper.frame_pool,
         )
         if estimate is None:
@@ -243,7 +251,7 @@ class Tracker:
         tracks = tracks.take(points.alive[tracks.index])
         better = turned_prediction(
             self.camera, present.data.gray, data.gray, (tracks.pixel, points.xyz[tracks.index]),
-            self._spread(present.data, present.pose), present.pose, predicted, gates,
+            partial(self._spread, present.data, present.pose), present.pose, predicted, gates,
         )  # fmt: skip
         if better is None:
             return predicted, prior_sigma

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
 from groma.features.images import GrayImage
+from groma.features.point_tracks import corners
 from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
 from groma.tracking.frame.camera import TrackCamera
@@ -62,8 +64,6 @@ class _FoundOnce(Generic[_Found]):
             if self._name not in found:
                 found[self._name] = self._find(instance)
             return found[self._name]
-
-
 
 
 @dataclass(frozen=True)
@@ -133,14 +133,26 @@ class FrameFeatures:
         inverse, sigma = self.inverse_depths(segments.ends)
         return DetectedSegments(segments, inverse, sigma)
 
+    @property
+    def corner_cell(self) -> int:
+        """Width of the cells of the image that get a point each, pixels."""
+        return max(12, int(math.sqrt(self.gray.size / self.options.num_points)))
+
+    @_FoundOnce
+    def corners(self) -> FloatArray:
+        """Corners (N, 2) worth following, strongest first."""
+        distance = self.options.gates.points.corner_distance * self.corner_cell
+        return corners(self.gray, self.options.num_points, distance)
+
     def lock_of(self, name: str) -> Any:
         """Return the lock of one thing to be found."""
         return self._locks.setdefault(name, RLock())
 
     def prepare(self, pool: Executor) -> None:
         """Begin with what a keyframe needs, in other threads; :meth:`wait` ends it."""
-        wanted = ("features", "detected") if self.options.lines else ("features",)
-        self._work += [pool.submit(getattr, self, name) for name in wanted if name not in vars(self)]
+        wanted = {"features": True, "detected": self.options.lines, "corners": self.options.points}
+        names = [name for name, is_wanted in wanted.items() if is_wanted and name not in vars(self)]
+        self._work += [pool.submit(getattr, self, name) for name in names]
 
     def prepare_ahead(self, pool: Executor, searching: Executor | None = None) -> None:
         """Begin in other threads with what depends on this image alone; with what a search needs where one is given."""

@@ -71,9 +71,7 @@ def match_near(
     """Pair known features with features of a frame (n, 2): near where a pose says, and most alike for both."""
     expected = camera.project(into(pose, known.places))
     rows = np.flatnonzero(camera.inside(expected, -radius))
-    pairs = pair_near(
-        expected[rows], known.descriptor[rows], features.pixel, features.descriptor, radius, max_bits
-    )
+    pairs = pair_near(expected[rows], known.descriptor[rows], features.pixel, features.descriptor, radius, max_bits)
     return np.column_stack([rows[pairs[:, 0]], pairs[:, 1]])
 
 
