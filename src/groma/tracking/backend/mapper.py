@@ -95,7 +95,7 @@ class Mapper:
         #: A frame that is to become a keyframe; its features are being found meanwhile.
         self.due: _Chosen | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="groma-adjust") if options.threaded else None
-        self._workers = ThreadPoolExecutor(2, thread_name_prefix="groma-detect") if options.threaded else None
+        self.workers = ThreadPoolExecutor(2, thread_name_prefix="groma-detect") if options.threaded else None
         #: For what belongs to a frame, which keyframes must not hold up.
         self.frame_pool = ThreadPoolExecutor(1, thread_name_prefix="groma-frame") if options.threaded else None
         self._pending: _Pending | None = None
@@ -121,7 +121,7 @@ class Mapper:
     @property
     def threaded(self) -> bool:
         """Whether features are found in other threads."""
-        return self._workers is not None
+        return self.workers is not None
 
     @property
     def busy(self) -> bool:
@@ -135,11 +135,6 @@ class Mapper:
         if self.due is not None and self.due.is_ready(DELAY if self.metric else 1):
             self.make_keyframe(present, watch)
 
-    def look_ahead(self, data: FrameFeatures, searched: bool) -> None:
-        """Begin with the frame after the present one; ``searched``: the present one could not be followed."""
-        if self.frame_pool is not None:
-            data.prepare_ahead(self.frame_pool, self._workers if searched else None)
-
     def adjust_start(self, present: Present) -> None:
         """Adjust the first keyframes of a single camera."""
         job = window_job(self.map, self.camera, self.options.window, False, self.metric)
@@ -150,8 +145,8 @@ class Mapper:
     def choose(self, present: Present, data: FrameFeatures) -> None:
         """Choose the present frame as a keyframe; its features are found in other threads meanwhile."""
         data.keep_up()
-        if self._workers is not None:
-            data.prepare(self._workers)
+        if self.workers is not None:
+            data.prepare(self.workers)
         near = self.map.near
         relative = se3.compose(present.pose[None], se3.inverse(near.pose[None]))[0]
         self.due = _Chosen(data, near.index, relative, present.followed)
@@ -295,8 +290,8 @@ class Mapper:
 
     def close(self) -> None:
         """End the threads."""
-        pools = self._pool, self._workers, self.frame_pool
-        self._pool = self._workers = self.frame_pool = None
+        pools = self._pool, self.workers, self.frame_pool
+        self._pool = self.workers = self.frame_pool = None
         for pool in pools:
             if pool is not None:
                 pool.shutdown(wait=True, cancel_futures=True)

@@ -20,7 +20,7 @@ from groma.features.images import GrayImage
 from groma.features.point_tracks import corners
 from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
-from groma.tracking.frame.camera import TrackCamera
+from groma.tracking.frame.camera import TrackCamera, back
 from groma.tracking.frame.depth import (
     DepthImage,
     depth_at,
@@ -207,21 +207,22 @@ class FrameFeatures:
 
     def keep_up(self) -> None:
         """Correct what was found in the right image, if how that is turned has become known better since."""
+        found = vars(self)
         old, new = self._turn, self._right_camera.turn.angles
-        if "right" not in self.__dict__ or np.array_equal(old, new):
+        if "right" not in found or np.array_equal(old, new):
             return
         for name in ("right", "disparities"):
-            self.__dict__.pop(name, None)
-        if "features" in self.__dict__:
+            found.pop(name, None)
+        if "features" in found:
             depth = retargeted_depths(self.camera, self.features.pixel, self.features.depth, old, new)
-            self.features = replace(self.features, depth=depth)
-        if "depth_grid" in self.__dict__:
+            found["features"] = replace(self.features, depth=depth)
+        if "depth_grid" in found:
             pixels = grid_pixels(self.camera, self.options.gates.depth)
-            self.depth_grid = retargeted_depths(self.camera, pixels, self.depth_grid, old, new)
-        if "detected" in self.__dict__:
+            found["depth_grid"] = retargeted_depths(self.camera, pixels, self.depth_grid, old, new)
+        if "detected" in found:
             ends = self.detected.segments.ends
             inverse = retargeted_ends(self.camera, ends, self.detected.inverse_depth, old, new)
-            self.detected = replace(self.detected, inverse_depth=inverse)
+            found["detected"] = replace(self.detected, inverse_depth=inverse)
         self._turn = new
 
     @_FoundOnce
@@ -259,6 +260,14 @@ class FrameFeatures:
     def depth_grid(self) -> FloatArray:
         """Depths at :func:`grid_pixels`; NaN where unknown."""
         return self.depths(grid_pixels(self.camera, self.options.gates.depth))
+
+    def spread_places(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels spread over a frame with a pose, and their places in the world, where it has a depth image."""
+        if self.depth is None:
+            return np.zeros((0, 2)), np.zeros((0, 3))
+        known = np.isfinite(self.depth_grid)
+        pixel = grid_pixels(self.camera, self.options.gates.depth)[known]
+        return pixel, back(pose, self.camera.bearings(pixel) * self.depth_grid[known, None])
 
     def depth_sigma(self, depth: FloatArray) -> FloatArray:
         """Standard deviations of depths from :meth:`depths`."""
