@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import os
 from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -211,7 +212,30 @@ def _read_obj(place: Path) -> Geometry:
 # PLY
 
 
-def _read_ply(place: Path) -> Geometry:
+def read_ply_points(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray]:
+    """Return the vertices of a PLY file and their colours, both (P, 3); black where there are none.
+
+    Raises
+    ------
+    FileFormatError
+        If it is damaged.
+    """
+    place = existing(path)
+    with reading(place, "PLY file"):
+        table = next((table for name, table in _ply_tables(place) if name == "vertex"), None)
+        if table is None:
+            raise FileFormatError("it has no vertices")
+        xyz, color = (
+            np.column_stack([np.asarray(table[name], float) for name in names])
+            if all(name in table for name in names)
+            else np.zeros((len(table["x"]), 3))
+            for names in (("x", "y", "z"), ("red", "green", "blue"))
+        )
+        return Geometry(points=xyz).points, np.nan_to_num(color)
+
+
+def _ply_tables(place: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the elements of a PLY file: name, and columns by name."""
     content = read_content(place)
     header, found, body = content.partition(b"end_header")
     if not content.startswith(b"ply") or not found:
@@ -219,9 +243,13 @@ def _read_ply(place: Path) -> Geometry:
     body = body.partition(b"\n")[2]
     form, layout = _ply_layout(header.decode("ascii", "replace"))
     source = _PlyText(body) if form == "ascii" else _PlyBytes(body, "<" if form == "binary_little_endian" else ">")
-    vertices, elements = np.zeros((0, 3)), []
     for name, count, properties in layout:
-        table = source.element(count, properties)
+        yield name, source.element(count, properties)
+
+
+def _read_ply(place: Path) -> Geometry:
+    vertices, elements = np.zeros((0, 3)), []
+    for name, table in _ply_tables(place):
         if name == "vertex":
             vertices = np.column_stack([np.asarray(table[axis], float) for axis in "xyz"])
         elif name == "edge":
@@ -311,4 +339,4 @@ class _PlyBytes:
         return table
 
 
-__all__ = ["ReferenceLines", "holds_scene", "read_line3dpp", "read_reference"]
+__all__ = ["ReferenceLines", "holds_scene", "read_line3dpp", "read_ply_points", "read_reference"]
