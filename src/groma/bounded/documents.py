@@ -23,6 +23,8 @@ _Kind = TypeVar("_Kind", dict[str, Any], list[Any], str)
 _WORDS = {dict: "an object {...}", list: "a list [...]", str: "a text"}
 #: Longest text that is taken for a name, characters.
 _LONGEST_NAME = 4096
+#: Numbers from here on are taken for infinite.
+_LARGEST_NUMBER = 1e300
 
 
 def read_document(path: str | os.PathLike[str]) -> Any:
@@ -70,11 +72,8 @@ def number(holder: dict[str, Any], name: str, place: object, default: float | No
     if name not in holder and default is not None:
         return default
     value = holder.get(name)
-    good = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-    if not good or not math.isfinite(value):
-        raise FileFormatError(
-            f"{place}: expected {shown(name)}, a finite number; got {_seen(value)}. Correct the file."
-        )
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST_NUMBER:
+        raise FileFormatError(f"{place}: expected {shown(name)}, a finite number; got {_seen(value)}. Correct it.")
     return float(value)
 
 

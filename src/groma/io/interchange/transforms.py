@@ -52,8 +52,8 @@ from groma.io.endings import IMAGES
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, panorama, polynomial, shared
 from groma.io.interchange.poses import FLIP, file_in, points_table, rigid, size_of_image
 from groma.io.ply import write_ply
+from groma.io.ply_tables import read_ply_points
 from groma.io.reading import existing, reading
-from groma.io.reference import read_ply_points
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Cameras, Points, Scene
 
