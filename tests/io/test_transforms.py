@@ -98,6 +98,17 @@ def test_intrinsics_of_a_frame_count_before_those_of_the_file(true, tmp_path):
     assert scene.cameras.params[:, 0].tolist() == [500.0, 700.0]
 
 
+def test_a_frame_with_a_camera_of_its_own_has_the_size_of_its_photograph(true, tmp_path):
+    listed = frames(true)
+    listed[0] |= {"fl_x": 700.0}
+    photographs(tmp_path, ["images/0.png"], (320, 200))
+    photographs(tmp_path, ["images/3.png"])
+    listed.reverse()
+    scene = read_scene(write(tmp_path, {"fl_x": 500.0, "frames": listed}))
+    assert scene.cameras.width.tolist() == [WIDTH, 320] and scene.cameras.height.tolist() == [HEIGHT, 200]
+    assert scene.images.camera_idx.tolist() == [0, 0, 0, 1]
+
+
 def test_sizes_come_from_the_photographs_where_the_file_has_none(true, tmp_path):
     """As in NeRF's Blender scenes, whose names have no ending either."""
     listed = frames(true)
@@ -106,9 +117,9 @@ def test_sizes_come_from_the_photographs_where_the_file_has_none(true, tmp_path)
     path = write(tmp_path, {"camera_angle_x": 2 * np.arctan(0.5), "frames": listed})
     with pytest.raises(FileFormatError, match="neither these nor the photograph"):
         read_scene(path)
-    photographs(tmp_path, ["images/0.png"])
+    photographs(tmp_path, ["images/1.png"])
     scene = read_scene(path)
-    assert scene.images.names[2] == "images/2.png"
+    assert scene.images.names[2] == "images/2.png" and len(scene.cameras) == 1
     assert scene.cameras.params_of(0).tolist() == pytest.approx([WIDTH, WIDTH / 2, HEIGHT / 2])
 
 

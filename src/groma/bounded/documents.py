@@ -48,6 +48,11 @@ def read_document(path: str | os.PathLike[str]) -> Any:
         raise FileFormatError(f"{path} is not JSON from {where} on: {error.msg}. Fetch or write it again.") from error
 
 
+def begins_with(head: bytes, mark: bytes) -> bool:
+    """Whether the first bytes of a file are those of a document that begins with ``{`` or ``[``, as asked for."""
+    return head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(mark)
+
+
 def of_kind(value: Any, kind: type[_Kind], place: object) -> _Kind:
     """Return a value if it is a dictionary, a list or a text, as asked for; else raise FileFormatError.
 
@@ -129,4 +134,4 @@ def _seen(value: Any) -> str:
     return text[:60] + ("..." if len(text) > 60 else "")
 
 
-__all__ = ["member", "number", "of_kind", "read_document", "size", "table"]
+__all__ = ["begins_with", "member", "number", "of_kind", "read_document", "size", "table"]

@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.bounded.documents import member, number, of_kind, read_document, size, table
+from groma.bounded.documents import begins_with, member, number, of_kind, read_document, size, table
 from groma.bounded.text import shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, panorama, polynomial
@@ -195,7 +195,7 @@ def _structure(document: dict[str, Any], views: list[_View], path: Path) -> tupl
 def _recognise(path: Path, head: bytes) -> bool:
     if path.is_dir():
         return (path / _NAME).is_file()
-    return head.lstrip().startswith(b"{") and b'"sfm_data_version"' in head
+    return begins_with(head, b"{") and b'"sfm_data_version"' in head
 
 
 register_format(

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.bounded.documents import member, number, of_kind, read_document, size, table
+from groma.bounded.documents import begins_with, member, number, of_kind, read_document, size, table
 from groma.bounded.text import finite, read_text, shown
 from groma.errors import FileFormatError
 from groma.geometry import quaternion
@@ -225,7 +225,7 @@ def _seen(tracks: dict[str, _Tracks], images: list[str], points: list[str]) -> t
 def _recognise(path: Path, head: bytes) -> bool:
     if path.is_dir():
         return (path / _NAME).is_file()
-    if not head.lstrip().startswith(b"["):
+    if not begins_with(head, b"["):
         return False
     with path.open("rb") as file:
         start = file.read(1 << 16)

@@ -42,7 +42,7 @@ import numpy as np
 
 from groma import cameras as camera_models
 from groma._typing import FloatArray
-from groma.bounded.documents import member, number, of_kind, read_document, size, table
+from groma.bounded.documents import begins_with, member, number, of_kind, read_document, size, table
 from groma.bounded.names import listed_file
 from groma.bounded.text import shown
 from groma.errors import FileFormatError, InputError
@@ -71,8 +71,6 @@ _POLYNOMIALS = {
     "RADIAL": (2, False),
     "OPENCV": (4, True),
 }
-
-
 #: Models that are written, and under which names.
 _WRITTEN = {
     **{name: name for name in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")},
@@ -109,19 +107,8 @@ def read_transforms(path: str | os.PathLike[str]) -> Transforms:
             of_kind(frame, dict, f"{place}, frame {row}")
             for row, frame in enumerate(member(document, "frames", list, place), 1)
         ]
-        top = {name: document[name] for name in INTRINSICS if name in document}
         names = [_name(frame, f"{place}, frame {row}") for row, frame in enumerate(frames, 1)]
-        lenses = []
-        sizes: dict[bool, tuple[int, int]] = {}  # of the photographs of the camera at the top, read once
-        for row, (frame, name) in enumerate(zip(frames, names, strict=True), 1):
-            own = {key: frame[key] for key in INTRINSICS if key in frame}
-            said = {**top, **own}
-            if not {"w", "h"} <= said.keys():
-                if own or not sizes:
-                    sizes[not own] = size_of_image(place.parent, name)
-                said |= dict(zip(("w", "h"), sizes[not own], strict=True))
-            lenses.append(_calibration(said, f"{place}, frame {row}"))
-        calibrations, camera_idx = shared(lenses)
+        calibrations, camera_idx = shared(_calibrations(document, frames, names, place))
         matrices = table([frame.get("transform_matrix") for frame in frames], (4, 4), f"{place}, transform_matrix")
         if len(matrices) and np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
             raise FileFormatError(f"{place}: expected matrices whose last row is 0 0 0 1. Transpose them.")
@@ -151,6 +138,24 @@ def _name(frame: dict[str, Any], place: str) -> str:
     return name if name.lower().endswith(IMAGES) or "." in name.rsplit("/", 1)[-1] else f"{name}.png"
 
 
+def _calibrations(
+    document: dict[str, Any], frames: list[dict[str, Any]], names: list[str], path: Path
+) -> list[Calibration]:
+    """Return the camera of each frame: what the top of the document says, and the frame instead where it says it."""
+    top = {name: document[name] for name in INTRINSICS if name in document}
+    has_sizes = {"w", "h"} <= top.keys() or all({"w", "h"} <= frame.keys() for frame in frames)
+    sizes = (size_of_image(path.parent, name) for name in ([] if has_sizes else names))
+    common = next((one for one in sizes if one != (0, 0)), (0, 0))
+    found = []
+    for row, (frame, name) in enumerate(zip(frames, names, strict=True), 1):
+        own = {key: frame[key] for key in INTRINSICS if key in frame}
+        said = {**top, **own}
+        if not {"w", "h"} <= said.keys():
+            said["w"], said["h"] = size_of_image(path.parent, name) if own else common
+        found.append(_calibration(said, f"{path}, frame {row}"))
+    return found
+
+
 def _calibration(said: dict[str, Any], place: str) -> Calibration:
     """Return the camera that intrinsics describe."""
     if said.get("w") == 0:
@@ -161,7 +166,7 @@ def _calibration(said: dict[str, Any], place: str) -> Calibration:
     extent = size(said, ("w", "h"), place)
     fallback = "OPENCV_FISHEYE" if said.get("is_fisheye") is True else ""
     model = of_kind(said.get("camera_model", fallback), str, place)
-    if model == "EQUIRECTANGULAR" or said.get("is_equirectangular") is True:
+    if model == "EQUIRECTANGULAR":
         return panorama(extent)
     focal_x = _focal(said, "x", extent[0], None, place)
     focal = (focal_x, _focal(said, "y", extent[1], focal_x, place))
@@ -293,7 +298,7 @@ def _entries(cameras: Cameras, row: int) -> dict[str, Any]:
 def _recognise(path: Path, head: bytes) -> bool:
     if path.is_dir():
         return (path / _NAME).is_file()
-    if not head.lstrip().startswith(b"{"):
+    if not begins_with(head, b"{"):
         return False
     with path.open("rb") as file:
         start = file.read(1 << 16)
