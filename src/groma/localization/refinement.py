@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Fit a pose to matches: points and lines together, each weighted by its noise and by that of its landmark.
+
+The landmarks are held. What is not known of them is seen through the derivative of the residual by the landmark,
+:math:`J_X`, and is added to the noise of the image,
+
+.. math:: \Sigma = \sigma^2 I + J_X\, \Sigma_X\, J_X^\top ,
+
+which is what eliminating landmarks with such priors would leave, to first order. The noise that the residuals show
+multiplies all of it.
+
+Errors of neighbouring matches are seldom independent: they share a surface, an image of the map, a lens. The covariance
+of the pose is therefore the larger of the usual inverse :math:`H^{-1}` and the one that adds gradients within cells of
+the image before it squares them (clustered sandwich),
+
+.. math:: H^{-1} \Big( \sum_{c} g_c g_c^\top \Big) H^{-1}, \qquad g_c = \sum_{i \in c} J_i^\top W_i r_i .
+
+Reference: K.-Y. Liang, S. Zeger, *Longitudinal data analysis using generalized linear models*, 1986, eq. (7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.fit import MEDIAN_SQUARE
+from groma.adjustment.stages import with_loss
+from groma.factors.contract import Factor
+from groma.factors.losses import Cauchy, GemanMcClure
+from groma.gates import chi_square_gate
+from groma.localization.camera import QueryCamera
+from groma.localization.gates import REFINEMENT, RefinementGates
+from groma.localization.matches import Matches, nearest_claims
+from groma.problem.problem import Problem
+from groma.scene import LineObservations, Lines, PointObservations, Points, Scene
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
+
+_ASSEMBLY = AssemblyOptions(
+    point_chart="euclidean", drop_behind=False, require_in_front=True, gauge="free", refine_landmarks=False
+)
+_POSE = SolverOptions(max_iterations=12, function_tolerance=1e-5, initial_damping=1e-6, threads=1, eliminate=("frames",))
+_LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """What a pose leaves of the matches, in standard deviations, and what it says about the pose."""
+
+    #: (n, 2) whitened residuals, (n, 2, 6) their derivatives by the left twist; NaN where a match has no image.
+    value: FloatArray
+    by_pose: FloatArray
+    #: (n,) square pixels of an ellipse of one standard deviation, over pi: root of the determinant of the noise.
+    spread: FloatArray
+
+    @property
+    def square(self) -> FloatArray:
+        """(n,) squared lengths; infinite where a match has no image."""
+        square = (self.value**2).sum(axis=1)
+        return np.where(np.isfinite(square), square, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A pose fitted to what agrees with it."""
+
+    #: (7,) cam_from_world, and the camera: as given, or estimated.
+    pose: FloatArray
+    camera: QueryCamera
+    points: Residuals
+    lines: Residuals
+    #: Which matches agree; of several that claim the same, the nearest.
+    point_inliers: BoolArray
+    line_inliers: BoolArray
+    #: Noise that the residuals show, in units of what was stated, and the squared residual that agrees.
+    sigma0: float
+    limit: float
+
+    def covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
+        """(6, 6) covariance of the left twist; infinite where the matches do not determine the pose."""
+        chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
+        J = np.concatenate([found.by_pose[kept] for found, kept in chosen]) / self.sigma0
+        r = np.concatenate([found.value[kept] for found, kept in chosen]) / self.sigma0
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->ij", J, J))
+        if not values[0] > np.finfo(float).eps * values[-1]:
+            return np.full((6, 6), np.inf)
+        root = vectors / np.sqrt(values)  # whitens the twist
+        middle = matches.segments2d.mean(axis=1)[self.line_inliers]
+        cell = cells_of(np.concatenate([matches.points2d[self.point_inliers], middle]), self.camera, gates.cells)
+        gradient = np.zeros((int(cell.max()) + 1, 6))
+        np.add.at(gradient, cell, np.einsum("nki,nk->ni", J @ root, r))
+        count = len(gradient)
+        if count <= 6:
+            return root @ root.T
+        shared, axes = np.linalg.eigh(gradient.T @ gradient * (count / (count - 6.0)))
+        by_chance = (1.0 + np.sqrt(6.0 / count)) ** 2  # the largest such eigenvalue of independent errors
+        root = root @ axes * np.sqrt(np.where(shared > by_chance, shared, 1.0))
+        return root @ root.T
+
+
+def cells_of(pixels: FloatArray, camera: QueryCamera, cells: int) -> IntArray:
+    """Number pixels (N, 2) by the cell of the image that they lie in, cells without any left out."""
+    side = max(camera.width, camera.height) / cells
+    place = np.floor(pixels / side).astype(np.int64)
+    return np.unique(place, axis=0, return_inverse=True)[1].ravel().astype(np.int64)
+
+
+def refine(
+    camera: QueryCamera,
+    matches: Matches,
+    start: FloatArray,
+    max_error: tuple[float, float],
+    refine_lens: bool = False,
+    gates: RefinementGates = REFINEMENT,
+) -> Refined:
+    """Fit a pose.
+
+    Parameters
+    ----------
+    camera, matches
+        The camera, and what may be seen.
+    start : (7,)
+        cam_from_world.
+    max_error
+        Matches of points and lines further from there, pixels, say nothing about the noise.
+    refine_lens
+        Estimate focal length and distortion, too.
+    gates
+        Numbers of the fit.
+    """
+    pose = start
+    for loss in (Cauchy(gates.wide_loss), GemanMcClure(gates.last_loss)):
+        problem = _problem(camera, matches, pose, refine_lens)
+        problem = solve(with_loss(problem, loss), _LENS if refine_lens else _POSE).problem
+        pose = problem.variables["frames"].state[0]
+        camera = _camera_of(problem, camera) if refine_lens else camera
+    problem = _problem(camera, matches, pose, False)
+    sigma0 = _noise(problem, matches, max_error, gates)
+    points, lines = residuals(problem, "points", matches.num_points), residuals(problem, "lines", matches.num_lines)
+    limit = chi_square_gate(gates.outlier, 2) * sigma0**2
+    agree = [
+        nearest_claims(claim, found.square, found.square <= limit)
+        for claim, found in zip(matches.claims(), (points, lines), strict=True)
+    ]
+    return Refined(pose, camera, points, lines, agree[0], agree[1], sigma0, limit)
+
+
+def residuals(problem: Problem, landmarks: str, count: int) -> Residuals:
+    """Whitened residuals of the matches of one kind, ``points`` or ``lines``; each match has a landmark of its own."""
+    value, by_pose, spread = np.full((count, 2), np.nan), np.zeros((count, 2, 6)), np.ones(count)
+    for factor in problem.factors:
+        rows = _landmark_rows(factor, landmarks)
+        if rows is None:
+            continue
+        record = _records(problem, factor, {"pose": 6})
+        weight = np.broadcast_to(_times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))
+        white = weight @ record
+        seen = (record != 0.0).any(axis=(1, 2))  # what cannot be evaluated is zero
+        value[rows[seen]], by_pose[rows[seen]] = white[seen, :, 6], white[seen, :, :6]
+        spread[rows] = 1.0 / np.abs(np.linalg.det(weight))
+    return Residuals(value, by_pose, spread)
+
+
+def _problem(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool) -> Problem:
+    """The problem of one pose; what is not known of the landmarks is added to the noise of the image."""
+    image = np.zeros(matches.num_points, np.int64), np.zeros(matches.num_lines, np.int64)
+    scene = Scene.from_images(
+        camera.table(), ["query"], [0], pose[None],
+        points=Points.at(matches.points3d),
+        point_observations=PointObservations.numbered(
+            image[0], np.arange(matches.num_points), matches.points2d, matches.point_sigma
+        ),
+        lines=Lines.through(matches.segments3d),
+        line_observations=LineObservations(
+            image[1], np.arange(matches.num_lines), matches.segments2d.reshape(-1, 4), matches.segment_sigma
+        ),
+    )  # fmt: skip
+    problem = assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem
+    covariances = {"points": matches.point_covariance, "lines": matches.line_covariance}
+    return Problem(problem.variables, [_with_landmarks(problem, factor, covariances) for factor in problem.factors])
+
+
+def _with_landmarks(problem: Problem, factor: Factor, covariances: dict[str, FloatArray | None]) -> Factor:
+    """Return a factor whose noise holds that of its landmarks, too."""
+    for name, covariance in covariances.items():
+        rows = _landmark_rows(factor, name)
+        if rows is None or covariance is None or not covariance.any():
+            continue
+        size = covariance.shape[1]
+        J = _records(problem, factor, {name[:-1]: size})[..., :size]
+        image = np.linalg.inv(_times(factor.sqrt_information, np.eye(2)[None]))
+        noise = image @ np.swapaxes(image, 1, 2) + J @ covariance[rows] @ np.swapaxes(J, 1, 2)
+        return replace(factor, sqrt_information=np.linalg.inv(np.linalg.cholesky(noise)))
+    return factor
+
+
+def _landmark_rows(factor: Factor, group: str) -> IntArray | None:
+    """The landmarks of a factor; None if it is of another kind."""
+    return next((ref.index for _, ref in factor.references() if ref.group == group), None)
+
+
+def _records(problem: Problem, factor: Factor, wanted: dict[str, int]) -> FloatArray:
+    """Derivatives by one slot of so many coordinates, and the residual in the last column; not whitened."""
+    (slot, size), = wanted.items()
+    columns = tuple(0 if own.name == slot else -1 for own, _ in factor.references())
+    ambients = tuple(problem.variables[ref.group].ambient() for _, ref in factor.references())
+    record = np.zeros((len(factor), factor.residual_size, size + 1))
+    factor.linearize(factor.prepare(ambients), 0, len(factor), columns, record)
+    return record
+
+
+def _times(weight: float | FloatArray, record: FloatArray) -> FloatArray:
+    weight = np.asarray(weight)
+    return weight @ record if weight.ndim == 3 else weight.reshape(-1, 1, 1) * record
+
+
+def _noise(problem: Problem, matches: Matches, max_error: tuple[float, float], gates: RefinementGates) -> float:
+    """Noise that the residuals show beside what was stated, from those that are no outliers for sure.
+
+    The median of what lies below a limit is too small where noise reaches the limit; the limit is wide.
+    """
+    squares, sigmas = [], (matches.point_sigma, matches.segment_sigma)
+    for name, sigma, limit in zip(("points", "lines"), sigmas, max_error, strict=True):
+        assert sigma is not None
+        found = residuals(problem, name, len(sigma))
+        squares.append(found.square[found.square <= (limit / sigma) ** 2])
+    together = np.concatenate(squares)
+    if not len(together):
+        return 1.0
+    free = max(1.0 - 3.0 / len(together), 0.1)  # six of two times so many numbers went into the pose
+    shown = float(np.median(together)) / (MEDIAN_SQUARE * free)
+    return float(np.sqrt((gates.stated_weight + len(together) * shown) / (gates.stated_weight + len(together))))
+
+
+def _camera_of(problem: Problem, camera: QueryCamera) -> QueryCamera:
+    state = problem.variables[f"intrinsics/{camera.model}"].state[0]
+    return QueryCamera(camera.model, state, camera.width, camera.height)
+
+
+__all__ = ["Refined", "Residuals", "refine", "residuals"]
