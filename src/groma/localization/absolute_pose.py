@@ -7,6 +7,7 @@ and the noise of both. What goes out is a pose, its covariance, which matches ag
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from groma.localization.camera import QueryCamera
 from groma.localization.gates import VERDICT
 from groma.localization.hypotheses import max_errors, propose, straightened
 from groma.localization.matches import Matches
-from groma.localization.refinement import Refined, refine
+from groma.localization.refinement import Refined, fitted, refine
 from groma.localization.verdict import Evidence, Status, evidence_of, judge, median_distance, moved
 
 
@@ -34,6 +35,12 @@ class PoseOptions:
     refine_lens: bool = False
     #: Look for a second place that fits as well.
     look_for_rival: bool = True
+    #: Focal lengths that are tried, over that of the camera: :data:`UNKNOWN_LENS` where nothing is known of it.
+    focal_factors: tuple[float, ...] = (1.0,)
+
+
+#: Focal lengths of phones to telephoto lenses, over the longer side of the image, in steps of a fifth.
+UNKNOWN_LENS = tuple(0.5 * 1.2**step for step in range(10))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +64,8 @@ class AbsolutePose:
     line_inliers: BoolArray
     #: The camera: as given, or estimated.
     camera: QueryCamera
+    #: The matches that the masks tell of.
+    matches: Matches
     #: Noise of the matches that agree, in units of what was stated.
     sigma0: float = 1.0
     #: Another pose that fits about as well, where there is one.
@@ -145,7 +154,7 @@ def pose_from_matches(
     matches: Matches,
     options: PoseOptions | None = None,
     places: int = 1,
-    start: FloatArray | None = None,
+    guided: Callable[[Refined], Matches] | None = None,
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
 
@@ -155,57 +164,74 @@ def pose_from_matches(
         See there.
     places
         Parts of a map that the matches were looked for in; chance has so many opportunities.
-    start : (7,), optional
-        A pose that is near, instead of one from few matches.
+    guided : callable, optional
+        Returns more matches once a pose is near; they refine it, and are those that the result tells of. They are no
+        evidence that the place is right, because they were looked for where it says.
     """
     options = options or PoseOptions()
-    best = _best(camera, matches, options, start)
+    best = _best(camera, matches, options)
     if best is None:
         return _failed(camera, matches)
     first = evidence_of(best, matches, places)
-    other = _rival(camera, matches, best, options, places) if options.look_for_rival and first.significant else None
-    covariance = best.covariance(matches)
-    distance = median_distance(best.pose, _seen(matches, best))
+    other = _rival(matches, best, options, places) if options.look_for_rival and first.significant else None
+    used = matches
+    if guided is not None and first.significant:
+        used = guided(best)
+        errors = _errors(used, options)
+        best = refine(best.camera, used, best.pose, errors, options.refine_lens)
+        first = evidence_of(fitted(best.camera, matches, best.pose, errors), matches, places)
+    covariance = best.covariance(used)
+    distance = median_distance(best.pose, _seen(used, best))
     verdict = judge(best, covariance, distance, first, None if other is None else other[1])
+    failed = verdict.status == "failed"
     return AbsolutePose(
         verdict.status,
         verdict.sentence,
         verdict.probability,
-        None if verdict.status == "failed" else best.pose,
-        None if verdict.status == "failed" else covariance,
+        None if failed else best.pose,
+        None if failed else covariance,
         best.point_inliers,
         best.line_inliers,
         best.camera,
+        used,
         best.sigma0,
         None if other is None or verdict.status != "uncertain" else other[0].pose,
     )
 
 
-def _best(
-    camera: QueryCamera, matches: Matches, options: PoseOptions, start: FloatArray | None = None
-) -> Refined | None:
-    """The pose that most agrees with, refined; None where there is none."""
-    straight = straightened(camera, matches)
-    errors = max_errors(matches) if options.max_error is None else (options.max_error, options.max_error)
-    if start is None:
-        start = propose(straight, errors, options.seed)
-    if start is None:
-        return None
-    return refine(camera, matches, start, errors, options.refine_lens)
+def _errors(matches: Matches, options: PoseOptions) -> tuple[float, float]:
+    return max_errors(matches) if options.max_error is None else (options.max_error, options.max_error)
+
+
+def _best(camera: QueryCamera, matches: Matches, options: PoseOptions) -> Refined | None:
+    """The pose that most agrees with, refined; None where there is none. Of several focal lengths the best."""
+    errors = _errors(matches, options)
+    starts = [_with_focal_length(camera, factor) for factor in options.focal_factors]
+    found = [(propose(straightened(one, matches), errors, options.seed), one) for one in starts]
+    refined = [refine(one, matches, pose, errors, options.refine_lens) for pose, one in found if pose is not None]
+    return max(refined, key=lambda one: int(one.point_inliers.sum() + one.line_inliers.sum()), default=None)
+
+
+def _with_focal_length(camera: QueryCamera, factor: float) -> QueryCamera:
+    if factor == 1.0:
+        return camera
+    params = camera.params.copy()
+    params[list(camera.kind.focal_indices)] *= factor
+    return QueryCamera(camera.model, params, camera.width, camera.height)
 
 
 def _rival(
-    camera: QueryCamera, matches: Matches, best: Refined, options: PoseOptions, places: int
+    matches: Matches, best: Refined, options: PoseOptions, places: int
 ) -> tuple[Refined, Evidence] | None:
     """The best pose of what disagrees with the first, if it is another one."""
     squares = [np.where(np.isfinite(one.square), one.square, np.inf) for one in (best.points, best.lines)]
     left = [square > 4.0 * best.limit for square in squares]
     rest = matches.take(left[0], left[1])
-    other = _best(best.camera, rest, replace(options, refine_lens=False))
+    other = _best(best.camera, rest, replace(options, refine_lens=False, focal_factors=(1.0,)))
     if other is None:
         return None
     found = evidence_of(other, rest, places)
-    way = moved(camera, best.pose, other.pose, _seen(rest, other))
+    way = moved(best.camera, best.pose, other.pose, _seen(rest, other))
     is_other = way > VERDICT.distinct * max_errors(matches)[0]
     return (other, found) if is_other and found.significant else None
 
@@ -220,11 +246,11 @@ def _failed(camera: QueryCamera, matches: Matches) -> AbsolutePose:
     number = matches.num_points + matches.num_lines
     why = f"No pose agrees with enough of the {number} matches." if number else "Nothing of the map was found in it."
     none = np.zeros(matches.num_points, bool), np.zeros(matches.num_lines, bool)
-    return AbsolutePose("failed", why, 0.0, None, None, *none, camera)
+    return AbsolutePose("failed", why, 0.0, None, None, *none, camera, matches)
 
 
 def _or_none(value: npt.ArrayLike | None, *shape: int) -> npt.ArrayLike:
     return np.zeros((0, *shape)) if value is None else value
 
 
-__all__ = ["AbsolutePose", "PoseOptions", "estimate_absolute_pose", "pose_from_matches"]
+__all__ = ["UNKNOWN_LENS", "AbsolutePose", "PoseOptions", "estimate_absolute_pose", "pose_from_matches"]

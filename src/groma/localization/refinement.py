@@ -35,6 +35,7 @@ from groma.gates import chi_square_gate
 from groma.localization.camera import QueryCamera
 from groma.localization.gates import REFINEMENT, RefinementGates
 from groma.localization.matches import Matches, nearest_claims
+from groma.localization.records import landmark_rows, records, times
 from groma.problem.problem import Problem
 from groma.scene import LineObservations, Lines, PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
@@ -138,6 +139,17 @@ def refine(
         problem = solve(with_loss(problem, loss), _LENS if refine_lens else _POSE).problem
         pose = problem.variables["frames"].state[0]
         camera = _camera_of(problem, camera) if refine_lens else camera
+    return fitted(camera, matches, pose, max_error, gates)
+
+
+def fitted(
+    camera: QueryCamera,
+    matches: Matches,
+    pose: FloatArray,
+    max_error: tuple[float, float],
+    gates: RefinementGates = REFINEMENT,
+) -> Refined:
+    """Say which matches agree with a pose as it is; parameters as of :func:`refine`."""
     problem = _problem(camera, matches, pose, False)
     sigma0 = _noise(problem, matches, max_error, gates)
     points, lines = residuals(problem, "points", matches.num_points), residuals(problem, "lines", matches.num_lines)
@@ -153,11 +165,11 @@ def residuals(problem: Problem, landmarks: str, count: int) -> Residuals:
     """Whitened residuals of the matches of one kind, ``points`` or ``lines``; each match has a landmark of its own."""
     value, by_pose, spread = np.full((count, 2), np.nan), np.zeros((count, 2, 6)), np.ones(count)
     for factor in problem.factors:
-        rows = _landmark_rows(factor, landmarks)
+        rows = landmark_rows(factor, landmarks)
         if rows is None:
             continue
-        record = _records(problem, factor, {"pose": 6})
-        weight = np.broadcast_to(_times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))
+        record = records(problem, factor, {"pose": 6})
+        weight = np.broadcast_to(times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))
         white = weight @ record
         seen = (record != 0.0).any(axis=(1, 2))  # what cannot be evaluated is zero
         value[rows[seen]], by_pose[rows[seen]] = white[seen, :, 6], white[seen, :, :6]
@@ -187,35 +199,15 @@ def _problem(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_len
 def _with_landmarks(problem: Problem, factor: Factor, covariances: dict[str, FloatArray | None]) -> Factor:
     """Return a factor whose noise holds that of its landmarks, too."""
     for name, covariance in covariances.items():
-        rows = _landmark_rows(factor, name)
+        rows = landmark_rows(factor, name)
         if rows is None or covariance is None or not covariance.any():
             continue
         size = covariance.shape[1]
-        J = _records(problem, factor, {name[:-1]: size})[..., :size]
-        image = np.linalg.inv(_times(factor.sqrt_information, np.eye(2)[None]))
+        J = records(problem, factor, {name[:-1]: size})[..., :size]
+        image = np.linalg.inv(times(factor.sqrt_information, np.eye(2)[None]))
         noise = image @ np.swapaxes(image, 1, 2) + J @ covariance[rows] @ np.swapaxes(J, 1, 2)
         return replace(factor, sqrt_information=np.linalg.inv(np.linalg.cholesky(noise)))
     return factor
-
-
-def _landmark_rows(factor: Factor, group: str) -> IntArray | None:
-    """The landmarks of a factor; None if it is of another kind."""
-    return next((ref.index for _, ref in factor.references() if ref.group == group), None)
-
-
-def _records(problem: Problem, factor: Factor, wanted: dict[str, int]) -> FloatArray:
-    """Derivatives by one slot of so many coordinates, and the residual in the last column; not whitened."""
-    (slot, size), = wanted.items()
-    columns = tuple(0 if own.name == slot else -1 for own, _ in factor.references())
-    ambients = tuple(problem.variables[ref.group].ambient() for _, ref in factor.references())
-    record = np.zeros((len(factor), factor.residual_size, size + 1))
-    factor.linearize(factor.prepare(ambients), 0, len(factor), columns, record)
-    return record
-
-
-def _times(weight: float | FloatArray, record: FloatArray) -> FloatArray:
-    weight = np.asarray(weight)
-    return weight @ record if weight.ndim == 3 else weight.reshape(-1, 1, 1) * record
 
 
 def _noise(problem: Problem, matches: Matches, max_error: tuple[float, float], gates: RefinementGates) -> float:
@@ -241,4 +233,4 @@ def _camera_of(problem: Problem, camera: QueryCamera) -> QueryCamera:
     return QueryCamera(camera.model, state, camera.width, camera.height)
 
 
-__all__ = ["Refined", "Residuals", "refine", "residuals"]
+__all__ = ["Refined", "Residuals", "cells_of", "fitted", "refine", "residuals"]
