@@ -179,7 +179,7 @@ def pose_from_matches(
         used = guided(best)
         errors = _errors(used, options)
         best = refine(best.camera, used, best.pose, errors, options.refine_lens)
-        first = evidence_of(fitted(best.camera, matches, best.pose, errors), matches, places)
+        first = evidence_of(fitted(best.camera, matches, best.pose, errors, options.refine_lens), matches, places)
     covariance = best.covariance(used)
     distance = median_distance(best.pose, _seen(used, best))
     verdict = judge(best, covariance, distance, first, None if other is None else other[1])

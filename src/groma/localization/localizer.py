@@ -22,11 +22,12 @@ from groma.localization.camera import QueryCamera
 from groma.localization.candidates import described_alike, found_near
 from groma.localization.features import DescribedImage, find_features
 from groma.localization.hypotheses import max_errors
-from groma.localization.map_index import MapIndex, kept_index
+from groma.localization.map_images import image_paths, images_in_summary
+from groma.localization.map_index import MapIndex, images_told, kept_index
 from groma.localization.matches import Matches
 from groma.localization.refinement import Refined
 from groma.localization.retrieval import VladRetrieval
-from groma.mapping.photographs import read_gray
+from groma.mapping.photographs import check_cameras, read_gray
 from groma.scene import Scene
 
 
@@ -75,8 +76,9 @@ class Localizer:
     ----------
     map_ : path or Scene
         OUT of ``groma map`` or ``groma track``, a COLMAP model, or a scene.
-    images : path
-        Folder of the photographs of the map.
+    images : path, optional
+        Folder of the photographs of the map, or a folder above. By default where they were when the map was described,
+        or made.
     index : path, optional
         File in which the descriptions of the map are kept, so that they are made once. By default beside the map; a
         scene without a file is described anew.
@@ -89,26 +91,22 @@ class Localizer:
     def __init__(
         self,
         map_: str | os.PathLike[str] | Scene,
-        images: str | os.PathLike[str],
+        images: str | os.PathLike[str] | None = None,
         index: str | os.PathLike[str] | None = None,
         options: LocalizeOptions | None = None,
         progress: Callable[[str, int, int], None] | None = None,
     ) -> None:
-        from groma.localization.map_index import build_index
-
         say = progress or (lambda stage, done, total: None)
         self.options = options or LocalizeOptions()
         self.scene = map_ if isinstance(map_, Scene) else read_scene(map_)
-        folder = Path(images)
-        check_map(self.scene, folder)
-        #: What could not be done as wanted, in words; empty otherwise.
-        self.warning = ""
+        check_map(self.scene)
         if index is None and not isinstance(map_, Scene):
             index = index_file(Path(map_))
-        if index is None:
-            self.index: MapIndex = build_index(self.scene, folder, say)
-        else:
-            self.index, self.warning = kept_index(self.scene, folder, Path(index), say)
+        path = None if index is None else Path(index)
+        #: Files of the images of the map, in their order.
+        self.files = image_paths(self.scene, _folder(map_, images, path))
+        #: The descriptions; and what could not be done as wanted, in words.
+        self.index, self.warning = kept_index(self.scene, self.files, path, say)
         self._retrieval = VladRetrieval(self.index.vocabulary)
 
     def camera_of_map(self, width: int, height: int) -> QueryCamera | None:
@@ -184,6 +182,18 @@ class Localizer:
         return np.argsort(-self._retrieval.similarity(described, self.index.image), kind="stable")[:wanted]  # type: ignore[arg-type]
 
 
+def _folder(map_: object, images: str | os.PathLike[str] | None, index: Path | None) -> Path:
+    """Folder of the photographs of a map: as given, else as the description or the summary of the map tells."""
+    if images is not None:
+        return Path(images)
+    told = None if index is None else images_told(index)
+    if told is None and not isinstance(map_, Scene):
+        told = images_in_summary(Path(str(map_)))
+    if told is None:
+        raise InputError("Where the photographs of the map are is not known. Pass their folder with --images.")
+    return told
+
+
 def unknown_camera(width: int, height: int) -> QueryCamera:
     """Return a camera as wide as its image is long, in a model with one distortion: where an estimate begins."""
     params = np.array([max(width, height), 0.5 * width, 0.5 * height, 0.0], float)
@@ -196,21 +206,11 @@ def index_file(map_: Path) -> Path:
     return path.with_name(f"{path.name}.index.npz")
 
 
-def check_map(scene: Scene, images: Path) -> None:
-    """Check that a map has images with poses, that their files are there, and that a plane holds their views."""
-    from groma.mapping.photographs import check_cameras
-
+def check_map(scene: Scene) -> None:
+    """Check that a map has images with poses, and that a plane holds their views."""
     if not scene.num_images:
         raise InputError("The map has no images with poses. Pass an output of groma map or groma track.")
     check_cameras(scene.cameras.models)
-    if not images.is_dir():
-        raise InputError(f"{images} is not a folder. Pass the photographs of the map with --images.")
-    missing = [name for name in scene.images.names if not (images / name).is_file()]
-    if missing:
-        raise InputError(
-            f"{len(missing)} of the {scene.num_images} images of the map are not in {images}, for example "
-            f"{missing[0]!r}. Pass the folder that their names begin in with --images."
-        )
 
 
 __all__ = ["GATES", "LocalizeOptions", "LocalizedImage", "Localizer", "LocalizerGates", "index_file", "unknown_camera"]

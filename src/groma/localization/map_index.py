@@ -8,8 +8,9 @@ show lines of the map, and one descriptor of the whole image. For each point and
 from __future__ import annotations
 
 import hashlib
+import os
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -40,6 +41,9 @@ _VERSION = 1
 #: Images that the features of an image are matched with.
 _NEIGHBORS = 12
 
+#: What a damaged file of arrays raises.
+_UNREADABLE = (OSError, KeyError, ValueError, zipfile.BadZipFile, FileFormatError)
+
 Progress = Callable[[str, int, int], None]
 
 
@@ -65,11 +69,11 @@ class MapIndex:
     vocabulary: npt.NDArray[np.float32]
     image: npt.NDArray[np.float32]
 
-    def write(self, path: Path, digest: str) -> None:
-        """Write the index whole or not at all; ``digest`` is that of the map it belongs to."""
+    def write(self, path: Path, digest: str, folder: Path) -> None:
+        """Write the index whole or not at all; ``digest`` is that of the map, ``folder`` holds its photographs."""
         arrays = {item.name: getattr(self, item.name) for item in fields(self)}
         with atomic_output(path, force=True) as draft, draft.open("wb") as file:
-            np.savez(file, digest=np.array(digest), **arrays)
+            np.savez(file, digest=np.array(digest), folder=np.array(str(folder)), **arrays)
 
 
 def read_index(path: Path, digest: str) -> MapIndex | None:
@@ -79,17 +83,25 @@ def read_index(path: Path, digest: str) -> MapIndex | None:
             if str(members.read("digest")) != digest:
                 return None
             return MapIndex(**{item.name: members.read(item.name) for item in fields(MapIndex)})
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile, FileFormatError):
+    except _UNREADABLE:
         return None
 
 
-def digest_of(scene: Scene, images: Path) -> str:
+def images_told(path: Path) -> Path | None:
+    """Return the folder of photographs that an index tells, if it is there."""
+    try:
+        with opened_arrays(path) as members:
+            folder = Path(str(members.read("folder")))
+    except _UNREADABLE:
+        return None
+    return folder if folder.is_dir() else None
+
+
+def digest_of(scene: Scene, files: Sequence[Path]) -> str:
     """Return a number that changes with the map, and with the files of its images."""
-    told = hashlib.sha256(f"{_VERSION} {images.absolute()}".encode())
-    for name in scene.images.names:
-        told.update(name.encode())
-        file = images / name
-        told.update(str(file.stat().st_size if file.is_file() else -1).encode())
+    told = hashlib.sha256(str(_VERSION).encode())
+    for name, file in zip(scene.images.names, files, strict=True):
+        told.update(f"{name} {file.stat().st_size}".encode())
     for array in (
         scene.cam_from_world, scene.cameras.params, scene.points.xyz, scene.lines.plucker,
         scene.line_observations.segment, scene.point_observations.pixel,
@@ -98,7 +110,7 @@ def digest_of(scene: Scene, images: Path) -> str:
     return told.hexdigest()
 
 
-def build_index(scene: Scene, images: Path, say: Progress) -> MapIndex:
+def build_index(scene: Scene, files: Sequence[Path], say: Progress) -> MapIndex:
     """Describe a map.
 
     Raises
@@ -106,7 +118,7 @@ def build_index(scene: Scene, images: Path, say: Progress) -> MapIndex:
     InputError
         If an image of the map cannot be read, or none of its points can be described.
     """
-    work = [(images / name, *_seen_in(scene, image)) for image, name in enumerate(scene.images.names)]
+    work = [(file, *_seen_in(scene, image)) for image, file in enumerate(files)]
     found = map_work(_describe_image, work, partial(say, "describing the images of the map"))
     neighbors = covisible_neighbors(scene, _NEIGHBORS)
     pairs = [(min(i, j), max(i, j)) for i, row in enumerate(neighbors) for j in row.tolist()]
@@ -184,18 +196,28 @@ def _covariances(scene: Scene, kind: str) -> FloatArray:
     return landmark_covariances(problem, kind, count) * noise**2
 
 
-def kept_index(scene: Scene, images: Path, path: Path, say: Progress) -> tuple[MapIndex, str]:
-    """Return the index of a map: from its file, or built and kept there; and a sentence if it cannot be kept."""
-    digest = digest_of(scene, images)
+def kept_index(scene: Scene, files: Sequence[Path], path: Path | None, say: Progress) -> tuple[MapIndex, str]:
+    """Return the index of a map, from its file or built and kept there; and a sentence if it cannot be kept."""
+    if path is None:
+        return build_index(scene, files, say), ""
+    digest = digest_of(scene, files)
     index = read_index(path, digest)
     if index is not None:
         return index, ""
-    index = build_index(scene, images, say)
+    index = build_index(scene, files, say)
     try:
-        index.write(path, digest)
+        index.write(path, digest, _common_folder(scene, files))
     except OutputError as error:
-        return index, f"The index of the map cannot be kept, and is built again next time: {error}"
+        return index, f"The descriptions of the map cannot be kept, and are made again next time: {error}"
     return index, ""
 
 
-__all__ = ["MapIndex", "build_index", "digest_of", "kept_index", "read_index"]
+def _common_folder(scene: Scene, files: Sequence[Path]) -> Path:
+    """The folder that the names of images begin in, or that all of their files are in."""
+    first = files[0].absolute()
+    folder = first.parents[len(Path(scene.images.names[0]).parts) - 1]
+    every = all(file.absolute() == folder / name for name, file in zip(scene.images.names, files, strict=True))
+    return folder if every else Path(os.path.commonpath([file.absolute().parent for file in files]))
+
+
+__all__ = ["MapIndex", "build_index", "digest_of", "images_told", "kept_index", "read_index"]

@@ -16,11 +16,13 @@ def landmark_rows(factor: Factor, group: str) -> IntArray | None:
 
 
 def records(problem: Problem, factor: Factor, wanted: dict[str, int]) -> FloatArray:
-    """Derivatives by one slot of so many coordinates, and the residual in the last column; not whitened."""
-    (slot, size), = wanted.items()
-    columns = tuple(0 if own.name == slot else -1 for own, _ in factor.references())
+    """Derivatives by slots of so many coordinates, side by side, and the residual in the last column; not whitened."""
+    begin, place = {}, 0
+    for slot, size in wanted.items():
+        begin[slot], place = place, place + size
+    columns = tuple(begin.get(own.name, -1) for own, _ in factor.references())
     ambients = tuple(problem.variables[ref.group].ambient() for _, ref in factor.references())
-    record = np.zeros((len(factor), factor.residual_size, size + 1))
+    record = np.zeros((len(factor), factor.residual_size, place + 1))
     factor.linearize(factor.prepare(ambients), 0, len(factor), columns, record)
     return record
 

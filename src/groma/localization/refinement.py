@@ -20,6 +20,7 @@ Reference: K.-Y. Liang, S. Zeger, *Longitudinal data analysis using generalized 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,6 +46,8 @@ _ASSEMBLY = AssemblyOptions(
     point_chart="euclidean", drop_behind=False, require_in_front=True, gauge="free", refine_landmarks=False
 )
 _POSE = SolverOptions(max_iterations=12, function_tolerance=1e-5, initial_damping=1e-6, threads=1, eliminate=("frames",))
+#: Information of scaled unknowns below which they are not determined.
+_SINGULAR = 1e-10
 _LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
 
 
@@ -52,7 +55,8 @@ _LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
 class Residuals:
     """What a pose leaves of the matches, in standard deviations, and what it says about the pose."""
 
-    #: (n, 2) whitened residuals, (n, 2, 6) their derivatives by the left twist; NaN where a match has no image.
+    #: (n, 2) whitened residuals, NaN where a match has no image; (n, 2, 6 + k) their derivatives by the left twist, and
+    #: by what is estimated of the lens.
     value: FloatArray
     by_pose: FloatArray
     #: (n,) square pixels of an ellipse of one standard deviation, over pi: root of the determinant of the noise.
@@ -86,21 +90,23 @@ class Refined:
         chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
         J = np.concatenate([found.by_pose[kept] for found, kept in chosen]) / self.sigma0
         r = np.concatenate([found.value[kept] for found, kept in chosen]) / self.sigma0
-        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->ij", J, J))
-        if not values[0] > np.finfo(float).eps * values[-1]:
+        scale = np.sqrt((J**2).sum(axis=(0, 1)))
+        if not (scale > 0.0).all():
             return np.full((6, 6), np.inf)
-        root = vectors / np.sqrt(values)  # whitens the twist
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->ij", J / scale, J / scale))
+        if not values[0] > _SINGULAR:
+            return np.full((6, 6), np.inf)
+        root = vectors / np.sqrt(values) / scale[:, None]  # whitens what is estimated
         middle = matches.segments2d.mean(axis=1)[self.line_inliers]
         cell = cells_of(np.concatenate([matches.points2d[self.point_inliers], middle]), self.camera, gates.cells)
-        gradient = np.zeros((int(cell.max()) + 1, 6))
+        count, dof = int(cell.max()) + 1, len(scale)
+        gradient = np.zeros((count, dof))
         np.add.at(gradient, cell, np.einsum("nki,nk->ni", J @ root, r))
-        count = len(gradient)
-        if count <= 6:
-            return root @ root.T
-        shared, axes = np.linalg.eigh(gradient.T @ gradient * (count / (count - 6.0)))
-        by_chance = (1.0 + np.sqrt(6.0 / count)) ** 2  # the largest such eigenvalue of independent errors
-        root = root @ axes * np.sqrt(np.where(shared > by_chance, shared, 1.0))
-        return root @ root.T
+        if count > dof:
+            shared, axes = np.linalg.eigh(gradient.T @ gradient * (count / (count - dof)))
+            by_chance = (1.0 + np.sqrt(dof / count)) ** 2  # the largest such eigenvalue of independent errors
+            root = root @ axes * np.sqrt(np.where(shared > by_chance, shared, 1.0))
+        return (root @ root.T)[:6, :6]
 
 
 def cells_of(pixels: FloatArray, camera: QueryCamera, cells: int) -> IntArray:
@@ -137,9 +143,11 @@ def refine(
     for loss in (Cauchy(gates.wide_loss), GemanMcClure(gates.last_loss)):
         problem = _problem(camera, matches, pose, refine_lens)
         problem = solve(with_loss(problem, loss), _LENS if refine_lens else _POSE).problem
-        pose = problem.variables["frames"].state[0]
-        camera = _camera_of(problem, camera) if refine_lens else camera
-    return fitted(camera, matches, pose, max_error, gates)
+        estimated = _camera_of(problem, camera) if refine_lens else camera
+        if estimated is None:
+            break
+        pose, camera = problem.variables["frames"].state[0], estimated
+    return fitted(camera, matches, pose, max_error, refine_lens, gates)
 
 
 def fitted(
@@ -147,12 +155,15 @@ def fitted(
     matches: Matches,
     pose: FloatArray,
     max_error: tuple[float, float],
+    refine_lens: bool = False,
     gates: RefinementGates = REFINEMENT,
 ) -> Refined:
     """Say which matches agree with a pose as it is; parameters as of :func:`refine`."""
     problem = _problem(camera, matches, pose, False)
     sigma0 = _noise(problem, matches, max_error, gates)
-    points, lines = residuals(problem, "points", matches.num_points), residuals(problem, "lines", matches.num_lines)
+    lens = _lens_columns(camera) if refine_lens else []
+    points = residuals(problem, "points", matches.num_points, lens)
+    lines = residuals(problem, "lines", matches.num_lines, lens)
     limit = chi_square_gate(gates.outlier, 2) * sigma0**2
     agree = [
         nearest_claims(claim, found.square, found.square <= limit)
@@ -161,20 +172,30 @@ def fitted(
     return Refined(pose, camera, points, lines, agree[0], agree[1], sigma0, limit)
 
 
-def residuals(problem: Problem, landmarks: str, count: int) -> Residuals:
-    """Whitened residuals of the matches of one kind, ``points`` or ``lines``; each match has a landmark of its own."""
-    value, by_pose, spread = np.full((count, 2), np.nan), np.zeros((count, 2, 6)), np.ones(count)
+def residuals(problem: Problem, landmarks: str, count: int, lens: Sequence[int] = ()) -> Residuals:
+    """Whitened residuals of the matches of one kind, ``points`` or ``lines``; each match has a landmark of its own.
+
+    ``lens`` are the parameters of the camera that are estimated, too.
+    """
+    value, by_pose, spread = np.full((count, 2), np.nan), np.zeros((count, 2, 6 + len(lens))), np.ones(count)
     for factor in problem.factors:
         rows = landmark_rows(factor, landmarks)
         if rows is None:
             continue
-        record = records(problem, factor, {"pose": 6})
+        size = next((problem.variables[r.group].manifold.dof for slot, r in factor.references() if slot.name == "intrinsics"), 0)
+        record = records(problem, factor, {"pose": 6, "intrinsics": size} if lens and size else {"pose": 6})
+        kept = [*range(6), *(6 + k for k in lens if size)]
         weight = np.broadcast_to(times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))
         white = weight @ record
         seen = (record != 0.0).any(axis=(1, 2))  # what cannot be evaluated is zero
-        value[rows[seen]], by_pose[rows[seen]] = white[seen, :, 6], white[seen, :, :6]
+        value[rows[seen]] = white[seen, :, -1]
+        by_pose[rows[seen], :, : len(kept)] = white[seen][:, :, kept]
         spread[rows] = 1.0 / np.abs(np.linalg.det(weight))
     return Residuals(value, by_pose, spread)
+
+
+def _lens_columns(camera: QueryCamera) -> list[int]:
+    return sorted((*camera.kind.focal_indices, *camera.kind.extra_indices))
 
 
 def _problem(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool) -> Problem:
@@ -228,8 +249,12 @@ def _noise(problem: Problem, matches: Matches, max_error: tuple[float, float], g
     return float(np.sqrt((gates.stated_weight + len(together) * shown) / (gates.stated_weight + len(together))))
 
 
-def _camera_of(problem: Problem, camera: QueryCamera) -> QueryCamera:
+def _camera_of(problem: Problem, camera: QueryCamera) -> QueryCamera | None:
+    """The camera that was estimated; None where no lens is like that."""
     state = problem.variables[f"intrinsics/{camera.model}"].state[0]
+    focal = state[list(camera.kind.focal_indices)]
+    if not (np.isfinite(state).all() and (focal > 0.0).all()):
+        return None
     return QueryCamera(camera.model, state, camera.width, camera.height)
 
 
