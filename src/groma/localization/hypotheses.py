@@ -58,7 +58,9 @@ def max_errors(matches: Matches, gates: HypothesisGates = HYPOTHESES) -> tuple[f
     return points, lines
 
 
-def propose(straight: Straight, errors: tuple[float, float], seed: int, gates: HypothesisGates = HYPOTHESES) -> FloatArray | None:
+def propose(
+    straight: Straight, errors: tuple[float, float], seed: int, gates: HypothesisGates = HYPOTHESES
+) -> FloatArray | None:
     """Return the pose (7,) cam_from_world that most matches agree with; None without one.
 
     Parameters
@@ -93,7 +95,10 @@ def propose(straight: Straight, errors: tuple[float, float], seed: int, gates: H
         )
     if report["num_inliers"] < gates.min_matches or not np.isfinite(found.Rt).all():
         return None
-    return np.concatenate([quaternion.from_matrix(np.asarray(found.R, np.float64)[None])[0], found.t])
+    # The last digits depend on where arrays lie in memory; they are cut off, so that a seed gives one result.
+    rotation = quaternion.from_matrix(np.asarray(found.R, np.float64)[None])[0].astype(np.float32).astype(np.float64)
+    shift = np.asarray(found.t, np.float64).astype(np.float32).astype(np.float64)
+    return np.concatenate([rotation / np.linalg.norm(rotation), shift])
 
 
 __all__ = ["Straight", "max_errors", "propose", "straightened"]

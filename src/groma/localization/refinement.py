@@ -33,6 +33,7 @@ from groma.adjustment.stages import with_loss
 from groma.factors.contract import Factor
 from groma.factors.losses import Cauchy, GemanMcClure
 from groma.gates import chi_square_gate
+from groma.geometry import se3
 from groma.localization.camera import QueryCamera
 from groma.localization.gates import REFINEMENT, RefinementGates
 from groma.localization.matches import Matches, nearest_claims
@@ -88,25 +89,42 @@ class Refined:
     def covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
         """(6, 6) covariance of the left twist; infinite where the matches do not determine the pose."""
         chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
-        J = np.concatenate([found.by_pose[kept] for found, kept in chosen]) / self.sigma0
-        r = np.concatenate([found.value[kept] for found, kept in chosen]) / self.sigma0
+        J = np.concatenate([found.by_pose[kept] for found, kept in chosen])
+        r = np.concatenate([found.value[kept] for found, kept in chosen])
         scale = np.sqrt((J**2).sum(axis=(0, 1)))
         if not (scale > 0.0).all():
             return np.full((6, 6), np.inf)
         values, vectors = np.linalg.eigh(np.einsum("nki,nkj->ij", J / scale, J / scale))
         if not values[0] > _SINGULAR:
             return np.full((6, 6), np.inf)
-        root = vectors / np.sqrt(values) / scale[:, None]  # whitens what is estimated
+        pull, sigma = _pull(r, gates.last_loss, J.shape[2])
+        root = sigma * vectors / np.sqrt(values) / scale[:, None]
         middle = matches.segments2d.mean(axis=1)[self.line_inliers]
         cell = cells_of(np.concatenate([matches.points2d[self.point_inliers], middle]), self.camera, gates.cells)
         count, dof = int(cell.max()) + 1, len(scale)
         gradient = np.zeros((count, dof))
-        np.add.at(gradient, cell, np.einsum("nki,nk->ni", J @ root, r))
+        np.add.at(gradient, cell, np.einsum("nki,nk->ni", J @ (root / sigma), pull / sigma))
         if count > dof:
             shared, axes = np.linalg.eigh(gradient.T @ gradient * (count / (count - dof)))
             by_chance = (1.0 + np.sqrt(dof / count)) ** 2  # the largest such eigenvalue of independent errors
             root = root @ axes * np.sqrt(np.where(shared > by_chance, shared, 1.0))
         return (root @ root.T)[:6, :6]
+
+
+def _pull(residual: FloatArray, scale: float, unknowns: int) -> tuple[FloatArray, float]:
+    r"""Return what each residual (n, 2) pulls under the last loss, and the standard deviation of an observation for an
+    estimate by it.
+
+    With the weight w(s) of a squared norm s, and pulls :math:`\psi = w r`, an M-estimate has the covariance of least
+    squares with the variance :math:`E[\psi^2] / E[\psi']^2`; pulls are divided by :math:`E[\psi']`, too.
+    """
+    z = (residual**2).sum(axis=1, keepdims=True) / scale**2
+    weight = (1.0 + z) ** -2
+    stiffness = weight - 4.0 * residual**2 / scale**2 * (1.0 + z) ** -3
+    mean = max(float(stiffness.mean()), float(weight.mean()) ** 2)  # of far outliers it may vanish
+    pull = weight * residual / mean
+    free = max(residual.size - unknowns, 1)
+    return pull, max(float(np.sqrt((pull**2).sum() / free)), 1e-12)
 
 
 def cells_of(pixels: FloatArray, camera: QueryCamera, cells: int) -> IntArray:
@@ -165,11 +183,29 @@ def fitted(
     points = residuals(problem, "points", matches.num_points, lens)
     lines = residuals(problem, "lines", matches.num_lines, lens)
     limit = chi_square_gate(gates.outlier, 2) * sigma0**2
+    near = (points.square <= limit, (lines.square <= limit) & _in_front(camera, matches, pose))
     agree = [
-        nearest_claims(claim, found.square, found.square <= limit)
-        for claim, found in zip(matches.claims(), (points, lines), strict=True)
+        nearest_claims(claim, found.square, inside)
+        for claim, found, inside in zip(matches.claims(), (points, lines), near, strict=True)
     ]
     return Refined(pose, camera, points, lines, agree[0], agree[1], sigma0, limit)
+
+
+def _in_front(camera: QueryCamera, matches: Matches, pose: FloatArray) -> BoolArray:
+    """Which lines (M,) are in front of the camera where their segments are.
+
+    The plane of a line and a segment is the same behind the camera, where a mirrored image would be seen.
+    """
+    if not matches.num_lines:
+        return np.zeros(0, bool)
+    R_t = se3.to_matrix(pose[None])[0]
+    ends = matches.segments3d @ R_t[:3, :3].T + R_t[:3, 3]
+    start, way = ends[:, 0], ends[:, 1] - ends[:, 0]
+    ray = camera.kind.unproject(camera.params, np.ascontiguousarray(matches.segments2d.mean(axis=1)))
+    along = np.einsum("ni,ni->n", way, ray)
+    square = np.einsum("ni,ni->n", way, way)
+    # How far along the ray it is nearest to the line; the denominator is not negative.
+    return np.einsum("ni,ni->n", start, ray) * square > np.einsum("ni,ni->n", start, way) * along
 
 
 def residuals(problem: Problem, landmarks: str, count: int, lens: Sequence[int] = ()) -> Residuals:
