@@ -27,7 +27,9 @@ class RefinementGates:
 
     outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
     wide_loss: float = gate(1.5, "sigma", "scale of the Cauchy loss of the first stage", "chosen on tracked sequences")
-    last_loss: float = gate(2.0, "sigma", "scale of the Geman-McClure loss that follows", "chosen on Strecha's castle")
+    last_loss: float = gate(
+        1.9, "sigma", "scale of the Geman-McClure loss that follows, of many matches", "chosen on stairs of 7-Scenes"
+    )
     cells: int = gate(8, "cells", "per longer side: errors within one may be alike", "derived from sizes of surfaces")
     stated_weight: float = gate(
         10.0, "observations", "that the stated noise counts for beside the noise that residuals show",

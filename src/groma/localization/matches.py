@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -76,10 +76,9 @@ class Matches:
         chosen = {name: getattr(self, name)[points] for name in _OF_POINTS}
         return Matches(**chosen, **{name: getattr(self, name)[lines] for name in _OF_LINES})
 
-    def joined(self, other: Matches) -> Matches:
-        """These matches and others."""
-        both = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in (*_OF_POINTS, *_OF_LINES)}
-        return Matches(**both)
+    def with_sigma(self, sigma: float) -> Matches:
+        """The same matches with one standard deviation for all, pixels."""
+        return replace(self, point_sigma=np.full(self.num_points, sigma), segment_sigma=np.full(self.num_lines, sigma))
 
     def claims(self) -> tuple[IntArray, IntArray]:
         """Numbers (N,) and (M,) of what is claimed in the image: equal for rows that claim the same."""

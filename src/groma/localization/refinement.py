@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -37,7 +38,7 @@ from groma.geometry import se3
 from groma.localization.camera import QueryCamera
 from groma.localization.gates import REFINEMENT, RefinementGates
 from groma.localization.matches import Matches, nearest_claims
-from groma.localization.records import landmark_rows, records, times
+from groma.localization.records import landmark_rows, records, residual_squares, times
 from groma.problem.problem import Problem
 from groma.scene import LineObservations, Lines, PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
@@ -97,7 +98,7 @@ class Refined:
         values, vectors = np.linalg.eigh(np.einsum("nki,nkj->ij", J / scale, J / scale))
         if not values[0] > _SINGULAR:
             return np.full((6, 6), np.inf)
-        pull, sigma = _pull(r, gates.last_loss, J.shape[2])
+        pull, sigma = _pull(r, J.shape[2], gates)
         root = sigma * vectors / np.sqrt(values) / scale[:, None]
         middle = matches.segments2d.mean(axis=1)[self.line_inliers]
         cell = cells_of(np.concatenate([matches.points2d[self.point_inliers], middle]), self.camera, gates.cells)
@@ -111,20 +112,37 @@ class Refined:
         return (root @ root.T)[:6, :6]
 
 
-def _pull(residual: FloatArray, scale: float, unknowns: int) -> tuple[FloatArray, float]:
+def _pull(residual: FloatArray, unknowns: int, gates: RefinementGates) -> tuple[FloatArray, float]:
     r"""Return what each residual (n, 2) pulls under the last loss, and the standard deviation of an observation for an
     estimate by it.
 
     With the weight w(s) of a squared norm s, and pulls :math:`\psi = w r`, an M-estimate has the covariance of least
-    squares with the variance :math:`E[\psi^2] / E[\psi']^2`; pulls are divided by :math:`E[\psi']`, too.
+    squares with the variance :math:`E[\psi^2] / E[\psi']^2`; pulls are divided by :math:`E[\psi']`, too. Both means are
+    those of the residuals and, counted as some more observations, those of normal noise as stated.
     """
-    z = (residual**2).sum(axis=1, keepdims=True) / scale**2
-    weight = (1.0 + z) ** -2
-    stiffness = weight - 4.0 * residual**2 / scale**2 * (1.0 + z) ** -3
-    mean = max(float(stiffness.mean()), float(weight.mean()) ** 2)  # of far outliers it may vanish
-    pull = weight * residual / mean
-    free = max(residual.size - unknowns, 1)
-    return pull, max(float(np.sqrt((pull**2).sum() / free)), 1e-12)
+    scale = last_scale(len(residual), gates)
+    c = scale**2
+    square = (residual**2).sum(axis=1, keepdims=True)
+    weight = (1.0 + square / c) ** -2
+    stiffness = weight - 4.0 * residual**2 / c * (1.0 + square / c) ** -3
+    square_of_normal, stiffness_of_normal = _of_normal_noise(scale)
+    stated = 2.0 * gates.stated_weight
+    mean = (float(stiffness.sum()) + stated * stiffness_of_normal) / (residual.size + stated)
+    mean = max(mean, float(weight.mean()) ** 2)  # of far outliers it may vanish
+    pull = weight * residual
+    free = max(residual.size - unknowns, 0)
+    variance = (float((pull**2).sum()) + stated * square_of_normal) / (free + stated)
+    return pull / mean, float(np.sqrt(variance)) / mean
+
+
+@lru_cache(maxsize=256)
+def _of_normal_noise(scale: float) -> tuple[float, float]:
+    """Mean square of a pull, and mean derivative, of a coordinate of normal noise under a Geman-McClure loss."""
+    node, share = np.polynomial.laguerre.laggauss(40)
+    square, c = 2.0 * node, scale**2  # chi square of two degrees
+    weight = (1.0 + square / c) ** -2
+    stiffness = weight - 2.0 * square / c * (1.0 + square / c) ** -3
+    return float(share @ (weight**2 * square)) / 2.0, float(share @ stiffness)
 
 
 def cells_of(pixels: FloatArray, camera: QueryCamera, cells: int) -> IntArray:
@@ -157,15 +175,29 @@ def refine(
     gates
         Numbers of the fit.
     """
-    pose = start
-    for loss in (Cauchy(gates.wide_loss), GemanMcClure(gates.last_loss)):
+    pose, agree = start, 0
+    for stage in ("wide", "last"):
         problem = _problem(camera, matches, pose, refine_lens)
+        loss = Cauchy(gates.wide_loss) if stage == "wide" else GemanMcClure(last_scale(agree, gates))
         problem = solve(with_loss(problem, loss), _LENS if refine_lens else _POSE).problem
         estimated = _camera_of(problem, camera) if refine_lens else camera
         if estimated is None:
             break
         pose, camera = problem.variables["frames"].state[0], estimated
+        squares = [
+            residual_squares(problem, name, len(rows))
+            for name, rows in (("points", matches.points2d), ("lines", matches.segments2d))
+        ]
+        agree = int((np.concatenate(squares) <= chi_square_gate(gates.outlier, 2)).sum())
     return fitted(camera, matches, pose, max_error, refine_lens, gates)
+
+
+def last_scale(agree: int, gates: RefinementGates = REFINEMENT) -> float:
+    """Return the scale of the last loss for so many matches that agree, standard deviations.
+
+    Where there are hardly more than the pose needs, a narrow loss picks those that happen to fit each other.
+    """
+    return gates.last_loss * (1.0 + gates.stated_weight / max(2 * agree - 6, 1))
 
 
 def fitted(
