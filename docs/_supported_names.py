@@ -85,7 +85,7 @@ ROOMS: Rooms = (
             "groma.adjustment.uncertainty": ("SceneUncertainty", "uncertainty"),
             "groma.adjustment.covariance_files": None,
             "groma.adjustment.consistency": None,
-            "groma.adjustment.parts": ("PartsResult", "adjust_parts", "write_parts"),
+            "groma.adjustment.parts": ("PartsResult", "adjust_parts", "join_parts", "write_parts"),
         },
     ),
     (

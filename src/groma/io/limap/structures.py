@@ -45,7 +45,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import FileFormatError, InputError
 from groma.io.archive import read_archive, write_archive
 from groma.io.atomic import atomic_output
-from groma.io.colmap.files import find_model
+from groma.io.colmap.files import find_model, is_model
 from groma.io.limap.files import (
     NAMES,
     PLANE,
@@ -103,14 +103,14 @@ def structures_of(source: str | os.PathLike[str]) -> Structures | None:
     Parameters
     ----------
     source : path
-        What :func:`groma.io.read_scene` read: the folder of a model, or the folder it lies in. A file has none.
+        What :func:`groma.io.read_scene` read: the folder of a model, or the folder it lies in. Nothing else has them.
 
     Raises
     ------
     FileFormatError
-        If the folder holds no COLMAP model, or the structures are damaged.
+        If the structures are damaged.
     """
-    if not Path(source).is_dir():
+    if not Path(source).is_dir() or not is_model(Path(source)):
         return None
     folder = find_model(source)[0] / "structures"
     return read_limap(folder) if folder.is_dir() and _form(folder) is not None else None
