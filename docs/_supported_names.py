@@ -18,6 +18,7 @@ ROOMS: Rooms = (
             "groma.geometry.line3": None,
             "groma.geometry.plane3": None,
             "groma.geometry.segment2": None,
+            "groma.geometry.segment3": None,
             "groma.geometry.transform": None,
             "groma.geometry.projection": None,
             "groma.geometry.incidence": None,

@@ -21,7 +21,8 @@ def convert(
         typer.Argument(
             metavar="OUTPUT",
             help="Its name says the format: a folder for a COLMAP model, .npz for a groma archive, .txt, .bz2 or .gz "
-            "for BAL, .ply or .obj for geometry only: points, lines and pieces of planes.",
+            "for BAL, .json for nerfstudio and instant-ngp: cameras, poses and points, .ply or .obj for geometry only: "
+            "points, lines and pieces of planes.",
         ),
     ],
     parts: Annotated[
@@ -65,6 +66,8 @@ def _convert(source: Path, target: Path, console: Console, force: bool) -> dict[
         from groma.io.convert import convert as convert_scene
 
         scene = convert_scene(source, target, force)
+    if target.suffix.lower() == ".json":  # cameras, poses and points
+        scene = scene.points_only().keep(point_observations=[])
     console.say(f"Wrote {target}: {sentence_of(scene, geometry=target.suffix.lower() in ('.ply', '.obj'))}")
     return counts_of(scene)
 
