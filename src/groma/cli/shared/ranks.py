@@ -3,11 +3,26 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ParamSpec
+
+P = ParamSpec("P")
+
+
+def led_by_first_rank(command: Callable[P, None]) -> Callable[P, None]:
+    """Wrap a command: of ranks only the first goes through it, and the others do what it gives them."""
+
+    @functools.wraps(command)
+    def led(*args: P.args, **kwargs: P.kwargs) -> None:
+        with ranks_as_workers() as leads:
+            if leads:
+                command(*args, **kwargs)
+
+    return led
 
 
 @contextmanager
@@ -61,4 +76,4 @@ class _Everyone(Executor):
             self._waiting[id(executor)] -= 1
 
 
-__all__ = ["ranks_as_workers"]
+__all__ = ["led_by_first_rank", "ranks_as_workers"]
