@@ -109,8 +109,9 @@ def read_line3dpp(path: str | os.PathLike[str]) -> ReferenceLines:
 
 def _of_scene(place: Path) -> Geometry:
     from groma.io import read_scene
+    from groma.scene.line_intervals import line_pieces
 
-    return Geometry(segments=read_scene(place).lines.segments)
+    return Geometry(segments=line_pieces(read_scene(place))[0])
 
 
 def _read_text(place: Path) -> Geometry:

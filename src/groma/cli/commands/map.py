@@ -7,9 +7,11 @@ from typing import Annotated
 import typer
 
 from groma.cli.shared import options as _options
+from groma.cli.shared.ranks import led_by_first_rank
 from groma.errors import InputError
 
 
+@led_by_first_rank
 def map_(
     images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of photographs, and of folders of them.")],
     output: Annotated[
@@ -133,6 +135,7 @@ def map_(
     result = run_map(console, images, work, start, options, matches)
     found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
     numbers = result.summary(found, result.contributions(true) if contributions else ())
+    numbers["images"] = str(images.absolute())  # where groma localize looks for them
     write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
