@@ -89,54 +89,61 @@ def map_(
     and OBJ, summary.json and report.html. Finished stages are kept in OUT.work until the end: after an interruption the
     same command goes on from there.
     """
-    from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.ranks import ranks_as_workers
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
-    check_inputs(images, model, line_matches, truth)
+    with ranks_as_workers() as leads:
+        if leads:
+            from groma.cli.shared import output as _output
+            from groma.cli.shared.console import Console
+            from groma.cli.shared.input import check_inputs
 
-    if model is not None and camera_params is not None:
-        raise InputError("--camera-params is for images without a model. Leave it out.")
+            console = Console(quiet, verbose, json_target, threads)
+            _output.check_outputs(force, output, json_target=json_target)
+            check_inputs(images, model, line_matches, truth)
 
-    if line_matches is not None and line_matcher is not None:
-        raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
+            if model is not None and camera_params is not None:
+                raise InputError("--camera-params is for images without a model. Leave it out.")
 
-    if truth is not None and not contributions:
-        raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
+            if line_matches is not None and line_matcher is not None:
+                raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
 
-    from groma.cli.shared.diagnosis import try_diagnosis
-    from groma.cli.shared.mapping import run_map, say_map, write_map
-    from groma.features.external import read_matches
-    from groma.io import read_scene
-    from groma.mapping.map import MapOptions
+            if truth is not None and not contributions:
+                raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
 
-    options = MapOptions(
-        min_segment_length=min_length,
-        detector=line_detector,
-        matcher=line_matcher,
-        find_planes=planes,
-        refine_points=refine_points,
-        refine_poses=refine_poses,
-        refine_intrinsics=refine_intrinsics,
-        max_iterations=max_iterations,
-        camera_model=camera_model,
-        camera_params=_parameters(camera_params),
-        threads=threads,
-        seed=seed,
-    )
-    start = read_scene(model) if model is not None else None
-    matches = read_matches(line_matches) if line_matches is not None else None
-    true = read_scene(truth) if truth is not None else None
-    work = output.with_name(output.name + ".work")
-    result = run_map(console, images, work, start, options, matches)
-    found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
-    numbers = result.summary(found, result.contributions(true) if contributions else ())
-    write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
-    say_map(console, result, numbers)
-    console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
-    _output.write_json(json_target, numbers, force)
+            from groma.cli.shared.diagnosis import try_diagnosis
+            from groma.cli.shared.mapping import run_map, say_map, write_map
+            from groma.features.external import read_matches
+            from groma.io import read_scene
+            from groma.mapping.map import MapOptions
+
+            options = MapOptions(
+                min_segment_length=min_length,
+                detector=line_detector,
+                matcher=line_matcher,
+                find_planes=planes,
+                refine_points=refine_points,
+                refine_poses=refine_poses,
+                refine_intrinsics=refine_intrinsics,
+                max_iterations=max_iterations,
+                camera_model=camera_model,
+                camera_params=_parameters(camera_params),
+                threads=threads,
+                seed=seed,
+            )
+            start = read_scene(model) if model is not None else None
+            matches = read_matches(line_matches) if line_matches is not None else None
+            true = read_scene(truth) if truth is not None else None
+            work = output.with_name(output.name + ".work")
+            result = run_map(console, images, work, start, options, matches)
+            found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
+            numbers = result.summary(found, result.contributions(true) if contributions else ())
+            numbers["images"] = str(images.absolute())  # where groma localize looks for them
+            write_map(
+                result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers
+            )
+            say_map(console, result, numbers)
+            console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
+            _output.write_json(json_target, numbers, force)
 
 
 def _parameters(text: str | None) -> tuple[float, ...] | None:
