@@ -140,7 +140,6 @@ def map_(
     result = run_map(console, images, work, start, options, matches)
     found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
     numbers = result.summary(found, result.contributions(true) if contributions else ())
-    numbers["images"] = str(images.absolute())  # where groma localize looks for them
     write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
