@@ -188,8 +188,8 @@ def camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variab
     return variables
 
 
-def first_camera_gauge(scene: Scene) -> BoolArray:
-    """Hold the first frame, and of the frame farthest from it the translation along the line between the two; this
+def first_camera_gauge(scene: Scene, first: int | None = None) -> BoolArray:
+    """Hold the first frame, or a given one, and of the frame farthest from it the translation along the line between the two; this
     unless measurements tell the scale.
 
     Frames with less than half of the usual number of observations are not taken for either: a camera that hardly
@@ -203,7 +203,7 @@ def first_camera_gauge(scene: Scene) -> BoolArray:
     seen = [table.image_idx for table in (scene.point_observations, scene.line_observations)]
     count = np.bincount(frame_of[np.concatenate(seen)], minlength=len(poses))
     fit = np.flatnonzero(count >= 0.5 * np.median(count))
-    first = int(fit[0])
+    first = int(fit[0]) if first is None else first
     held[first] = True
     centers = se3.inverse(poses)[:, 4:]
     away = centers - centers[first]

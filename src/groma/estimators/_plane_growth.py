@@ -186,7 +186,10 @@ class Grower:
         )  # fmt: skip
         if found[0] == 0:
             return self._log_tried
-        return float(stats.poisson.logsf(found[0] - 4, found[1])) / np.log(10.0) + self._log_tried  # three fix it
+        count = found[0] - 3.0  # three fix it
+        # That one number alone is nearly all of it where more are too unlikely for the other formula.
+        chance = max(stats.poisson.logsf(count - 1.0, found[1]), stats.poisson.logpmf(count, found[1]))
+        return float(chance) / np.log(10.0) + self._log_tried
 
 
 def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:

@@ -16,6 +16,7 @@ import numpy as np
 from groma.io.trajectories import Trajectory
 from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
+from groma.tracking.backend.plane_outcome import PlaneOutcome
 from groma.tracking.backend.submaps import Joint, Part, Places, best_joint
 from groma.tracking.frame.rectification import RightTurn
 from groma.tracking.map.track_map import TrackMap
@@ -88,18 +89,22 @@ class Ending:
         what = f"joining maps {joint.older + 1} and {joint.newer + 1}"
         return self.attempt(what, lambda: places.joined(joint), places)
 
-    def adjust(self, part: int) -> tuple[SolveReport | None, RightTurn]:
-        """Adjust all keyframes of a map; return the report and how the right camera is turned."""
+    def adjust(self, part: int) -> tuple[SolveReport | None, RightTurn, PlaneOutcome | None]:
+        """Adjust all keyframes of a map; return the report, how the right camera is turned, and what of planes."""
         nothing = None, self._mapper.right.turn
         report, turn = self.attempt(
             "the adjustment of all keyframes", lambda: self._mapper.adjust_at_end(part), nothing
         )
+        with_planes, planes = self.attempt(
+            "the search for planes", lambda: self._mapper.adjust_with_planes(part), (None, None)
+        )
+        report = with_planes or report
         if report is not None and not report.converged:
             self.warnings.append(
                 f"The adjustment of all keyframes did not converge in {report.iterations} steps "
                 f"({report.termination.key}). groma adjust on scene.npz continues it."
             )
-        return report, turn
+        return report, turn, planes
 
     def submap(self, root: int) -> Part:
         """Return the trajectory and the scene of a map."""

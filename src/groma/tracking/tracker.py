@@ -24,6 +24,7 @@ from groma.io.trajectories import Trajectory
 from groma.scene import Scene
 from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
+from groma.tracking.backend.plane_outcome import PlaneOutcome
 from groma.tracking.backend.submaps import about_submaps
 from groma.tracking.ending import Ending
 from groma.tracking.frame.camera import TrackCamera, back
@@ -372,7 +373,12 @@ class Tracker:
         warnings += about_submaps(self._breaks, where, [count[root] for root in others])
         return TrackResult(whole.trajectory, whole.scene, whole.keyframes, statistics, tuple(warnings), tuple(submaps))
 
-    def statistics(self, report: SolveReport | None = None, right_turn: RightTurn | None = None) -> dict:
+    def statistics(
+        self,
+        report: SolveReport | None = None,
+        right_turn: RightTurn | None = None,
+        planes: PlaneOutcome | None = None,
+    ) -> dict:
         """Return counts and times so far as plain numbers."""
         out: dict = {
             "frames": dict(self._history.statuses),
@@ -388,6 +394,8 @@ class Tracker:
         }
         if self.camera.baseline > 0:
             out["right_camera"] = (right_turn or self._mapper.right.turn).numbers(self.camera)
+        if planes is not None:
+            out["landmark_planes"] = planes.numbers()
         if report is not None:
             out["final_adjustment"] = {"iterations": report.iterations, "seconds": dict(report.seconds)}
         return out

@@ -44,19 +44,44 @@ def surface_noise_px(scene: Scene, options: StructureOptions) -> float:
         What they were found with. No more than its ``surface_sigma_px`` is returned, and that where nothing is on a
         plane.
     """
-    heights = [_of_points(scene, options.point_sigma_px), _of_lines(scene, options.line_sigma_px)]
-    plane, height, variance, length = (np.concatenate(column) for column in zip(*heights, strict=True))
+    plane, *heights = _heights(scene, options)
     count = np.bincount(plane, minlength=scene.num_planes)[plane]
     told = count > _UNKNOWNS
-    variance, length = variance[told], length[told]
-    squared = height[told] ** 2 * count[told] / (count[told] - _UNKNOWNS)
-    most = options.surface_sigma_px
+    return _upper_end(*(column[told] for column in (*heights, count)), options.surface_sigma_px)
+
+
+def plane_noise_px(scene: Scene, options: StructureOptions) -> FloatArray:
+    """Return the same (K,) of each plane on its own; the most where three landmarks or fewer lie on it.
+
+    Parameters are those of :func:`surface_noise_px`.
+    """
+    plane, *heights = _heights(scene, options)
+    count = np.bincount(plane, minlength=scene.num_planes)
+    out = np.full(scene.num_planes, options.surface_sigma_px)
+    for k in np.flatnonzero(count > _UNKNOWNS):
+        of = plane == k
+        out[k] = _upper_end(*(column[of] for column in heights), count[k], options.surface_sigma_px)
+    return out
+
+
+def _upper_end(
+    height: FloatArray, variance: FloatArray, length: FloatArray, count: IntArray | int, most: float
+) -> float:
+    """Upper end of the confidence interval of t, from landmarks on planes with so many of them."""
+    squared = height**2 * count / (count - _UNKNOWNS)
     tried = np.geomspace(min(LANDMARK_GATES.min_sigma_px, most), most, _TRIED)
     surprise = np.empty(_TRIED)
     for k, sigma in enumerate(tried):
         total = variance + (sigma * length) ** 2
         surprise[k] = (np.log(total) + squared / total).sum()
     return float(tried[np.flatnonzero(surprise <= surprise.min() + 1.0)[-1]])
+
+
+def _heights(scene: Scene, options: StructureOptions) -> _Heights:
+    """Of points and of the ends of lines on planes."""
+    kinds = _of_points(scene, options.point_sigma_px), _of_lines(scene, options.line_sigma_px)
+    plane, height, variance, length = (np.concatenate(column) for column in zip(*kinds, strict=True))
+    return plane, height, variance, length
 
 
 def _of_points(scene: Scene, sigma_px: float | None) -> _Heights:
