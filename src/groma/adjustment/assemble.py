@@ -189,8 +189,8 @@ def camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variab
 
 
 def first_camera_gauge(scene: Scene, first: int | None = None) -> BoolArray:
-    """Hold the first frame, or a given one, and of the frame farthest from it the translation along the line between the two; this
-    unless measurements tell the scale.
+    """Hold the first frame, or a given one, and of the frame farthest from it the translation along the line between
+    the two; this unless measurements tell the scale.
 
     Frames with less than half of the usual number of observations are not taken for either: a camera that hardly
     anything holds would leave the scale to relations measured in lengths, which shrink the scene.

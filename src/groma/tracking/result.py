@@ -19,9 +19,7 @@ from groma.tracking.map.track_map import TrackMap
 MIN_VIEWS = 2
 
 
-def map_to_scene(
-    track_map: TrackMap, camera: TrackCamera, relations: bool = True, min_views: int = MIN_VIEWS
-) -> Scene:
+def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = True, min_views: int = MIN_VIEWS) -> Scene:
     """Return a scene of the living keyframes, the landmarks, and all that was measured; poses are cam_from_world.
 
     Adjusting it is the problem of the last adjustment of the track.

@@ -35,7 +35,9 @@ def track(
     points: Annotated[bool, typer.Option("--points/--no-points", help="Follow points.")] = True,
     lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Follow line segments.")] = True,
     line_detector: _options.LineDetector = "lsd",
-    planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Find planes in depth images, or in points and lines.")] = True,
+    planes: Annotated[
+        bool, typer.Option("--planes/--no-planes", help="Find planes in depth images, or in points and lines.")
+    ] = True,
     loops: Annotated[bool, typer.Option("--loops/--no-loops", help="Close loops.")] = True,
     max_frames: Annotated[
         int | None, typer.Option("--max-frames", min=1, metavar="N", help="Stop after N frames. Default: all.")

@@ -44,10 +44,11 @@ def surface_noise_px(scene: Scene, options: StructureOptions) -> float:
         What they were found with. No more than its ``surface_sigma_px`` is returned, and that where nothing is on a
         plane.
     """
-    plane, *heights = _heights(scene, options)
+    plane, height, variance, length = _heights(scene, options)
     count = np.bincount(plane, minlength=scene.num_planes)[plane]
     told = count > _UNKNOWNS
-    return _upper_end(*(column[told] for column in (*heights, count)), options.surface_sigma_px)
+    squared = height[told] ** 2 * count[told] / (count[told] - _UNKNOWNS)
+    return _upper_end(squared, variance[told], length[told], options.surface_sigma_px)
 
 
 def plane_noise_px(scene: Scene, options: StructureOptions) -> FloatArray:
@@ -55,20 +56,18 @@ def plane_noise_px(scene: Scene, options: StructureOptions) -> FloatArray:
 
     Parameters are those of :func:`surface_noise_px`.
     """
-    plane, *heights = _heights(scene, options)
+    plane, height, variance, length = _heights(scene, options)
     count = np.bincount(plane, minlength=scene.num_planes)
     out = np.full(scene.num_planes, options.surface_sigma_px)
     for k in np.flatnonzero(count > _UNKNOWNS):
         of = plane == k
-        out[k] = _upper_end(*(column[of] for column in heights), count[k], options.surface_sigma_px)
+        squared = height[of] ** 2 * count[k] / (count[k] - _UNKNOWNS)
+        out[k] = _upper_end(squared, variance[of], length[of], options.surface_sigma_px)
     return out
 
 
-def _upper_end(
-    height: FloatArray, variance: FloatArray, length: FloatArray, count: IntArray | int, most: float
-) -> float:
-    """Upper end of the confidence interval of t, from landmarks on planes with so many of them."""
-    squared = height**2 * count / (count - _UNKNOWNS)
+def _upper_end(squared: FloatArray, variance: FloatArray, length: FloatArray, most: float) -> float:
+    """Upper end of the confidence interval of t, from scaled squares of heights, up to the most."""
     tried = np.geomspace(min(LANDMARK_GATES.min_sigma_px, most), most, _TRIED)
     surprise = np.empty(_TRIED)
     for k, sigma in enumerate(tried):
@@ -79,8 +78,9 @@ def _upper_end(
 
 def _heights(scene: Scene, options: StructureOptions) -> _Heights:
     """Of points and of the ends of lines on planes."""
-    kinds = _of_points(scene, options.point_sigma_px), _of_lines(scene, options.line_sigma_px)
-    plane, height, variance, length = (np.concatenate(column) for column in zip(*kinds, strict=True))
+    points, lines = _of_points(scene, options.point_sigma_px), _of_lines(scene, options.line_sigma_px)
+    plane = np.concatenate([points[0], lines[0]])
+    height, variance, length = (np.concatenate([points[k], lines[k]]) for k in (1, 2, 3))
     return plane, height, variance, length
 
 
@@ -111,4 +111,4 @@ def _of_lines(scene: Scene, sigma_px: float | None) -> _Heights:
     return np.repeat(plane, 2), height.ravel(), variance.ravel(), length
 
 
-__all__ = ["surface_noise_px"]
+__all__ = ["plane_noise_px", "surface_noise_px"]
