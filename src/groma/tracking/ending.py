@@ -8,6 +8,7 @@ it, so that nothing that was found is lost to a failure at the end.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import combinations
 from typing import TypeVar
 
@@ -17,7 +18,8 @@ from groma.io.trajectories import Trajectory
 from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.plane_outcome import PlaneOutcome
-from groma.tracking.backend.submaps import Joint, Part, Places, best_joint
+from groma.tracking.backend.submaps import Joint, Places, Submap, best_joint
+from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.rectification import RightTurn
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.outcome import History
@@ -25,6 +27,27 @@ from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """What became of a map at the end."""
+
+    #: Of the last adjustment of all keyframes, if there was one.
+    report: SolveReport | None
+    right_turn: RightTurn
+    #: None where planes were not looked for in points and lines.
+    planes: PlaneOutcome | None
+
+    def numbers(self, camera: TrackCamera) -> dict:
+        """Return it as plain values."""
+        out: dict = {"right_camera": self.right_turn.numbers(camera)} if camera.baseline > 0 else {}
+        if self.planes is not None:
+            out["landmark_planes"] = self.planes.numbers()
+        if self.report is not None:
+            seconds = dict(self.report.seconds)
+            out["final_adjustment"] = {"iterations": self.report.iterations, "seconds": seconds}
+        return out
 
 
 class Ending:
@@ -89,24 +112,23 @@ class Ending:
         what = f"joining maps {joint.older + 1} and {joint.newer + 1}"
         return self.attempt(what, lambda: places.joined(joint), places)
 
-    def adjust(self, part: int) -> tuple[SolveReport | None, RightTurn, PlaneOutcome | None]:
-        """Adjust all keyframes of a map; return the report, how the right camera is turned, and what of planes."""
-        nothing = None, self._mapper.right.turn
+    def adjust(self, number: int) -> Adjusted:
+        """Adjust all keyframes of a map together, and with planes that are found in its points and lines."""
+        mapper, turn = self._mapper, self._mapper.right.turn
         report, turn = self.attempt(
-            "the adjustment of all keyframes", lambda: self._mapper.adjust_at_end(part), nothing
+            "the adjustment of all keyframes", lambda: mapper.adjust_at_end(number), (None, turn)
         )
-        with_planes, planes = self.attempt(
-            "the search for planes", lambda: self._mapper.adjust_with_planes(part), (None, None)
-        )
-        report = with_planes or report
+        what = "the planes of the map's points and lines"
+        again, planes = self.attempt(what, lambda: mapper.adjust_with_planes(number), (None, None))
+        report = again or report
         if report is not None and not report.converged:
             self.warnings.append(
                 f"The adjustment of all keyframes did not converge in {report.iterations} steps "
                 f"({report.termination.key}). groma adjust on scene.npz continues it."
             )
-        return report, turn, planes
+        return Adjusted(report, turn, planes)
 
-    def submap(self, root: int) -> Part:
+    def submap(self, root: int) -> Submap:
         """Return the trajectory and the scene of a map."""
         mapper = self._mapper
         track_map, relations = mapper.maps[root], mapper.options.relations
@@ -114,7 +136,7 @@ class Ending:
         trajectory = self._built("the trajectory", lambda: self._history.trajectory(track_map, root), Trajectory())
         nothing = map_to_scene(TrackMap(), mapper.camera)
         scene = self._built("the scene", lambda: map_to_scene(track_map, mapper.camera, relations), nothing)
-        return Part(trajectory, scene, stamps[: scene.num_images])
+        return Submap(trajectory, scene, stamps[: scene.num_images])
 
     def _built(self, what: str, step: Callable[[], T], otherwise: T) -> T:
         """Return what a step gives that is needed after an interruption too."""
