@@ -79,9 +79,8 @@ def _upper_end(squared: FloatArray, variance: FloatArray, length: FloatArray, mo
 def _heights(scene: Scene, options: StructureOptions) -> _Heights:
     """Of points and of the ends of lines on planes."""
     points, lines = _of_points(scene, options.point_sigma_px), _of_lines(scene, options.line_sigma_px)
-    plane = np.concatenate([points[0], lines[0]])
-    height, variance, length = (np.concatenate([points[k], lines[k]]) for k in (1, 2, 3))
-    return plane, height, variance, length
+    plane, height = np.concatenate([points[0], lines[0]]), np.concatenate([points[1], lines[1]])
+    return plane, height, np.concatenate([points[2], lines[2]]), np.concatenate([points[3], lines[3]])
 
 
 def _of_points(scene: Scene, sigma_px: float | None) -> _Heights:

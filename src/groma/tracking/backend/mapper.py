@@ -306,12 +306,12 @@ class Mapper:
                 report = self._adjust_all()
         return report, turn
 
-    def adjust_with_planes(self, part: int) -> tuple[SolveReport | None, PlaneOutcome | None]:
+    def adjust_with_planes(self, number: int) -> tuple[SolveReport | None, PlaneOutcome | None]:
         """Find planes in the points and lines of a map, and adjust all keyframes with them; those that fail go.
 
         Depth images show planes themselves: where they did, nothing is done.
         """
-        self.current = part
+        self.current = number
         track_map, options, gates = self.map, self.options, self.options.gates.landmark_planes
         wanted = options.planes and options.relations and options.adjust_at_end
         if not wanted or (track_map.planes.found > 0).any() or len(track_map.living()) < 2:
