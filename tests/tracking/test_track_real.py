@@ -118,7 +118,7 @@ def test_street_by_one_camera(shared_data):
     assert scores.drift_percent is not None
     assert scores.drift_percent < 2.0
     height, slope = _ground_below(result.scene)
-    assert scores.scale * height == pytest.approx(1.65, abs=0.25)
+    assert scores.similarity.scale * height == pytest.approx(1.65, abs=0.25)
     assert slope < 2.0
 
 
@@ -138,7 +138,7 @@ def test_a_board_by_one_camera(shared_data):
     toward = quaternion.rotate(scene.cam_from_world[:, :4], np.tile(hesse[:3], (scene.num_images, 1)))
     true = quaternion.rotate(quaternion.conjugate(world_from_cam[:, :4]), np.tile([0.0, 0.0, 1.0], (len(rows), 1)))
     assert np.degrees(np.arccos(np.abs((toward * true).sum(axis=1)))).max() < 2.0
-    distance = np.abs(scene.cam_centers_in_world @ hesse[:3] + hesse[3]) * scores.scale
+    distance = np.abs(scene.cam_centers_in_world @ hesse[:3] + hesse[3]) * scores.similarity.scale
     np.testing.assert_allclose(distance, np.abs(world_from_cam[:, 6]), atol=0.01)
 
 

@@ -15,7 +15,7 @@ from groma.tracking.map.map_scene import SeenLines, SeenPlanes, SeenPoints, map_
 from groma.tracking.map.relations import find_relations
 from groma.tracking.map.track_map import TrackMap
 
-#: Points seen in fewer keyframes do not go into the scene, unless they lie on a plane.
+#: Points seen in fewer keyframes do not go into the scene.
 MIN_VIEWS = 2
 
 
@@ -31,7 +31,7 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
     relations
         Whether landmarks that belong together were tied.
     min_views
-        Points seen in fewer keyframes are left out, unless they lie on a plane.
+        Points seen in fewer keyframes are left out.
     """
     living = track_map.living()
     cameras = Cameras(
@@ -51,7 +51,6 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
     }
     points = PointMeasurements.stack([m.points for m in measured])
     often = np.bincount(points.index, minlength=len(track_map.points)) >= min_views
-    often |= track_map.points.plane >= 0
     keep = often[points.index]
     points = points.take(keep)
     lines = LineMeasurements.stack([m.lines for m in measured])

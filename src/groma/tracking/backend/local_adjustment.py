@@ -206,12 +206,10 @@ def job_of(
         for kind in ("points", "lines", "planes")
     }
     in_table = {kind: np.concatenate(rows[kind]) if rows[kind] else np.zeros(0, np.int64) for kind in rows}
-    # Points seen once tell nothing about poses, points that no free keyframe sees neither: unless they are on a plane.
+    # Points seen once tell nothing about poses; points that no free keyframe sees neither.
     free = ~held
     often = np.bincount(points.index, minlength=len(track_map.points)) >= min_views
-    on_plane = track_map.points.plane >= 0
-    often |= on_plane
-    moving = on_plane.copy()
+    moving = np.zeros(len(track_map.points), dtype=bool)
     moving[points.index[free[pose["points"]]]] = True
     keep = often[points.index] & moving[points.index]
     points, point_pose, point_rows = points.take(keep), pose["points"][keep], in_table["points"][keep]

@@ -5,7 +5,8 @@ Comes in: the map as a scene. The search and the tests are those of :mod:`groma.
 compared with the noise of its landmark, so that maps without a metric scale have the same planes. Surfaces differ in
 flatness: a board is flat to a fraction of a pixel, a street with its kerbs is not. So the search is repeated for some
 deviations of surfaces, and of planes that claim the same landmarks the one stays that chance would make most rarely.
-Goes out: planes of the map, and the plane that each point and line lies on.
+Goes out: planes of the map, and the plane that each point and line lies on. Points that one stereo pair saw alone help
+to find planes, but are not noted, as they take no part in adjustments.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def find_planes(track_map: TrackMap, scene: Scene, gates: LandmarkPlaneGates = D
     track_map : TrackMap
         The map. It is changed.
     scene : Scene
-        The same as a scene: identifiers of landmarks are their numbers in the map, plus one.
+        The same as a scene, with points seen once: identifiers of landmarks are their numbers in the map, plus one.
     gates : LandmarkPlaneGates
         What counts as a plane.
     """
@@ -88,19 +89,20 @@ def forget(track_map: TrackMap, planes: IntArray) -> None:
 
 def _chosen(scene: Scene, gates: LandmarkPlaneGates) -> list[_Claim]:
     """Planes, the least accidental first, that keep enough of what they claim beside those before."""
-    free = np.ones(scene.num_points, dtype=bool), np.ones(scene.num_lines, dtype=bool)
+    again = np.bincount(scene.point_observations.point_idx, minlength=scene.num_points) > 1
+    free_point, free_line = np.ones(scene.num_points, dtype=bool), np.ones(scene.num_lines, dtype=bool)
     chosen = []
     claims = [claim for sigma in gates.surface_sigmas_px for claim in _claims(scene, sigma, gates)]
     for claim in sorted(claims, key=lambda claim: claim.false_alarms):
-        points, lines = (rows[still[rows]] for rows, still in zip((claim.points, claim.lines), free, strict=True))
-        left = replace(claim, points=points, lines=lines)
-        if left.support < max(gates.min_support, gates.min_own * claim.support):
+        left = replace(claim, points=claim.points[free_point[claim.points]], lines=claim.lines[free_line[claim.lines]])
+        kept = replace(left, points=left.points[again[left.points]])
+        if left.support < gates.min_own * claim.support or kept.support < gates.min_support:
             continue
-        chosen.append(left)
+        chosen.append(kept)
         # Nothing else lies in its layer: relief so near to a plane cannot be told from it.
         normal, offset = claim.hesse[:3], claim.hesse[3]
-        free[0][np.abs(scene.points.xyz @ normal + offset) < claim.band] = False
-        free[1][(np.abs(scene.lines.segments @ normal + offset) < claim.band).all(axis=1)] = False
+        free_point &= np.abs(scene.points.xyz @ normal + offset) > claim.band
+        free_line &= (np.abs(scene.lines.segments @ normal + offset) > claim.band).any(axis=1)
     return chosen
 
 
