@@ -237,7 +237,7 @@ def job_of(
     coordinates = held
     if held.sum() == 1 and len(scene.relations):
         # Distances between landmarks cost less in a smaller map: unless it is metric, its scale is held too.
-        coordinates = first_camera_gauge(scene, int(held.argmax()))
+        coordinates = first_camera_gauge(scene, first=int(held.argmax()))
     problem = assemble(scene, replace(options, held_frames=coordinates)).problem
     if not problem.factors:
         return None
