@@ -218,6 +218,8 @@ def first_camera_gauge(
         The poses.
     count, is_metric : (F,) int, bool, optional
         Observations of each frame, and whether measurements tell the scale; where not given, those of the scene.
+    first : int, optional
+        The frame that is held; by default the first with half of the usual number of observations.
     """
     poses = scene.frames.rig_from_world
     held = np.zeros((len(poses), 6), dtype=bool)
