@@ -141,9 +141,7 @@ def test_command(place, tmp_path, capsys):
     (queries / "bad.jpg").write_text("no image")
     cv2.imwrite(str(queries / "black.png"), np.zeros((480, 640), np.uint8))
     out = tmp_path / "out"
-    assert (
-        run(["localize", str(place / "map.npz"), str(queries), "-o", str(out), "--images", str(place / "images")]) == 0
-    )
+    assert run(["localize", str(place / "map.npz"), str(queries), "-o", str(out), "--images", str(place / "images")]) == 0
     assert "localized" in capsys.readouterr().out
     told = json.loads((out / "localized.json").read_text())
     assert sorted(told) == sorted([*QUERIES, "bad.jpg", "black.png"])

@@ -39,7 +39,9 @@ class TriangulationGates:
 
     beam: float = gate(4.0, "sigma", "distance from an epipolar line", "derived from noise, and as much from the poses")
     outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
-    depth: float = gate(0.2, "share", "of its distance: largest standard deviation of a point", "convention: a fifth")
+    depth: float = gate(
+        0.2, "share", "of its distance: largest standard deviation of a point", "convention: a fifth"
+    )
 
 
 GATES = TriangulationGates()

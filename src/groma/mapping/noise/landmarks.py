@@ -103,7 +103,9 @@ def point_noise(scene: Scene, sigma_px: float | None = None) -> PointNoise:
 
     Columns in the right images of stereo pairs are observations, too.
     """
-    point, residual, by_world = (np.concatenate(x) for x in zip(_pixel_rows(scene), _column_rows(scene), strict=True))
+    pixels, columns = _pixel_rows(scene), _column_rows(scene)
+    point = np.concatenate([pixels[0], columns[0]])
+    residual, by_world = np.concatenate([pixels[1], columns[1]]), np.concatenate([pixels[2], columns[2]])
     good = np.asarray(np.isfinite(residual) & np.isfinite(by_world).all(axis=1))
     residual, by_world = np.where(good, residual, 0.0), np.where(good[:, None], by_world, 0.0)
     count = np.bincount(point[good], minlength=scene.num_points)
