@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,6 +46,12 @@ class LineMap:
     outcomes: tuple[IntArray, ...]
     #: One array per image: its neighbours, best first.
     neighbors: tuple[IntArray, ...]
+    #: (S, n) of all segments, image by image: the rows of those that supported its place in space, by neighbour; -1.
+    supporters: IntArray = field(default_factory=lambda: np.zeros((0, 0), np.int32))
+    #: (S,) the :class:`Outcome` of each of them by its own place: why it had none, or NOT_LINKED.
+    rejection: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    #: (S, 2) how the depth changes along each of them by vanishing points, and its standard deviation; zero for none.
+    depth_ratios: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
     def num_lines(self) -> int:
