@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
@@ -23,6 +22,7 @@ from groma.estimators._plane_loops import (
 )
 from groma.estimators._plane_options import PLANE_SEARCH as GATES
 from groma.estimators._plane_options import PlaneOptions
+from groma.estimators._poisson import log10_more_than
 from groma.estimators.association import inlier_probability
 from groma.estimators.plane_fit import PlaneFit, fit_plane, tilt_sigma
 from groma.geometry.algebra import norm, perpendicular
@@ -186,7 +186,7 @@ class Grower:
         )  # fmt: skip
         if found[0] == 0:
             return self._log_tried
-        return float(stats.poisson.logsf(found[0] - 4, found[1])) / np.log(10.0) + self._log_tried  # three fix it
+        return log10_more_than(found[0] - 4, found[1]) + self._log_tried  # three fix it
 
 
 def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:

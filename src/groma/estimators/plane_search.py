@@ -24,7 +24,6 @@ from dataclasses import dataclass, field
 from heapq import heapify, heappop, heappush, nsmallest
 
 import numpy as np
-from scipy import stats
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
@@ -32,10 +31,13 @@ from groma.estimators._plane_candidates import Features, Scores, features_of, fr
 from groma.estimators._plane_growth import Grower, Grown, connected_to
 from groma.estimators._plane_options import PLANE_SEARCH, PlaneOptions
 from groma.execution import map_in_threads, num_threads
+from groma.gates import chi_square_gate
 from groma.geometry.algebra import vectors
 
 #: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
 BAND = PLANE_SEARCH.band
+#: Candidates whose scores are brought up to date together.
+_SCORED_TOGETHER = 16
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ def _extract(
     """Take planes out one after the other; ``labels`` is filled."""
     rng = np.random.default_rng(options.seed)
     features = features_of(places, noise, partner, carrier)
-    gate = float(stats.chi2.ppf(options.level, 1))
+    gate = chi_square_gate(1.0 - options.level, 1)
     first, first_homes = from_neighbours(features, gate, rng)
     second, second_homes, num_pairs = from_segments(features, num_points, gate)
     candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])
@@ -171,7 +173,7 @@ def _extract(
     queue = [(-float(score[k]), int(k)) for k in np.flatnonzero(alive)]
     heapify(queue)
     growth = _Growth(features, gate, float(log_tried), options)
-    failures = 0
+    failures, scored = 0, np.zeros(len(candidates), np.int64)
     patience = max(PLANE_SEARCH.patience, len(candidates) // PLANE_SEARCH.candidates_per_failure)
     at = np.argsort(homes, kind="stable")
     first_at = np.searchsorted(homes[at], np.arange(len(places) + 1))
@@ -180,12 +182,18 @@ def _extract(
         _, best = heappop(queue)
         if not alive[best]:
             continue
-        # Scores only fall while planes are taken out: one that is still the best need not be compared again.
-        support, score = scores.of(np.array([best]), labels)
-        if support[0] < 0.5 * options.min_support or score[0] < least_score:
-            continue
-        if queue and -score[0] > queue[0][0] + 1e-9 * score[0]:
-            heappush(queue, (-float(score[0]), best))
+        # Scores only fall while planes are taken out: the best is the best if its own is of after the last one.
+        if scored[best] < len(found):
+            stale = [best]
+            while queue and len(stale) < _SCORED_TOGETHER and scored[queue[0][1]] < len(found):
+                _, other = heappop(queue)
+                if alive[other]:
+                    stale.append(other)
+            support, score = scores.of(np.array(stale), labels)
+            scored[stale] = len(found)
+            hopeful = (support >= 0.5 * options.min_support) & (score >= least_score)
+            for k in np.flatnonzero(hopeful):
+                heappush(queue, (-float(score[k]), stale[k]))
             continue
         alive[best] = False
         failures += 1
