@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators._chance import log10_poisson_tail
 from groma.estimators._plane_candidates import Features
 from groma.estimators._plane_loops import (
     ball_loop,
@@ -22,7 +23,6 @@ from groma.estimators._plane_loops import (
 )
 from groma.estimators._plane_options import PLANE_SEARCH as GATES
 from groma.estimators._plane_options import PlaneOptions
-from groma.estimators._poisson import log10_more_than
 from groma.estimators.association import inlier_probability
 from groma.estimators.plane_fit import PlaneFit, fit_plane, tilt_sigma
 from groma.geometry.algebra import norm, perpendicular
@@ -186,7 +186,7 @@ class Grower:
         )  # fmt: skip
         if found[0] == 0:
             return self._log_tried
-        return log10_more_than(found[0] - 4, found[1]) + self._log_tried  # three fix it
+        return log10_poisson_tail(found[0] - 4, found[1]) + self._log_tried  # three fix it
 
 
 def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:
