@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from _wireframe import arc, random_lines, wireframe
 
+from groma.errors import InputError
 from groma.geometry import quaternion
 from groma.mapping.checkpoint_files import LINE_MAP
 from groma.mapping.lines.build import map_lines
@@ -100,3 +101,10 @@ def test_lines_that_nothing_changed_are_not_fitted_again(world):
     changed = (after.lines != fitted.lines).any(axis=(1, 2))
     assert np.flatnonzero(changed).tolist() == [4]
     assert fitted.with_sigma(2.0 * fitted.sigma).stale.all()
+
+
+def test_an_earlier_map_of_other_segments_is_refused(world):
+    first = map_lines(world.scene, world.segments)
+    fewer = [world.segments[0].select(np.arange(5)), *world.segments[1:]]
+    with pytest.raises(InputError, match="same segments"):
+        map_lines(world.scene, fewer, earlier=EarlierMap(world.scene, first))

@@ -88,7 +88,7 @@ def map_lines(
     Raises
     ------
     InputError
-        If the number of segment sets is not the number of images.
+        If the number of segment sets is not the number of images, or an earlier map is of other segments.
 
     Notes
     -----
@@ -99,6 +99,11 @@ def map_lines(
         raise InputError(
             f"segments must hold one set per image of the scene ({scene.num_images}); got {len(segments)}. "
             "Pass Segments.empty() for images without."
+        )
+    if earlier is not None and len(earlier.lines.rejection) != sum(len(one) for one in segments):
+        raise InputError(
+            f"The earlier map must be of the same segments ({sum(len(one) for one in segments)}); it is of "
+            f"{len(earlier.lines.rejection)}. Pass none to map the lines from the beginning."
         )
     report = progress or (lambda stage, done, total: None)
     choose = neighbors or partial(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,11 +48,11 @@ class LineMap:
     #: One array per image: its neighbours, best first.
     neighbors: tuple[IntArray, ...]
     #: (S, n) of all segments, image by image: the rows of those that supported its place in space, by neighbour; -1.
-    supporters: IntArray = field(default_factory=lambda: np.zeros((0, 0), np.int32))
+    supporters: IntArray
     #: (S,) the :class:`Outcome` of each of them by its own place: why it had none, or NOT_LINKED.
-    rejection: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    rejection: IntArray
     #: (S, 2) how the depth changes along each of them by vanishing points, and its standard deviation; zero for none.
-    depth_ratios: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    depth_ratios: FloatArray
 
     @property
     def num_lines(self) -> int:

@@ -32,7 +32,10 @@ class EarlierGates:
         100, "points", "of an image that tell how far its epipolar lines moved", "cost: of a quantile"
     )
     moved_share: float = gate(
-        0.1, "share", "of the points whose epipolar line moved by more than noise: search again", "as for all images"
+        0.1,
+        "share",
+        "of the points whose epipolar line moved by more than noise: search again",
+        "chosen on castle, fountain",
     )
 
 
