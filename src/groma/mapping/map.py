@@ -40,11 +40,8 @@ from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
 from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider, explain, map_lines
-<<<<<<< HEAD
-from groma.mapping.lines.hypotheses.earlier import EarlierMap
-=======
 from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE, left_out, with_confidence
->>>>>>> main
+from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
