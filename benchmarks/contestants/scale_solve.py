@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 from _common import Clock, peak_memory_mib, report
 
-import groma.solver.solve as solve_module
+import groma.solver.joint as joint
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.io import read_scene
 from groma.scene import Scene, synthetic
@@ -33,12 +33,12 @@ def main() -> None:
     if threads == 1:  # the stages of a report are then timed by CPU time, so that other work does not count
         solver_report.time = SimpleNamespace(perf_counter=time.process_time)
     small = problem_of(synthetic.corridor(120).start.points_only())
-    threshold = solve_module.COMPACT_FROM
+    threshold = joint.COMPACT_FROM
     for bytes_ in (threshold, 0):
-        solve_module.COMPACT_FROM = bytes_
+        joint.COMPACT_FROM = bytes_
         for solver in ("dense", "pcg"):
             solve(small, SolverOptions(max_iterations=2, threads=threads, linear_solver=solver))
-    solve_module.COMPACT_FROM = threshold
+    joint.COMPACT_FROM = threshold
     before = peak_memory_mib()
     reading = Clock()
     scene = read_scene(path)

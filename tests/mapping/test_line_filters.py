@@ -25,7 +25,8 @@ def tracks(world):
     views, line_of = build_views(world.scene, world.segments, 5.0, 0.1, 2.0), np.concatenate(world.truth)
     none = Tracks.none(views, np.full(len(line_of), Outcome.NOT_LINKED))
     zero = np.zeros(len(world.lines))
-    return replace(none, lines=world.lines, line_of=line_of, uncertainty=zero, unchecked=zero)
+    stale = np.zeros(len(zero), bool)
+    return replace(none, lines=world.lines, line_of=line_of, uncertainty=zero, unchecked=zero, stale=stale)
 
 
 def evidence(tracks, **options):

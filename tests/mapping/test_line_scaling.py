@@ -126,7 +126,8 @@ def line_map(counts, num_lines=0):
     outcomes = np.repeat(np.array(list(counts), np.int64), list(counts.values()))
     empty = {item: np.zeros(0) for item in ("segments", "image_idx", "segment_idx", "line_idx", "residual")}
     empty |= {item: np.zeros(0) for item in ("num_images", "median_residual", "uncertainty")}
-    return LineMap(lines=np.zeros((num_lines, 6)), **empty, outcomes=(outcomes,), neighbors=())
+    places = {"supporters": np.zeros((0, 0)), "rejection": np.zeros(0), "depth_ratios": np.zeros((0, 2))}
+    return LineMap(lines=np.zeros((num_lines, 6)), **empty, outcomes=(outcomes,), neighbors=(), **places)
 
 
 @pytest.mark.parametrize("outcome", list(WORDS))

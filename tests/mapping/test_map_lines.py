@@ -24,7 +24,7 @@ from groma.mapping.lines.build import (
 )
 from groma.mapping.lines.filtering.filters import is_certain
 from groma.mapping.lines.hypotheses.directions import depth_ratios
-from groma.mapping.lines.hypotheses.proposals import Proposer, angles_about_baseline
+from groma.mapping.lines.hypotheses.proposals import Proposer, Questions, angles_about_baseline
 from groma.mapping.lines.linking.tracks import Tracks
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.lines.views import build_views
@@ -197,9 +197,8 @@ def test_directions_place_what_two_views_cannot():
     P = views.camera[0]
     x = xyz @ P[:, :3].T + P[:, 3]
     proposer = Proposer(views, ratios, MapLinesOptions())
-    found = proposer.propose(
-        0, np.array([1]), [(np.empty((0, 2), np.int64), np.empty(0))], (x[:, :2] / x[:, 2:], 1 / x[:, 2])
-    )
+    no_match = np.empty((0, 2), np.int64), np.empty(0)
+    found = proposer.propose(Questions(0, np.array([1]), [no_match], (x[:, :2] / x[:, 2:], 1 / x[:, 2])))
     assert (found.neighbor == 2).all()  # slot of a point with a direction: no other proposal is possible
     assert len(np.unique(found.segment)) >= 8
     for s, q in zip(found.segment, found.values[:, :2], strict=True):

@@ -17,10 +17,13 @@ from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.estimators._plane_loops import BALL, height_kernel, least_axis_kernel, variance_kernel
 from groma.estimators._plane_options import PLANE_SEARCH
+from groma.execution import map_in_threads, num_threads
 from groma.geometry.algebra import dot, norm
 
 #: Pairs looked at together.
 _CHUNK = 16384
+#: Candidates that are worth a thread.
+_SCORED_AT_ONCE = 8
 
 
 @dataclass(frozen=True)
@@ -265,16 +268,32 @@ class Scores:
     def __init__(self, features: Features, planes: FloatArray, homes: IntArray, gate: float, reach: float) -> None:
         self._features, self._planes, self._homes = features, planes, homes
         self._gate, self._reach = gate, reach
-        self._stamp, self._number = np.zeros(len(features.places), np.int64), 0
-        self._queue = np.empty(PLANE_SEARCH.max_followed, np.int64)
+        self._rooms: list[_Room] = []
 
     def of(self, which: IntArray, labels: IntArray) -> tuple[IntArray, FloatArray]:
         """Support (M,) and score (M,) of some candidates among the features without a label."""
         features, support, score = self._features, np.empty(len(which), np.int64), np.empty(len(which))
-        scores_loop(
-            features.places, features.packed, features.spacing, features.partner, features.neighbours, labels,
-            self._gate, self._reach, self._planes, self._homes, which, self._stamp, self._number, self._queue, support,
-            score,
-        )  # fmt: skip
-        self._number += len(which)
+        pieces = max(1, min(num_threads(), len(which) // _SCORED_AT_ONCE))
+        cuts = [len(which) * piece // pieces for piece in range(pieces + 1)]
+        while len(self._rooms) < pieces:
+            self._rooms.append(_Room(len(features.places)))
+
+        def fill(piece: int) -> None:
+            room, part = self._rooms[piece], slice(cuts[piece], cuts[piece + 1])
+            scores_loop(
+                features.places, features.packed, features.spacing, features.partner, features.neighbours, labels,
+                self._gate, self._reach, self._planes, self._homes, which[part], room.stamp, room.number, room.queue,
+                support[part], score[part],
+            )  # fmt: skip
+            room.number += part.stop - part.start
+
+        map_in_threads(fill, range(pieces))
         return support, score
+
+
+class _Room:
+    """Where one thread keeps which features it has met."""
+
+    def __init__(self, num_features: int) -> None:
+        self.stamp, self.number = np.zeros(num_features, np.int64), 0
+        self.queue = np.empty(PLANE_SEARCH.max_followed, np.int64)

@@ -36,6 +36,8 @@ from groma.geometry.algebra import vectors
 
 #: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
 BAND = PLANE_SEARCH.band
+#: Candidates whose scores are brought up to date together.
+_SCORED_TOGETHER = 16
 
 
 @dataclass(frozen=True)
@@ -171,7 +173,7 @@ def _extract(
     queue = [(-float(score[k]), int(k)) for k in np.flatnonzero(alive)]
     heapify(queue)
     growth = _Growth(features, gate, float(log_tried), options)
-    failures = 0
+    failures, scored = 0, np.zeros(len(candidates), np.int64)
     patience = max(PLANE_SEARCH.patience, len(candidates) // PLANE_SEARCH.candidates_per_failure)
     at = np.argsort(homes, kind="stable")
     first_at = np.searchsorted(homes[at], np.arange(len(places) + 1))
@@ -180,12 +182,18 @@ def _extract(
         _, best = heappop(queue)
         if not alive[best]:
             continue
-        # Scores only fall while planes are taken out: one that is still the best need not be compared again.
-        support, score = scores.of(np.array([best]), labels)
-        if support[0] < 0.5 * options.min_support or score[0] < least_score:
-            continue
-        if queue and -score[0] > queue[0][0] + 1e-9 * score[0]:
-            heappush(queue, (-float(score[0]), best))
+        # Scores only fall while planes are taken out: the best is the best if its own is of after the last one.
+        if scored[best] < len(found):
+            stale = [best]
+            while queue and len(stale) < _SCORED_TOGETHER and scored[queue[0][1]] < len(found):
+                _, other = heappop(queue)
+                if alive[other]:
+                    stale.append(other)
+            support, score = scores.of(np.array(stale), labels)
+            scored[stale] = len(found)
+            hopeful = (support >= 0.5 * options.min_support) & (score >= least_score)
+            for k in np.flatnonzero(hopeful):
+                heappush(queue, (-float(score[k]), stale[k]))
             continue
         alive[best] = False
         failures += 1

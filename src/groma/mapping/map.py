@@ -41,6 +41,7 @@ from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, 
 from groma.mapping.image_segments import detect_segments, given_segments
 from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider, explain, map_lines
 from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE, left_out, with_confidence
+from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
@@ -217,7 +218,7 @@ def map_segments(
     """
     options = stages.options
     scene = with_point_noise(points)
-    line_map = stages.run(find_lines, scene, segments, matches, neighbors)
+    line_map = stages.run(find_lines, scene, segments, matches, neighbors, None)
     scene = line_map.add_to(scene, segments)
     weighted = _weighted(scene, options)
     for turn in range(GATES.max_rounds if options.refine_poses and scene.num_lines else 0):
@@ -228,7 +229,8 @@ def map_segments(
         joint = with_point_noise(joint.replace(point_observations=given))
         # The lines as mapped are good starts, and only the adjusted ones tell the noise of the segments.
         weighted = _weighted(joint, options)
-        line_map = stages.run(find_lines_again, joint, segments, matches, neighbors, tag=tag)
+        earlier = EarlierMap(before, line_map)
+        line_map = stages.run(find_lines_again, joint, segments, matches, neighbors, earlier, tag=tag)
         scene = line_map.add_to(joint, segments)
         if scene.num_lines == 0 or moved_px(before, joint, GATES.moved_share) <= options.lines.noise:
             break
@@ -294,10 +296,11 @@ def _find_lines(
     segments: list[Segments],
     matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
     neighbors: NeighborChooser | None,
+    earlier: EarlierMap | None,
     options: MapOptions,
     say: StageProgress,
 ) -> LineMap:
-    return map_lines(scene, segments, matches, options.lines, say, neighbors)
+    return map_lines(scene, segments, matches, options.lines, say, neighbors, earlier)
 
 
 #: 3D lines from the segments; and again, with better poses.

@@ -62,8 +62,9 @@ class Workers:
 
 #: Problems with fewer factors are one share: they are not worth a thread.
 FACTORS_FOR_THREADS = 50_000
-#: Most shares, and most bytes that their copies of the reduced system take, unless two take more.
-MAX_SHARES, MAX_BYTES = 16, 2**30
+#: Most shares, and most bytes that their copies of the reduced system take for every factor, about twice what its
+#: measurement does, unless two copies take more: even one thread has them all.
+MAX_SHARES, MAX_BYTES = 16, 96
 #: Landmarks add to each block of a copy so many times on average, or clearing and adding the copies takes too long.
 USES_OF_A_BLOCK = 20
 
@@ -79,7 +80,7 @@ def num_shares(layout: Layout) -> int:
     for group in layout.eliminated:
         uses += sum(len(seen.pair_slots) for seen in group.incidences.values())
         uses += sum(len(slots) for slots, _ in group.cross.values())
-    count = min(MAX_SHARES, MAX_BYTES // max(8 * numbers, 1), len(layout.chunks) // 2)
+    count = min(MAX_SHARES, MAX_BYTES * size // max(8 * numbers, 1), len(layout.chunks) // 2)
     if layout.eliminated:
         count = min(count, uses // max(USES_OF_A_BLOCK * blocks, 1)) if blocks else count
     return max(2, count)

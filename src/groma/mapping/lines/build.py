@@ -30,7 +30,8 @@ from groma.errors import InputError
 from groma.execution import work_with
 from groma.mapping.lines.filtering.filters import Evidence, filtered
 from groma.mapping.lines.hypotheses.directions import depth_ratios
-from groma.mapping.lines.hypotheses.places import find_places
+from groma.mapping.lines.hypotheses.earlier import EarlierMap
+from groma.mapping.lines.hypotheses.places import Places, find_places
 from groma.mapping.lines.line_map import LineMap, explain
 from groma.mapping.lines.linking.growth import grow
 from groma.mapping.lines.linking.merge import merge_agreeing
@@ -54,6 +55,7 @@ def map_lines(
     options: MapLinesOptions | None = None,
     progress: Callable[[str, int, int], None] | None = None,
     neighbors: Callable[[Scene], list[IntArray]] | None = None,
+    earlier: EarlierMap | None = None,
 ) -> LineMap:
     """Build 3D lines from the segments of posed images.
 
@@ -74,6 +76,9 @@ def map_lines(
     neighbors : callable, optional
         Chooses for every image of a scene which others it is compared with, the best first, in place of
         :func:`~groma.mapping.lines.neighbors.covisible_neighbors`.
+    earlier : EarlierMap, optional
+        A map of the same segments at nearly the same poses: only what these poses change is searched again. Not used
+        where matches are given.
 
     Returns
     -------
@@ -83,7 +88,7 @@ def map_lines(
     Raises
     ------
     InputError
-        If the number of segment sets is not the number of images.
+        If the number of segment sets is not the number of images, or an earlier map is of other segments.
 
     Notes
     -----
@@ -95,6 +100,11 @@ def map_lines(
             f"segments must hold one set per image of the scene ({scene.num_images}); got {len(segments)}. "
             "Pass Segments.empty() for images without."
         )
+    if earlier is not None and len(earlier.lines.rejection) != sum(len(one) for one in segments):
+        raise InputError(
+            f"The earlier map must be of the same segments ({sum(len(one) for one in segments)}); it is of "
+            f"{len(earlier.lines.rejection)}. Pass none to map the lines from the beginning."
+        )
     report = progress or (lambda stage, done, total: None)
     choose = neighbors or partial(
         covisible_neighbors, num_neighbors=options.num_neighbors, min_shared=options.min_shared
@@ -102,8 +112,14 @@ def map_lines(
     with work_with():
         compared = choose(scene)
         views = build_views(scene, segments, options.min_length, options.noise, options.depth_margin)
-        ratios = depth_ratios(scene, segments, views) if options.use_directions else np.zeros((len(views.image_idx), 2))
-        places = find_places(scene, views, ratios, compared, matches, options, partial(report, "proposals"))
+        known = None if earlier is None or matches is not None else earlier.known(scene, views, compared, options.noise)
+        if earlier is not None and earlier.same_cameras(scene):
+            ratios = earlier.lines.depth_ratios  # by the image alone, whatever its pose
+        elif options.use_directions:
+            ratios = depth_ratios(scene, segments, views)
+        else:
+            ratios = np.zeros((len(views.image_idx), 2))
+        places = find_places(scene, views, ratios, compared, matches, options, partial(report, "proposals"), known)
         unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, partial(report, "tracks"))
         evidence = Evidence(
             options=options,
@@ -112,10 +128,10 @@ def map_lines(
             size=np.column_stack([scene.cameras.width, scene.cameras.height])[scene.images.camera_idx],
             unmerged=unmerged,
         )
-        return _line_map(filtered(merge_agreeing(unmerged), evidence), compared)
+        return _line_map(filtered(merge_agreeing(unmerged), evidence), compared, places, ratios)
 
 
-def _line_map(tracks: Tracks, neighbors: list[IntArray]) -> LineMap:
+def _line_map(tracks: Tracks, neighbors: list[IntArray], places: Places, ratios: FloatArray) -> LineMap:
     """Collect the result; lines run like most of their segments."""
     views = tracks.views
     rows, line_idx = tracks.members()
@@ -138,6 +154,9 @@ def _line_map(tracks: Tracks, neighbors: list[IntArray]) -> LineMap:
         uncertainty=tracks.uncertainty,
         outcomes=tuple(outcomes[views.rows(i)] for i in range(len(views.camera))),
         neighbors=tuple(neighbors),
+        supporters=places.supporters.astype(np.int32),
+        rejection=places.rejection,
+        depth_ratios=ratios,
     )
 
 

@@ -47,6 +47,12 @@ class LineMap:
     outcomes: tuple[IntArray, ...]
     #: One array per image: its neighbours, best first.
     neighbors: tuple[IntArray, ...]
+    #: (S, n) of all segments, image by image: the rows of those that supported its place in space, by neighbour; -1.
+    supporters: IntArray
+    #: (S,) the :class:`Outcome` of each of them by its own place: why it had none, or NOT_LINKED.
+    rejection: IntArray
+    #: (S, 2) how the depth changes along each of them by vanishing points, and its standard deviation; zero for none.
+    depth_ratios: FloatArray
 
     @property
     def num_lines(self) -> int:

@@ -8,8 +8,8 @@ One image at a time: proposals from the segments of its neighbours, from known p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -20,7 +20,8 @@ from groma.errors import InputError
 from groma.execution import map_work
 from groma.mapping.groups import grouped
 from groma.mapping.lines.hypotheses.consensus import choose
-from groma.mapping.lines.hypotheses.proposals import WEAK, Proposer
+from groma.mapping.lines.hypotheses.earlier import Known
+from groma.mapping.lines.hypotheses.proposals import WEAK, Proposer, Questions
 from groma.mapping.lines.matches import MatchProvider
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.outcomes import Outcome
@@ -60,6 +61,14 @@ class Places:
             rejection=np.full(count, rejection, np.int64),
         )
 
+    def where(self, chosen: BoolArray, other: Places) -> Places:
+        """Return these places where chosen (S,), and those of another elsewhere."""
+        columns = {}
+        for item in fields(self):
+            one, two = getattr(self, item.name), getattr(other, item.name)
+            columns[item.name] = np.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), one, two)
+        return Places(**columns)
+
     def ends_in_space(self, views: LineViews) -> FloatArray:
         """(S, 2, 3) end points in the world; meaningless without a place."""
         center = views.center[views.image_idx]
@@ -74,6 +83,7 @@ def find_places(
     matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
     options: MapLinesOptions,
     progress: Callable[[int, int], None],
+    known: Sequence[Known] | None = None,
 ) -> Places:
     """Return the place of every segment of every image.
 
@@ -89,9 +99,11 @@ def find_places(
         As for :func:`groma.mapping.lines.build.map_lines`.
     options, progress
         Gates; called with the number of images done and in all.
+    known : sequence of C Known, optional
+        What an earlier map says of each image.
     """
     points = _points_by_image(scene, views) if options.use_points else [None] * scene.num_images
-    work = list(zip(range(len(neighbors)), neighbors, points, strict=True))
+    work = list(zip(range(len(neighbors)), neighbors, points, known or [None] * len(neighbors), strict=True))
     found = map_work(partial(_places_in, Proposer(views, ratios, options), matches), work, progress)
     found = [Places.none(0, max(1, options.num_neighbors), Outcome.NO_MATCH), *found]
     columns = {item.name: np.concatenate([getattr(one, item.name) for one in found]) for item in fields(Places)}
@@ -102,18 +114,34 @@ def find_places(
 def _places_in(
     proposer: Proposer,
     matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
-    image: tuple[int, IntArray, tuple[FloatArray, FloatArray] | None],
+    image: tuple[int, IntArray, tuple[FloatArray, FloatArray] | None, Known | None],
 ) -> Places:
-    """The same of one image: its number, neighbours and known points."""
-    views, options, (i, others, points) = proposer.views, proposer.options, image
-    rows, width = views.rows(i), max(1, options.num_neighbors)
+    """The same of one image: its number, neighbours, known points, and what else is known."""
+    views, (i, others, points, known) = proposer.views, image
+    rows, width = views.rows(i), max(1, proposer.options.num_neighbors)
     count = rows.stop - rows.start
     if len(others) == 0:
         return Places.none(count, width, Outcome.NO_NEIGHBOR)
-    given = [_given(matches, i, int(j)) for j in others]
-    for j, pairs in zip(others, given, strict=True):
-        _check_pairs(pairs, i, int(j), views)
-    proposals = proposer.propose(i, others, given, points)
+    if known is None:
+        given = [_given(matches, i, int(j)) for j in others]
+        for j, pairs in zip(others, given, strict=True):
+            _check_pairs(pairs, i, int(j), views)
+        return _agreed(proposer, Questions(i, others, given, points), width)
+    given = [known.pairs(n, views.rows(int(j)).start) for n, j in enumerate(others)]
+    supported = _agreed(proposer, Questions(i, others, given, points), width)
+    had_none = known.rejection != Outcome.NOT_LINKED
+    supported = replace(supported, rejection=np.where(had_none, known.rejection, supported.rejection))
+    if not known.moved:
+        return supported
+    searched = _agreed(proposer, Questions(i, others, [None] * len(others), points, ~supported.found), width)
+    return supported.where(supported.found, searched)
+
+
+def _agreed(proposer: Proposer, asked: Questions, width: int) -> Places:
+    """The places on which proposals agree, with room for so many supporters."""
+    options, others = proposer.options, asked.neighbors
+    proposals = proposer.propose(asked)
+    count = len(proposals.reached)
     # A line of min_images images is this segment and min_images - 1 neighbours; two of them must agree.
     chosen = choose(proposals, count, len(others), max(1, min(2, options.min_images - 1)))
     ambiguous = chosen.found & (chosen.rival > options.max_rival * chosen.score)

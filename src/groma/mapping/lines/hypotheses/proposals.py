@@ -25,12 +25,13 @@ Plücker notes, eq. (33) for the two planes. The parametrisation by inverse dept
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from groma._numba import kernel, loop
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.hypotheses.known_points import lines_through_points
@@ -103,98 +104,106 @@ def _carry(M, ray, across, b):
 
 
 @kernel
-def _propose(
-    b, sigma, q_low, q_high, ratio, line, ends, sigma_j, a, directed, min_overlap, max_relative, limits, out
-):  # fmt: skip
-    """One pair of segments: fill out = q1 q2 c11 c12 c22; return how far it got.
+def _reach(b, line, r, per_gain, q_low, q_high, limits, out):
+    """Fill the inverse depths out = q1 q2 that line r gives; False where they are out of range."""
+    out[0] = (line[r, 0] * b[0, 0] + line[r, 1] * b[0, 1] + line[r, 2] * b[0, 2]) * per_gain
+    out[1] = (line[r, 0] * b[1, 0] + line[r, 1] * b[1, 1] + line[r, 2] * b[1, 2]) * per_gain
+    middle, least, most = 0.5 * (out[0] + out[1]), q_low / limits[1], q_high * limits[1]
+    if not (middle >= q_low and middle <= q_high):
+        return False
+    return out[0] >= least and out[0] <= most and out[1] >= least and out[1] <= most
+
+
+@kernel
+def _propose(b, s, r, ratio, line, ends, sigma, gain, a, directed, min_overlap, max_relative, limits, out):
+    """Segments s and r, which give out = q1 q2: add c11 c12 c22; return how far the pair got.
 
     ``b`` are the rays of the first segment by :func:`_carry`. ``limits`` are the least change over the range of depths
     in sigma, the margin of the ends, and the largest squared disagreement with the direction.
     """
-    gain = line[0] * a[0] + line[1] * a[1] + line[2] * a[2]
-    if not abs(gain) * (q_high - q_low) > limits[0] * sigma_j:
-        return WEAK  # the whole range of depths lies within the noise
-    per_gain = -1.0 / gain
-    out[0] = (line[0] * b[0, 0] + line[1] * b[0, 1] + line[2] * b[0, 2]) * per_gain
-    out[1] = (line[0] * b[1, 0] + line[1] * b[1, 1] + line[2] * b[1, 2]) * per_gain
-    middle = 0.5 * (out[0] + out[1])
-    if not (middle >= q_low and middle <= q_high):
+    ux, uy = ends[r, 2] - ends[r, 0], ends[r, 3] - ends[r, 1]
+    per_length2 = 1.0 / (ux * ux + uy * uy)
+    z1, z2 = out[0] * a[2] + b[0, 2], out[1] * a[2] + b[1, 2]
+    if z1 <= 0.05 or z2 <= 0.05:
         return OUT_OF_BEAM
-    least, most = q_low / limits[1], q_high * limits[1]
-    if not (out[0] >= least and out[0] <= most and out[1] >= least and out[1] <= most):
-        return OUT_OF_BEAM
-    ux, uy = ends[2] - ends[0], ends[3] - ends[1]
-    length2 = ux * ux + uy * uy
-    shift = line[0] * b[2, 0] + line[1] * b[2, 1] + line[2] * b[2, 2]
-    t1 = t2 = g1 = g2 = h1 = h2 = 0.0
-    for k in range(2):
-        q = out[k]
-        z = q * a[2] + b[k, 2]
-        if z <= 0.05:
-            return OUT_OF_BEAM
-        x, y = (q * a[0] + b[k, 0]) / z, (q * a[1] + b[k, 1]) / z
-        t = ((x - ends[0]) * ux + (y - ends[1]) * uy) / length2
-        if k == 0:
-            t1, g1, h1 = t, gain / z, shift / z
-        else:
-            t2, g2, h2 = t, gain / z, shift / z
+    z1, z2 = 1.0 / z1, 1.0 / z2
+    x1, y1 = (out[0] * a[0] + b[0, 0]) * z1 - ends[r, 0], (out[0] * a[1] + b[0, 1]) * z1 - ends[r, 1]
+    x2, y2 = (out[1] * a[0] + b[1, 0]) * z2 - ends[r, 0], (out[1] * a[1] + b[1, 1]) * z2 - ends[r, 1]
+    t1, t2 = (x1 * ux + y1 * uy) * per_length2, (x2 * ux + y2 * uy) * per_length2
     if directed and t2 <= t1:
         return OUT_OF_BEAM
     low, high = min(t1, t2), max(t1, t2)
     overlap = min(high, 1.0) - max(low, 0.0)
     if overlap < min_overlap * min(high - low, 1.0):
         return OUT_OF_BEAM
-    s2, r2 = sigma_j * sigma_j, sigma * sigma
+    shift = line[r, 0] * b[2, 0] + line[r, 1] * b[2, 1] + line[r, 2] * b[2, 2]
+    g1, g2, h1, h2 = gain * z1, gain * z2, shift * z1, shift * z2
+    s2, r2 = sigma[r] * sigma[r], sigma[s] * sigma[s]
     out[2] = (s2 * ((1.0 - t1) * (1.0 - t1) + t1 * t1) + r2 * h1 * h1) / (g1 * g1)
     out[3] = s2 * ((1.0 - t1) * (1.0 - t2) + t1 * t2) / (g1 * g2)
     out[4] = (s2 * ((1.0 - t2) * (1.0 - t2) + t2 * t2) + r2 * h2 * h2) / (g2 * g2)
     for attempt in range(2):
         if out[2] <= (max_relative * out[0]) ** 2 and out[4] <= (max_relative * out[1]) ** 2:
             return PROPOSED
-        if attempt == 1 or ratio[0] <= 0.0 or not _use_direction(ratio, limits[2], out):
+        if attempt == 1 or ratio[s, 0] <= 0.0 or not _use_direction(ratio[s], limits[2], out):
             return WEAK
     return WEAK
 
 
 @loop
 def _propose_beam(
-    rows_i, rows_j, ray, across, sigma, search, ratio, line, ends, beam_i, beam_j, bin_pointers, bin_members, M, a,
-    directed, min_overlap, max_relative, limits, neighbor, out_index, out, reached,
+    rows_i, rows_j, ray, across, sigma, search, ratio, line, ends, beam_i, beams, M, a, directed, min_overlap,
+    max_relative, limits, neighbor, out_index, out, reached,
 ):  # fmt: skip
-    """All pairs whose angles about the baseline overlap; return the number written, or needed if out is too short."""
-    count = 0
+    """All pairs whose angles about the baseline overlap; return the number written, or needed if out is too short.
+
+    Two intervals overlap if the second contains the beginning of the first, or begins in it; ``beams`` finds both.
+    """
+    beam_j, bin_pointers, bin_members, order, begins = beams
+    gain, count = np.empty(len(rows_j)), 0
+    for j in range(len(rows_j)):
+        r = rows_j[j]
+        gain[j] = line[r, 0] * a[0] + line[r, 1] * a[1] + line[r, 2] * a[2]
     work, b = np.empty(5), np.empty((3, 3))
     num_bins = len(bin_pointers) - 1
     size = 2.0 * math.pi / num_bins
     for i in range(len(rows_i)):
         s = rows_i[i]
         _carry(M, ray[s], across[s], b)
-        low, high = beam_i[i, 0], beam_i[i, 1]
-        bin_low, bin_high = int(np.floor(low / size)), int(np.floor(high / size))
-        for k in range(bin_low, min(bin_high, bin_low + num_bins - 1) + 1):
-            here = k % num_bins
-            for e in range(bin_pointers[here], bin_pointers[here + 1]):
-                j = bin_members[e]
-                # A pair that shares several bins counts in the first of them.
-                if k != bin_low and int(np.floor(beam_j[j, 0] / size)) % num_bins != here:
+        low, q_low, q_high = beam_i[i, 0], search[s, 0], search[s, 1]
+        here = int(np.floor(low / size)) % num_bins
+        around = bin_pointers[here + 1] - bin_pointers[here]
+        furthest = reached[i]
+        for e in range(around + begins[i, 1] - begins[i, 0]):
+            if e < around:
+                j = bin_members[bin_pointers[here] + e]
+                back = low - beam_j[j, 0]
+                if back < 0.0:
+                    back += 2.0 * math.pi
+                if back > beam_j[j, 1] - beam_j[j, 0]:
                     continue
-                away = 0.5 * (low + high) - 0.5 * (beam_j[j, 0] + beam_j[j, 1])
-                away -= 2.0 * math.pi * math.floor(away / (2.0 * math.pi) + 0.5)
-                if abs(away) > 0.5 * (high - low + beam_j[j, 1] - beam_j[j, 0]):
-                    continue
-                r = rows_j[j]
-                got = _propose(
-                    b, sigma[s], search[s, 0], search[s, 1], ratio[s], line[r], ends[r], sigma[r], a, directed,
-                    min_overlap, max_relative, limits, work,
-                )  # fmt: skip
-                reached[i] = max(reached[i], got)
-                if got == PROPOSED:
-                    if count < len(out):
-                        out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor, r
-                        out[count, 5] = 1.0
-                        for c in range(5):
-                            out[count, c] = work[c]
-                    count += 1
+            else:
+                after = begins[i, 0] + e - around
+                j = order[after - len(order) if after >= len(order) else after]
+            r = rows_j[j]
+            if not abs(gain[j]) * (q_high - q_low) > limits[0] * sigma[r]:
+                furthest = max(furthest, WEAK)  # the whole range of depths lies within the noise
+                continue
+            if not _reach(b, line, r, -1.0 / gain[j], q_low, q_high, limits, work):
+                furthest = max(furthest, OUT_OF_BEAM)
+                continue
+            got = _propose(
+                b, s, r, ratio, line, ends, sigma, gain[j], a, directed, min_overlap, max_relative, limits, work
+            )  # fmt: skip
+            furthest = max(furthest, got)
+            if got == PROPOSED:
+                if count < len(out):
+                    out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor, r
+                    out[count, 5] = 1.0
+                    for c in range(5):
+                        out[count, c] = work[c]
+                count += 1
+        reached[i] = furthest
     return count
 
 
@@ -211,10 +220,11 @@ def _propose_pairs(
         if not (usable[s] and usable[r]):
             continue
         _carry(M, ray[s], across[s], b)
-        got = _propose(
-            b, sigma[s], search[0], search[1], ratio[s], line[r], ends[r], sigma[r], a, False, min_overlap,
-            max_relative, limits, work,
-        )  # fmt: skip
+        gain, got = line[r, 0] * a[0] + line[r, 1] * a[1] + line[r, 2] * a[2], OUT_OF_BEAM
+        if not abs(gain) * (search[1] - search[0]) > limits[0] * sigma[r]:
+            got = WEAK
+        elif _reach(b, line, r, -1.0 / gain, search[0], search[1], limits, work):
+            got = _propose(b, s, r, ratio, line, ends, sigma, gain, a, False, min_overlap, max_relative, limits, work)
         reached[i] = max(reached[i], got)
         if got == PROPOSED:
             out_index[count, 0], out_index[count, 1], out_index[count, 2] = i, neighbor, r
@@ -257,7 +267,23 @@ def angles_about_baseline(ray: FloatArray, baseline: FloatArray) -> FloatArray:
     turn = angle[:, 1] - angle[:, 0]
     turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
     low = np.where(turn < 0, angle[:, 0] + turn, angle[:, 0])
+    low -= 2 * np.pi * np.floor(low / (2 * np.pi) + 0.5)
     return np.column_stack([low, low + np.abs(turn)])
+
+
+@dataclass(frozen=True, eq=False)
+class Questions:
+    """Of which segments of an image, and from where, there shall be proposals."""
+
+    #: The reference image, and its (n,) neighbours.
+    image: int
+    neighbors: IntArray
+    #: Matched segments (m, 2) and scores (m,) of each neighbour; None takes all segments in the epipolar beam.
+    matches: Sequence[tuple[IntArray, FloatArray] | None]
+    #: Pixels (p, 2) and inverse depths (p,) of known points seen in the image.
+    near_points: tuple[FloatArray, FloatArray] | None
+    #: Segments of the image of which the beam is searched; None: all.
+    among: BoolArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,30 +296,18 @@ class Proposer:
     options: MapLinesOptions
     gates: ProposalGates = field(default_factory=ProposalGates)
 
-    def propose(
-        self, image: int, neighbors: IntArray, matches: list, near_points: tuple[FloatArray, FloatArray] | None
-    ) -> Proposals:
-        """Proposals for the segments of an image.
-
-        Parameters
-        ----------
-        image : int
-            The reference image.
-        neighbors : (n,) int
-            Its neighbours.
-        matches : list of n (pairs, score) or None
-            Matched segments (m, 2) and scores (m,); None for a neighbour takes all segments in the epipolar beam.
-        near_points : (pixel (p, 2), inverse depth (p,)) or None
-            Known points seen in the image.
-        """
+    def propose(self, asked: Questions) -> Proposals:
+        """Proposals for the segments of an image."""
+        image, neighbors, near_points = asked.image, asked.neighbors, asked.near_points
         views, rows = self.views, self.views.rows(image)
         reached = np.zeros(rows.stop - rows.start, np.int64)
         parts: list[tuple[IntArray, FloatArray]] = [(np.empty((0, 3), np.int64), np.empty((0, 6)))]
         if near_points is not None and len(near_points[0]):
             parts.append(lines_through_points(views, rows, self.ratios[rows], near_points, len(neighbors)))
-        for n, (j, given) in enumerate(zip(neighbors, matches, strict=True)):
+        usable = np.flatnonzero(views.usable[rows] if asked.among is None else views.usable[rows] & asked.among)
+        for n, (j, given) in enumerate(zip(neighbors, asked.matches, strict=True)):
             if given is None:
-                parts.append(self._beam(image, int(j), n, reached))
+                parts.append(self._beam(image, int(j), n, usable, reached))
             else:
                 parts.append(self._pairs(image, int(j), n, given, reached))
         index, values = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -312,24 +326,23 @@ class Proposer:
         )  # fmt: skip
         return index[:count], values[:count]
 
-    def _beam(self, image: int, j: int, n: int, reached: IntArray) -> tuple[IntArray, FloatArray]:
-        """The same of all segments of image j in the epipolar beam of each segment."""
+    def _beam(self, image: int, j: int, n: int, usable: IntArray, reached: IntArray) -> tuple[IntArray, FloatArray]:
+        """The same of all segments of image j in the epipolar beam of each of some segments."""
         views = self.views
         baseline = views.center[j] - views.center[image]
         if not np.linalg.norm(baseline) > 0.0:
             return np.empty((0, 3), np.int64), np.empty((0, 6))
-        usable = np.flatnonzero(views.usable[views.rows(image)])
-        rows_i, rows_j = views.usable_rows(image), views.usable_rows(j)
+        rows_i, rows_j = views.rows(image).start + usable, views.usable_rows(j)
         beam_i = angles_about_baseline(views.ray[rows_i], baseline)
         beam_j = angles_about_baseline(views.ray[rows_j], baseline)
-        bins = _bins_of(beam_j)
+        beams = _sorted_beams(beam_i, beam_j)
         furthest = np.zeros(len(rows_i), np.int64)
         room = _ROOM * len(rows_i)
         while True:
             index, values = np.empty((room, 3), np.int64), np.empty((room, 6))
             needed = _propose_beam(
                 rows_i, rows_j, views.ray, views.across, views.sigma, views.range, self.ratios, views.line, views.ends,
-                beam_i, beam_j, *bins, *self._camera(image, j), self.options.directed, self.options.min_overlap,
+                beam_i, beams, *self._camera(image, j), self.options.directed, self.options.min_overlap,
                 self.options.max_relative_sigma, self.gates.limits(), n, index, values, furthest,
             )  # fmt: skip
             if needed <= room:
@@ -346,14 +359,29 @@ class Proposer:
         return camera[:, :3].copy(), camera @ np.append(self.views.center[image], 1.0)
 
 
-def _bins_of(beams: FloatArray) -> tuple[IntArray, IntArray]:
-    """Pointers and members of the bins of the angle about the baseline."""
+def _sorted_beams(beam_i: FloatArray, beam_j: FloatArray) -> tuple[FloatArray | IntArray, ...]:
+    """Intervals of image j so that those that overlap one of image i are found: the last column is by interval of i.
+
+    Returns the intervals, pointers and members of the bins that each covers, their order by where they begin, and
+    which of that order (n, 2), counted on around the circle, begin within each interval of image i.
+    """
     pointers = np.zeros(_NUM_BINS + 1, np.int64)
-    _bin_beams(beams, pointers, np.empty(0, np.int64))
+    _bin_beams(beam_j, pointers, np.empty(0, np.int64))
     members = np.empty(pointers[-1], np.int64)
     if len(members):
-        _bin_beams(beams, pointers, members)
-    return pointers, members
+        _bin_beams(beam_j, pointers, members)
+    order = np.argsort(beam_j[:, 0], kind="stable")
+    first = beam_j[order, 0]
+    return beam_j, pointers, members, order, np.searchsorted(np.append(first, first + 2.0 * np.pi), beam_i, "right")
 
 
-__all__ = ["OUT_OF_BEAM", "PROPOSED", "WEAK", "ProposalGates", "Proposals", "Proposer", "angles_about_baseline"]
+__all__ = [
+    "OUT_OF_BEAM",
+    "PROPOSED",
+    "WEAK",
+    "ProposalGates",
+    "Proposals",
+    "Proposer",
+    "Questions",
+    "angles_about_baseline",
+]

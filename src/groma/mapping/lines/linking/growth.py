@@ -17,7 +17,6 @@ test are let go, and the ends of a line are cut to the part of it that at least 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -76,7 +75,7 @@ def linked(tracks: Tracks, places: Places) -> Tracks:
 
 def with_own_noise(tracks: Tracks, bounds: tuple[float, float]) -> Tracks:
     """Return the tracks with standard deviations scaled to what the residuals of the lines show, within bounds."""
-    return replace(tracks, sigma=float(np.clip(_noise_scale(tracks), *bounds)) * tracks.sigma)
+    return tracks.with_sigma(float(np.clip(_noise_scale(tracks), *bounds)) * tracks.sigma)
 
 
 def recovered(tracks: Tracks, neighbors: list[IntArray], directed: bool) -> Tracks:
@@ -94,7 +93,7 @@ def recovered(tracks: Tracks, neighbors: list[IntArray], directed: bool) -> Trac
     order = np.argsort(distance, kind="stable")
     segment, best = np.unique(hit[order, 1], return_index=True)
     line_of[segment] = alias[hit[order, 0]][best]
-    return replace(tracks, line_of=line_of)
+    return tracks.observed_by(line_of)
 
 
 # ------------------------------------------------------------------------------------------------------------ evidence

@@ -67,6 +67,8 @@ class Tracks:
     uncertainty: FloatArray
     #: (L,) the same without the image that tells most: what a wrong match in one image could hide behind.
     unchecked: FloatArray
+    #: (L,) lines whose observations, or their noise, are not those that they were last fitted to.
+    stale: BoolArray
     gates: TrackGates = field(default_factory=TrackGates)
 
     @staticmethod
@@ -83,6 +85,7 @@ class Tracks:
             lines=np.zeros((0, 2, 3)),
             uncertainty=np.zeros(0),
             unchecked=np.zeros(0),
+            stale=np.zeros(0, bool),
         )
 
     @property
@@ -133,31 +136,59 @@ class Tracks:
         chosen, group = np.unique(representative, return_inverse=True)
         line_of, linked = self.line_of.copy(), self.linked.copy()
         line_of[members], linked[members] = self.num_lines + group, True
-        return replace(self, line_of=line_of, linked=linked, lines=np.concatenate([self.lines, ends[chosen]]))
+        unknown = np.zeros(len(chosen))
+        return replace(
+            self, line_of=line_of, linked=linked, lines=np.concatenate([self.lines, ends[chosen]]),
+            uncertainty=np.append(self.uncertainty, unknown), unchecked=np.append(self.unchecked, unknown),
+            stale=np.append(self.stale, unknown == 0.0),
+        )  # fmt: skip
+
+    def observed_by(self, line_of: IntArray) -> Tracks:
+        """Return the tracks with other lines (S,) of the segments."""
+        stale, changed = self.stale.copy(), line_of != self.line_of
+        for one in (line_of[changed], self.line_of[changed]):
+            stale[one[one >= 0]] = True
+        return replace(self, line_of=line_of, stale=stale)
+
+    def with_sigma(self, sigma: FloatArray) -> Tracks:
+        """Return the tracks with other standard deviations (S,) of the segments."""
+        rows, line = self.members()
+        stale = self.stale.copy()
+        stale[line[sigma[rows] != self.sigma[rows]]] = True
+        return replace(self, sigma=sigma, stale=stale)
 
     def refined(self, min_images: int = 2) -> Tracks:
-        """Return the lines at maximum likelihood, without observations that do not fit and lines of too few images."""
+        """Return the lines at maximum likelihood, without observations that do not fit and lines of too few images.
+
+        Lines that have the observations they were last fitted to stay as they are.
+        """
         views = self.views
         rows, pointers = self.table()
-        lines, uncertainty, unchecked = self.lines, self.uncertainty, self.unchecked
+        line = self.line_of[rows]
+        active, squared = np.ones(len(rows), bool), self.squared[rows]
+        lines, uncertainty, unchecked = self.lines.copy(), self.uncertainty.copy(), self.unchecked.copy()
         seen = SegmentRays(views.center, views.image_idx, views.ray, views.length)
-        active, squared = np.ones(len(rows), bool), np.zeros(len(rows))
+        stale = self.stale
         for k in range(self.gates.fitting_rounds):
-            fit = fit_lines(views, self.sigma, pointers, rows, active, lines)
-            squared, uncertainty, unchecked = fit.squared, fit.uncertainty, fit.unchecked
-            lines, front = trim(seen, pointers, rows, active, fit.X)
-            fits = (squared < AGREEMENT.max_squared(2)) & front
+            which, here = np.flatnonzero(stale), stale[line]
+            mine, ends = rows[here], np.concatenate([[0], np.cumsum(np.diff(pointers)[which])])
+            fit = fit_lines(views, self.sigma, ends, mine, active[here], lines[which])
+            squared[here], uncertainty[which], unchecked[which] = fit.squared, fit.uncertainty, fit.unchecked
+            lines[which], front = trim(seen, ends, mine, active[here], fit.X)
+            fits = (fit.squared < AGREEMENT.max_squared(2)) & front
             if k == self.gates.fitting_rounds - 1:
-                fits &= active
-            if (fits == active).all():
+                fits &= active[here]
+            changed = fits != active[here]
+            active[here] = fits
+            stale = np.bincount(line[here][changed], minlength=self.num_lines) > 0
+            if not changed.any():
                 break
-            active = fits
         distances, line_of, rejection = self.squared.copy(), self.line_of.copy(), self.rejection.copy()
         distances[rows] = squared
         line_of[rows[~active]], rejection[rows[~active]] = -1, Outcome.OUTLIER
         fitted = replace(
             self, line_of=line_of, rejection=rejection, squared=distances, lines=lines, uncertainty=uncertainty,
-            unchecked=unchecked,
+            unchecked=unchecked, stale=stale,
         )  # fmt: skip
         return fitted.keep(fitted.num_images() >= min_images, Outcome.FEW_IMAGES)
 
@@ -170,7 +201,7 @@ class Tracks:
         reasons = np.where((self.line_of >= 0) & (line_of < 0), rejection, self.rejection)
         return replace(
             self, line_of=line_of, rejection=reasons, lines=self.lines[kept], uncertainty=self.uncertainty[kept],
-            unchecked=self.unchecked[kept],
+            unchecked=self.unchecked[kept], stale=self.stale[kept],
         )  # fmt: skip
 
     def joined(self, alias: IntArray, deviation: FloatArray) -> Tracks:
@@ -178,7 +209,7 @@ class Tracks:
         rows, line = self.members()
         sigma, line_of = self.sigma.copy(), self.line_of.copy()
         sigma[rows], line_of[rows] = np.hypot(sigma[rows], deviation[line]), alias[line]
-        return replace(self, sigma=sigma, line_of=line_of).refined(min_images=1)
+        return self.with_sigma(sigma).observed_by(line_of).refined(min_images=1)
 
     def outcomes(self) -> IntArray:
         """(S,) the :class:`Outcome` of every segment."""
