@@ -58,7 +58,7 @@ def map_(
     min_confidence: Annotated[
         float,
         typer.Option(min=0.0, max=1.0, metavar="P", help="Leave out lines that are less probably right; 0: keep all."),
-    ] = 0.8,
+    ] = 0.5,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
     refine_poses: Annotated[
         bool, typer.Option("--refine-poses/--fix-poses", help="Move the cameras too, or the landmarks alone.")

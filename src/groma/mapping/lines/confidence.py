@@ -33,8 +33,8 @@ WEIGHTS: dict[str, float] = {
     "support": 0.331,
     "length": 3.316,
 }
-#: Lines of a smaller probability are no part of a map, unless it is asked for them.
-DEFAULT_CONFIDENCE = 0.8
+#: Lines of a smaller probability are no part of a map, unless it is asked for them: those more likely wrong than right.
+DEFAULT_CONFIDENCE = 0.5
 #: An image that would show less of a line than this, pixels, is not expected to show it: the default of detection.
 _MIN_LENGTH = 12.0
 #: Smallest misfit and spread, below which they say nothing more.
