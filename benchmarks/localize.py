@@ -83,7 +83,11 @@ def stairs(path: Path, seeds: int = 20) -> dict[str, object]:
         poses = [method(seed + 1) for seed in range(seeds)]
         seconds = (time.process_time() - start) / seeds
         errors = np.array([_errors(pose, true) for pose in poses if pose is not None])
-        told[name] = {"cm": 100 * float(np.median(errors[:, 0])), "deg": float(np.median(errors[:, 1])), "seconds": seconds}
+        told[name] = {
+            "cm": 100 * float(np.median(errors[:, 0])),
+            "deg": float(np.median(errors[:, 1])),
+            "seconds": seconds,
+        }
     found = estimate_absolute_pose(camera, *points, *lines)
     told["stated cm"] = 100 * float(np.linalg.norm(found.center_sigma))
     told["stated deg"] = found.rotation_sigma_deg
@@ -174,7 +178,10 @@ def _summary(rows: list[tuple]) -> dict[str, object]:
 
 def _alignment(scene, poses: dict[str, np.ndarray]) -> np.ndarray:
     """The motion (4, 4) from the world of a map to that of the truth: mean turn, mean shift."""
-    pairs = [(_matrix(poses[name]), _matrix(pose)) for name, pose in zip(scene.images.names, scene.cam_from_world, strict=True)]
+    pairs = [
+        (_matrix(poses[name]), _matrix(pose))
+        for name, pose in zip(scene.images.names, scene.cam_from_world, strict=True)
+    ]
     U, _, Vt = np.linalg.svd(sum((np.linalg.inv(true) @ own)[:3, :3] for true, own in pairs))
     moved = np.eye(4)
     moved[:3, :3] = U @ Vt

@@ -98,6 +98,14 @@ ROOMS: Rooms = (
         },
     ),
     (
+        "Localisation",
+        {
+            "groma.localization.absolute_pose": ("AbsolutePose", "PoseOptions", "estimate_absolute_pose"),
+            "groma.localization.camera": None,
+            "groma.localization.localizer": ("LocalizeOptions", "LocalizedImage", "Localizer"),
+        },
+    ),
+    (
         "Evaluation",
         {
             "groma.evaluation": None,

@@ -11,13 +11,13 @@ import pytest
 from groma.cli.main import run
 from groma.errors import InputError
 from groma.evaluation import cabinet
+from groma.features.contract import ImageRetrieval
 from groma.geometry import quaternion, so3
 from groma.io import read_scene, write_scene
 from groma.localization.camera import QueryCamera
 from groma.localization.localizer import LocalizeOptions, Localizer
 from groma.localization.map_index import read_index
 from groma.localization.retrieval import VladRetrieval
-from groma.features.contract import ImageRetrieval
 
 #: Images around one corner of the cabinet; every third is a query.
 FRAMES = [f"{number:04d}.jpg" for number in range(24, 45)]
@@ -141,7 +141,9 @@ def test_command(place, tmp_path, capsys):
     (queries / "bad.jpg").write_text("no image")
     cv2.imwrite(str(queries / "black.png"), np.zeros((480, 640), np.uint8))
     out = tmp_path / "out"
-    assert run(["localize", str(place / "map.npz"), str(queries), "-o", str(out), "--images", str(place / "images")]) == 0
+    assert (
+        run(["localize", str(place / "map.npz"), str(queries), "-o", str(out), "--images", str(place / "images")]) == 0
+    )
     assert "localized" in capsys.readouterr().out
     told = json.loads((out / "localized.json").read_text())
     assert sorted(told) == sorted([*QUERIES, "bad.jpg", "black.png"])

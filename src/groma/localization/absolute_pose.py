@@ -220,9 +220,7 @@ def _with_focal_length(camera: QueryCamera, factor: float) -> QueryCamera:
     return QueryCamera(camera.model, params, camera.width, camera.height)
 
 
-def _rival(
-    matches: Matches, best: Refined, options: PoseOptions, places: int
-) -> tuple[Refined, Evidence] | None:
+def _rival(matches: Matches, best: Refined, options: PoseOptions, places: int) -> tuple[Refined, Evidence] | None:
     """The best pose of what disagrees with the first, if it is another one."""
     squares = [np.where(np.isfinite(one.square), one.square, np.inf) for one in (best.points, best.lines)]
     left = [square > 4.0 * best.limit for square in squares]

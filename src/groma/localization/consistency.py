@@ -65,9 +65,7 @@ def localization_consistency(
     return tuple(_row(kind, np.array(found)) for kind, found in values.items() if found)
 
 
-def _measured(
-    scene: Scene, image: int, camera: QueryCamera, noise_px: float, rng: np.random.Generator
-) -> Matches:
+def _measured(scene: Scene, image: int, camera: QueryCamera, noise_px: float, rng: np.random.Generator) -> Matches:
     """What an image sees of a scene, both with noise."""
     pose = scene.cam_from_world[image]
     seen, lines = scene.point_observations, scene.line_observations

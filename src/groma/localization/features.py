@@ -34,7 +34,9 @@ class FeatureGates:
     """Which points and segments of a photograph are looked at."""
 
     max_points: int = gate(4000, "points", "described in an image, the strongest", "cost: of matching")
-    contrast: float = gate(0.02, "1", "least contrast of a point, OpenCV's units", "convention: half of OpenCV's default")
+    contrast: float = gate(
+        0.02, "1", "least contrast of a point, OpenCV's units", "convention: half of OpenCV's default"
+    )
     sigma: float = gate(
         0.2, "share", "noise of a point over the standard deviation of the blur it was found at",
         "derived from residuals of triangulated points",
@@ -101,9 +103,7 @@ def describe_places(
 ) -> tuple[DescribedPoints, IntArray]:
     """Describe given places (n, 2), upright; those at the border are left out: also return the rows that are left."""
     size = 2.0 * gates.corner_scale
-    places = [
-        cv2.KeyPoint(float(u) - 0.5, float(v) - 0.5, size, 0.0, 1.0, 0, row) for row, (u, v) in enumerate(pixels)
-    ]
+    places = [cv2.KeyPoint(float(u) - 0.5, float(v) - 0.5, size, 0.0, 1.0, 0, row) for row, (u, v) in enumerate(pixels)]
     kept, described = cv2.SIFT_create().compute(image, places)  # type: ignore[attr-defined]
     return _described(kept, described, gates), np.array([one.class_id for one in kept], np.int64)
 
@@ -124,7 +124,9 @@ def unit(descriptors: Bytes) -> npt.NDArray[np.float32]:
     return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), np.float32(1e-6))
 
 
-def find_features(image: GrayImage, camera: QueryCamera, lines: bool = True, min_length: float = 15.0) -> DescribedImage:
+def find_features(
+    image: GrayImage, camera: QueryCamera, lines: bool = True, min_length: float = 15.0
+) -> DescribedImage:
     """Find and describe points and segments; segments without the distortion of the lens."""
     segments = Segments.empty()
     if lines:
@@ -145,4 +147,15 @@ def _straightener(model: str, params: tuple[float, ...], width: int, height: int
     return Straightener.of(cameras.model(model), np.array(params), width, height)
 
 
-__all__ = ["FEATURES", "Bytes", "DescribedImage", "DescribedPoints", "FeatureGates", "describe_places", "find_corners", "find_features", "find_points", "unit"]
+__all__ = [
+    "FEATURES",
+    "Bytes",
+    "DescribedImage",
+    "DescribedPoints",
+    "FeatureGates",
+    "describe_places",
+    "find_corners",
+    "find_features",
+    "find_points",
+    "unit",
+]

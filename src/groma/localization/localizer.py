@@ -23,7 +23,7 @@ from groma.localization.candidates import described_alike, found_near
 from groma.localization.features import DescribedImage, find_features
 from groma.localization.hypotheses import max_errors
 from groma.localization.map_images import image_paths, images_in_summary
-from groma.localization.map_index import MapIndex, images_told, kept_index
+from groma.localization.map_index import images_told, kept_index
 from groma.localization.matches import Matches
 from groma.localization.refinement import Refined
 from groma.localization.retrieval import VladRetrieval

@@ -66,7 +66,11 @@ class PlacedImage:
     def write(self, path: Path, digest: str) -> None:
         """Write it whole or not at all."""
         with atomic_output(path, force=True) as draft, draft.open("wb") as file:
-            np.savez(file, digest=np.array(digest), **{item.name: np.array(getattr(self, item.name)) for item in fields(self)})
+            np.savez(
+                file,
+                digest=np.array(digest),
+                **{item.name: np.array(getattr(self, item.name)) for item in fields(self)},
+            )
 
 
 def placed(name: str, found: LocalizedImage) -> PlacedImage:

@@ -34,7 +34,8 @@ def times(weight: float | FloatArray, record: FloatArray) -> FloatArray:
 
 def residual_squares(problem: Problem, group: str, count: int) -> FloatArray:
     """Squared whitened residuals (count,) of the observations of one kind, in the order of the factors; zero where a
-    residual cannot be evaluated."""
+    residual cannot be evaluated.
+    """
     parts = [
         (times(factor.sqrt_information, records(problem, factor, {"pose": 6}))[..., 6] ** 2).sum(axis=1)
         for factor in problem.factors
@@ -45,7 +46,8 @@ def residual_squares(problem: Problem, group: str, count: int) -> FloatArray:
 
 def landmark_covariances(problem: Problem, group: str, count: int) -> FloatArray:
     """Covariances of points (count, 3, 3), or of (moment, direction) of lines (count, 6, 6) with a unit direction, from
-    their observations with the poses held; NaN for those that are not determined."""
+    their observations with the poses held; NaN for those that are not determined.
+    """
     size = 3 if group == "points" else 6
     total = np.zeros((count, size, size))
     for factor in problem.factors:

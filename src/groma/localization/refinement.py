@@ -47,7 +47,9 @@ from groma.solver.solve import solve
 _ASSEMBLY = AssemblyOptions(
     point_chart="euclidean", drop_behind=False, require_in_front=True, gauge="free", refine_landmarks=False
 )
-_POSE = SolverOptions(max_iterations=12, function_tolerance=1e-5, initial_damping=1e-6, threads=1, eliminate=("frames",))
+_POSE = SolverOptions(
+    max_iterations=12, function_tolerance=1e-5, initial_damping=1e-6, threads=1, eliminate=("frames",)
+)
 #: Information of scaled unknowns below which they are not determined.
 _SINGULAR = 1e-10
 _LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
@@ -250,7 +252,9 @@ def residuals(problem: Problem, landmarks: str, count: int, lens: Sequence[int] 
         rows = landmark_rows(factor, landmarks)
         if rows is None:
             continue
-        size = next((problem.variables[r.group].manifold.dof for slot, r in factor.references() if slot.name == "intrinsics"), 0)
+        size = next(
+            (problem.variables[r.group].manifold.dof for slot, r in factor.references() if slot.name == "intrinsics"), 0
+        )
         record = records(problem, factor, {"pose": 6, "intrinsics": size} if lens and size else {"pose": 6})
         kept = [*range(6), *(6 + k for k in lens if size)]
         weight = np.broadcast_to(times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))

@@ -63,9 +63,7 @@ class Verdict:
     sentence: str
 
 
-def evidence_of(
-    refined: Refined, matches: Matches, places: int = 1, gates: VerdictGates = VERDICT
-) -> Evidence:
+def evidence_of(refined: Refined, matches: Matches, places: int = 1, gates: VerdictGates = VERDICT) -> Evidence:
     """Return the evidence for a pose that was looked for in so many places."""
     camera = refined.camera
     by_chance = np.minimum(math.pi * refined.limit * refined.points.spread / camera.area, 0.5)
@@ -112,7 +110,9 @@ def judge(
         int(refined.line_inliers.sum()), "lines"
     )
     if chance < gates.chance:
-        return Verdict("failed", probability, f"No pose: only {agree} agree with the best one, as may happen by chance.")
+        return Verdict(
+            "failed", probability, f"No pose: only {agree} agree with the best one, as may happen by chance."
+        )
     if rival > 1.0 - gates.right and second is not None:
         return Verdict(
             "uncertain",
@@ -121,7 +121,11 @@ def judge(
             "another. They may look alike.",
         )
     if probability < gates.right:
-        return Verdict("uncertain", probability, f"{agree} agree, which may happen by chance once in {1 / max(1 - chance, 1e-9):.0f}.")
+        return Verdict(
+            "uncertain",
+            probability,
+            f"{agree} agree, which may happen by chance once in {1 / max(1 - chance, 1e-9):.0f}.",
+        )
     sigma = np.sqrt(np.diag(covariance))
     if not (np.isfinite(sigma).all() and sigma[3:].max() <= gates.turn and sigma[:3].max() <= gates.center * distance):
         return Verdict("uncertain", probability, f"{agree} agree, but they do not determine the pose: {_open(sigma)}.")

@@ -33,7 +33,8 @@ def localize(
         ),
     ] = "auto",
     camera_model: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Lens model of the queries, by COLMAP's name; with its parameters.")
+        str | None,
+        typer.Option(metavar="NAME", help="Lens model of the queries, by COLMAP's name; with its parameters."),
     ] = None,
     camera_params: Annotated[
         str | None, typer.Option(metavar="F,CX,CY,...", help="The parameters, if they are known; they are then kept.")
