@@ -2,11 +2,12 @@
 """Localised photographs against the truth, beside the peers on the same matches.
 
     python benchmarks/localize.py stairs DATA                     one query with given matches, 20 seeds, and peers
-    python benchmarks/localize.py held-out MAP IMAGES TRUTH       photographs that are not in a map, points alone and with lines
+    python benchmarks/localize.py held-out MAP IMAGES TRUTH       photographs that are not in a map
     python benchmarks/localize.py wrong MAP IMAGES OTHER...       photographs that must not be localised
 
 ``DATA`` is ``localization_stairs/query_1.npz``; ``TRUTH`` a scene with the poses of all photographs in ``IMAGES``. Maps
-whose world is not that of the truth are aligned by the poses of their own images (``--align``). Times are process times.
+whose world is not that of the truth are aligned by the poses of their own images (``--align``). Photographs are placed by points alone, and with lines. Times
+are process times.
 """
 
 from __future__ import annotations

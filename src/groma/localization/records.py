@@ -28,6 +28,7 @@ def records(problem: Problem, factor: Factor, wanted: dict[str, int]) -> FloatAr
 
 
 def times(weight: float | FloatArray, record: FloatArray) -> FloatArray:
+    """Records (n, 2, m) multiplied by the inverse noise of a factor: a number, (n,) of them, or (n, 2, 2) matrices."""
     weight = np.asarray(weight)
     return weight @ record if weight.ndim == 3 else weight.reshape(-1, 1, 1) * record
 

@@ -185,7 +185,8 @@ def _log_choose(n: int, k: int) -> float:
 def _open(sigma: FloatArray) -> str:
     if not np.isfinite(sigma).all():
         return "the camera could move without any of them noticing"
-    return f"its standard deviation is {np.linalg.norm(sigma[:3]):.3g} scene units and {np.rad2deg(np.linalg.norm(sigma[3:])):.2g} degrees"
+    shift, turn = float(np.linalg.norm(sigma[:3])), float(np.rad2deg(np.linalg.norm(sigma[3:])))
+    return f"its standard deviation is {shift:.3g} scene units and {turn:.2g} degrees"
 
 
 __all__ = ["Evidence", "Status", "Verdict", "evidence_of", "judge", "median_distance", "moved"]

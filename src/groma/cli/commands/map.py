@@ -7,9 +7,11 @@ from typing import Annotated
 import typer
 
 from groma.cli.shared import options as _options
+from groma.cli.shared.ranks import led_by_first_rank
 from groma.errors import InputError
 
 
+@led_by_first_rank
 def map_(
     images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of photographs, and of folders of them.")],
     output: Annotated[
@@ -53,6 +55,10 @@ def map_(
         ),
     ] = None,
     min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
+    min_confidence: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, metavar="P", help="Leave out lines that are less probably right; 0: keep all."),
+    ] = 0.8,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
     refine_poses: Annotated[
         bool, typer.Option("--refine-poses/--fix-poses", help="Move the cameras too, or the landmarks alone.")
@@ -116,6 +122,7 @@ def map_(
         min_segment_length=min_length,
         detector=line_detector,
         matcher=line_matcher,
+        min_confidence=min_confidence,
         find_planes=planes,
         refine_points=refine_points,
         refine_poses=refine_poses,
@@ -133,7 +140,6 @@ def map_(
     result = run_map(console, images, work, start, options, matches)
     found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
     numbers = result.summary(found, result.contributions(true) if contributions else ())
-    numbers["images"] = str(images.absolute())  # where groma localize looks for them
     write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")

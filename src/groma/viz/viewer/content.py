@@ -16,6 +16,7 @@ import numpy as np
 from groma import cameras
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.geometry import quaternion
+from groma.scene.line_intervals import line_pieces
 from groma.scene.similarity import Similarity
 from groma.viz import colours as _colours
 from groma.viz.colours import Colours
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 #: Half the size of the scene in the frame of the viewer.
 REACH = 5.0
 #: What lines can be coloured by.
-LINE_MODES = ("length", "reprojection error", "direction", "number of images")
+LINE_MODES = ("length", "reprojection error", "direction", "number of images", "confidence")
 #: Half the largest opening of a drawn camera, radians; wider ones are drawn with this one.
 _WIDEST = 1.2
 
@@ -58,8 +59,9 @@ class ViewContent:
     points: FloatArray
     #: By mode: (P, 3), in the same order.
     point_colours: dict[str, Colours]
-    #: (L, 2, 3)
+    #: (S, 2, 3) what images support of the lines, and the line (S,) of each piece.
     segments: FloatArray
+    segment_line: IntArray
     #: K convex polygons (n, 3), and how many landmarks lie on each.
     patches: list[FloatArray]
     patch_members: IntArray
@@ -85,6 +87,9 @@ class ViewContent:
             return _by_number(numbers.residual_px, " px", from_zero=True)
         if mode == "number of images":
             return _by_number(numbers.num_images.astype(float), " images")
+        if mode == "confidence":
+            known = np.where(self.scene.lines.confidence >= 0.0, self.scene.lines.confidence, np.nan)
+            return LineColours(_colours.ramp(known), "0 ", "1 ", "Probability to be right; grey: not known.")
         shared = len(self.scene.relations.line_along_direction) > 0
         meaning = (
             "One colour per shared direction; others grey." if shared else "Red along x, green along y, blue along z."
@@ -104,18 +109,19 @@ class ViewContent:
             Lines that can be hit.
         """
         distance, depth = ray_to_segments(origin, direction, self.segments)
-        distance[~shown] = np.inf
+        distance[~shown[self.segment_line]] = np.inf
         nearest = distance.min(initial=np.inf)
         if not nearest <= tolerance:
             return None
         # Of lines that are hit about equally well, the one in front.
         candidates = np.flatnonzero(distance <= nearest + 0.25 * tolerance)
-        return int(candidates[np.argmin(depth[candidates])])
+        return int(self.segment_line[candidates[np.argmin(depth[candidates])]])
 
 
 def view_content(scene: Scene) -> ViewContent:
     """Compute what the viewer draws of a scene."""
     shown = drawable(scene)
+    pieces, line = line_pieces(scene)
     frame, position, target = _frame(scene)
     order = np.random.default_rng(0).permutation(scene.num_points)
     errors = shown.point_errors[order]
@@ -135,7 +141,8 @@ def view_content(scene: Scene) -> ViewContent:
         view_from_world=frame,
         points=frame.points(scene.points.xyz[order]),
         point_colours=point_colours,
-        segments=frame.points(scene.lines.segments),
+        segments=frame.points(pieces),
+        segment_line=line,
         patches=[frame.points(patch) for patch in shown.patches],
         patch_members=shown.patch_members,
         directions=frame.directions(scene.directions.vectors),
