@@ -6,8 +6,8 @@
     python benchmarks/localize.py wrong MAP IMAGES OTHER...       photographs that must not be localised
 
 ``DATA`` is ``localization_stairs/query_1.npz``; ``TRUTH`` a scene with the poses of all photographs in ``IMAGES``. Maps
-whose world is not that of the truth are aligned by the poses of their own images (``--align``). Photographs are placed by points alone, and with lines. Times
-are process times.
+whose world is not that of the truth are aligned by the poses of their own images (``--align``). Photographs are placed by
+points alone, and with lines. Times are process times.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ import numpy as np
 
 from groma.geometry import quaternion, so3
 from groma.io import read_scene
-from groma.localization.absolute_pose import PoseOptions, estimate_absolute_pose
-from groma.localization.camera import QueryCamera
 from groma.localization.localizer import LocalizeOptions, Localizer
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
+from groma.localization.pose.camera import QueryCamera
 from groma.mapping.photographs import image_files, read_gray
 
 #: Shares of queries within these distances (metres) and angles (degrees) are told.

@@ -101,8 +101,8 @@ ROOMS: Rooms = (
     (
         "Localisation",
         {
-            "groma.localization.absolute_pose": ("AbsolutePose", "PoseOptions", "estimate_absolute_pose"),
-            "groma.localization.camera": None,
+            "groma.localization.pose.absolute_pose": ("AbsolutePose", "PoseOptions", "estimate_absolute_pose"),
+            "groma.localization.pose.camera": None,
             "groma.localization.localizer": ("LocalizeOptions", "LocalizedImage", "Localizer"),
         },
     ),

@@ -8,8 +8,8 @@ from worlds import CAMERA, make_world, project
 import groma
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3, so3
-from groma.localization.absolute_pose import PoseOptions, estimate_absolute_pose
-from groma.localization.camera import QueryCamera
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
+from groma.localization.pose.camera import QueryCamera
 
 #: What wrong matches may still do: the loss leaves them a small weight. A pixel is 0.007 here.
 OUTLIERS = 5e-4
@@ -179,7 +179,7 @@ def test_an_unknown_lens_is_estimated():
     lens = QueryCamera("SIMPLE_RADIAL", np.array([810.0, 320.0, 240.0, -0.06]), 640, 480)
     world = make_world(rng, points=150, lines=0, camera=lens)
     start = QueryCamera("SIMPLE_RADIAL", np.array([640.0, 320.0, 240.0, 0.0]), 640, 480)
-    from groma.localization.absolute_pose import UNKNOWN_LENS
+    from groma.localization.pose.absolute_pose import UNKNOWN_LENS
 
     options = PoseOptions(refine_lens=True, focal_factors=UNKNOWN_LENS)
     found = of(world, ("points",), start, options=options)

@@ -14,9 +14,9 @@ from groma.evaluation import cabinet
 from groma.features.contract import ImageRetrieval
 from groma.geometry import quaternion, so3
 from groma.io import read_scene, write_scene
-from groma.localization.camera import QueryCamera
 from groma.localization.localizer import LocalizeOptions, Localizer
 from groma.localization.map_index import read_index
+from groma.localization.pose.camera import QueryCamera
 from groma.localization.retrieval import VladRetrieval
 
 #: Images around one corner of the cabinet; every third is a query.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma.geometry import quaternion, so3
-from groma.localization.camera import QueryCamera
+from groma.localization.pose.camera import QueryCamera
 
 CAMERA = QueryCamera("PINHOLE", np.array([600.0, 610.0, 330.0, 235.0]), 640, 480)
 

@@ -12,7 +12,7 @@ from groma.features.matching.descriptor import Descriptors
 from groma.features.segments import Segments
 from groma.gates import gate
 from groma.geometry import se3
-from groma.localization.camera import QueryCamera
+from groma.localization.pose.camera import QueryCamera
 
 
 @dataclass(frozen=True)

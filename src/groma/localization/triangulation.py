@@ -24,10 +24,10 @@ from groma.factors.losses import Cauchy, GemanMcClure
 from groma.features.matching.wide_baseline import fundamental_from_poses
 from groma.gates import chi_square_gate, gate
 from groma.geometry import quaternion, se3
-from groma.localization.camera import QueryCamera
 from groma.localization.features import DescribedPoints, unit
 from groma.localization.matching import match_descriptors
-from groma.localization.records import landmark_covariances, residual_squares
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.records import landmark_covariances, residual_squares
 from groma.scene import PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -73,7 +73,7 @@ def triangulate_features(
     """
     begin = np.concatenate([[0], np.cumsum([len(one) for one in features])])
     straight = [_straight(scene, image, one) for image, one in enumerate(features)]
-    edges = [np.zeros((0, 2), np.int64)]
+    edges: list[IntArray] = [np.zeros((0, 2), np.int64)]
     vectors = [unit(one.descriptors) for one in features]
     for done, (i, j) in enumerate(pairs):
         say(done, len(pairs))
@@ -208,7 +208,8 @@ def _well_determined(
 def _rows_of(factor: Factor, seen: _Observed, scene: Scene) -> IntArray:
     """Observations of a group of factors, which holds those of one camera model in order."""
     models = np.array(scene.cameras.models, dtype=object)[scene.images.camera_idx[seen.image]]
-    return np.flatnonzero(models == factor.camera_model.name)
+    name = factor.camera_model.name  # type: ignore[attr-defined]  # of points seen at pixels
+    return np.flatnonzero(models == name)
 
 
 __all__ = ["PointMap", "triangulate_features"]

@@ -67,9 +67,9 @@ def localize(
 
     from groma._counted import counted
     from groma.cli.shared.interrupt import PROCESS, interruptible
-    from groma.localization.absolute_pose import PoseOptions
     from groma.localization.calibration import CalibrationChoice, parameters
     from groma.localization.localizer import LocalizeOptions, Localizer
+    from groma.localization.pose.absolute_pose import PoseOptions
     from groma.localization.result import LocalizeResult
     from groma.localization.run import localize_images, query_files
 

@@ -29,10 +29,10 @@ import numpy as np
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray
 from groma.geometry import se3
-from groma.localization.camera import QueryCamera
-from groma.localization.gates import VERDICT, VerdictGates
-from groma.localization.matches import Matches
-from groma.localization.refinement import Refined, cells_of
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.gates import VERDICT, VerdictGates
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.refinement import Refined, cells_of
 
 Status = Literal["localized", "uncertain", "failed"]
 
@@ -132,6 +132,19 @@ def judge(
     return Verdict("localized", probability, f"{agree} agree.")
 
 
+def doubted_if_mirrored(verdict: Verdict, own: int, mirror: Evidence, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where more cells speak for the mirror image than for the photograph (own).
+
+    Mirrored photographs are rare, and what is symmetric fits both ways: the sign test must exclude that both are alike.
+    """
+    from scipy.special import bdtr
+
+    if not mirror.significant or mirror.agree <= own or bdtr(own, own + mirror.agree, 0.5) > 1.0 - gates.right:
+        return verdict
+    words = f"{mirror.agree} measurements speak for its mirror image, {own} for the photograph: it may be mirrored."
+    return Verdict("uncertain", 1.0 - gates.right, words)
+
+
 def moved(camera: QueryCamera, first: FloatArray, second: FloatArray, places: FloatArray) -> float:
     """Median way in pixels of what is seen at some places in the world, from one pose to another."""
     way = np.linalg.norm(camera.project(first, places) - camera.project(second, places), axis=1)
@@ -189,4 +202,4 @@ def _open(sigma: FloatArray) -> str:
     return f"its standard deviation is {shift:.3g} scene units and {turn:.2g} degrees"
 
 
-__all__ = ["Evidence", "Status", "Verdict", "evidence_of", "judge", "median_distance", "moved"]
+__all__ = ["Evidence", "Status", "Verdict", "doubted_if_mirrored", "evidence_of", "judge", "median_distance", "moved"]

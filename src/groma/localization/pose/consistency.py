@@ -14,9 +14,9 @@ from scipy.stats import chi2
 from groma._typing import FloatArray
 from groma.adjustment.consistency import BAND, LIMIT, ConsistencyRow
 from groma.geometry import se3
-from groma.localization.absolute_pose import AbsolutePose, PoseOptions, pose_from_matches
-from groma.localization.camera import QueryCamera
-from groma.localization.matches import Matches
+from groma.localization.pose.absolute_pose import AbsolutePose, PoseOptions, pose_from_matches
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.matches import Matches
 from groma.scene import Scene
 from groma.scene.synthetic import holistic
 
