@@ -6,8 +6,8 @@
     python benchmarks/localize.py wrong MAP IMAGES OTHER...       photographs that must not be localised
 
 ``DATA`` is ``localization_stairs/query_1.npz``; ``TRUTH`` a scene with the poses of all photographs in ``IMAGES``. Maps
-whose world is not that of the truth are aligned by the poses of their own images (``--align``). Photographs are placed by
-points alone, and with lines. Times are process times.
+whose world is not that of the truth are aligned by the poses of their own images (``--align``). Photographs are
+placed by points alone, and with lines. Times are process times.
 """
 
 from __future__ import annotations

@@ -90,7 +90,8 @@ class DescribedImage:
 def find_points(image: GrayImage, gates: FeatureGates = FEATURES) -> DescribedPoints:
     """Find and describe blobs of any scale and direction."""
     sift = cv2.SIFT_create(gates.max_points, contrastThreshold=gates.contrast)  # type: ignore[attr-defined]
-    return _described(*sift.detectAndCompute(image, None), False, gates)
+    found, described = sift.detectAndCompute(image, None)
+    return _described(found, described, False, gates)
 
 
 def find_corners(image: GrayImage, gates: FeatureGates = FEATURES) -> DescribedPoints:
