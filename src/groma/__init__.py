@@ -147,7 +147,6 @@ _SUBPACKAGES = (
     "cameras",
     "compilation",
     "errors",
-    "estimate_absolute_pose",
     "estimators",
     "evaluation",
     "factors",

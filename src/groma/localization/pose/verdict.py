@@ -8,7 +8,7 @@ cells agree with by chance is at most
 
 .. math:: \text{NFA} = (n - 3) \binom{n}{k} \binom{k}{3}\, p^{\,k-3} .
 
-For segments, each a cell of its own, :math:`p` is the share of the places within the reach of a search.
+For lines, each a cell of its own with all segments that it may have, :math:`p` is the share of the places within the reach of a search.
 
 **Another place.** Matches that disagree are searched for a second pose. Where one is found that chance does not
 explain, :math:`k_1` cells speak for the first and :math:`k_2` for the second. If both were equally good, each would
@@ -70,8 +70,8 @@ def evidence_of(refined: Refined, matches: Matches, places: int = 1, gates: Verd
     agree, chance = _by_cell(matches.points2d, refined.point_inliers, by_chance, camera, gates.cells)
     reach = (gates.search_share * max(camera.width, camera.height)) ** 2
     by_chance = np.minimum(math.pi * refined.limit * refined.lines.spread / reach, 0.5)
-    claim = matches.claims()[1]
-    line_agree, line_chance = _joined(claim, refined.line_inliers, by_chance)
+    line = np.unique(matches.segments3d.reshape(-1, 6), axis=0, return_inverse=True)[1].ravel()
+    line_agree, line_chance = _joined(line, refined.line_inliers, by_chance)
     agree, chance = np.concatenate([agree, line_agree]), np.concatenate([chance, line_chance])
     n, k = len(agree), int(agree.sum())
     if k <= 3:
