@@ -23,7 +23,11 @@ def test_tails_of_poisson():
         for mean in (1e-3, 0.5, 30.0):
             expected = stats.poisson.logsf(count, mean) / np.log(10.0)
             assert log10_poisson_tail(count, mean) == pytest.approx(expected, rel=1e-12)
-    assert log10_poisson_tail(400, 1e-3) == -np.inf
+    # Below the smallest number; the terms after the first add a part in 400 000.
+    for count, mean in ((400, 1e-3), (2000, 30.0)):
+        expected = stats.poisson.logpmf(count + 1, mean) / np.log(10.0)
+        assert log10_poisson_tail(count, mean) == pytest.approx(expected, rel=1e-5)
+    assert log10_poisson_tail(3, 0.0) == -np.inf
 
 
 @pytest.mark.parametrize("module", ["groma.mapping.map", "groma.tracking.sequence", "groma.adjustment.adjust"])

@@ -77,6 +77,17 @@ def test_no_plane_in_clutter_and_none_in_a_blob():
     assert len(find_planes(blob, noise_of(blob))) == 0
 
 
+def test_chance_is_told_apart_where_it_is_below_all_numbers():
+    """Ten times the points make a plane of the same kind far less accidental, and the logarithm stays finite."""
+    rng = np.random.default_rng(5)
+    alarms = []
+    for count in (300, 3000):
+        points = np.concatenate([wall(rng, count, 2, 0.0), rng.uniform(0, 4, (count // 3, 3))])
+        alarms.append(float(find_planes(points, noise_of(points)).log10_false_alarms[0]))
+    assert np.isfinite(alarms).all()
+    assert alarms[1] < 5 * alarms[0] < -300
+
+
 @pytest.mark.kernels
 def test_coplanar_walls_far_apart_are_two_planes():
     rng = np.random.default_rng(4)

@@ -9,10 +9,11 @@ from _comparison import equal
 
 from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble
 from groma.errors import InputError
+from groma.geometry import quaternion
 from groma.io import read_scene
 from groma.mapping.noise.landmarks import line_noise, point_noise
 from groma.mapping.structure.find import StructureOptions, detect_structure, find_structure
-from groma.scene import Directions, Planes, Relations, Scene
+from groma.scene import Directions, Planes, Relations, RightColumns, Scene
 from groma.scene.synthetic.scenes import corridor, holistic
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -50,6 +51,32 @@ def test_covariances_fit_the_errors():
     moves = np.einsum("lai,lei->lea", lines.across, ends - on_truth).reshape(-1, 4)
     squared = np.einsum("ni,nij,nj->n", moves, np.linalg.inv(lines.covariance), moves)
     assert np.median(squared) == pytest.approx(3.36, rel=0.35)
+
+
+def test_columns_in_right_images_are_observations():
+    """Information is additive: that of a column is the outer product of its derivative, here by differences."""
+    _, scene = measured("corridor", "tiny")
+    table = scene.point_observations
+    rows = np.arange(0, len(table), 3)
+    baseline, sigma = 0.2, 0.7
+    poses, params = scene.cam_from_world[table.image_idx[rows]], scene.cameras.params[0]
+
+    def columns(xyz):
+        in_cam = quaternion.rotate(poses[:, :4], xyz[table.point_idx[rows]]) + poses[:, 4:]
+        return params[0] * (in_cam[:, 0] - baseline) / in_cam[:, 2] + params[-2]
+
+    xyz, step = scene.points.xyz, 1e-6
+    by_world = np.stack([(columns(xyz + d) - columns(xyz - d)) / (2 * step) for d in step * np.eye(3)], axis=1)
+    added = np.zeros((scene.num_points, 3, 3))
+    np.add.at(added, table.point_idx[rows], by_world[:, :, None] * by_world[:, None, :] / sigma**2)
+    full = np.full(len(rows), baseline), np.full(len(rows), sigma)
+    pairs = scene.replace(right_columns=RightColumns(rows, columns(xyz), *full))
+    without, with_columns = (np.linalg.inv(point_noise(s, 1.0).covariance) for s in (scene, pairs))
+    assert np.abs(added).max() > 1.0
+    np.testing.assert_allclose(with_columns - without, added, rtol=1e-4, atol=1e-4 * np.abs(added).max())
+    # A column that is off is a misfit.
+    off = pairs.replace(right_columns=RightColumns(rows, columns(xyz) + 5.0, *full))
+    assert (point_noise(off, 1.0).misfit[table.point_idx[rows]] > 1.5).all()
 
 
 def test_corridor_has_its_walls_and_directions():

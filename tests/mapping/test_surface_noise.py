@@ -12,7 +12,7 @@ import groma
 from groma.adjustment.terms.relations import lengths_per_pixel
 from groma.mapping.noise.landmarks import project_points
 from groma.mapping.structure.find import StructureOptions, find_structure
-from groma.mapping.structure.flatness import surface_noise_px
+from groma.mapping.structure.flatness import plane_noise_px, surface_noise_px
 from groma.scene import Directions, Planes, Relations, synthetic
 
 pytestmark = pytest.mark.kernels
@@ -50,6 +50,22 @@ def without_lines(scene):
 def test_roughness_is_found(rough):
     found = room(rough)
     assert surface_noise_px(without_lines(found), OPTIONS) == pytest.approx(rough, rel=0.25)
+
+
+def test_each_plane_has_its_own_roughness():
+    found = without_lines(room(0.2))
+    each = plane_noise_px(found, OPTIONS)
+    count = np.bincount(found.relations.point_on_plane[:, 1], minlength=found.num_planes)
+    assert each[count >= 30] == pytest.approx(0.2, rel=0.5)
+    # One plane whose points are moved onto it is flat, and the others are as before.
+    plane = int(count.argmax())
+    point = found.relations.point_on_plane[found.relations.point_on_plane[:, 1] == plane, 0]
+    normal, offset = found.planes.hesse[plane, :3], found.planes.hesse[plane, 3]
+    xyz = found.points.xyz.copy()
+    xyz[point] -= (xyz[point] @ normal + offset)[:, None] * normal
+    flat = plane_noise_px(found.replace(points=found.points.replace(xyz=xyz)), OPTIONS)
+    assert flat[plane] < 0.3 * each[plane]
+    assert (plane_noise_px(found.replace(relations=Relations()), OPTIONS) == OPTIONS.surface_sigma_px).all()
 
 
 def test_flat_walls_are_flat():

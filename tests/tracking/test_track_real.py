@@ -5,8 +5,9 @@ import cv2
 import numpy as np
 import pytest
 
+import groma
 from groma.evaluation.trajectory import Alignment, score_trajectory
-from groma.geometry import so3
+from groma.geometry import quaternion, so3
 from groma.io.sequences import Frame, SequenceCamera, open_sequence
 from groma.tracking import Tracker, TrackOptions
 
@@ -92,13 +93,53 @@ def test_street_by_a_stereo_pair(shared_data):
     assert 0.1 < pitch < 0.3
     assert 0.1 < yaw < 0.5
     assert -0.4 < roll < -0.1
+    assert groma.adjust(result.scene).report.solve.iterations == 0
+    height, slope = _ground_below(result.scene)
+    assert height == pytest.approx(1.65, abs=0.15)
+    assert slope < 2.0
+
+
+def _ground_below(scene):
+    """The plane that most points lie on: how far below the cameras it is, and its slope there, degrees."""
+    counts = np.bincount(scene.relations.point_on_plane[:, 1], minlength=scene.num_planes)
+    hesse = scene.planes.hesse[int(counts.argmax())]
+    centers = scene.cam_centers_in_world
+    height = np.abs(centers @ hesse[:3] + hesse[3])
+    way = centers[-1] - centers[0]
+    down = quaternion.rotate(quaternion.conjugate(scene.cam_from_world[0, :4]), np.array([0.0, 1.0, 0.0]))
+    upright = np.degrees(np.arccos(np.abs(hesse[:3] @ down)))
+    assert np.degrees(np.arcsin(np.abs(hesse[:3] @ way) / np.linalg.norm(way))) < 2.0
+    return float(np.median(height)), float(upright)
 
 
 def test_street_by_one_camera(shared_data):
-    statuses, _, scores = _track(shared_data / "stereo_kitti06", "sim3", kind="mono")
+    statuses, result, scores = _track(shared_data / "stereo_kitti06", "sim3", kind="mono")
     assert "lost" not in statuses
     assert scores.drift_percent is not None
     assert scores.drift_percent < 2.0
+    height, slope = _ground_below(result.scene)
+    assert scores.similarity.scale * height == pytest.approx(1.65, abs=0.25)
+    assert slope < 2.0
+
+
+def test_a_board_by_one_camera(shared_data):
+    """The board is the plane z = 0 of the reference, up to a similarity."""
+    folder = shared_data / "mono_checkerboard_desk"
+    _, result, scores = _track(folder, "sim3", stride=3)
+    scene, reference = result.scene, open_sequence(folder, stride=3).reference
+    assert reference is not None
+    assert scores.ate.rmse < 0.005
+    counts = np.bincount(scene.relations.point_on_plane[:, 1], minlength=scene.num_planes)
+    hesse = scene.planes.hesse[int(counts.argmax())]
+    assert counts.max() > 100
+    # Seen from each keyframe, plane and board are in the same direction and at the same distance.
+    rows = [int(np.abs(reference.timestamps - time).argmin()) for time in result.keyframes]
+    world_from_cam = reference.world_from_cam[rows]
+    toward = quaternion.rotate(scene.cam_from_world[:, :4], np.tile(hesse[:3], (scene.num_images, 1)))
+    true = quaternion.rotate(quaternion.conjugate(world_from_cam[:, :4]), np.tile([0.0, 0.0, 1.0], (len(rows), 1)))
+    assert np.degrees(np.arccos(np.abs((toward * true).sum(axis=1)))).max() < 2.0
+    distance = np.abs(scene.cam_centers_in_world @ hesse[:3] + hesse[3]) * scores.similarity.scale
+    np.testing.assert_allclose(distance, np.abs(world_from_cam[:, 6]), atol=0.01)
 
 
 def test_the_kitchen_turned_about_the_camera(shared_data):

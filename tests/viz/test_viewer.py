@@ -83,7 +83,8 @@ def test_openings_are_those_of_the_camera(scene):
 
 @pytest.mark.parametrize("mode", LINE_MODES)
 def test_line_colours(scene, mode):
-    content = view_content(scene)
+    lines = scene.lines.replace(confidence=np.linspace(0.0, 1.0, scene.num_lines))
+    content = view_content(scene.replace(lines=lines))
     found = content.line_colours(mode)
     assert found.colours.shape == (scene.num_lines, 3) and found.colours.dtype == np.uint8
     assert len(np.unique(found.colours, axis=0)) > 1

@@ -203,9 +203,11 @@ def observations_of_frames(scene: Scene) -> IntArray:
     return np.bincount(scene.images.frame_idx[np.concatenate(seen)], minlength=scene.num_frames)
 
 
-def first_camera_gauge(scene: Scene, count: IntArray | None = None, is_metric: bool | None = None) -> BoolArray:
-    """Hold the first frame, and of the frame farthest from it the translation along the line between the two; this
-    unless measurements tell the scale.
+def first_camera_gauge(
+    scene: Scene, count: IntArray | None = None, is_metric: bool | None = None, first: int | None = None
+) -> BoolArray:
+    """Hold the first frame, or a given one, and of the frame farthest from it the translation along the line between
+    the two; this unless measurements tell the scale.
 
     Frames with less than half of the usual number of observations are not taken for either: a camera that hardly
     anything holds would leave the scale to relations measured in lengths, which shrink the scene.
@@ -216,6 +218,8 @@ def first_camera_gauge(scene: Scene, count: IntArray | None = None, is_metric: b
         The poses.
     count, is_metric : (F,) int, bool, optional
         Observations of each frame, and whether measurements tell the scale; where not given, those of the scene.
+    first : int, optional
+        The frame that is held; by default the first with half of the usual number of observations.
     """
     poses = scene.frames.rig_from_world
     held = np.zeros((len(poses), 6), dtype=bool)
@@ -223,7 +227,7 @@ def first_camera_gauge(scene: Scene, count: IntArray | None = None, is_metric: b
         return held
     count = observations_of_frames(scene) if count is None else count
     fit = np.flatnonzero(count >= 0.5 * np.median(count))
-    first = int(fit[0])
+    first = int(fit[0]) if first is None else first
     held[first] = True
     centers = se3.inverse(poses)[:, 4:]
     away = centers - centers[first]

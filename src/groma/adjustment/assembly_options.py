@@ -43,7 +43,7 @@ class AssemblyOptions:
     planes: bool = True
     #: Move the cameras; otherwise they are held.
     refine_poses: bool = True
-    #: (F,) frames that are held, besides what the gauge holds.
+    #: (F,) frames that are held, besides what the gauge holds; (F, 6) coordinates of frames if that is ``free``.
     held_frames: BoolArray | None = None
     #: Move the landmarks; otherwise they are held.
     refine_landmarks: bool = True

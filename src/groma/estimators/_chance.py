@@ -17,8 +17,13 @@ def log10_poisson_tail(count: float, mean: float) -> float:
     """Return the logarithm of the probability of more than ``count`` events where ``mean`` are expected."""
     if count < 0:
         return 0.0
+    if mean <= 0.0:
+        return -math.inf
     tail = float(pdtrc(count, mean))
-    return math.log(tail) / math.log(10.0) if tail > 0.0 else -math.inf
+    # Below the smallest number the first term is nearly all of the sum.
+    first = math.floor(count) + 1
+    log_tail = math.log(tail) if tail > 0.0 else first * math.log(mean) - mean - math.lgamma(first + 1)
+    return log_tail / math.log(10.0)
 
 
 __all__ = ["chi_square_quantile", "log10_poisson_tail"]

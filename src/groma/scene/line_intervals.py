@@ -91,7 +91,8 @@ def line_pieces(scene: Scene, segments: FloatArray | None = None) -> tuple[Float
 def supported_lengths(scene: Scene) -> FloatArray:
     """Lengths (L,) of what images support of each line, scene units."""
     pieces, line = line_pieces(scene)
-    return np.bincount(line, np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1), scene.num_lines)
+    length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
+    return np.asarray(np.bincount(line, length, scene.num_lines), np.float64)
 
 
 def shares_on_lines(

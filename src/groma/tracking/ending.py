@@ -8,6 +8,7 @@ it, so that nothing that was found is lost to a failure at the end.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import combinations
 from typing import TypeVar
 
@@ -16,7 +17,9 @@ import numpy as np
 from groma.io.trajectories import Trajectory
 from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
+from groma.tracking.backend.plane_outcome import PlaneOutcome
 from groma.tracking.backend.submaps import Joint, Places, Submap, best_joint
+from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.rectification import RightTurn
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.outcome import History
@@ -24,6 +27,27 @@ from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """What became of a map at the end."""
+
+    #: Of the last adjustment of all keyframes, if there was one.
+    report: SolveReport | None
+    right_turn: RightTurn
+    #: None where planes were not looked for in points and lines.
+    planes: PlaneOutcome | None
+
+    def numbers(self, camera: TrackCamera) -> dict:
+        """Return it as plain values."""
+        out: dict = {"right_camera": self.right_turn.numbers(camera)} if camera.baseline > 0 else {}
+        if self.planes is not None:
+            out["landmark_planes"] = self.planes.numbers()
+        if self.report is not None:
+            seconds = dict(self.report.seconds)
+            out["final_adjustment"] = {"iterations": self.report.iterations, "seconds": seconds}
+        return out
 
 
 class Ending:
@@ -88,18 +112,21 @@ class Ending:
         what = f"joining maps {joint.older + 1} and {joint.newer + 1}"
         return self.attempt(what, lambda: places.joined(joint), places)
 
-    def adjust(self, number: int) -> tuple[SolveReport | None, RightTurn]:
-        """Adjust all keyframes of a map; return the report and how the right camera is turned."""
-        nothing = None, self._mapper.right.turn
+    def adjust(self, number: int) -> Adjusted:
+        """Adjust all keyframes of a map together, and with planes that are found in its points and lines."""
+        mapper, turn = self._mapper, self._mapper.right.turn
         report, turn = self.attempt(
-            "the adjustment of all keyframes", lambda: self._mapper.adjust_at_end(number), nothing
+            "the adjustment of all keyframes", lambda: mapper.adjust_at_end(number), (None, turn)
         )
+        what = "the planes of the map's points and lines"
+        again, planes = self.attempt(what, lambda: mapper.adjust_with_planes(number), (None, None))
+        report = again or report
         if report is not None and not report.converged:
             self.warnings.append(
                 f"The adjustment of all keyframes did not converge in {report.iterations} steps "
                 f"({report.termination.key}). groma adjust on scene.npz continues it."
             )
-        return report, turn
+        return Adjusted(report, turn, planes)
 
     def submap(self, root: int) -> Submap:
         """Return the trajectory and the scene of a map."""

@@ -19,7 +19,7 @@ from groma.tracking.map.track_map import TrackMap
 MIN_VIEWS = 2
 
 
-def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = True) -> Scene:
+def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = True, min_views: int = MIN_VIEWS) -> Scene:
     """Return a scene of the living keyframes, the landmarks, and all that was measured; poses are cam_from_world.
 
     Adjusting it is the problem of the last adjustment of the track.
@@ -30,6 +30,8 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
         The map, and the camera of all its keyframes.
     relations
         Whether landmarks that belong together were tied.
+    min_views
+        Points seen in fewer keyframes are left out.
     """
     living = track_map.living()
     cameras = Cameras(
@@ -48,7 +50,7 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
         for kind in ("points", "lines", "planes")
     }
     points = PointMeasurements.stack([m.points for m in measured])
-    often = np.bincount(points.index, minlength=len(track_map.points)) >= MIN_VIEWS
+    often = np.bincount(points.index, minlength=len(track_map.points)) >= min_views
     keep = often[points.index]
     points = points.take(keep)
     lines = LineMeasurements.stack([m.lines for m in measured])
@@ -64,7 +66,7 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
         SeenPoints(point_ids, replace(points, index=point_idx), image["points"][keep]),
         SeenLines(line_ids, replace(lines, index=line_idx), image["lines"]),
         SeenPlanes(plane_ids, replace(planes, index=np.searchsorted(plane_ids, planes.index)), image["planes"]),
-        relations=find_relations(track_map, line_ids, plane_ids) if relations else Relations(),
+        relations=find_relations(track_map, point_ids, line_ids, plane_ids) if relations else Relations(),
     )
 
 

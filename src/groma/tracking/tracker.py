@@ -24,7 +24,6 @@ from groma.geometry import se3
 from groma.io.sequences.frame import Frame, SequenceCamera
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
-from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.submaps import about_submaps
 from groma.tracking.ending import Ending
@@ -364,7 +363,8 @@ class Tracker:
         others = [root for root in roots if root != main]
         for root in others:
             ending.adjust(root)
-        statistics = self.statistics(*ending.adjust(main))
+        adjusted = ending.adjust(main).numbers(self.camera)
+        statistics = self.statistics() | adjusted
         whole, *submaps = [ending.submap(root) for root in (main, *others)]
         warnings = [*self._checks.warnings, *ending.warnings]
         if not history.entries:
@@ -372,7 +372,7 @@ class Tracker:
         warnings += about_submaps(self._breaks, where, [count[root] for root in others])
         return TrackResult(whole.trajectory, whole.scene, whole.keyframes, statistics, tuple(warnings), tuple(submaps))
 
-    def statistics(self, report: SolveReport | None = None, right_turn: RightTurn | None = None) -> dict:
+    def statistics(self) -> dict:
         """Return counts and times so far as plain numbers."""
         out: dict = {
             "frames": dict(self._history.statuses),
@@ -387,9 +387,7 @@ class Tracker:
             "milliseconds": self._history.milliseconds(),
         }
         if self.camera.baseline > 0:
-            out["right_camera"] = (right_turn or self._mapper.right.turn).numbers(self.camera)
-        if report is not None:
-            out["final_adjustment"] = {"iterations": report.iterations, "seconds": dict(report.seconds)}
+            out["right_camera"] = self._mapper.right.turn.numbers(self.camera)
         return out
 
 

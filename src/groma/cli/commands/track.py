@@ -35,7 +35,9 @@ def track(
     points: Annotated[bool, typer.Option("--points/--no-points", help="Follow points.")] = True,
     lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Follow line segments.")] = True,
     line_detector: _options.LineDetector = "lsd",
-    planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Find planes in depth images.")] = True,
+    planes: Annotated[
+        bool, typer.Option("--planes/--no-planes", help="Find planes in depth images, or in points and lines.")
+    ] = True,
     loops: Annotated[bool, typer.Option("--loops/--no-loops", help="Close loops.")] = True,
     max_frames: Annotated[
         int | None, typer.Option("--max-frames", min=1, metavar="N", help="Stop after N frames. Default: all.")
@@ -124,6 +126,8 @@ def _say(console: "Console", numbers: dict[str, Any]) -> None:
     total = numbers["milliseconds"].get("total")
     if total:
         console.say(f"Time per frame: median {total['median']:.1f} ms, 95 % below {total['p95']:.1f} ms")
+    if "landmark_planes" in numbers:
+        console.say(numbers["landmark_planes"]["sentence"])
     if "right_camera" in numbers:
         turn = numbers["right_camera"]
         angles = ", ".join(

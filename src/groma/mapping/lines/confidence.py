@@ -63,17 +63,17 @@ def line_confidence(scene: Scene) -> FloatArray:
 def line_evidence(scene: Scene) -> FloatArray:
     r"""Return what the probability of each line is computed from, (L, 7), in the order of ``WEIGHTS``.
 
-    ==============  ==================================================================================================
-    ``constant``    1
-    ``images``      logarithm of the number of images that show it
-    ``spread``      logarithm of :math:`\sqrt{\lambda}`, the smaller eigenvalue of the mean of :math:`n n^\top` over the
-                    normals of its viewing planes: how far apart the views are, as the sine of an angle
-    ``uncertainty`` logarithm of the largest standard deviation of its ends across it, over the usual distance of lines
-                    from their cameras
-    ``misfit``      logarithm of its reduced chi: residuals over their expected size
-    ``support``     log odds of an image showing it, among the images in whose frame it lies
-    ``length``      logarithm of its longest observed segment, pixels
-    ==============  ==================================================================================================
+    ===============  ================================================================================================
+    ``constant``     1
+    ``images``       logarithm of the number of images that show it
+    ``spread``       logarithm of :math:`\sqrt{\lambda}`, the smaller eigenvalue of the mean of :math:`n n^\top` over
+                     the normals of its viewing planes: how far apart the views are, as the sine of an angle
+    ``uncertainty``  logarithm of the largest standard deviation of its ends across it, over the usual distance of
+                     lines from their cameras
+    ``misfit``       logarithm of its reduced chi: residuals over their expected size
+    ``support``      log odds of an image showing it, among the images in whose frame it lies
+    ``length``       logarithm of its longest observed segment, pixels
+    ===============  ================================================================================================
     """
     seen, noise = scene.line_observations, line_noise(scene)
     images = num_distinct(seen.line_idx, seen.image_idx, scene.num_lines)
@@ -143,7 +143,8 @@ def _num_in_frame(scene: Scene) -> FloatArray:
 
 def _inside(pixels: FloatArray, size: FloatArray) -> BoolArray:
     ends = pixels.reshape(-1, 2, 2)
-    return ((ends >= 0.0) & (ends <= size)).all(axis=(1, 2)) if size.all() else np.isfinite(pixels).all(axis=1)
+    inside = ((ends >= 0.0) & (ends <= size)) if size.all() else np.isfinite(ends)
+    return np.asarray(inside.all(axis=(1, 2)), np.bool_)
 
 
 __all__ = ["DEFAULT_CONFIDENCE", "WEIGHTS", "left_out", "line_confidence", "line_evidence", "with_confidence"]

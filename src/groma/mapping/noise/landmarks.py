@@ -99,18 +99,19 @@ class LineNoise:
 
 
 def point_noise(scene: Scene, sigma_px: float | None = None) -> PointNoise:
-    """Return the covariances of the points; ``sigma_px`` None estimates it from the residuals."""
-    table = scene.point_observations
-    pixels, by_world = project_points(scene, table.image_idx, scene.points.xyz[table.point_idx])
-    residual = pixel_differences(scene, table.image_idx, pixels, table.pixel)
-    good = np.asarray(np.isfinite(residual).all(axis=1) & np.isfinite(by_world).all(axis=(1, 2)))
-    weight = good / table.sigma
-    residual = np.where(good[:, None], residual, 0.0) * weight[:, None]
-    by_world = np.where(good[:, None, None], by_world, 0.0) * weight[:, None, None]
-    count = np.bincount(table.point_idx[good], minlength=scene.num_points)
-    squares = _sum(dot(residual, residual)[:, None], table.point_idx, scene.num_points)[:, 0]
-    sigma, misfit = _misfit(squares, 2 * count - 3, sigma_px)
-    information = _sum(np.einsum("nki,nkj->nij", by_world, by_world), table.point_idx, scene.num_points) / sigma**2
+    """Return the covariances of the points; ``sigma_px`` None estimates it from the residuals.
+
+    Columns in the right images of stereo pairs are observations, too.
+    """
+    pixels, columns = _pixel_rows(scene), _column_rows(scene)
+    point = np.concatenate([pixels[0], columns[0]])
+    residual, by_world = np.concatenate([pixels[1], columns[1]]), np.concatenate([pixels[2], columns[2]])
+    good = np.asarray(np.isfinite(residual) & np.isfinite(by_world).all(axis=1))
+    residual, by_world = np.where(good, residual, 0.0), np.where(good[:, None], by_world, 0.0)
+    count = np.bincount(point[good], minlength=scene.num_points)
+    squares = _sum(residual[:, None] ** 2, point, scene.num_points)[:, 0]
+    sigma, misfit = _misfit(squares, count - 3, sigma_px)
+    information = _sum(by_world[:, :, None] * by_world[:, None, :], point, scene.num_points) / sigma**2
     return PointNoise(_inverse(information, _extent(scene)), misfit, sigma)
 
 
@@ -142,10 +143,16 @@ def line_noise(scene: Scene, sigma_px: float | None = None) -> LineNoise:
     return LineNoise(across, _inverse(information / sigma**2, _extent(scene)), misfit, sigma)
 
 
-def project_points(scene: Scene, image_idx: IntArray, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (N, 2) of points in the world and their derivatives (N, 2, 3) by them; NaN behind the camera."""
+def project_points(
+    scene: Scene, image_idx: IntArray, places: FloatArray, baseline: FloatArray | float = 0.0
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 2) of points in the world and their derivatives (N, 2, 3) by them; NaN behind the camera.
+
+    With baselines (N,) the pixels are those in the right images of stereo pairs.
+    """
     poses = scene.cam_from_world[image_idx]
     in_cam = quaternion.rotate(poses[:, :4], places) + poses[:, 4:]
+    in_cam[:, 0] -= baseline
     pixels, by_world = np.full((len(places), 2), np.nan), np.full((len(places), 2, 3), np.nan)
     for name, rows, params in _by_model(scene, image_idx):
         model = camera_model(name)
@@ -154,6 +161,22 @@ def project_points(scene: Scene, image_idx: IntArray, places: FloatArray) -> tup
         pixels[front], by_cam, _ = model.project_jacobian(chosen, np.ascontiguousarray(in_cam[front]))
         by_world[front] = by_cam @ quaternion.to_matrix(poses[front, :4])
     return pixels, by_world
+
+
+def _pixel_rows(scene: Scene) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Points (N,), whitened residuals (N,) and their derivatives (N, 3) of the coordinates of all observations."""
+    table = scene.point_observations
+    pixels, by_world = project_points(scene, table.image_idx, scene.points.xyz[table.point_idx])
+    residual = pixel_differences(scene, table.image_idx, pixels, table.pixel) / table.sigma[:, None]
+    return np.repeat(table.point_idx, 2), residual.ravel(), (by_world / table.sigma[:, None, None]).reshape(-1, 3)
+
+
+def _column_rows(scene: Scene) -> tuple[IntArray, FloatArray, FloatArray]:
+    """The same of the columns in right images."""
+    table = scene.right_columns
+    seen = scene.point_observations.take(table.observation_idx)
+    pixels, by_world = project_points(scene, seen.image_idx, scene.points.xyz[seen.point_idx], table.baseline)
+    return seen.point_idx, (pixels[:, 0] - table.u_right) / table.sigma, by_world[:, 0] / table.sigma[:, None]
 
 
 def pixel_differences(scene: Scene, image_idx: IntArray, first: FloatArray, second: FloatArray) -> FloatArray:

@@ -53,7 +53,7 @@ class StructureOptions:
     #: The same for lines on planes and along directions. It is higher, as a wrong relation bends a whole line, and as
     #: covariances do not contain errors that images share, such as those of an edge that is a groove.
     min_line_probability: float = 0.9
-    #: Landmarks seen in fewer images take no part: nothing checks their matches.
+    #: Landmarks seen in fewer images take no part: nothing checks their matches. A stereo pair is two images.
     min_views: int = 3
     #: Landmarks whose reprojection error is so many times the usual one take no part.
     max_misfit: float = 3.0
@@ -231,7 +231,9 @@ def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
     lines = line_noise(scene, options.line_sigma_px).widened(
         options.surface_sigma_px * lengths_per_pixel(scene, "line")
     )
-    seen = num_distinct(scene.point_observations.point_idx, scene.point_observations.image_idx, scene.num_points)
+    table = scene.point_observations
+    seen = num_distinct(table.point_idx, table.image_idx, scene.num_points)
+    seen = seen + np.bincount(table.point_idx[scene.right_columns.observation_idx], minlength=scene.num_points)
     lines_seen = num_distinct(scene.line_observations.line_idx, scene.line_observations.image_idx, scene.num_lines)
     point_usable = (seen >= options.min_views) & (points.misfit < options.max_misfit)
     line_usable = (lines_seen >= options.min_views) & (lines.misfit < options.max_misfit)

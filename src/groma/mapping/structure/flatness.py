@@ -44,19 +44,43 @@ def surface_noise_px(scene: Scene, options: StructureOptions) -> float:
         What they were found with. No more than its ``surface_sigma_px`` is returned, and that where nothing is on a
         plane.
     """
-    heights = [_of_points(scene, options.point_sigma_px), _of_lines(scene, options.line_sigma_px)]
-    plane, height, variance, length = (np.concatenate(column) for column in zip(*heights, strict=True))
+    plane, height, variance, length = _heights(scene, options)
     count = np.bincount(plane, minlength=scene.num_planes)[plane]
     told = count > _UNKNOWNS
-    variance, length = variance[told], length[told]
     squared = height[told] ** 2 * count[told] / (count[told] - _UNKNOWNS)
-    most = options.surface_sigma_px
+    return _upper_end(squared, variance[told], length[told], options.surface_sigma_px)
+
+
+def plane_noise_px(scene: Scene, options: StructureOptions) -> FloatArray:
+    """Return the same (K,) of each plane on its own; the most where three landmarks or fewer lie on it.
+
+    Parameters are those of :func:`surface_noise_px`.
+    """
+    plane, height, variance, length = _heights(scene, options)
+    count = np.bincount(plane, minlength=scene.num_planes)
+    out = np.full(scene.num_planes, options.surface_sigma_px)
+    for k in np.flatnonzero(count > _UNKNOWNS):
+        of = plane == k
+        squared = height[of] ** 2 * count[k] / (count[k] - _UNKNOWNS)
+        out[k] = _upper_end(squared, variance[of], length[of], options.surface_sigma_px)
+    return out
+
+
+def _upper_end(squared: FloatArray, variance: FloatArray, length: FloatArray, most: float) -> float:
+    """Upper end of the confidence interval of t, from scaled squares of heights, up to the most."""
     tried = np.geomspace(min(LANDMARK_GATES.min_sigma_px, most), most, _TRIED)
     surprise = np.empty(_TRIED)
     for k, sigma in enumerate(tried):
         total = variance + (sigma * length) ** 2
         surprise[k] = (np.log(total) + squared / total).sum()
     return float(tried[np.flatnonzero(surprise <= surprise.min() + 1.0)[-1]])
+
+
+def _heights(scene: Scene, options: StructureOptions) -> _Heights:
+    """Of points and of the ends of lines on planes."""
+    points, lines = _of_points(scene, options.point_sigma_px), _of_lines(scene, options.line_sigma_px)
+    plane, height = np.concatenate([points[0], lines[0]]), np.concatenate([points[1], lines[1]])
+    return plane, height, np.concatenate([points[2], lines[2]]), np.concatenate([points[3], lines[3]])
 
 
 def _of_points(scene: Scene, sigma_px: float | None) -> _Heights:
@@ -86,4 +110,4 @@ def _of_lines(scene: Scene, sigma_px: float | None) -> _Heights:
     return np.repeat(plane, 2), height.ravel(), variance.ravel(), length
 
 
-__all__ = ["surface_noise_px"]
+__all__ = ["plane_noise_px", "surface_noise_px"]

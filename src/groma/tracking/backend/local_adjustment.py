@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import AssemblyOptions, assemble, first_camera_gauge
 from groma.geometry import se3
 from groma.problem.problem import Problem
 from groma.scene import Lines, Relations
@@ -222,7 +222,8 @@ def job_of(
 
     point_ids, point_local = np.unique(points.index, return_inverse=True)
     line_ids, line_local = np.unique(lines.index, return_inverse=True)
-    plane_ids, plane_local = np.unique(planes.index, return_inverse=True)
+    tied = np.concatenate([track_map.points.plane[point_ids], track_map.lines.plane[line_ids]])
+    plane_ids = np.union1d(planes.index, np.intersect1d(tied, np.flatnonzero(track_map.planes.of_landmarks)))
     scene = map_scene(
         camera,
         track_map.view,
@@ -230,10 +231,14 @@ def job_of(
         [str(k.index) for k in keyframes],
         SeenPoints(point_ids, replace(points, index=point_local), point_pose),
         SeenLines(line_ids, replace(lines, index=line_local), line_pose),
-        SeenPlanes(plane_ids, replace(planes, index=plane_local), pose["planes"]),
-        relations=find_relations(track_map, line_ids, plane_ids) if relations else Relations(),
+        SeenPlanes(plane_ids, replace(planes, index=np.searchsorted(plane_ids, planes.index)), pose["planes"]),
+        relations=find_relations(track_map, point_ids, line_ids, plane_ids) if relations else Relations(),
     )
-    problem = assemble(scene, replace(options, held_frames=held)).problem
+    coordinates = held
+    if held.sum() == 1 and len(scene.relations):
+        # Distances between landmarks cost less in a smaller map: unless it is metric, its scale is held too.
+        coordinates = first_camera_gauge(scene, first=int(held.argmax()))
+    problem = assemble(scene, replace(options, held_frames=coordinates)).problem
     if not problem.factors:
         return None
     return AdjustmentJob(

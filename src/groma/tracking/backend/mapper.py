@@ -16,6 +16,7 @@ from groma.geometry import se3
 from groma.solver.report import SolveReport
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
 from groma.tracking.backend.loop_closure import LoopSearch, close_loop, search_for_loop
+from groma.tracking.backend.plane_outcome import PlaneOutcome, drop_what_failed
 from groma.tracking.backend.stereo_calibration import correct_map, estimate_turn, shift_between
 from groma.tracking.backend.submaps import Joint, find_joint, search_older_maps
 from groma.tracking.frame.camera import TrackCamera
@@ -23,11 +24,13 @@ from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.frame.rectification import RightCamera, RightTurn
 from groma.tracking.map.culling import drop_repeating_keyframes, drop_unseen
 from groma.tracking.map.keyframes import Followed, add_keyframe
+from groma.tracking.map.landmark_planes import find_planes
 from groma.tracking.map.planes import merge_planes
 from groma.tracking.map.relations import find_lines_on_planes
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.pose.following import carry
+from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
 
 #: A chosen frame becomes a keyframe, and the result of a window's adjustment is taken up, after this many frames.
@@ -309,6 +312,28 @@ class Mapper:
                 correct_map(self.map, self.camera, self.right.turn, turn, self.options, job)
                 report = self._adjust_all()
         return report, turn
+
+    def adjust_with_planes(self, number: int) -> tuple[SolveReport | None, PlaneOutcome | None]:
+        """Find planes in the points and lines of a map, and adjust all keyframes with them; those that fail go.
+
+        Depth images show planes themselves: where they did, nothing is done.
+        """
+        self.current = number
+        track_map, options, gates = self.map, self.options, self.options.gates.landmark_planes
+        wanted = options.planes and options.relations and options.adjust_at_end
+        if not wanted or (track_map.planes.found > 0).any() or len(track_map.living()) < 2:
+            return None, None
+        scene = map_to_scene(track_map, self.camera, min_views=1)
+        searched = scene.num_points, scene.num_lines
+        found = find_planes(track_map, scene, gates)
+        if not found:
+            return None, PlaneOutcome(searched, 0, 0)
+        report = self._adjust_all()
+        dropped, gone = drop_what_failed(track_map, self.camera, gates)
+        if gone:
+            report = self._adjust_all()
+        points, lines = (int((table.alive & (table.plane >= 0)).sum()) for table in (track_map.points, track_map.lines))
+        return report, PlaneOutcome(searched, found, found - gone, points, lines, dropped)
 
 
 def _follow_world(present: Present, new_from_old: FloatArray) -> None:

@@ -148,6 +148,7 @@ def joined_map(track_map: TrackMap, other: TrackMap, here_from_there: FloatArray
         moved = Lines.through(into(here_from_there, other.lines.segment[alive]))
         rows = alive + start["lines"]
         out.lines.segment[rows], out.lines.plucker[rows] = moved.segments, moved.plucker
+    out.points.plane[points] = _shifted(other.points.plane, start["planes"])
     out.lines.plane[lines] = _shifted(other.lines.plane, start["planes"])
     out.planes.hesse[planes] = planes_into(here_from_there, other.planes.hesse)
     out.planes.samples[planes] = into(here_from_there, other.planes.samples)

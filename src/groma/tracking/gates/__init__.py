@@ -15,7 +15,7 @@ from groma.tracking.gates.frame import (
     StereoGates,
     TurnGates,
 )
-from groma.tracking.gates.map import CullingGates, KeyframeGates, LineGates, PlaneGates, PointGates
+from groma.tracking.gates.map import CullingGates, KeyframeGates, LandmarkPlaneGates, LineGates, PlaneGates, PointGates
 from groma.tracking.gates.pose import (
     DepthCheckGates,
     FindingGates,
@@ -42,6 +42,7 @@ class TrackingGates:
     points: PointGates = field(default_factory=PointGates)
     lines: LineGates = field(default_factory=LineGates)
     planes: PlaneGates = field(default_factory=PlaneGates)
+    landmark_planes: LandmarkPlaneGates = field(default_factory=LandmarkPlaneGates)
     culling: CullingGates = field(default_factory=CullingGates)
     motion: MotionGates = field(default_factory=MotionGates)
     start: StartGates = field(default_factory=StartGates)
@@ -64,6 +65,7 @@ __all__ = [
     "FindingGates",
     "FramePlaneGates",
     "KeyframeGates",
+    "LandmarkPlaneGates",
     "LineGates",
     "LoopGates",
     "MotionGates",

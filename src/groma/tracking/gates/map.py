@@ -93,6 +93,25 @@ class PlaneGates:
 
 
 @dataclass(frozen=True)
+class LandmarkPlaneGates:
+    """Planes in the points and lines of a map without depth images."""
+
+    surface_sigmas_px: tuple[float, ...] = gate(
+        (0.2, 0.8, 3.2),
+        "px",
+        "deviations of surfaces that are tried",
+        "derived from that of photographs, times 1, 4 and 16",
+    )
+    min_views: int = gate(
+        2, "images", "that see a landmark (a stereo pair is two); it was followed between them", SEQUENCES
+    )
+    min_support: int = gate(
+        10, "points", "on a plane (a line counts 2)", "derived from the search, which asks for as many"
+    )
+    min_own: float = gate(0.5, "share", "of what a plane claims that no likelier one has", "convention: the majority")
+
+
+@dataclass(frozen=True)
 class CullingGates:
     """Keyframes that only repeat others."""
 

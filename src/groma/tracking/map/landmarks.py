@@ -63,7 +63,7 @@ class _Growing:
 
 
 class PointTable(_Growing):
-    """Points: place, where their patch is kept, and how often they were looked for and found."""
+    """Points: place, where their patch is kept, how often they were looked for and found, and the plane they lie on."""
 
     _columns = {  # noqa: RUF012
         "xyz": ((3,), np.float64, 0.0),
@@ -75,6 +75,8 @@ class PointTable(_Growing):
         "visible": ((), np.int32, 0),
         "found": ((), np.int32, 0),
         "misses": ((), np.int32, 0),
+        "plane": ((), np.int64, -1),
+        "plane_sigma": ((), np.float64, 0.0),
     }
     xyz: FloatArray
     state: np.ndarray
@@ -85,10 +87,12 @@ class PointTable(_Growing):
     visible: IntArray
     found: IntArray
     misses: IntArray
+    plane: IntArray
+    plane_sigma: FloatArray
 
 
 class LineTable(_Growing):
-    """Lines: place, the part that was seen, and the strength of their edge in the image."""
+    """Lines: place, the part that was seen, the strength of their edge in the image, and their plane."""
 
     _columns = {  # noqa: RUF012
         "plucker": ((6,), np.float64, 0.0),
@@ -100,6 +104,7 @@ class LineTable(_Growing):
         "visible": ((), np.int32, 0),
         "found": ((), np.int32, 0),
         "plane": ((), np.int64, -1),
+        "plane_sigma": ((), np.float64, 0.0),
     }
     plucker: FloatArray
     segment: FloatArray
@@ -110,10 +115,14 @@ class LineTable(_Growing):
     visible: IntArray
     found: IntArray
     plane: IntArray
+    plane_sigma: FloatArray
 
 
 class PlaneTable(_Growing):
-    """Planes: place, samples of the part that was seen, and how many points support them."""
+    """Planes: place, samples of the part that was seen, and how many points support them.
+
+    Those found in depth images count in how many; those found in points and lines of the map, in none.
+    """
 
     #: Samples of the extent kept for each plane.
     samples_kept = 64
@@ -131,6 +140,11 @@ class PlaneTable(_Growing):
     support: FloatArray
     found: IntArray
     merged_into: IntArray
+
+    @property
+    def of_landmarks(self) -> BoolArray:
+        """Which planes with a place were found in points and lines, not in depth images."""
+        return self.alive & (self.found == 0)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Relations between landmarks that the data support.
 
-A line lies on a plane if both its ends do and the plane was seen there. Planes whose normals are nearly parallel or
-perpendicular are taken to be so; a robust loss lets go of those that are not.
+A line lies on a plane of depth images if both its ends do and the plane was seen there. Such planes whose normals are
+nearly parallel or perpendicular are taken to be so; a robust loss lets go of those that are not. What lies on planes of
+the map's own points and lines is found with them (:mod:`groma.tracking.map.landmark_planes`).
 """
 
 from __future__ import annotations
@@ -41,30 +42,34 @@ def find_lines_on_planes(track_map: TrackMap) -> None:
             samples = samples[np.isfinite(samples[:, 0])]
             middle = ends[of].mean(axis=1)
             gap = np.linalg.norm(middle[:, None] - samples[None], axis=2).min(axis=1)
-            lines.plane[rows[of[gap < NEAR]]] = plane
+            near = rows[of[gap < NEAR]]
+            lines.plane[near], lines.plane_sigma[near] = plane, ON_PLANE_SIGMA
 
 
 def plane_pairs(track_map: TrackMap, rows: IntArray) -> tuple[IntArray, IntArray]:
-    """Pairs (n, 2) of positions in ``rows`` of planes that are nearly parallel, and nearly perpendicular."""
+    """Pairs (n, 2) of positions in ``rows`` of planes of depth images: nearly parallel, and nearly perpendicular."""
+    seen = np.flatnonzero(~track_map.planes.of_landmarks[rows])
     normals = track_map.planes.hesse[rows, :3]
-    first, second = np.triu_indices(len(rows), 1)
-    cosine = np.abs((normals[first] * normals[second]).sum(axis=1))
-    pairs = np.column_stack([first, second])
+    pairs = seen[np.column_stack(np.triu_indices(len(seen), 1))]
+    cosine = np.abs((normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(axis=1))
     return pairs[cosine > math.cos(SQUARE)], pairs[cosine < math.sin(SQUARE)]
 
 
-def find_relations(track_map: TrackMap, lines: IntArray, planes: IntArray) -> Relations:
-    """Return the relations among the given landmarks; they count in ``lines`` and ``planes``."""
+def find_relations(track_map: TrackMap, points: IntArray, lines: IntArray, planes: IntArray) -> Relations:
+    """Return the relations among the given landmarks; they count in ``points``, ``lines`` and ``planes``."""
     if not len(planes):
         return Relations()
-    place = np.full(len(track_map.planes), -1)
+    place = np.full(len(track_map.planes) + 1, -1)
     place[planes] = np.arange(len(planes))
-    plane = track_map.lines.plane[lines]
-    rows = np.flatnonzero((plane >= 0) & (place[plane] >= 0))
+    # Landmarks without a plane have the number -1, which is the last place.
+    of_point, of_line = place[track_map.points.plane[points]], place[track_map.lines.plane[lines]]
+    on, along = np.flatnonzero(of_point >= 0), np.flatnonzero(of_line >= 0)
     parallel, perpendicular = plane_pairs(track_map, planes)
     return Relations(
-        line_on_plane=np.column_stack([rows, place[plane[rows]]]),
-        line_on_plane_sigma=np.full(len(rows), ON_PLANE_SIGMA),
+        point_on_plane=np.column_stack([on, of_point[on]]),
+        point_on_plane_sigma=track_map.points.plane_sigma[points[on]],
+        line_on_plane=np.column_stack([along, of_line[along]]),
+        line_on_plane_sigma=track_map.lines.plane_sigma[lines[along]],
         parallel_planes=parallel,
         parallel_planes_sigma=np.full(len(parallel), SQUARE_SIGMA),
         perpendicular_planes=perpendicular,
