@@ -8,7 +8,8 @@ cells agree with by chance is at most
 
 .. math:: \text{NFA} = (n - 3) \binom{n}{k} \binom{k}{3}\, p^{\,k-3} .
 
-For lines, each a cell of its own with all segments that it may have, :math:`p` is the share of the places within the reach of a search.
+For lines, each a cell of its own with all segments that it may have, :math:`p` is the share of the places within the
+reach of a search.
 
 **Another place.** Matches that disagree are searched for a second pose. Where one is found that chance does not
 explain, :math:`k_1` cells speak for the first and :math:`k_2` for the second. If both were equally good, each would
