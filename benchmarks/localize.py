@@ -2,11 +2,12 @@
 """Localised photographs against the truth, beside the peers on the same matches.
 
     python benchmarks/localize.py stairs DATA                     one query with given matches, 20 seeds, and peers
-    python benchmarks/localize.py held-out MAP IMAGES TRUTH       photographs that are not in a map, points alone and with lines
+    python benchmarks/localize.py held-out MAP IMAGES TRUTH       photographs that are not in a map
     python benchmarks/localize.py wrong MAP IMAGES OTHER...       photographs that must not be localised
 
 ``DATA`` is ``localization_stairs/query_1.npz``; ``TRUTH`` a scene with the poses of all photographs in ``IMAGES``. Maps
-whose world is not that of the truth are aligned by the poses of their own images (``--align``). Times are process times.
+whose world is not that of the truth are aligned by the poses of their own images (``--align``). Photographs are
+placed by points alone, and with lines. Times are process times.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ import numpy as np
 
 from groma.geometry import quaternion, so3
 from groma.io import read_scene
-from groma.localization.absolute_pose import PoseOptions, estimate_absolute_pose
-from groma.localization.camera import QueryCamera
 from groma.localization.localizer import LocalizeOptions, Localizer
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
+from groma.localization.pose.camera import QueryCamera
 from groma.mapping.photographs import image_files, read_gray
 
 #: Shares of queries within these distances (metres) and angles (degrees) are told.
@@ -83,7 +84,11 @@ def stairs(path: Path, seeds: int = 20) -> dict[str, object]:
         poses = [method(seed + 1) for seed in range(seeds)]
         seconds = (time.process_time() - start) / seeds
         errors = np.array([_errors(pose, true) for pose in poses if pose is not None])
-        told[name] = {"cm": 100 * float(np.median(errors[:, 0])), "deg": float(np.median(errors[:, 1])), "seconds": seconds}
+        told[name] = {
+            "cm": 100 * float(np.median(errors[:, 0])),
+            "deg": float(np.median(errors[:, 1])),
+            "seconds": seconds,
+        }
     found = estimate_absolute_pose(camera, *points, *lines)
     told["stated cm"] = 100 * float(np.linalg.norm(found.center_sigma))
     told["stated deg"] = found.rotation_sigma_deg
@@ -174,7 +179,10 @@ def _summary(rows: list[tuple]) -> dict[str, object]:
 
 def _alignment(scene, poses: dict[str, np.ndarray]) -> np.ndarray:
     """The motion (4, 4) from the world of a map to that of the truth: mean turn, mean shift."""
-    pairs = [(_matrix(poses[name]), _matrix(pose)) for name, pose in zip(scene.images.names, scene.cam_from_world, strict=True)]
+    pairs = [
+        (_matrix(poses[name]), _matrix(pose))
+        for name, pose in zip(scene.images.names, scene.cam_from_world, strict=True)
+    ]
     U, _, Vt = np.linalg.svd(sum((np.linalg.inv(true) @ own)[:3, :3] for true, own in pairs))
     moved = np.eye(4)
     moved[:3, :3] = U @ Vt

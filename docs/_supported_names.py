@@ -99,6 +99,14 @@ ROOMS: Rooms = (
         },
     ),
     (
+        "Localisation",
+        {
+            "groma.localization.pose.absolute_pose": ("AbsolutePose", "PoseOptions", "estimate_absolute_pose"),
+            "groma.localization.pose.camera": None,
+            "groma.localization.localizer": ("LocalizeOptions", "LocalizedImage", "Localizer"),
+        },
+    ),
+    (
         "Evaluation",
         {
             "groma.evaluation": None,

@@ -61,9 +61,9 @@ if TYPE_CHECKING:
     from groma.io import read_scene, read_trajectory, write_scene
     from groma.io.convert import convert
     from groma.io.sequences import open_sequence
-    from groma.localization.absolute_pose import AbsolutePose, PoseOptions, estimate_absolute_pose
-    from groma.localization.camera import QueryCamera
     from groma.localization.localizer import LocalizedImage, LocalizeOptions, Localizer
+    from groma.localization.pose.absolute_pose import AbsolutePose, PoseOptions, estimate_absolute_pose
+    from groma.localization.pose.camera import QueryCamera
     from groma.mapping.map import MapOptions, map_images
     from groma.mapping.result import MapResult
     from groma.problem.problem import Problem
@@ -79,7 +79,7 @@ if TYPE_CHECKING:
 #: Where each public name lives, and after a colon its name there if that is another; with ``__all__`` and the imports
 #: above the only place to touch when one is added.
 _HOME = {
-    "AbsolutePose": "groma.localization.absolute_pose",
+    "AbsolutePose": "groma.localization.pose.absolute_pose",
     "AdjustOptions": "groma.adjustment.adjust",
     "AdjustResult": "groma.adjustment.report",
     "FileFormatError": "groma.errors",
@@ -99,11 +99,11 @@ _HOME = {
     "PointReprojection": "groma.factors.observations.point_reprojection",
     "PoseGraphOptions": "groma.adjustment.pose_graph",
     "PoseGraphResult": "groma.adjustment.pose_graph",
-    "PoseOptions": "groma.localization.absolute_pose",
+    "PoseOptions": "groma.localization.pose.absolute_pose",
     "PosePrior": "groma.factors.priors.pose_prior",
     "Problem": "groma.problem.problem",
     "ProblemError": "groma.errors",
-    "QueryCamera": "groma.localization.camera",
+    "QueryCamera": "groma.localization.pose.camera",
     "Ref": "groma.factors.contract",
     "Scene": "groma.scene",
     "ShapeError": "groma.errors",
@@ -122,7 +122,7 @@ _HOME = {
     "contributions": "groma.adjustment.contributions",
     "convert": "groma.io.convert",
     "diagnose": "groma.adjustment.diagnosis:diagnose_scene",
-    "estimate_absolute_pose": "groma.localization.absolute_pose",
+    "estimate_absolute_pose": "groma.localization.pose.absolute_pose",
     "evaluate_lines": "groma.evaluation.lines",
     "evaluate_planes": "groma.evaluation.planes",
     "evaluate_poses": "groma.evaluation.poses",
@@ -147,7 +147,6 @@ _SUBPACKAGES = (
     "cameras",
     "compilation",
     "errors",
-    "estimate_absolute_pose",
     "estimators",
     "evaluation",
     "factors",

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma.geometry import quaternion, so3
-from groma.localization.camera import QueryCamera
+from groma.localization.pose.camera import QueryCamera
 
 CAMERA = QueryCamera("PINHOLE", np.array([600.0, 610.0, 330.0, 235.0]), 640, 480)
 
@@ -39,7 +39,9 @@ def make_world(rng, points=60, lines=20, camera=CAMERA):
     pose = np.concatenate([quaternion.from_matrix(turn)[0], rng.normal(0.0, 2.0, 3)])
 
     def places(count):
-        pixels = np.column_stack([rng.uniform(20, camera.width - 20, count), rng.uniform(20, camera.height - 20, count)])
+        pixels = np.column_stack(
+            [rng.uniform(20, camera.width - 20, count), rng.uniform(20, camera.height - 20, count)]
+        )
         rays = camera.kind.unproject(camera.params, pixels)
         inside = rays / rays[:, 2:] * rng.uniform(3.0, 7.0, (count, 1))
         return (inside - pose[4:]) @ turn[0]

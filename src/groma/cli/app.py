@@ -7,7 +7,20 @@ from typing import Annotated
 import typer
 
 import groma
-from groma.cli.commands import adjust, convert, demo, evaluate, localize, map, report, selfcheck, synth, track, view, warmup
+from groma.cli.commands import (
+    adjust,
+    convert,
+    demo,
+    evaluate,
+    localize,
+    map,
+    report,
+    selfcheck,
+    synth,
+    track,
+    view,
+    warmup,
+)
 from groma.cli.shared.guard import guard
 
 app = typer.Typer(

@@ -12,8 +12,8 @@ from groma.errors import InputError
 from groma.gates import gate
 from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.quiet import quiet
-from groma.localization.camera import QueryCamera
 from groma.localization.localizer import unknown_camera
+from groma.localization.pose.camera import QueryCamera
 
 #: Where calibrations may come from.
 SOURCES = ("auto", "map", "exif", "unknown")

@@ -11,12 +11,12 @@ from scipy.spatial import KDTree
 from groma._typing import FloatArray, IntArray
 from groma.features.matching.wide_baseline import match_wide_baseline
 from groma.features.segments import Segments
-from groma.localization.camera import QueryCamera
 from groma.localization.features import DescribedImage, unit
 from groma.localization.line_matching import SeenLines, lines_near
 from groma.localization.map_index import MapIndex
-from groma.localization.matches import Matches
 from groma.localization.matching import MATCHES, match_descriptors
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.matches import Matches
 from groma.scene import Scene
 
 
@@ -55,8 +55,9 @@ def described_alike(
         What matches, and the number of matching points of each image.
     """
     vectors = unit(query.points.descriptors)
-    points, segments, count = [np.zeros((0, 2), np.int64)], [np.zeros((0, 2), np.int64)], []
-    determined = np.isfinite(index.line_covariance).all(axis=(1, 2))
+    points: list[IntArray] = [np.zeros((0, 2), np.int64)]
+    segments, count = points.copy(), []
+    determined = np.isfinite(index.line_covariance[:, 0, 0])
     for image in images.tolist():
         own = slice(index.begin[image], index.begin[image + 1])
         pairs = match_descriptors(vectors, unit(index.descriptor[own]))
@@ -100,9 +101,9 @@ def found_near(
     points = _points_near(query, index, images, camera, pose, reach[0])
     if not lines:
         return Candidates(points, np.zeros((0, 2), np.int64))
-    rows = np.concatenate([np.arange(index.segment_begin[i], index.segment_begin[i + 1]) for i in images])
+    rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in images])
     line = scene.line_observations.line_idx[index.segment[rows]]
-    determined = np.isfinite(index.line_covariance[line]).all(axis=(1, 2))
+    determined = np.isfinite(index.line_covariance[line, 0, 0])
     known, owner = np.unique(line[determined], return_inverse=True)
     seen = SeenLines(owner.ravel(), index.segment_descriptor[rows[determined]], scene.lines.segments[known])
     pairs = lines_near(camera, pose, seen, query.segments, query.segment_descriptors, reach[1])
@@ -113,7 +114,7 @@ def _points_near(
     query: DescribedImage, index: MapIndex, images: IntArray, camera: QueryCamera, pose: FloatArray, reach: float
 ) -> IntArray:
     none = np.zeros((0, 2), np.int64)
-    rows = np.concatenate([np.arange(index.begin[i], index.begin[i + 1]) for i in images])
+    rows = np.concatenate([np.arange(int(index.begin[i]), int(index.begin[i + 1])) for i in images])
     expected = camera.project(pose, index.xyz[index.point[rows]])
     inside = camera.inside(expected, reach)
     rows, expected = rows[inside], expected[inside]

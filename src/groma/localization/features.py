@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.contract import SegmentDetector
 from groma.features.images import GrayImage
 from groma.features.matching.descriptor import Descriptors, describe
 from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
 from groma.gates import gate
-from groma.localization.camera import QueryCamera
+from groma.localization.pose.camera import QueryCamera
 from groma.mapping.image_segments import Straightener
 
 Bytes = npt.NDArray[np.uint8]
@@ -34,7 +34,7 @@ class FeatureGates:
     """Which points and segments of a photograph are looked at."""
 
     max_points: int = gate(4000, "points", "described in an image, the strongest", "cost: of matching")
-    contrast: float = gate(0.02, "1", "least contrast of a point, OpenCV's units", "convention: half of OpenCV's default")
+    contrast: float = gate(0.02, "1", "least contrast of a point, OpenCV's units", "convention: half of its default")
     sigma: float = gate(
         0.2, "share", "noise of a point over the standard deviation of the blur it was found at",
         "derived from residuals of triangulated points",
@@ -55,21 +55,26 @@ class DescribedPoints:
     #: (n, 2) pixels, (n,) their standard deviations.
     pixels: FloatArray
     sigma: FloatArray
-    #: (n, 128) descriptors.
+    #: (n, 128) descriptors, and which of them are upright instead of along the direction of the gradients.
     descriptors: Bytes
+    upright: BoolArray
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     def joined(self, other: DescribedPoints) -> DescribedPoints:
         """These points and others."""
-        pairs = [(getattr(self, name), getattr(other, name)) for name in ("pixels", "sigma", "descriptors")]
-        return DescribedPoints(*(np.concatenate(pair) for pair in pairs))
+        return DescribedPoints(
+            np.concatenate([self.pixels, other.pixels]),
+            np.concatenate([self.sigma, other.sigma]),
+            np.concatenate([self.descriptors, other.descriptors]),
+            np.concatenate([self.upright, other.upright]),
+        )
 
     @staticmethod
     def empty() -> DescribedPoints:
         """No points."""
-        return DescribedPoints(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
+        return DescribedPoints(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8), np.zeros(0, bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +90,8 @@ class DescribedImage:
 def find_points(image: GrayImage, gates: FeatureGates = FEATURES) -> DescribedPoints:
     """Find and describe blobs of any scale and direction."""
     sift = cv2.SIFT_create(gates.max_points, contrastThreshold=gates.contrast)  # type: ignore[attr-defined]
-    return _described(*sift.detectAndCompute(image, None), gates)
+    found, described = sift.detectAndCompute(image, None)
+    return _described(found, described, False, gates)
 
 
 def find_corners(image: GrayImage, gates: FeatureGates = FEATURES) -> DescribedPoints:
@@ -101,21 +107,36 @@ def describe_places(
 ) -> tuple[DescribedPoints, IntArray]:
     """Describe given places (n, 2), upright; those at the border are left out: also return the rows that are left."""
     size = 2.0 * gates.corner_scale
-    places = [
-        cv2.KeyPoint(float(u) - 0.5, float(v) - 0.5, size, 0.0, 1.0, 0, row) for row, (u, v) in enumerate(pixels)
-    ]
+    places = [cv2.KeyPoint(float(u) - 0.5, float(v) - 0.5, size, 0.0, 1.0, 0, row) for row, (u, v) in enumerate(pixels)]
     kept, described = cv2.SIFT_create().compute(image, places)  # type: ignore[attr-defined]
-    return _described(kept, described, gates), np.array([one.class_id for one in kept], np.int64)
+    return _described(kept, described, True, gates), np.array([one.class_id for one in kept], np.int64)
 
 
-def _described(found, described, gates: FeatureGates) -> DescribedPoints:
+def _described(found, described, upright: bool, gates: FeatureGates) -> DescribedPoints:
     if described is None or not len(found):
         return DescribedPoints.empty()
     pixels = np.array([one.pt for one in found], np.float64) + 0.5
     scale = 0.5 * np.array([one.size for one in found], np.float64)  # OpenCV tells the diameter
     root = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))
     octets = np.minimum(np.round(_LENGTH * root), 255.0).astype(np.uint8)
-    return DescribedPoints(pixels, np.maximum(gates.sigma * scale, gates.min_sigma), octets)
+    return DescribedPoints(
+        pixels, np.maximum(gates.sigma * scale, gates.min_sigma), octets, np.full(len(found), upright)
+    )
+
+
+def mirrored(points: DescribedPoints, width: int) -> DescribedPoints:
+    """Return what would be found in the mirror image (left and right exchanged) of an image that is so wide.
+
+    A descriptor has 4 rows across and 4 columns along its direction, of 8 orientations. Blobs have a direction of their
+    own, which is mirrored, too: rows change places. Corners are described upright: columns do.
+    """
+    cells = points.descriptors.reshape(-1, 4, 4, 8)
+    turn = np.arange(8)
+    blobs = cells[:, ::-1][..., (8 - turn) % 8].reshape(-1, 128)
+    corners = cells[:, :, ::-1][..., (12 - turn) % 8].reshape(-1, 128)
+    descriptors = np.where(points.upright[:, None], corners, blobs)
+    pixels = np.column_stack([width - points.pixels[:, 0], points.pixels[:, 1]])
+    return DescribedPoints(pixels, points.sigma, descriptors, points.upright)
 
 
 def unit(descriptors: Bytes) -> npt.NDArray[np.float32]:
@@ -124,7 +145,9 @@ def unit(descriptors: Bytes) -> npt.NDArray[np.float32]:
     return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), np.float32(1e-6))
 
 
-def find_features(image: GrayImage, camera: QueryCamera, lines: bool = True, min_length: float = 15.0) -> DescribedImage:
+def find_features(
+    image: GrayImage, camera: QueryCamera, lines: bool = True, min_length: float = 15.0
+) -> DescribedImage:
     """Find and describe points and segments; segments without the distortion of the lens."""
     segments = Segments.empty()
     if lines:
@@ -145,4 +168,16 @@ def _straightener(model: str, params: tuple[float, ...], width: int, height: int
     return Straightener.of(cameras.model(model), np.array(params), width, height)
 
 
-__all__ = ["FEATURES", "Bytes", "DescribedImage", "DescribedPoints", "FeatureGates", "describe_places", "find_corners", "find_features", "find_points", "unit"]
+__all__ = [
+    "FEATURES",
+    "Bytes",
+    "DescribedImage",
+    "DescribedPoints",
+    "FeatureGates",
+    "describe_places",
+    "find_corners",
+    "find_features",
+    "find_points",
+    "mirrored",
+    "unit",
+]

@@ -12,15 +12,19 @@ from groma.features.matching.descriptor import Descriptors
 from groma.features.segments import Segments
 from groma.gates import gate
 from groma.geometry import se3
-from groma.localization.camera import QueryCamera
+from groma.localization.pose.camera import QueryCamera
 
 
 @dataclass(frozen=True)
 class GuidedLineGates:
     """Which segments may show a line that a pose puts near them."""
 
-    angle: float = gate(0.1, "rad", "between a segment and the image of a line", "derived from the noise of short segments")
-    overlap: float = gate(0.3, "share", "of the segment, that the image of the 3D segment covers", "convention: a third")
+    angle: float = gate(
+        0.1, "rad", "between a segment and the image of a line", "derived from the noise of short segments"
+    )
+    overlap: float = gate(
+        0.3, "share", "of the segment, that the image of the 3D segment covers", "convention: a third"
+    )
     descriptor: float = gate(0.9, "1", "largest distance of descriptors", "convention: that of wide_baseline")
 
 

@@ -15,17 +15,18 @@ import numpy.typing as npt
 from groma._typing import IntArray
 from groma.errors import InputError
 from groma.features.images import GrayImage, to_gray
+from groma.features.segments import Segments
 from groma.gates import gate
 from groma.io import read_scene
-from groma.localization.absolute_pose import UNKNOWN_LENS, AbsolutePose, PoseOptions, pose_from_matches
-from groma.localization.camera import QueryCamera
 from groma.localization.candidates import described_alike, found_near
-from groma.localization.features import DescribedImage, find_features
-from groma.localization.hypotheses import max_errors
+from groma.localization.features import DescribedImage, find_features, mirrored
 from groma.localization.map_images import image_paths, images_in_summary
-from groma.localization.map_index import MapIndex, images_told, kept_index
-from groma.localization.matches import Matches
-from groma.localization.refinement import Refined
+from groma.localization.map_index import images_told, kept_index
+from groma.localization.pose.absolute_pose import UNKNOWN_LENS, AbsolutePose, PoseOptions, pose_from_matches
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.hypotheses import max_errors
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.refinement import Refined
 from groma.localization.retrieval import VladRetrieval
 from groma.mapping.photographs import check_cameras, read_gray
 from groma.scene import Scene
@@ -167,8 +168,13 @@ class Localizer:
             )
             return last[0].matches(query, self.scene, self.index)
 
+        def mirror() -> Matches:
+            other = replace(query, points=mirrored(query.points, camera.width), segments=Segments.empty())
+            alike, _ = described_alike(other, self.scene, self.index, images, lines=False)
+            return alike.matches(other, self.scene, self.index)
+
         pose = pose_from_matches(
-            camera, found.matches(query, self.scene, self.index), options, max(len(images), 1), guided
+            camera, found.matches(query, self.scene, self.index), options, max(len(images), 1), guided, mirror
         )
         done = time.perf_counter()
         return LocalizedImage(pose, last[0].points[:, 1], last[0].lines[:, 1], described - start, done - described)

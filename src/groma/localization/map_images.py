@@ -34,8 +34,8 @@ def image_paths(scene: Scene, folder: Path) -> list[Path]:
         alike = below[Path(names[row]).name]
         if len(alike) != 1:
             raise InputError(
-                f"{len(missing)} of the {len(names)} images of the map are not in {folder}, for example {names[row]!r}. "
-                "Pass the folder that their names begin in with --images."
+                f"{len(missing)} of the {len(names)} images of the map are not in {folder}, for example "
+                f"{names[row]!r}. Pass the folder that their names begin in with --images."
             )
         found[row] = alike[0]
     return found

@@ -29,7 +29,7 @@ from groma.features.matching.descriptor import describe
 from groma.features.segments import Segments
 from groma.io import atomic_output
 from groma.localization.features import Bytes, DescribedPoints, describe_places, find_points
-from groma.localization.records import landmark_covariances, residual_squares
+from groma.localization.pose.records import landmark_covariances, residual_squares
 from groma.localization.retrieval import VladRetrieval
 from groma.localization.triangulation import triangulate_features
 from groma.mapping.lines.neighbors import covisible_neighbors
@@ -127,7 +127,7 @@ def build_index(scene: Scene, files: Sequence[Path], say: Progress) -> MapIndex:
     made = triangulate_features(scene, features, pairs, partial(say, "placing the points of the map"))
     own_covariance, line_covariance = _covariances(scene, "points"), _covariances(scene, "lines")
     rows, offset = [], np.concatenate([[0], np.cumsum([len(one) for one in features])])
-    known = np.isfinite(own_covariance).all(axis=(1, 2))
+    known = np.isfinite(own_covariance[:, 0, 0])
     points, pixels, descriptors = [], [], []
     for image, one in enumerate(found):
         point = made.point[offset[image] : offset[image + 1]]

@@ -15,8 +15,8 @@ from groma.bounded.arrays import opened_arrays
 from groma.errors import FileFormatError
 from groma.geometry import quaternion
 from groma.io import atomic_output
-from groma.localization.camera import QueryCamera
 from groma.localization.localizer import LocalizedImage
+from groma.localization.pose.camera import QueryCamera
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,8 @@ class PlacedImage:
     def write(self, path: Path, digest: str) -> None:
         """Write it whole or not at all."""
         with atomic_output(path, force=True) as draft, draft.open("wb") as file:
-            np.savez(file, digest=np.array(digest), **{item.name: np.array(getattr(self, item.name)) for item in fields(self)})
+            arrays = {item.name: np.array(getattr(self, item.name)) for item in fields(self)}
+            np.savez(file, **{"digest": np.array(digest), **arrays})  # type: ignore[arg-type]
 
 
 def placed(name: str, found: LocalizedImage) -> PlacedImage:
@@ -108,7 +109,7 @@ def read_placed(path: Path, digest: str) -> PlacedImage | None:
         with opened_arrays(path) as members:
             if str(members.read("digest")) != digest:
                 return None
-            values = {item.name: members.read(item.name) for item in fields(PlacedImage)}
+            values: dict[str, Any] = {item.name: members.read(item.name) for item in fields(PlacedImage)}
     except (OSError, KeyError, ValueError, zipfile.BadZipFile, FileFormatError):
         return None
     for name in ("name", "status", "sentence", "model"):

@@ -40,7 +40,7 @@ class LocalizeResult:
         return {one.name: one.to_dict() for one in self.queries}
 
     def poses(self) -> str:
-        """Return the content of ``poses.txt``, in hloc's form: name qw qx qy qz tx ty tz of those that are localised."""
+        """Return the content of ``poses.txt``, as hloc has it: name qw qx qy qz tx ty tz of what is localised."""
         rows = []
         for one in self.queries:
             if one.status == "localized":

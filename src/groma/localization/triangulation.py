@@ -19,15 +19,15 @@ from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.fit import noise_of
 from groma.adjustment.stages import with_loss
-from groma.features.matching.wide_baseline import fundamental_from_poses
 from groma.factors.contract import Factor
 from groma.factors.losses import Cauchy, GemanMcClure
+from groma.features.matching.wide_baseline import fundamental_from_poses
 from groma.gates import chi_square_gate, gate
 from groma.geometry import quaternion, se3
-from groma.localization.camera import QueryCamera
 from groma.localization.features import DescribedPoints, unit
 from groma.localization.matching import match_descriptors
-from groma.localization.records import landmark_covariances, residual_squares
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.records import landmark_covariances, residual_squares
 from groma.scene import PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -39,9 +39,7 @@ class TriangulationGates:
 
     beam: float = gate(4.0, "sigma", "distance from an epipolar line", "derived from noise, and as much from the poses")
     outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
-    depth: float = gate(
-        0.2, "share", "of its distance: largest standard deviation of a point", "convention: a fifth"
-    )
+    depth: float = gate(0.2, "share", "of its distance: largest standard deviation of a point", "convention: a fifth")
 
 
 GATES = TriangulationGates()
@@ -75,7 +73,7 @@ def triangulate_features(
     """
     begin = np.concatenate([[0], np.cumsum([len(one) for one in features])])
     straight = [_straight(scene, image, one) for image, one in enumerate(features)]
-    edges = [np.zeros((0, 2), np.int64)]
+    edges: list[IntArray] = [np.zeros((0, 2), np.int64)]
     vectors = [unit(one.descriptors) for one in features]
     for done, (i, j) in enumerate(pairs):
         say(done, len(pairs))
@@ -210,7 +208,8 @@ def _well_determined(
 def _rows_of(factor: Factor, seen: _Observed, scene: Scene) -> IntArray:
     """Observations of a group of factors, which holds those of one camera model in order."""
     models = np.array(scene.cameras.models, dtype=object)[scene.images.camera_idx[seen.image]]
-    return np.flatnonzero(models == getattr(factor, "camera_model").name)
+    name = factor.camera_model.name  # type: ignore[attr-defined]  # of points seen at pixels
+    return np.flatnonzero(models == name)
 
 
 __all__ = ["PointMap", "triangulate_features"]

@@ -33,7 +33,8 @@ def localize(
         ),
     ] = "auto",
     camera_model: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Lens model of the queries, by COLMAP's name; with its parameters.")
+        str | None,
+        typer.Option(metavar="NAME", help="Lens model of the queries, by COLMAP's name; with its parameters."),
     ] = None,
     camera_params: Annotated[
         str | None, typer.Option(metavar="F,CX,CY,...", help="The parameters, if they are known; they are then kept.")
@@ -66,9 +67,9 @@ def localize(
 
     from groma._counted import counted
     from groma.cli.shared.interrupt import PROCESS, interruptible
-    from groma.localization.absolute_pose import PoseOptions
     from groma.localization.calibration import CalibrationChoice, parameters
     from groma.localization.localizer import LocalizeOptions, Localizer
+    from groma.localization.pose.absolute_pose import PoseOptions
     from groma.localization.result import LocalizeResult
     from groma.localization.run import localize_images, query_files
 

@@ -68,7 +68,7 @@ def _check_derivatives(console: "Console", golden: Path | None, seed: int) -> tu
 
 def _check_covariances(console: "Console", runs: int, seed: int) -> tuple[bool, dict[str, Any]]:
     from groma.adjustment.consistency import ConsistencyReport, consistency
-    from groma.localization.consistency import localization_consistency
+    from groma.localization.pose.consistency import localization_consistency
 
     outcome = ConsistencyReport(runs, seed, consistency(runs, seed).rows + localization_consistency(runs, seed))
     console.say("Normalised estimation error squared: its average should be the degrees of freedom.")

@@ -75,13 +75,12 @@ class QueryCamera:
     def inside(self, pixels: FloatArray, margin: float = 0.0) -> npt.NDArray[np.bool_]:
         """Which pixels (N, 2) lie in the image, grown by a margin."""
         with np.errstate(invalid="ignore"):
-            return ((pixels >= -margin) & (pixels <= np.array([self.width, self.height]) + margin)).all(axis=1)
+            inside = (pixels >= -margin) & (pixels <= np.array([self.width, self.height]) + margin)
+        return inside[:, 0] & inside[:, 1]
 
     def table(self) -> Cameras:
         """The camera as the only row of a table."""
-        return Cameras(
-            np.array([1]), (self.model,), self.params[None], np.array([self.width]), np.array([self.height])
-        )
+        return Cameras(np.array([1]), (self.model,), self.params[None], np.array([self.width]), np.array([self.height]))
 
     @staticmethod
     def of(table: Cameras, row: int) -> QueryCamera:

@@ -15,12 +15,21 @@ import numpy.typing as npt
 
 from groma._typing import BoolArray, FloatArray
 from groma.geometry import quaternion
-from groma.localization.camera import QueryCamera
-from groma.localization.gates import VERDICT
-from groma.localization.hypotheses import max_errors, propose, straightened
-from groma.localization.matches import Matches
-from groma.localization.refinement import Refined, fitted, refine
-from groma.localization.verdict import Evidence, Status, evidence_of, judge, median_distance, moved
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.gates import VERDICT
+from groma.localization.pose.hypotheses import max_errors, propose, straightened
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.refinement import Refined, fitted, refine
+from groma.localization.pose.verdict import (
+    Evidence,
+    Status,
+    Verdict,
+    doubted_if_mirrored,
+    evidence_of,
+    judge,
+    median_distance,
+    moved,
+)
 
 
 @dataclass(frozen=True)
@@ -136,6 +145,7 @@ def estimate_absolute_pose(
         Also where no pose is found: its status then is ``failed``, and its sentence says why.
     """
     points, segments = np.asarray(_or_none(points2d, 2)), np.asarray(_or_none(segments2d, 2, 2))
+    of = ((points, 3, covariances[0]), (segments, 6, covariances[1]))
     matches = Matches(
         points,
         np.asarray(_or_none(points3d, 3)),
@@ -143,8 +153,7 @@ def estimate_absolute_pose(
         np.asarray(_or_none(segments3d, 2, 3)),
         np.full(len(points), float(sigma[0])),
         np.full(len(segments), float(sigma[1])),
-        None if covariances[0] is None else np.asarray(covariances[0], float),
-        None if covariances[1] is None else np.asarray(covariances[1], float),
+        *(np.zeros((len(rows), size, size)) if given is None else np.asarray(given, float) for rows, size, given in of),
     )
     return pose_from_matches(camera, matches, options)
 
@@ -155,6 +164,7 @@ def pose_from_matches(
     options: PoseOptions | None = None,
     places: int = 1,
     guided: Callable[[Refined], Matches] | None = None,
+    mirror: Callable[[], Matches] | None = None,
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
 
@@ -167,6 +177,9 @@ def pose_from_matches(
     guided : callable, optional
         Returns more matches once a pose is near; they refine it, and are those that the result tells of. They are no
         evidence that the place is right, because they were looked for where it says.
+    mirror : callable, optional
+        Returns the matches of the mirror image of the photograph, by points: where they agree with a pose far better,
+        the photograph was mirrored.
     """
     options = options or PoseOptions()
     best = _best(camera, matches, options)
@@ -183,6 +196,8 @@ def pose_from_matches(
     covariance = best.covariance(used)
     distance = median_distance(best.pose, _seen(used, best))
     verdict = judge(best, covariance, distance, first, None if other is None else other[1])
+    if mirror is not None and verdict.status == "localized":
+        verdict = _unless_mirrored(verdict, best, mirror(), matches, options)
     failed = verdict.status == "failed"
     return AbsolutePose(
         verdict.status,
@@ -197,6 +212,20 @@ def pose_from_matches(
         best.sigma0,
         None if other is None or verdict.status != "uncertain" else other[0].pose,
     )
+
+
+def _unless_mirrored(
+    verdict: Verdict, best: Refined, mirror: Matches, matches: Matches, options: PoseOptions
+) -> Verdict:
+    """Return a verdict, or another one where the mirror image of a photograph fits clearly better."""
+    points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
+    other = _best(best.camera, mirror, replace(options, refine_lens=False, focal_factors=(1.0,)))
+    if other is None:
+        return verdict
+    own = 0
+    if points.num_points:
+        own = evidence_of(fitted(best.camera, points, best.pose, _errors(points, options)), points).agree
+    return doubted_if_mirrored(verdict, own, evidence_of(other, mirror))
 
 
 def _errors(matches: Matches, options: PoseOptions) -> tuple[float, float]:
@@ -220,9 +249,7 @@ def _with_focal_length(camera: QueryCamera, factor: float) -> QueryCamera:
     return QueryCamera(camera.model, params, camera.width, camera.height)
 
 
-def _rival(
-    matches: Matches, best: Refined, options: PoseOptions, places: int
-) -> tuple[Refined, Evidence] | None:
+def _rival(matches: Matches, best: Refined, options: PoseOptions, places: int) -> tuple[Refined, Evidence] | None:
     """The best pose of what disagrees with the first, if it is another one."""
     squares = [np.where(np.isfinite(one.square), one.square, np.inf) for one in (best.points, best.lines)]
     left = [square > 4.0 * best.limit for square in squares]

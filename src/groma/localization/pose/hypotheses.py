@@ -16,9 +16,9 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray
 from groma.gates import chi_square_gate
 from groma.geometry import quaternion
-from groma.localization.camera import QueryCamera
-from groma.localization.gates import HYPOTHESES, HypothesisGates
-from groma.localization.matches import Matches
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.gates import HYPOTHESES, HypothesisGates
+from groma.localization.pose.matches import Matches
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,8 @@ def straightened(camera: QueryCamera, matches: Matches) -> Straight:
     """Move what was measured to where the camera would see it without distortion."""
     points = camera.straight(matches.points2d)
     segments = camera.straight(matches.segments2d).reshape(-1, 2, 2)
-    good, good_lines = np.isfinite(points).all(axis=1), np.isfinite(segments).all(axis=(1, 2))
+    good: BoolArray = np.isfinite(points.sum(axis=1))
+    good_lines: BoolArray = np.isfinite(segments.sum(axis=(1, 2)))
     kept = matches.take(good, good_lines)
     moved = Matches(
         points[good], kept.points3d, segments[good_lines], kept.segments3d,
@@ -54,7 +55,7 @@ def max_errors(matches: Matches, gates: HypothesisGates = HYPOTHESES) -> tuple[f
     """Return how far points, and ends of segments from their lines, may lie from where a proposed pose puts them."""
     factor = gates.slack * float(np.sqrt(chi_square_gate(gates.outlier, 2)))
     sigmas = (matches.point_sigma, matches.segment_sigma)
-    points, lines = (factor * float(np.median(sigma)) if len(sigma) else factor for sigma in sigmas)  # type: ignore[arg-type]
+    points, lines = (factor * float(np.median(sigma)) if len(sigma) else factor for sigma in sigmas)
     return points, lines
 
 

@@ -45,7 +45,10 @@ class VerdictGates:
         32, "cells", "per longer side: what agrees in one cell counts once", "derived from the reach of a descriptor"
     )
     search_share: float = gate(
-        0.25, "share", "of the longer side: extent of what a segment could be taken for", "derived from guided search"
+        0.1,
+        "share",
+        "of the longer side: distance of lines that are alike, in man-made scenes",
+        "chosen on the cabinet",
     )
     right: float = gate(0.999, "probability", "that the pose is right, for it to be believed", "convention: 1 in 1000")
     chance: float = gate(0.5, "probability", "that it is right, for a pose to be told at all", "convention: even odds")

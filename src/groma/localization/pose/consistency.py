@@ -14,9 +14,9 @@ from scipy.stats import chi2
 from groma._typing import FloatArray
 from groma.adjustment.consistency import BAND, LIMIT, ConsistencyRow
 from groma.geometry import se3
-from groma.localization.absolute_pose import AbsolutePose, PoseOptions, pose_from_matches
-from groma.localization.camera import QueryCamera
-from groma.localization.matches import Matches
+from groma.localization.pose.absolute_pose import AbsolutePose, PoseOptions, pose_from_matches
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.matches import Matches
 from groma.scene import Scene
 from groma.scene.synthetic import holistic
 
@@ -65,9 +65,7 @@ def localization_consistency(
     return tuple(_row(kind, np.array(found)) for kind, found in values.items() if found)
 
 
-def _measured(
-    scene: Scene, image: int, camera: QueryCamera, noise_px: float, rng: np.random.Generator
-) -> Matches:
+def _measured(scene: Scene, image: int, camera: QueryCamera, noise_px: float, rng: np.random.Generator) -> Matches:
     """What an image sees of a scene, both with noise."""
     pose = scene.cam_from_world[image]
     seen, lines = scene.point_observations, scene.line_observations

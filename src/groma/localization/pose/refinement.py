@@ -35,10 +35,10 @@ from groma.factors.contract import Factor
 from groma.factors.losses import Cauchy, GemanMcClure
 from groma.gates import chi_square_gate
 from groma.geometry import se3
-from groma.localization.camera import QueryCamera
-from groma.localization.gates import REFINEMENT, RefinementGates
-from groma.localization.matches import Matches, nearest_claims
-from groma.localization.records import landmark_rows, records, residual_squares, times
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.gates import REFINEMENT, RefinementGates
+from groma.localization.pose.matches import Matches, nearest_claims
+from groma.localization.pose.records import landmark_rows, records, residual_squares, times
 from groma.problem.problem import Problem
 from groma.scene import LineObservations, Lines, PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
@@ -47,7 +47,9 @@ from groma.solver.solve import solve
 _ASSEMBLY = AssemblyOptions(
     point_chart="euclidean", drop_behind=False, require_in_front=True, gauge="free", refine_landmarks=False
 )
-_POSE = SolverOptions(max_iterations=12, function_tolerance=1e-5, initial_damping=1e-6, threads=1, eliminate=("frames",))
+_POSE = SolverOptions(
+    max_iterations=12, function_tolerance=1e-5, initial_damping=1e-6, threads=1, eliminate=("frames",)
+)
 #: Information of scaled unknowns below which they are not determined.
 _SINGULAR = 1e-10
 _LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
@@ -250,7 +252,9 @@ def residuals(problem: Problem, landmarks: str, count: int, lens: Sequence[int] 
         rows = landmark_rows(factor, landmarks)
         if rows is None:
             continue
-        size = next((problem.variables[r.group].manifold.dof for slot, r in factor.references() if slot.name == "intrinsics"), 0)
+        size = next(
+            (problem.variables[r.group].manifold.dof for slot, r in factor.references() if slot.name == "intrinsics"), 0
+        )
         record = records(problem, factor, {"pose": 6, "intrinsics": size} if lens and size else {"pose": 6})
         kept = [*range(6), *(6 + k for k in lens if size)]
         weight = np.broadcast_to(times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))
@@ -285,11 +289,11 @@ def _problem(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_len
     return Problem(problem.variables, [_with_landmarks(problem, factor, covariances) for factor in problem.factors])
 
 
-def _with_landmarks(problem: Problem, factor: Factor, covariances: dict[str, FloatArray | None]) -> Factor:
+def _with_landmarks(problem: Problem, factor: Factor, covariances: dict[str, FloatArray]) -> Factor:
     """Return a factor whose noise holds that of its landmarks, too."""
     for name, covariance in covariances.items():
         rows = landmark_rows(factor, name)
-        if rows is None or covariance is None or not covariance.any():
+        if rows is None or not covariance.any():
             continue
         size = covariance.shape[1]
         J = records(problem, factor, {name[:-1]: size})[..., :size]
@@ -306,7 +310,6 @@ def _noise(problem: Problem, matches: Matches, max_error: tuple[float, float], g
     """
     squares, sigmas = [], (matches.point_sigma, matches.segment_sigma)
     for name, sigma, limit in zip(("points", "lines"), sigmas, max_error, strict=True):
-        assert sigma is not None
         found = residuals(problem, name, len(sigma))
         squares.append(found.square[found.square <= (limit / sigma) ** 2])
     together = np.concatenate(squares)

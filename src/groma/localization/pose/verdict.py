@@ -8,7 +8,8 @@ cells agree with by chance is at most
 
 .. math:: \text{NFA} = (n - 3) \binom{n}{k} \binom{k}{3}\, p^{\,k-3} .
 
-For segments, each a cell of its own, :math:`p` is the share of the places within the reach of a search.
+For lines, each a cell of its own with all segments that it may have, :math:`p` is the share of the places within the
+reach of a search.
 
 **Another place.** Matches that disagree are searched for a second pose. Where one is found that chance does not
 explain, :math:`k_1` cells speak for the first and :math:`k_2` for the second. If both were equally good, each would
@@ -29,10 +30,10 @@ import numpy as np
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray
 from groma.geometry import se3
-from groma.localization.camera import QueryCamera
-from groma.localization.gates import VERDICT, VerdictGates
-from groma.localization.matches import Matches
-from groma.localization.refinement import Refined, cells_of
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.gates import VERDICT, VerdictGates
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.refinement import Refined, cells_of
 
 Status = Literal["localized", "uncertain", "failed"]
 
@@ -63,17 +64,15 @@ class Verdict:
     sentence: str
 
 
-def evidence_of(
-    refined: Refined, matches: Matches, places: int = 1, gates: VerdictGates = VERDICT
-) -> Evidence:
+def evidence_of(refined: Refined, matches: Matches, places: int = 1, gates: VerdictGates = VERDICT) -> Evidence:
     """Return the evidence for a pose that was looked for in so many places."""
     camera = refined.camera
     by_chance = np.minimum(math.pi * refined.limit * refined.points.spread / camera.area, 0.5)
     agree, chance = _by_cell(matches.points2d, refined.point_inliers, by_chance, camera, gates.cells)
     reach = (gates.search_share * max(camera.width, camera.height)) ** 2
     by_chance = np.minimum(math.pi * refined.limit * refined.lines.spread / reach, 0.5)
-    claim = matches.claims()[1]
-    line_agree, line_chance = _joined(claim, refined.line_inliers, by_chance)
+    line = np.unique(matches.segments3d.reshape(-1, 6), axis=0, return_inverse=True)[1].ravel()
+    line_agree, line_chance = _joined(line, refined.line_inliers, by_chance)
     agree, chance = np.concatenate([agree, line_agree]), np.concatenate([chance, line_chance])
     n, k = len(agree), int(agree.sum())
     if k <= 3:
@@ -112,7 +111,9 @@ def judge(
         int(refined.line_inliers.sum()), "lines"
     )
     if chance < gates.chance:
-        return Verdict("failed", probability, f"No pose: only {agree} agree with the best one, as may happen by chance.")
+        return Verdict(
+            "failed", probability, f"No pose: only {agree} agree with the best one, as may happen by chance."
+        )
     if rival > 1.0 - gates.right and second is not None:
         return Verdict(
             "uncertain",
@@ -121,11 +122,28 @@ def judge(
             "another. They may look alike.",
         )
     if probability < gates.right:
-        return Verdict("uncertain", probability, f"{agree} agree, which may happen by chance once in {1 / max(1 - chance, 1e-9):.0f}.")
+        return Verdict(
+            "uncertain",
+            probability,
+            f"{agree} agree, which may happen by chance once in {1 / max(1 - chance, 1e-9):.0f}.",
+        )
     sigma = np.sqrt(np.diag(covariance))
     if not (np.isfinite(sigma).all() and sigma[3:].max() <= gates.turn and sigma[:3].max() <= gates.center * distance):
         return Verdict("uncertain", probability, f"{agree} agree, but they do not determine the pose: {_open(sigma)}.")
     return Verdict("localized", probability, f"{agree} agree.")
+
+
+def doubted_if_mirrored(verdict: Verdict, own: int, mirror: Evidence, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where more cells speak for the mirror image than for the photograph (own).
+
+    Mirrored photographs are rare, and what is symmetric fits both ways: the sign test must exclude that both are alike.
+    """
+    from scipy.special import bdtr
+
+    if not mirror.significant or mirror.agree <= own or bdtr(own, own + mirror.agree, 0.5) > 1.0 - gates.right:
+        return verdict
+    words = f"{mirror.agree} measurements speak for its mirror image, {own} for the photograph: it may be mirrored."
+    return Verdict("uncertain", 1.0 - gates.right, words)
 
 
 def moved(camera: QueryCamera, first: FloatArray, second: FloatArray, places: FloatArray) -> float:
@@ -181,7 +199,8 @@ def _log_choose(n: int, k: int) -> float:
 def _open(sigma: FloatArray) -> str:
     if not np.isfinite(sigma).all():
         return "the camera could move without any of them noticing"
-    return f"its standard deviation is {np.linalg.norm(sigma[:3]):.3g} scene units and {np.rad2deg(np.linalg.norm(sigma[3:])):.2g} degrees"
+    shift, turn = float(np.linalg.norm(sigma[:3])), float(np.rad2deg(np.linalg.norm(sigma[3:])))
+    return f"its standard deviation is {shift:.3g} scene units and {turn:.2g} degrees"
 
 
-__all__ = ["Evidence", "Status", "Verdict", "evidence_of", "judge", "median_distance", "moved"]
+__all__ = ["Evidence", "Status", "Verdict", "doubted_if_mirrored", "evidence_of", "judge", "median_distance", "moved"]

@@ -28,13 +28,15 @@ def records(problem: Problem, factor: Factor, wanted: dict[str, int]) -> FloatAr
 
 
 def times(weight: float | FloatArray, record: FloatArray) -> FloatArray:
+    """Records (n, 2, m) multiplied by the inverse noise of a factor: a number, (n,) of them, or (n, 2, 2) matrices."""
     weight = np.asarray(weight)
     return weight @ record if weight.ndim == 3 else weight.reshape(-1, 1, 1) * record
 
 
 def residual_squares(problem: Problem, group: str, count: int) -> FloatArray:
     """Squared whitened residuals (count,) of the observations of one kind, in the order of the factors; zero where a
-    residual cannot be evaluated."""
+    residual cannot be evaluated.
+    """
     parts = [
         (times(factor.sqrt_information, records(problem, factor, {"pose": 6}))[..., 6] ** 2).sum(axis=1)
         for factor in problem.factors
@@ -45,7 +47,8 @@ def residual_squares(problem: Problem, group: str, count: int) -> FloatArray:
 
 def landmark_covariances(problem: Problem, group: str, count: int) -> FloatArray:
     """Covariances of points (count, 3, 3), or of (moment, direction) of lines (count, 6, 6) with a unit direction, from
-    their observations with the poses held; NaN for those that are not determined."""
+    their observations with the poses held; NaN for those that are not determined.
+    """
     size = 3 if group == "points" else 6
     total = np.zeros((count, size, size))
     for factor in problem.factors:

@@ -16,6 +16,11 @@ def _empty(*shape: int) -> FloatArray:
     return np.zeros((0, *shape))
 
 
+#: Stands for standard deviations of one pixel, and for landmarks that are exact.
+_LEFT_OUT: FloatArray = np.zeros(0)
+_LEFT_OUT.flags.writeable = False
+
+
 @dataclass(frozen=True, eq=False)
 class Matches:
     """What may be seen of what; several rows may claim one point or one segment of the image.
@@ -30,11 +35,11 @@ class Matches:
     segments2d: FloatArray = field(default_factory=lambda: _empty(2, 2))
     segments3d: FloatArray = field(default_factory=lambda: _empty(2, 3))
     #: (N,) and (M,) standard deviations in the image: of a coordinate, and of the ends across the segment.
-    point_sigma: FloatArray | None = None
-    segment_sigma: FloatArray | None = None
+    point_sigma: FloatArray = field(default_factory=lambda: _LEFT_OUT)
+    segment_sigma: FloatArray = field(default_factory=lambda: _LEFT_OUT)
     #: (N, 3, 3) covariances of the points, and (M, 6, 6) of (moment, direction) of the lines with a unit direction.
-    point_covariance: FloatArray | None = None
-    line_covariance: FloatArray | None = None
+    point_covariance: FloatArray = field(default_factory=lambda: _LEFT_OUT)
+    line_covariance: FloatArray = field(default_factory=lambda: _LEFT_OUT)
 
     def __post_init__(self) -> None:
         points, lines = len(np.atleast_1d(self.points2d)), len(np.atleast_1d(self.segments2d))
@@ -45,7 +50,7 @@ class Matches:
         }  # fmt: skip
         for name, shape in shapes.items():
             value = getattr(self, name)
-            if value is None:
+            if value is _LEFT_OUT:
                 value = np.ones(shape) if name.endswith("sigma") else np.zeros(shape)
             array = np.ascontiguousarray(value, dtype=np.float64)
             if name == "segments2d" and array.shape == (lines, 4):
