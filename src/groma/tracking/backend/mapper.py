@@ -247,6 +247,8 @@ class Mapper:
             self._assumed = self.right.turn
         self._next_look = math.ceil(gates.growth * len(living))
         turn, job = estimate_turn(self.map, self.camera, self.right.turn, gates)
+        if not turn.is_surer_than(self.right.turn):
+            return
         if self._assumed is not None and len(living) >= gates.start_over_keyframes:
             if shift_between(self.camera, self._assumed, turn) > gates.start_over:
                 self.better_turn = turn
