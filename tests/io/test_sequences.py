@@ -3,56 +3,19 @@
 rectification against projected points, and faults: missing, damaged, repeated, unordered files; the shared data.
 """
 
-import shutil
 import threading
 
 import cv2
 import numpy as np
 import pytest
+from _sequences import POINTS, SIZE, blob_center, image, pose, values
 
 from groma import cameras
 from groma.errors import FileFormatError, InputError
-from groma.geometry import quaternion, se3
-from groma.io import Trajectory, write_trajectory
-from groma.io.sequences import Sequence, SequenceCamera, open_sequence
-
-SIZE = (64, 48)
-
-
-def image(path, value, size=SIZE, dtype=np.uint8):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.full((size[1], size[0]), value, dtype))
-
-
-def straight(times):
-    """A trajectory along z."""
-    count = len(times)
-    return Trajectory(
-        np.asarray(times, float), np.hstack([np.tile([0, 0, 0, 1.0, 0, 0], (count, 1)), np.arange(count)[:, None]])
-    )
-
-
-def values(sequence):
-    """The grey value of each frame."""
-    return [int(frame.gray[0, 0]) for frame in sequence]
-
+from groma.geometry import se3
+from groma.io.sequences import Sequence, open_sequence
 
 # ------------------------------------------------------------------------------------------------------- TUM RGB-D
-
-
-@pytest.fixture
-def tum(tmp_path):
-    """Six colour images and five depth images at times of their own."""
-    times, depth_times = [10.0, 10.1, 10.2, 10.3, 10.4, 10.5], [10.008, 10.107, 10.195, 10.305, 10.45]
-    for row in range(6):
-        image(tmp_path / f"rgb/{row}.png", 10 * row)
-    for row in range(5):
-        image(tmp_path / f"depth/{row}.png", 5000 * (row + 1), dtype=np.uint16)
-    (tmp_path / "rgb.txt").write_text("# time file\n" + "".join(f"{t} rgb/{i}.png\n" for i, t in enumerate(times)))
-    (tmp_path / "depth.txt").write_text("".join(f"{t} depth/{i}.png\n" for i, t in enumerate(depth_times)))
-    (tmp_path / "camera.txt").write_text("50 51 32 24\n")
-    write_trajectory(straight(times), tmp_path / "groundtruth.txt")
-    return tmp_path
 
 
 def test_tum(tum):
@@ -151,107 +114,7 @@ def test_only_a_few_frames_are_read_ahead_and_threads_end(tum):
     assert threading.active_count() == before
 
 
-# --------------------------------------------------------------------------------------------------------- Cameras
-
-
-@pytest.mark.parametrize(
-    ("camera", "params"),
-    [
-        ("50 51 32 24", [50, 51, 32.5, 24.5]),
-        ([50, 51, 32, 24], [50, 51, 32.5, 24.5]),
-        ([[50, 0, 32], [0, 51, 24], [0, 0, 1]], [50, 51, 32.5, 24.5]),
-        ("1 PINHOLE 64 48 50 51 32 24", [50, 51, 32, 24]),
-        ("SIMPLE_PINHOLE 64 48 50 32 24", [50, 50, 32, 24]),
-        (SequenceCamera("PINHOLE", np.array([50.0, 51, 32, 24]), 64, 48), [50, 51, 32, 24]),
-        ("50 51 32 24 -0.2 0.05 0.001 0.002", [50, 51, 32.5, 24.5]),
-    ],
-)
-def test_ways_to_say_a_camera(tum, tmp_path, camera, params):
-    np.testing.assert_array_equal(open_sequence(tum, camera=camera).camera.params, params)
-    if isinstance(camera, str):
-        (tmp_path / "other.txt").write_text(f"# a comment\n{camera}\n")
-        np.testing.assert_array_equal(open_sequence(tum, camera=tmp_path / "other.txt").camera.params, params)
-
-
-def test_matrix_file(tum):
-    (tum / "camera.txt").write_text("50 0 32\n0 51 24\n0 0 1\n")
-    np.testing.assert_array_equal(open_sequence(tum).camera.params, [50, 51, 32.5, 24.5])
-
-
-@pytest.mark.parametrize(
-    ("camera", "words"),
-    [
-        ("50 51 32", "Cannot read"),
-        ([50, 51, 32], "3 numbers"),
-        ("1 PINHOLE 64 48 50 51 32", "takes 4"),
-        ("1 CIRCLE 64 48 50 51 32", "CIRCLE"),
-        ("1 PINHOLE 640 480 500 500 320 240", "for images of"),
-        ("-50 51 32 24", "positive"),
-        ("missing.txt", "Cannot read"),
-        ("PINHOLE 64 48 a 51 32 24", "not a camera"),
-        ("PINHOLE wide 48 50 51 32 24", "not a camera"),
-        ([50, [51], 32, 24], "not a camera"),
-    ],
-)
-def test_cameras_that_are_refused(tum, camera, words):
-    with pytest.raises(InputError, match=words):
-        open_sequence(tum, camera=camera)
-
-
-def blob_image(pixels, size):
-    """Bright Gaussian blobs at pixels (first pixel's centre at 0.5, 0.5)."""
-    u, v = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
-    total = sum(np.exp(-((u - a) ** 2 + (v - b) ** 2) / (2 * 2.0**2)) for a, b in pixels)
-    return np.clip(200 * total, 0, 255).astype(np.uint8)
-
-
-def blob_center(gray, near, radius=7):
-    """Centre of the blob nearest to a pixel."""
-    u0, v0 = int(near[0]), int(near[1])
-    patch = gray[v0 - radius : v0 + radius + 1, u0 - radius : u0 + radius + 1].astype(float)
-    v, u = np.mgrid[v0 - radius : v0 + radius + 1, u0 - radius : u0 + radius + 1] + 0.5
-    return np.array([(patch * u).sum(), (patch * v).sum()]) / patch.sum()
-
-
-POINTS = np.array([[-0.5, -0.3, 2.0], [0.4, -0.25, 1.8], [0.1, 0.3, 2.5], [-0.3, 0.25, 2.2], [0.5, 0.35, 2.4]])
-
-
-def test_undistortion_puts_points_where_a_pinhole_sees_them(tmp_path):
-    size, numbers = (320, 240), np.array([250.0, 255, 158, 121, -0.25, 0.08, 0.002, -0.001])
-    distorted = cameras.model("OPENCV").project(numbers + np.array([0, 0, 0.5, 0.5, 0, 0, 0, 0]), POINTS)
-    (tmp_path / "images").mkdir()
-    cv2.imwrite(str(tmp_path / "images/0001.png"), blob_image(distorted, size))
-    sequence = open_sequence(tmp_path, camera=numbers)
-    expected = cameras.model("PINHOLE").project(sequence.camera.params, POINTS)
-    assert np.abs(expected - distorted).max() > 1.2
-    gray = next(iter(sequence)).gray
-    for point in expected:
-        np.testing.assert_allclose(blob_center(gray, point), point, atol=0.15)  # blobs are bent and rounded to 8 bits
-
-
-def test_depth_is_undistorted_with_the_image(tum):
-    ramp = np.tile(np.arange(1, 65, dtype=np.uint16) * 100, (48, 1))
-    cv2.imwrite(str(tum / "depth/0.png"), ramp)
-    cv2.imwrite(str(tum / "rgb/0.png"), (ramp // 100).astype(np.uint8))
-    frame = next(iter(open_sequence(tum, camera="50 50 31.5 23.5 -0.2 0 0 0", depth_scale=100)))
-    inside = frame.depth > 0
-    assert inside.mean() > 0.9
-    assert np.abs(frame.depth[inside] - frame.gray[inside]).max() <= 1.0
-    assert (frame.depth != ramp / 100).any()
-
-
 # ----------------------------------------------------------------------------------------------------------- KITTI
-
-
-@pytest.fixture
-def kitti(tmp_path):
-    for row in range(3):
-        image(tmp_path / f"image_0/{row:06d}.png", 10 * row)
-        image(tmp_path / f"image_1/{row:06d}.png", 10 * row + 1)
-    (tmp_path / "calib.txt").write_text("P0: 70 0 30 0 0 70 20 0 0 0 1 0\nP1: 70 0 30 -35 0 70 20 0 0 0 1 0\nTr: 1 2\n")
-    (tmp_path / "times.txt").write_text("0.0\n0.1\n0.2\n")
-    write_trajectory(straight([0, 1, 2]), tmp_path / "poses.txt", "kitti")
-    return tmp_path
 
 
 def test_kitti(kitti):
@@ -287,58 +150,6 @@ def test_kitti_with_dropped_images(kitti):
 
 
 # ----------------------------------------------------------------------------------------------------------- EuRoC
-
-YAML = """%YAML:1.0
-sensor_type: camera  # a comment: with a colon
-T_BS:
-  cols: 4
-  rows: 4
-  data: [{data}]
-rate_hz: 20
-resolution: [320, 240]
-camera_model: pinhole
-intrinsics: [{intrinsics}] #fu, fv, cu, cv
-distortion_model: radial-tangential
-distortion_coefficients: [{distortion}]
-"""
-
-
-def pose(rotation_vector, translation):
-    matrix = np.eye(4)
-    matrix[:3, :3] = quaternion.to_matrix(quaternion.exp(np.array(rotation_vector, float)))
-    matrix[:3, 3] = translation
-    return matrix
-
-
-@pytest.fixture
-def euroc(tmp_path):
-    """Two cameras that squint and are distorted, and see blobs at known points of the left camera."""
-    body_from_left = pose([0.3, -0.2, 1.5], [0.1, 0.2, 0.3])
-    left_from_right = pose([0.02, -0.03, 0.01], [0.11, 0.002, -0.003])
-    sensors = [
-        (body_from_left, np.array([250.0, 252, 158, 121]), np.array([-0.28, 0.07, 0.0002, 0.0001])),
-        (body_from_left @ left_from_right, np.array([248.0, 249, 163, 118]), np.array([-0.27, 0.06, -0.0003, 0.0002])),
-    ]
-    stamps = [1403636579763555584 + 50000000 * row for row in range(3)]
-    for number, (body_from_cam, intrinsics, distortion) in enumerate(sensors):
-        folder = tmp_path / f"mav0/cam{number}"
-        (folder / "data").mkdir(parents=True)
-        text = {"intrinsics": intrinsics, "distortion": distortion, "data": body_from_cam.ravel()}
-        (folder / "sensor.yaml").write_text(
-            YAML.format(**{key: ",\n   ".join(map(repr, value.tolist())) for key, value in text.items()})
-        )
-        (folder / "data.csv").write_text("#timestamp [ns],filename\n" + "".join(f"{t},{t}.png\r\n" for t in stamps))
-        cam_from_left = np.linalg.inv(body_from_cam) @ body_from_left
-        points = POINTS @ cam_from_left[:3, :3].T + cam_from_left[:3, 3]
-        params = np.append(intrinsics + 0.5 * np.array([0, 0, 1, 1]), distortion)
-        gray = blob_image(cameras.model("OPENCV").project(params, points), (320, 240))
-        for stamp in stamps:
-            cv2.imwrite(str(folder / f"data/{stamp}.png"), gray)
-    world_from_body = pose([1.0, 0.4, -0.3], [4.0, 5.0, 6.0])
-    truth = Trajectory(np.array(stamps) * 1e-9, np.tile(se3.from_matrix(world_from_body), (3, 1)))
-    (tmp_path / "mav0/state_groundtruth_estimate0").mkdir()
-    write_trajectory(truth, tmp_path / "mav0/state_groundtruth_estimate0/data.csv", "euroc")
-    return tmp_path, world_from_body @ body_from_left
 
 
 def test_euroc_is_rectified(euroc):
@@ -499,51 +310,3 @@ def test_shared_sequences(shared_data, name, kind, count, size):
     np.testing.assert_array_equal([frame.timestamp for frame in frames], sequence.reference.timestamps[:3])
     assert all(frame.gray.shape == size[::-1] for frame in frames)
     assert sequence.warnings == []
-
-
-# ------------------------------------------------------------------------------------------------ Strangers' files
-
-
-@pytest.mark.parametrize("name", ["../x.png", "/etc/x.png", "rgb/../../x.png", "a\0b.png"])
-def test_names_that_leave_the_folder_are_refused(tmp_path, name):
-    image(tmp_path / "s/rgb/0.png", 3, (32, 24))
-    (tmp_path / "s/camera.txt").write_text("30 30 16 12")
-    (tmp_path / "s/rgb.txt").write_text(f"# list\n0 rgb/0.png\n1 {name}\n")
-    with pytest.raises(FileFormatError, match=r"rgb\.txt, line 3: expected the name of a file"):
-        open_sequence(tmp_path / "s")
-    (tmp_path / "s/associations.txt").write_text(f"0 rgb/0.png 0 {name}\n")
-    with pytest.raises(FileFormatError, match=r"associations\.txt, line 1: expected the name of a file"):
-        open_sequence(tmp_path / "s")
-
-
-def test_an_image_of_euroc_outside_is_refused(euroc):
-    table = euroc[0] / "mav0/cam0/data.csv"
-    table.write_text(table.read_text().replace("\n1", "\n5,../../../x.png\n1", 1))
-    with pytest.raises(FileFormatError, match=r"data\.csv, line 2: expected the name of a file"):
-        open_sequence(euroc[0])
-
-
-def test_a_long_word_in_a_calibration_takes_no_time(euroc):
-    sensor = euroc[0] / "mav0/cam0/sensor.yaml"
-    good = open_sequence(euroc[0]).camera
-    # A quadratic search would take minutes.
-    sensor.write_text(sensor.read_text() + "a" * 500_000 + "\n" + "a:[" * 100_000 + "\n")
-    np.testing.assert_array_equal(open_sequence(euroc[0]).camera.params, good.params)
-
-
-def test_a_huge_number_of_a_frame_takes_no_memory(kitti):
-    (kitti / "times.txt").unlink()
-    source = next((kitti / "image_0").iterdir())
-    shutil.copy(source, kitti / "image_0/99999999999999.png")
-    sequence = open_sequence(kitti)
-    assert [frame.timestamp for frame in sequence][-1] == pytest.approx(9999999999999.9)
-
-
-def test_an_image_too_large_is_skipped_and_named(tmp_path):
-    image(tmp_path / "0.png", 3, (32, 24))
-    content = (tmp_path / "0.png").read_bytes()
-    (tmp_path / "1.png").write_bytes(content[:16] + (70_000).to_bytes(4, "big") * 2 + content[24:])
-    (tmp_path / "camera.txt").write_text("30 30 16 12")
-    sequence = open_sequence(tmp_path)
-    assert len(list(sequence)) == 1
-    assert any("1.png: its header promises 70000x70000 pixels" in words for words in sequence.warnings)

@@ -16,7 +16,7 @@ import numpy as np
 from groma.io.trajectories import Trajectory
 from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
-from groma.tracking.backend.submaps import Joint, Part, Places, best_joint
+from groma.tracking.backend.submaps import Joint, Places, Submap, best_joint
 from groma.tracking.frame.rectification import RightTurn
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.outcome import History
@@ -88,11 +88,11 @@ class Ending:
         what = f"joining maps {joint.older + 1} and {joint.newer + 1}"
         return self.attempt(what, lambda: places.joined(joint), places)
 
-    def adjust(self, part: int) -> tuple[SolveReport | None, RightTurn]:
+    def adjust(self, number: int) -> tuple[SolveReport | None, RightTurn]:
         """Adjust all keyframes of a map; return the report and how the right camera is turned."""
         nothing = None, self._mapper.right.turn
         report, turn = self.attempt(
-            "the adjustment of all keyframes", lambda: self._mapper.adjust_at_end(part), nothing
+            "the adjustment of all keyframes", lambda: self._mapper.adjust_at_end(number), nothing
         )
         if report is not None and not report.converged:
             self.warnings.append(
@@ -101,7 +101,7 @@ class Ending:
             )
         return report, turn
 
-    def submap(self, root: int) -> Part:
+    def submap(self, root: int) -> Submap:
         """Return the trajectory and the scene of a map."""
         mapper = self._mapper
         track_map, relations = mapper.maps[root], mapper.options.relations
@@ -109,7 +109,7 @@ class Ending:
         trajectory = self._built("the trajectory", lambda: self._history.trajectory(track_map, root), Trajectory())
         nothing = map_to_scene(TrackMap(), mapper.camera)
         scene = self._built("the scene", lambda: map_to_scene(track_map, mapper.camera, relations), nothing)
-        return Part(trajectory, scene, stamps[: scene.num_images])
+        return Submap(trajectory, scene, stamps[: scene.num_images])
 
     def _built(self, what: str, step: Callable[[], T], otherwise: T) -> T:
         """Return what a step gives that is needed after an interruption too."""

@@ -12,7 +12,7 @@ from groma._typing import FloatArray, IntArray
 from groma.geometry import se3
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
-from groma.tracking.backend.submaps import Part
+from groma.tracking.backend.submaps import Submap
 from groma.tracking.map.track_map import TrackMap
 
 #: What a frame can be.
@@ -57,7 +57,7 @@ class TrackResult:
     statistics: dict
     warnings: tuple[str, ...] = ()
     #: The other submaps.
-    submaps: tuple[Part, ...] = ()
+    submaps: tuple[Submap, ...] = ()
 
 
 @dataclass

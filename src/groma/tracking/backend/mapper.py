@@ -291,9 +291,9 @@ class Mapper:
             if pool is not None:
                 pool.shutdown(wait=True, cancel_futures=True)
 
-    def adjust_at_end(self, part: int) -> tuple[SolveReport | None, RightTurn]:
+    def adjust_at_end(self, number: int) -> tuple[SolveReport | None, RightTurn]:
         """Adjust all keyframes of a map together; return the report and how the right camera is turned."""
-        self.current = part
+        self.current = number
         turn = self.right.turn
         if not self.options.adjust_at_end or len(self.map.living()) < 2:
             return None, turn

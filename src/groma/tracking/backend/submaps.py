@@ -25,7 +25,7 @@ from groma.tracking.map.track_map import Keyframe, TrackMap
 
 
 @dataclass(frozen=True)
-class Part:
+class Submap:
     """A submap of a track that could not be joined to the longest one; its world is its own."""
 
     trajectory: Trajectory
@@ -202,4 +202,4 @@ def _shifted(index: IntArray, by: int) -> IntArray:
     return np.where(index >= 0, index + by, -1)
 
 
-__all__ = ["Joint", "Part", "Places", "about_submaps", "best_joint", "find_joint", "joined_map", "search_older_maps"]
+__all__ = ["Joint", "Places", "Submap", "about_submaps", "best_joint", "find_joint", "joined_map", "search_older_maps"]

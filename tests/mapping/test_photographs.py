@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Photographs as they are stored: kinds of files, damaged ones, names that differ from the model's."""
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from groma.errors import InputError
+from groma.mapping.photographs import check_names, image_files, read_gray
+
+
+def test_every_kind_of_image_is_read_as_it_is_stored(tmp_path):
+    grey = (np.indices((24, 32)).sum(0) * 4).astype(np.uint8)
+    colour = np.dstack([grey, grey, grey])
+    kinds = {
+        "a.png": grey,
+        "b.jpg": colour,
+        "c12.png": np.round(grey * (4095 / 255)).astype(np.uint16),
+        "c16.png": grey.astype(np.uint16) * 257,
+        "d16.tif": colour.astype(np.uint16) * 257,
+        "e float.tif": colour.astype(np.float32) / 255,
+        "f.bmp": colour,
+        "größe.png": np.dstack([colour, grey]),
+    }
+    for name, image in kinds.items():
+        content = cv2.imencode(os.path.splitext(name)[1], image)[1].tobytes()
+        if name == "b.jpg":  # EXIF: turned by 90 degrees
+            exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+            content = content[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + content[2:]
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "._a.png").write_bytes(b"a shadow file")
+    files = image_files(tmp_path)
+    assert [path.name for path in files] == sorted(kinds)
+    for path in files:
+        assert np.abs(read_gray(path).astype(int) - grey).max() <= 4, path.name
+
+
+def test_a_jpeg_that_ends_too_early_is_refused(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (80, 90), dtype=np.uint8)
+    content = cv2.imencode(".jpg", noise)[1].tobytes()
+    (tmp_path / "a.jpg").write_bytes(content + b"some camera's appendix")
+    assert read_gray(tmp_path / "a.jpg").shape == (80, 90)
+    (tmp_path / "a.jpg").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="ends in the middle of the picture"):
+        read_gray(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize(
+    ("rename", "said"),
+    [
+        (lambda name: f"left/{name}", r"Pass the folder photos/left\."),
+        (lambda name: name.upper(), "upper and lower case"),
+        (lambda name: name.rsplit(".", 1)[0] + ".webp", "of another kind"),
+        (lambda name: "other" + name, "names must match"),
+    ],
+)
+def test_names_that_differ_are_compared_with_the_models(model, rename, said):
+    model = model.replace(
+        images=type(model.images)(**{**vars(model.images), "names": ("a.jpg", "b.jpg", "c.jpg", "d.jpg")})
+    )
+    with pytest.raises(InputError, match=said):
+        check_names(Path("photos"), [rename(name) for name in model.images.names], model)
+
+
+def test_the_models_folder_is_named(model):
+    model = model.replace(images=type(model.images)(**{**vars(model.images), "names": ("p/a", "p/b", "p/c", "p/d")}))
+    with pytest.raises(InputError, match=r"Pass the folder .*home\."):
+        check_names(Path("/home/p"), ["a", "b", "c", "d"], model)
+    with pytest.raises(InputError, match="begin with 'p'"):
+        check_names(Path("/home/q"), ["a", "b", "c", "d"], model)
