@@ -52,9 +52,9 @@ class RightTurn:
         covariance = np.asarray(np.linalg.inv(own + information), np.float64)
         return RightTurn(covariance @ (own @ self.angles + information @ other), covariance)
 
-    def is_surer_than(self, other: RightTurn) -> bool:
-        """Whether the angle that is hardest to tell, yaw, is known better than in another estimate."""
-        return bool(self.covariance[1, 1] <= other.covariance[1, 1])
+    def is_as_sure_as(self, other: RightTurn, gates: RectificationGates = DEFAULT.rectification) -> bool:
+        """Whether the angle that is hardest to tell, yaw, is known as well as in an earlier estimate."""
+        return bool(self.covariance[1, 1] <= gates.as_sure * other.covariance[1, 1])
 
     def numbers(self, camera: TrackCamera) -> dict[str, list[float]]:
         """Return angles (pitch, yaw, roll) and standard deviations as plain numbers.
