@@ -2,13 +2,13 @@
 r"""Covariance of one variable when the errors of some landmarks' measurements go together.
 
 What a landmark errs is often much the same in all images, and lens models err alike for neighbours. Such measurements
-are no independent samples, and the stated noise says nothing of it. But the gradients of clusters that are independent of
-each other sum to nearly zero at the solution, and by how little they cancel tells the covariance of a variable x:
+are no independent samples, and the stated noise says nothing of it. But the gradients of independent clusters sum to
+zero at the solution, and how large they are tells the covariance of a variable x:
 
 .. math:: \Sigma_x = \frac{n}{n - d} \sum_c z_c z_c^\top, \qquad z_c = \sum_{i \in c} \Sigma_{x k}\, J_k^\top w_i r_i,
 
-summed over the measurements i of the landmarks in each of n clusters c and over the kept blocks k, with the weights w of
-the losses. A landmark's own gradient is zero; so all its measurements belong to one cluster.
+summed over the measurements i of the landmarks in each of n clusters c and over the kept blocks k, with the weights w
+of the losses. A landmark's own gradient is zero; so all its measurements belong to one cluster.
 
 Reference: K.-Y. Liang, S. L. Zeger, *Longitudinal data analysis using generalized linear models*, 1986.
 """

@@ -8,8 +8,8 @@ the scene without the pair, so near and far points together tell yaw: all keyfra
 with a right camera that may turn, against a prior of what rectification leaves and what the rows tell.
 
 Points that are followed agree to some extent with any yaw that was assumed when they were looked for. So described
-features tell yaw first (:mod:`groma.tracking.backend.described_tracks`), and followed points, which are more precise, once
-it is known so.
+features tell yaw first (:mod:`groma.tracking.backend.described_tracks`), and followed points, which are more precise,
+once it is known so.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ from groma.tracking.gates import RectificationGates
 from groma.tracking.map.map_scene import TRACKING
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
-from groma.tracking.pose.estimate import GATE
+
+#: Of the increments of a right camera.
+YAW = 4
 
 
 def estimate_turn(
@@ -96,19 +98,19 @@ def _by_columns(
     job.function_tolerance = 1e-6
     job.solve()
     assert job.solved is not None
-    rotation = quaternion.to_matrix(job.solved.variables[RIGHT_CAMERAS].state[0, :4])
     try:
         covariances = Covariances(job.solved)
     except ProblemError:
         return known, None
-    # What columns tell on their own counts for less where their errors are alike.
-    covariance = covariances.of(RIGHT_CAMERAS, 0)[0, 3:, 3:]
-    both, beforehand = np.linalg.inv(covariance), np.linalg.inv(known.covariance)
+    # What columns tell on their own of yaw counts for less where their errors are alike.
+    before, after = known.covariance[1, 1], covariances.of(RIGHT_CAMERAS, 0)[0, YAW, YAW]
+    information = 1.0 / after - 1.0 / before
+    if not information > 0.0:
+        return known, None
+    yaw = _log(_exp(turn.angles) @ quaternion.to_matrix(job.solved.variables[RIGHT_CAMERAS].state[0, :4]))[1]
+    own = (yaw / after - known.angles[1] / before) / information
     alike = _alike(job, camera, covariances, gates)
-    columns, pull = (both - beforehand) / alike, (both @ _log(rotation) - beforehand @ prior.angles) / alike
-    covariance = np.asarray(np.linalg.inv(columns + beforehand), np.float64)
-    angles = covariance @ (pull + beforehand @ prior.angles)
-    return RightTurn(_log(_exp(turn.angles) @ _exp(angles)), covariance), job
+    return known.joined(np.array([0.0, own, 0.0]), np.diag([0.0, information / alike, 0.0])), job
 
 
 def _step(keyframes: list[Keyframe]) -> float:
@@ -139,9 +141,8 @@ def _alike(job: AdjustmentJob, camera: TrackCamera, covariances: Covariances, ga
     middle = np.stack([np.bincount(landmark, weights=column) for column in job.point_table.pixel.T], axis=1)
     middle /= np.bincount(landmark)[:, None]
     cluster = np.unique(cells_of(camera, middle, gates), return_inverse=True)[1].ravel()
-    yaw = 4
-    independent = covariances.of(RIGHT_CAMERAS, 0)[0, yaw, yaw]
-    return float(clustered(covariances, (RIGHT_CAMERAS, 0), "points", cluster)[yaw, yaw] / independent)
+    independent = covariances.of(RIGHT_CAMERAS, 0)[0, YAW, YAW]
+    return float(clustered(covariances, (RIGHT_CAMERAS, 0), "points", cluster)[YAW, YAW] / independent)
 
 
 def shift_between(camera: TrackCamera, old: RightTurn, new: RightTurn) -> float:
