@@ -305,6 +305,7 @@ class Mapper:
             if shift_between(self.camera, self.right.turn, turn) > self.options.gates.rectification.matters:
                 correct_map(self.map, self.camera, self.right.turn, turn, self.options, job)
                 report = self._adjust_all()
+            turn = turn.confirming(self._began_with or turn)
         return report, turn
 
 

@@ -56,6 +56,15 @@ class RightTurn:
         """Whether the angle that is hardest to tell, yaw, is known as well as in an earlier estimate."""
         return bool(self.covariance[1, 1] <= gates.as_sure * other.covariance[1, 1])
 
+    def confirming(self, assumed: RightTurn) -> RightTurn:
+        """Return the estimate with what followed points cannot tell: in part they agree with what was assumed.
+
+        Up to half of an error stayed where it was measured; then as much is left as was found.
+        """
+        covariance = self.covariance.copy()
+        covariance[1, 1] += (self.angles[1] - assumed.angles[1]) ** 2
+        return RightTurn(self.angles, covariance)
+
     def numbers(self, camera: TrackCamera) -> dict[str, list[float]]:
         """Return angles (pitch, yaw, roll) and standard deviations as plain numbers.
 
