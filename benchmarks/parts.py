@@ -2,7 +2,9 @@
 """A scene larger than memory: time and memory of an adjustment in parts, by observations and by ranks.
 
     python benchmarks/parts.py [--millions 1 4 16 50] [--steps 5] [--threads 2] [--work FOLDER] [--keep auto]
-    python benchmarks/parts.py --ranks 1 2 --rounds 5 --threads 1 [--millions 4]
+    python benchmarks/parts.py --ranks 1 2 --rounds 5 --threads 1 [--millions 4] [--corridor]
+    python benchmarks/parts.py --plain-sums --rounds 5 --threads 1 [--millions 4] [--corridor]
+    python benchmarks/parts.py --states 50 --ranks 1 2 4
 
 The scene is an aerial block: photographs straight down on a grid, each point of the ground in about ten of them, 9 000
 points in a photograph, 0.5 px of noise. It is written part by part, so that it never is in memory. Every size is solved
@@ -10,10 +12,16 @@ by :func:`groma.adjustment.parts.adjust_parts` in a process of its own; 50 milli
 Reported are CPU time per step, peak memory of the process, bytes per observation, and the exponent of growth.
 
 With ``--ranks`` the same parts are adjusted by so many processes together (``mpiexec`` must be at hand), in turn, for
-so many rounds. Reported are ratios to the first number, medians over the rounds: wall time per step, CPU time of all
-ranks, peak memory of a rank; the bytes that a rank puts into a sum; and the time foreseen for many ranks. That assumes:
-work on parts divides evenly, the shared system is solved by each, and a sum takes two passes of its bytes at
-``BANDWIDTH`` and two latencies per doubling of ranks.
+so many rounds. Reported are ratios to the first number, medians over the rounds: wall time per step, CPU time per step
+of the busiest rank (it waits actively), peak memory of a rank; the bytes that a rank puts into the sums of a step; and
+the time foreseen for many ranks. That assumes: work on parts divides evenly, the shared system is solved by each, and
+a sum takes two passes of its bytes at ``BANDWIDTH`` and two latencies per doubling of ranks. ``--corridor`` takes a
+walk round a corridor in place of the block: points, lines, planes, and what lies on them.
+
+With ``--plain-sums`` one process adjusts in turn with sums of twice the digits, as always, and with plain ones.
+
+With ``--states`` a corridor of so many images with known poses is solved at once and in parts by so many ranks, without
+damping, until nothing changes; reported are the largest differences of states, metres and radians.
 """
 
 import argparse
@@ -105,24 +113,29 @@ def make(folder: Path, observations: float, part: int = PART, seed: int = 0) -> 
     return total
 
 
-def run(folder: Path, steps: int, threads: int, keep: str, output: Path) -> dict:
+def run(folder: Path, arguments: argparse.Namespace, output: Path) -> dict:
     """Adjust the parts of a folder in this process, and in all that were started with it."""
     from groma.adjustment.parts import adjust_parts, parts_of
     from groma.solver.options import SolverOptions
     from groma.solver.reduce.mpi import reducer_of_launcher
 
     options = SolverOptions(
-        max_iterations=steps, threads=threads, function_tolerance=0.0, gradient_tolerance=0.0, step_tolerance=0.0
-    )
+        max_iterations=arguments.steps, threads=arguments.threads, shared_system=arguments.shared_system,
+        function_tolerance=0.0, gradient_tolerance=0.0, step_tolerance=0.0,
+    )  # fmt: skip
     reducer = reducer_of_launcher()
-    began = time.process_time(), time.perf_counter()
-    result = adjust_parts(parts_of(folder), output, options=options, keep=keep, reducer=reducer, force=True)
+    began, steps_at = (time.process_time(), time.perf_counter()), []
+    result = adjust_parts(
+        parts_of(folder), output, options=options, keep=arguments.keep, reducer=reducer, force=True,
+        progress=lambda _: steps_at.append(time.process_time()),
+    )  # fmt: skip
     report, peak = result.report, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return {
         "rank": reducer.rank,
         "cpu_s": sum(map(float, reducer.gather(str(time.process_time() - began[0])))),
         "wall_s": time.perf_counter() - began[1],
         "steps": report.iterations,
+        "step_cpu_s": max(map(float, reducer.gather(str((steps_at[-1] - steps_at[0]) / max(1, len(steps_at) - 1))))),
         "step_s": (report.history[-1].seconds - report.history[0].seconds) / max(1, report.iterations - 1),
         "seconds": report.seconds,
         "initial_cost": report.initial_cost,
@@ -130,15 +143,16 @@ def run(folder: Path, steps: int, threads: int, keep: str, output: Path) -> dict
         "residuals": report.num_residuals,
         "unknowns": report.num_unknowns,
         "solver": report.linear_solver,
-        "bytes": getattr(reducer, "bytes_per_sum", 0),
+        "bytes": getattr(reducer, "bytes_summed", 0) // (report.iterations + 1),
         "peak_mib": max(map(float, reducer.gather(str(peak)))),
     }
 
 
-def started(folder: Path, arguments: argparse.Namespace, ranks: int = 1) -> dict:
+def started(folder: Path, arguments: argparse.Namespace, ranks: int = 1, plain: bool = False) -> dict:
     """Adjust the parts of a folder in processes of their own; return what rank 0 reports."""
     own = [sys.executable, __file__, "--run", folder, "--steps", arguments.steps, "--threads", arguments.threads]
-    own += ["--keep", arguments.keep]
+    own += ["--keep", arguments.keep, "--shared-system", arguments.shared_system]
+    own += ["--plain-sums"] if plain else []
     if ranks > 1:
         launcher = shutil.which("mpiexec", path=sysconfig.get_path("scripts")) or "mpiexec"
         own = [launcher, "-n", ranks, *own]
@@ -154,25 +168,126 @@ def compare_ranks(folder: Path, observations: int, arguments: argparse.Namespace
             found.append(started(folder, arguments, ranks))
     first = rows[arguments.ranks[0]]
     print(f"{observations:,} observations, {arguments.rounds} rounds in turn, --keep {arguments.keep}\n")
-    print("| ranks | step, ratio | CPU of all, ratio | memory of a rank, ratio | bytes of a sum | final cost |")
-    print("|--:|--:|--:|--:|--:|--:|")
+    print("| ranks | step | CPU of a rank in a step | memory of a rank | MiB | bytes of a step | final cost |")
+    print("|--:|--:|--:|--:|--:|--:|--:|")
     for ranks, found in rows.items():
         step, spent, peak = (
             np.median([own[key] / base[key] for own, base in zip(found, first, strict=True)])
-            for key in ("step_s", "cpu_s", "peak_mib")
+            for key in ("step_s", "step_cpu_s", "peak_mib")
         )
         cost, size = found[0]["final_cost"], found[0]["bytes"]
-        print(f"| {ranks} | {step:.2f} | {spent:.2f} | {peak:.2f} | {size:,} | {cost:.17g} |")
+        size = f"{found[0]['peak_mib']:.0f} | {size:,}"
+        print(f"| {ranks} | {step:.2f} | {spent:.2f} | {peak:.2f} | {size} | {cost:.17g} |")
     alone = rows[min(rows)][0]
     num_bytes = max(row["bytes"] for found in rows.values() for row in found)
     solve = alone["seconds"]["solve"] / (alone["steps"] + 1)
-    parts = float(np.median([row["step_s"] for row in rows[min(rows)]])) * min(rows) - solve
-    print(f"\nOf a step of {parts + solve:.2f} s on one rank {solve:.3f} s solve the shared system. Foreseen:")
+    parts = float(np.median([row["step_cpu_s"] for row in rows[min(rows)]])) * min(rows) - solve
+    print(f"\nOf {parts + solve:.2f} s of CPU time for a step of one rank {solve:.3f} s solve the system. Foreseen:")
     for ranks in (1, 16, 64, 256):
         message = (2 * num_bytes / BANDWIDTH + 2 * LATENCY * np.log2(ranks)) if ranks > 1 else 0.0
         print(
             f"  {ranks:4d} ranks: {parts / ranks + solve + message:.3f} s a step, of which {message:.4f} s for the sum"
         )
+
+
+def compare_sums(folder: Path, observations: int, arguments: argparse.Namespace) -> None:
+    """Adjust the parts with exact and with plain sums in turn, and print what exact ones cost."""
+    rounds = [[started(folder, arguments, plain=plain) for plain in (False, True)] for _ in range(arguments.rounds)]
+    spent = [exact["step_cpu_s"] / plain["step_cpu_s"] for exact, plain in rounds]
+    exact, plain = rounds[0]
+    print(
+        f"{observations:,} observations, {arguments.rounds} rounds: CPU time of a step with exact sums over plain ones "
+        f"{np.median(spent):.3f} ({min(spent):.3f} to {max(spent):.3f}); a step takes {plain['step_cpu_s']:.2f} s. "
+        f"Final costs {exact['final_cost']:.17g} and {plain['final_cost']:.17g}."
+    )
+
+
+def sum_plainly() -> None:
+    """Let sums forget their rounding errors, as plain ones do."""
+    from groma.solver.reduce import exact_sums
+
+    def add(sums: np.ndarray, values: np.ndarray, rows: np.ndarray | None = None) -> None:
+        sums.real[... if rows is None else rows] += values
+
+    exact_sums.add = add
+
+
+def make_corridor(folder: Path, observations: float, part: int) -> int:
+    """Write a walk round a corridor in parts; return its number of observations."""
+    from groma.adjustment.parts import write_parts
+    from groma.scene import synthetic
+
+    scene = synthetic.corridor(max(12, round(observations / 1220))).start
+    write_parts(scene, folder, part)
+    print(f"{scene}\n")
+    return scene.num_observations
+
+
+def compare_states(images: int, ranks: list[int], work: Path) -> None:
+    """Print the largest differences between the states of a solve at once and of parts."""
+    from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble
+    from groma.adjustment.parts import join_parts, parts_of, write_parts
+    from groma.geometry import line3
+    from groma.scene import PosePriors, synthetic
+    from groma.solver.solve import solve
+
+    made = synthetic.corridor(images)
+    count = made.start.num_frames
+    priors = PosePriors(np.arange(count), made.truth.frames.rig_from_world, np.full((count, 6), 0.01))
+    paths = write_parts(made.start.replace(pose_priors=priors), work / "parts", made.start.num_observations // 12)
+    whole = join_parts(paths)
+    print(f"{whole}, {len(paths)} parts\n")
+    problem = assemble(whole, AssemblyOptions()).problem
+    solved = disassemble(whole, solve(solve(problem, states_options()).problem, states_options("gauss_newton")).problem)
+    print("| ranks | poses | points | lines | planes | same files as of the first |\n|--:|--:|--:|--:|--:|---|")
+    launcher, files = shutil.which("mpiexec", path=sysconfig.get_path("scripts")) or "mpiexec", []
+    for number in ranks:
+        output = work / f"of-{number}"
+        own = [launcher, "-n", number, sys.executable, __file__, "--run-states", work / "parts", "--work", output]
+        subprocess.run([str(word) for word in own], check=True, capture_output=True, env=os.environ)
+        found = join_parts(parts_of(output))
+        files.append([path.read_bytes() for path in parts_of(output)])
+        off = [
+            np.abs(getattr(getattr(found, table), column) - getattr(getattr(solved, table), column)).max()
+            for table, column in (("frames", "rig_from_world"), ("points", "xyz"), ("planes", "hesse"))
+        ]
+        off.insert(2, line3.distance_to_point(found.lines.plucker[:, None], solved.lines.segments).max())
+        print(
+            f"| {number} | {' | '.join(f'{value:.1e}' for value in off)} | {'yes' if files[-1] == files[0] else 'no'} |"
+        )
+
+
+def states_options(method: str = "levenberg_marquardt"):
+    """Return options with which a solve goes on until nothing changes."""
+    from groma.solver.options import SolverOptions
+
+    return SolverOptions(
+        method=method, linear_solver="dense", threads=1, max_iterations=50,
+        function_tolerance=0.0, gradient_tolerance=0.0, step_tolerance=0.0,
+    )  # fmt: skip
+
+
+def run_states(folder: Path, output: Path) -> None:
+    """Solve parts together with the other processes, with damping and then without, and write them."""
+    from groma.adjustment.assemble import AssemblyOptions
+    from groma.adjustment.parts import parts_of
+    from groma.adjustment.parts.checkpoint import Checkpoint
+    from groma.adjustment.parts.opened import open_parts
+    from groma.adjustment.parts.run import Run, Solved
+    from groma.factors.losses import Trivial
+    from groma.solver.reduce.mpi import Ranks
+    from groma.solver.reduce.shards import solve_shards
+
+    reducer = Ranks()
+    opened = open_parts(parts_of(folder), AssemblyOptions(), reducer)
+    variables = opened.variables
+    for method in ("levenberg_marquardt", "gauss_newton"):
+        solution = solve_shards(variables, opened.shards(Trivial()), states_options(method), None, reducer, 1e9)
+        variables = solution.variables
+    output.mkdir(exist_ok=True)
+    run = Run(opened, [Trivial()], states_options(), None, reducer, 1e9, Checkpoint(output, "", opened, reducer))
+    states = {name: group.state for name, group in variables.items()}
+    run.write(Solved(states, solution.report, (), Trivial()), output)
 
 
 def main() -> None:
@@ -185,20 +300,37 @@ def main() -> None:
     parser.add_argument("--ranks", type=int, nargs="+", help="compare numbers of processes")
     parser.add_argument("--part", type=int, default=PART, help="observations of a part")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--corridor", action="store_true", help="points, lines and planes in place of a block")
+    parser.add_argument("--plain-sums", action="store_true", help="compare exact sums with plain ones")
+    parser.add_argument("--shared-system", default="auto", help="formed, or products of conjugate gradients")
+    parser.add_argument("--states", type=int, metavar="IMAGES", help="compare states with those of a solve at once")
     parser.add_argument("--run", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--run-states", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    if arguments.run_states is not None:
+        run_states(arguments.run_states, arguments.work)
+        return
+    if arguments.states is not None:
+        with tempfile.TemporaryDirectory(dir=arguments.work) as work:
+            compare_states(arguments.states, arguments.ranks or [1, 2, 4], Path(work))
+        return
     if arguments.run is not None:
+        if arguments.plain_sums:
+            sum_plainly()
         output = arguments.run.parent / f"{arguments.run.name}-adjusted"
-        row = run(arguments.run, arguments.steps, arguments.threads, arguments.keep, output)
+        row = run(arguments.run, arguments, output)
         if row["rank"] == 0:
             print(json.dumps(row))
         return
-    if arguments.ranks is not None:
+    if arguments.ranks is not None or arguments.plain_sums:
+        compare, make_scene = compare_ranks if arguments.ranks else compare_sums, make
+        if arguments.corridor:
+            make_scene = make_corridor
         with tempfile.TemporaryDirectory(dir=arguments.work) as work:
             for million in arguments.millions:
                 folder = Path(work) / f"{million:g}"
                 folder.mkdir()
-                compare_ranks(folder, make(folder, 1e6 * million, arguments.part), arguments)
+                compare(folder, make_scene(folder, 1e6 * million, arguments.part), arguments)
         return
     print(
         "| observations | parts | unknowns | solver | steps | CPU s per step | wall s | peak MiB | reduced chi-square |"

@@ -18,6 +18,7 @@ ROOMS: Rooms = (
             "groma.geometry.line3": None,
             "groma.geometry.plane3": None,
             "groma.geometry.segment2": None,
+            "groma.geometry.segment3": None,
             "groma.geometry.transform": None,
             "groma.geometry.projection": None,
             "groma.geometry.incidence": None,
@@ -84,7 +85,7 @@ ROOMS: Rooms = (
             "groma.adjustment.uncertainty": ("SceneUncertainty", "uncertainty"),
             "groma.adjustment.covariance_files": None,
             "groma.adjustment.consistency": None,
-            "groma.adjustment.parts": ("PartsResult", "adjust_parts", "write_parts"),
+            "groma.adjustment.parts": ("PartsResult", "adjust_parts", "join_parts", "write_parts"),
         },
     ),
     (

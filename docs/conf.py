@@ -30,6 +30,7 @@ extensions = [
     "_factor_table",
     "_navigation",
     "_reference",
+    "_segment_figures",
     "_thresholds",
 ]
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         features,
         geometry,
         io,
+        localization,
         mapping,
         problem,
         scene,
@@ -60,6 +61,9 @@ if TYPE_CHECKING:
     from groma.io import read_scene, read_trajectory, write_scene
     from groma.io.convert import convert
     from groma.io.sequences import open_sequence
+    from groma.localization.absolute_pose import AbsolutePose, PoseOptions, estimate_absolute_pose
+    from groma.localization.camera import QueryCamera
+    from groma.localization.localizer import LocalizedImage, LocalizeOptions, Localizer
     from groma.mapping.map import MapOptions, map_images
     from groma.mapping.result import MapResult
     from groma.problem.problem import Problem
@@ -75,6 +79,7 @@ if TYPE_CHECKING:
 #: Where each public name lives, and after a colon its name there if that is another; with ``__all__`` and the imports
 #: above the only place to touch when one is added.
 _HOME = {
+    "AbsolutePose": "groma.localization.absolute_pose",
     "AdjustOptions": "groma.adjustment.adjust",
     "AdjustResult": "groma.adjustment.report",
     "FileFormatError": "groma.errors",
@@ -83,6 +88,9 @@ _HOME = {
     "LineBearing": "groma.factors.observations.line_bearing",
     "LineOnPlane": "groma.factors.relations.line_on_plane",
     "LineReprojection": "groma.factors.observations.line_reprojection",
+    "LocalizeOptions": "groma.localization.localizer",
+    "LocalizedImage": "groma.localization.localizer",
+    "Localizer": "groma.localization.localizer",
     "MapOptions": "groma.mapping.map",
     "MapResult": "groma.mapping.result",
     "OutputError": "groma.errors",
@@ -91,9 +99,11 @@ _HOME = {
     "PointReprojection": "groma.factors.observations.point_reprojection",
     "PoseGraphOptions": "groma.adjustment.pose_graph",
     "PoseGraphResult": "groma.adjustment.pose_graph",
+    "PoseOptions": "groma.localization.absolute_pose",
     "PosePrior": "groma.factors.priors.pose_prior",
     "Problem": "groma.problem.problem",
     "ProblemError": "groma.errors",
+    "QueryCamera": "groma.localization.camera",
     "Ref": "groma.factors.contract",
     "Scene": "groma.scene",
     "ShapeError": "groma.errors",
@@ -112,6 +122,7 @@ _HOME = {
     "contributions": "groma.adjustment.contributions",
     "convert": "groma.io.convert",
     "diagnose": "groma.adjustment.diagnosis:diagnose_scene",
+    "estimate_absolute_pose": "groma.localization.absolute_pose",
     "evaluate_lines": "groma.evaluation.lines",
     "evaluate_planes": "groma.evaluation.planes",
     "evaluate_poses": "groma.evaluation.poses",
@@ -136,12 +147,14 @@ _SUBPACKAGES = (
     "cameras",
     "compilation",
     "errors",
+    "estimate_absolute_pose",
     "estimators",
     "evaluation",
     "factors",
     "features",
     "geometry",
     "io",
+    "localization",
     "mapping",
     "problem",
     "scene",
@@ -152,6 +165,7 @@ _SUBPACKAGES = (
 )
 
 __all__ = [
+    "AbsolutePose",
     "AdjustOptions",
     "AdjustResult",
     "FileFormatError",
@@ -160,6 +174,9 @@ __all__ = [
     "LineBearing",
     "LineOnPlane",
     "LineReprojection",
+    "LocalizeOptions",
+    "LocalizedImage",
+    "Localizer",
     "MapOptions",
     "MapResult",
     "OutputError",
@@ -168,9 +185,11 @@ __all__ = [
     "PointReprojection",
     "PoseGraphOptions",
     "PoseGraphResult",
+    "PoseOptions",
     "PosePrior",
     "Problem",
     "ProblemError",
+    "QueryCamera",
     "Ref",
     "Scene",
     "ShapeError",
@@ -193,6 +212,7 @@ __all__ = [
     "convert",
     "diagnose",
     "errors",
+    "estimate_absolute_pose",
     "estimators",
     "evaluate_lines",
     "evaluate_planes",
@@ -204,6 +224,7 @@ __all__ = [
     "features",
     "geometry",
     "io",
+    "localization",
     "loss",
     "map_images",
     "mapping",

@@ -35,8 +35,9 @@ from pathlib import Path
 from typing import Any
 
 from numba.core import sigutils
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
 from numba.core.registry import cpu_target
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
 from groma import _numba_digest
@@ -173,6 +174,12 @@ class _Cache(FunctionCache):
         content = _digest((_numba_digest.environment(), kinds, processor, found.content))
         return _Key(_digest((kinds, processor, found.selected)), content)
 
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load, without making the compiler ready to compile, which Numba does first and which takes longer."""
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
+
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save; a full disk, or a folder that became read-only, costs time in the next process and nothing else."""
         try:
@@ -182,13 +189,25 @@ class _Cache(FunctionCache):
                 counts.unsaved += 1
 
 
+class _Unopened:
+    """Stands for the files of a compiled function until something is asked of them."""
+
+    def __init__(self, dispatcher: Any) -> None:
+        self._dispatcher = dispatcher
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            opened: Any = _Cache(self._dispatcher.py_func, self._dispatcher)
+        except RuntimeError:  # Numba found no folder that can be written
+            opened = NullCache()
+        self._dispatcher._cache = opened
+        return getattr(opened, name)
+
+
 def keep_on_disk(dispatcher: Any) -> Any:
     """Let a compiled function be kept on disk where some folder can be written; return it."""
     if hasattr(dispatcher, "py_func"):  # a plain function without the compiler
-        try:
-            dispatcher._cache = _Cache(dispatcher.py_func, dispatcher)
-        except RuntimeError:  # Numba found no folder that can be written
-            pass
+        dispatcher._cache = _Unopened(dispatcher)
     return dispatcher
 
 

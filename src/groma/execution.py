@@ -42,11 +42,18 @@ class _Crew:
     #: None for the calling thread alone.
     executor: Executor | None
     workers: int
+    #: Threads of this process, where the executor has others.
+    beside: _Crew | None = None
 
     @property
     def shares_memory(self) -> bool:
         """Whether a piece of work costs nothing to hand over."""
         return isinstance(self.executor, ThreadPoolExecutor)
+
+    @property
+    def here(self) -> _Crew:
+        """Those of this process."""
+        return self if self.shares_memory else self.beside or _Crew(None, 1)
 
 
 _CREW: ContextVar[_Crew | None] = ContextVar("groma_crew", default=None)
@@ -68,7 +75,8 @@ def work_with(workers: int | Executor | None = None) -> Iterator[None]:
     ----------
     workers : int, Executor or None
         A number of threads, one for the calling thread alone, None for one per core; or any executor of
-        ``concurrent.futures``, such as those of ``mpi4py.futures`` and ``dask.distributed``, which stays open.
+        ``concurrent.futures``, such as those of ``mpi4py.futures`` and ``dask.distributed``, which stays open. Pieces
+        that are not worth sending to other processes then go to threads of this one, one per core.
 
     Examples
     --------
@@ -82,14 +90,14 @@ def work_with(workers: int | Executor | None = None) -> Iterator[None]:
         return
     if workers is None:
         workers = available_cores()
-    if isinstance(workers, Executor):
+    if isinstance(workers, ThreadPoolExecutor):
         with _set(_Crew(workers, _num_workers(workers))):
             yield
-    elif workers <= 1:
-        with _set(_Crew(None, 1)):
+    elif isinstance(workers, Executor):
+        with _threads(available_cores()) as beside, _set(_Crew(workers, _num_workers(workers), beside)):
             yield
     else:
-        with ThreadPoolExecutor(workers, thread_name_prefix="groma") as pool, _set(_Crew(pool, workers)):
+        with _threads(workers) as crew, _set(crew):
             yield
 
 
@@ -100,9 +108,9 @@ def num_workers() -> int:
 
 
 def num_threads() -> int:
-    """Return how many of them are threads of this process, one if they are not."""
+    """Return how many threads of this process do what is not sent to others, one without :func:`work_with`."""
     crew = _CREW.get()
-    return crew.workers if crew is not None and crew.shares_memory else 1
+    return 1 if crew is None else crew.here.workers
 
 
 def map_work(
@@ -152,11 +160,15 @@ def map_work(
 
 
 def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
-    """Do what :func:`map_work` does in threads, if that is what :func:`work_with` has given, else in this thread.
+    """Do what :func:`map_work` does in threads of this process.
 
     It is for pieces that share more memory than they are worth: they are not sent to other processes.
     """
-    return map_work(function, items) if num_threads() > 1 else [function(item) for item in items]
+    crew = _CREW.get()
+    if crew is None or crew.here.workers < 2:
+        return [function(item) for item in items]
+    with _set(crew.here):
+        return map_work(function, items)
 
 
 def map_ranges(function: Callable[[slice], Any], count: int, size: int) -> None:
@@ -170,6 +182,16 @@ def map_ranges(function: Callable[[slice], Any], count: int, size: int) -> None:
 def _each(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
     """Do some of the work, where a worker is."""
     return [function(item) for item in items]
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[_Crew]:
+    """Yield so many threads, for one the calling thread."""
+    if count <= 1:
+        yield _Crew(None, 1)
+        return
+    with ThreadPoolExecutor(count, thread_name_prefix="groma") as pool:
+        yield _Crew(pool, count)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ pixels. Options that a user is meant to change stay in the ``...Options`` classe
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import field, fields, is_dataclass
 from functools import lru_cache
@@ -87,7 +88,9 @@ def chi_square_gate(probability: float, dof: int) -> float:
 
     .. math:: P(\chi^2_{\text{dof}} > \text{gate}) = \text{probability}
     """
-    from scipy.special import chdtri
+    if dof == 2:
+        return -2.0 * math.log(probability)
+    from scipy.special import chdtri  # takes longer to import than most of what needs it takes to run
 
     return float(chdtri(dof, probability))
 

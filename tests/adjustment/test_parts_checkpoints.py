@@ -143,7 +143,8 @@ def test_known_poses_count_once(tmp_path):
 def test_the_report_is_that_of_the_whole(tmp_path):
     """Root mean squares, numbers and the scale of the last loss, with the bins of the median as its only difference."""
     scene = synthetic.corridor("tiny").start
-    result = adjust_parts(write_parts(scene, tmp_path / "parts", observations=250), tmp_path / "out", LOSSES, OPTIONS)
+    paths = write_parts(scene, tmp_path / "parts", observations=250)
+    result = adjust_parts(paths, tmp_path / "out", LOSSES, OPTIONS, planes=False)
     whole = groma.adjust(scene, groma.AdjustOptions(planes=False, threads=1)).report
     mine = result.adjustment
     assert (mine.num_points, mine.num_lines, mine.num_images) == (whole.num_points, whole.num_lines, whole.num_images)

@@ -21,11 +21,17 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "io"))
 
+import test_bundler
+import test_nvm
+import test_openmvg
+import test_opensfm
+import test_transforms
 from _models import rig_scene
 from _mutations import gzip_stored
+from _views import views
 
 from groma.features.external import read_matches
-from groma.io import read_g2o, read_scene, read_trajectory, structures_of, write_archive, write_colmap
+from groma.io import read_g2o, read_scene, read_trajectory, structures_of, write_archive, write_colmap, write_scene
 from groma.io.reference import holds_scene, read_line3dpp, read_reference
 from groma.io.sequences import open_sequence
 from groma.mapping.checkpoint_files import LINE_MAP, SEGMENTS
@@ -71,6 +77,7 @@ def _all(home: Path) -> Iterator[_Made]:
     yield from _arrays()
     yield from _sequences()
     yield from _images()
+    yield from _interchange()
 
 
 def _one(read: Callable[[Path], object], name: str) -> Callable[[Path], object]:
@@ -292,3 +299,41 @@ def _images() -> Iterator[_Made]:
 
 def _photo(name: str) -> Callable[[Path], object]:
     return lambda folder: (read_picture(folder / name, 20), read_gray(folder / name).shape)
+
+
+def _interchange() -> Iterator[_Made]:
+    """Yield files of other programs, written by the tests of their formats: small ones, most of whose text matters."""
+    true = views(4, 5)
+    names = "".join(f"{row}.png\n" for row in range(4)).encode()
+    photographs = {f"{row}.png": _encoded(".png") for row in range(4)}
+    bundle = test_bundler.bundle(true).encode()
+    yield "bundler", {"bundle.out": bundle, "list.txt": names}, read_scene
+    yield "bundler_images", {"bundle.out": bundle, "list.txt": names, **photographs}, read_scene
+    for name, coefficient in (("nvm", 0.0), ("nvm_lens", 0.05)):
+        yield name, {"a.nvm": test_nvm.nvm(true, coefficient).encode()}, _one(read_scene, "a.nvm")
+    for kind in ("pinhole_brown_t2", "fisheye", "spherical"):
+        values = test_openmvg.KINDS[kind][1] if kind != "spherical" else []
+        document = json.dumps(test_openmvg.document(true, kind, values), indent=1).encode()
+        yield f"openmvg_{kind}", {"sfm_data.json": document}, read_scene
+    for kind in ("perspective", "brown", "fisheye_opencv"):
+        said, _ = test_opensfm.CAMERAS[kind]
+        one = test_opensfm.reconstruction(true, kind, said)
+        one["reference_lla"] = {"latitude": 52.5, "longitude": 13.4, "altitude": 30.0}
+        files = {
+            "reconstruction.json": json.dumps([one, one], indent=1).encode(),
+            "tracks.csv": test_opensfm.tracks(true, kind, said, 2).encode(),
+        }
+        yield f"opensfm_{kind}", files, read_scene
+    frames = test_transforms.frames(true)
+    lens = {**test_transforms.LENS, **test_transforms.BENT, "camera_model": "OPENCV", "aabb_scale": 16}
+    for name, said in (("transforms", lens), ("transforms_angle", {"camera_angle_x": 0.7})):
+        document = json.dumps({**said, "ply_file_path": "a.ply", "frames": frames}, indent=1).encode()
+        images = {f"images/{name}": content for name, content in photographs.items()}
+        yield name, {"transforms.json": document, "a.ply": PLY, **images}, _transforms
+
+
+def _transforms(folder: Path) -> Scene:
+    """Read, and write where the cameras can be."""
+    scene = read_scene(folder)
+    write_scene(scene, folder / "again.json", force=True)
+    return scene

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from groma.features.point_tracks import corners, follow, image_noise
+from groma.features.point_tracks import _alike, corners, follow, image_noise
 
 
 def _texture(seed: int) -> np.ndarray:
@@ -48,3 +48,18 @@ def test_no_image_content_at_all():
     there, good = follow(plain, plain, np.array([[40.0, 40.0]]))
     assert there.shape == (1, 2)
     assert not good.any()
+
+
+def test_patches_are_compared_by_their_correlation():
+    rng = np.random.default_rng(6)
+    one, two = _noisy(_texture(7), 2.0, 8), _noisy(_texture(7), 2.0, 9)
+    at = rng.integers(20, 200, (40, 2)).astype(np.float32)
+    to = at + rng.integers(-3, 4, at.shape).astype(np.float32)
+    rows = np.arange(-7, 8)
+    expected = []
+    for (u, v), (x, y) in zip(at.astype(int), to.astype(int), strict=True):
+        patches = one[v + rows[:, None], u + rows], two[y + rows[:, None], x + rows]
+        expected.append(np.corrcoef(*(patch.ravel() for patch in patches))[0, 1])
+    np.testing.assert_allclose(_alike(one, two, at, to, 15), expected, atol=1e-9)
+    plain = np.full_like(one, 90)
+    assert not _alike(plain, plain, at, to, 15).any()

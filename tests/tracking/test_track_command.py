@@ -164,11 +164,11 @@ from groma.tracking import Tracker
 
 process, done = Tracker.process, []
 
-def dying(self, frame):
+def dying(self, frame, following=None):
     if len(done) == 12:
         os.kill(os.getpid(), signal.SIGKILL)
     done.append(frame)
-    return process(self, frame)
+    return process(self, frame, following)
 
 Tracker.process = dying
 run(sys.argv[1:])

@@ -148,7 +148,7 @@ def test_looking_at_a_running_track_changes_nothing(rgbd, tracked):
     np.testing.assert_array_equal(tracker.finish().trajectory.world_from_cam, tracked[1].trajectory.world_from_cam)
 
 
-def test_a_thread_changes_little(rgbd, truth):
+def test_a_track_without_threads(rgbd, truth):
     result = _run(rgbd[:12], threaded=False)[1]
     assert _room.position_error(result.trajectory, truth) < 0.01
 

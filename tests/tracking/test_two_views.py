@@ -49,7 +49,7 @@ def begun(pixels):
 
 def judged(candidates, pixels):
     """The same with a third view."""
-    more = [continued(CAMERA, one, pixels[2], GATES.max_residual * SIGMA) for one in candidates]
+    more = [continued(CAMERA, one, pixels[2], SIGMA, GATES) for one in candidates]
     return [adjusted(CAMERA, one, pixels, SIGMA, GATES.max_residual) for one in more]
 
 
@@ -64,7 +64,7 @@ def error(found, true):
 def test_a_plane_seen_thrice_leaves_the_right_motion(seed):
     rng = np.random.default_rng(seed)
     pixels = seen(plane(rng, 0.5), [IDENTITY, SECOND, THIRD], rng)
-    decided = likely(judged(likely(begun(pixels), GATES.max_behind), pixels), GATES.max_behind)
+    decided = likely(judged(likely(begun(pixels), GATES), pixels), GATES)
     assert len(decided) == 1
     turn, direction = error(decided[0].poses[2], THIRD)
     assert turn < 0.02
@@ -78,9 +78,9 @@ def test_two_views_of_a_small_plane_leave_several_motions_and_a_third_prefers_th
         rng = np.random.default_rng(seed)
         pixels = seen(plane(rng, 0.25), [IDENTITY, SECOND, THIRD], rng)
         candidates = begun(pixels)
-        left.append(len(likely(candidates, GATES.max_behind)))
+        left.append(len(likely(candidates, GATES)))
         # So small a plane hardly tells turn from shift; the mirrored motion is off by more than 0.2 rad.
-        decided = likely(judged(candidates, pixels), GATES.max_behind)
+        decided = likely(judged(candidates, pixels), GATES)
         assert error(decided[0].poses[2], THIRD)[0] < 0.16
     assert max(left) > 1
 
@@ -91,7 +91,7 @@ def test_points_in_depth_leave_one_motion_in_spite_of_outliers(seed):
     pixels = seen(box(rng), [IDENTITY, SECOND, THIRD], rng)
     wrong = rng.choice(200, 40, replace=False)
     pixels[2, wrong] += rng.uniform(-60.0, 60.0, (40, 2))
-    decided = likely(judged(likely(begun(pixels), GATES.max_behind), pixels), GATES.max_behind)
+    decided = likely(judged(likely(begun(pixels), GATES), pixels), GATES)
     assert len(decided) == 1
     turn, direction = error(decided[0].poses[2], THIRD)
     assert turn < 0.01

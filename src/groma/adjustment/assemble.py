@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from groma._typing import BoolArray, FloatArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.terms import (
     line_depths,
@@ -100,7 +100,8 @@ def assemble(scene: Scene, options: AssemblyOptions, more: Sequence[Term] = ()) 
     notes: list[str] = []
     if options.gauge == "auto":
         options = replace(options, gauge=gauge_of(scene, options))
-    draft = Draft(scene, options, {**camera_variables(scene, options), **_landmark_variables(scene, options)}, notes)
+    variables = {**camera_variables(scene, options), **_landmark_variables(scene, options)}
+    draft = Draft(scene, options, {**variables, **structure_variables(scene, options)}, notes)
     made = [(term.name, group) for term in (*TERMS, *more) if term.applies(draft) for group in term.factors(draft)]
     factors = [group.factor for _, group in made]
     used = {ref.group for factor in factors for _, ref in factor.references()}
@@ -162,12 +163,20 @@ def at_places_of(problem: Problem, scene: Scene) -> Problem:
 # --------------------------------------------------------------------------------------------------------- cameras
 
 
-def camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variables]:
-    """Return the groups of frames, sensors and intrinsics, and what of them is held."""
+def camera_variables(scene: Scene, options: AssemblyOptions, gauge: BoolArray | None = None) -> dict[str, Variables]:
+    """Return the groups of frames, sensors and intrinsics, and what of them is held.
+
+    Parameters
+    ----------
+    scene, options
+        Cameras, and what of them moves.
+    gauge : (F, 6) bool, optional
+        What ``first_camera`` holds, where the scene is one part of a whole; else :func:`first_camera_gauge`.
+    """
     chart = POSE_CHARTS[options.pose_chart]
     held: bool | BoolArray = not options.refine_poses
     if options.refine_poses and options.gauge == "first_camera":
-        held = first_camera_gauge(scene)
+        held = first_camera_gauge(scene) if gauge is None else gauge
     if options.refine_poses and options.held_frames is not None:
         held = options.held_frames if isinstance(held, bool) else held | options.held_frames[:, None]
     variables = {"frames": Variables(chart, scene.frames.rig_from_world, held)}
@@ -188,27 +197,38 @@ def camera_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variab
     return variables
 
 
-def first_camera_gauge(scene: Scene) -> BoolArray:
+def observations_of_frames(scene: Scene) -> IntArray:
+    """Return how many points and lines were observed in each frame, (F,)."""
+    seen = [table.image_idx for table in (scene.point_observations, scene.line_observations)]
+    return np.bincount(scene.images.frame_idx[np.concatenate(seen)], minlength=scene.num_frames)
+
+
+def first_camera_gauge(scene: Scene, count: IntArray | None = None, is_metric: bool | None = None) -> BoolArray:
     """Hold the first frame, and of the frame farthest from it the translation along the line between the two; this
     unless measurements tell the scale.
 
     Frames with less than half of the usual number of observations are not taken for either: a camera that hardly
     anything holds would leave the scale to relations measured in lengths, which shrink the scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        The poses.
+    count, is_metric : (F,) int, bool, optional
+        Observations of each frame, and whether measurements tell the scale; where not given, those of the scene.
     """
     poses = scene.frames.rig_from_world
     held = np.zeros((len(poses), 6), dtype=bool)
     if len(poses) == 0:
         return held
-    frame_of = scene.images.frame_idx
-    seen = [table.image_idx for table in (scene.point_observations, scene.line_observations)]
-    count = np.bincount(frame_of[np.concatenate(seen)], minlength=len(poses))
+    count = observations_of_frames(scene) if count is None else count
     fit = np.flatnonzero(count >= 0.5 * np.median(count))
     first = int(fit[0])
     held[first] = True
     centers = se3.inverse(poses)[:, 4:]
     away = centers - centers[first]
     far = int(fit[np.argmax(np.linalg.norm(away[fit], axis=1))])
-    if far != first and not scene.is_metric:
+    if far != first and not (scene.is_metric if is_metric is None else is_metric):
         in_camera = quaternion.rotate(poses[far, :4], away[far])
         held[far, int(np.argmax(np.abs(in_camera)))] = True
     return held
@@ -218,22 +238,30 @@ def first_camera_gauge(scene: Scene) -> BoolArray:
 
 
 def _landmark_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variables]:
-    """Return the groups of landmarks that take part; terms use what they need."""
+    """Return the groups of points and lines, if they take part; terms use what they need."""
     variables = {}
     if options.points and (scene.num_point_observations or len(scene.point_depths)):
         variables["points"] = _point_variables(scene, options.point_chart)
     if options.lines and scene.num_line_observations:
         chart = LINE_CHARTS[options.line_chart]
         variables["lines"] = Variables(chart, chart.from_ambient(scene.lines.plucker))
+    return variables if options.refine_landmarks else _held(variables)
+
+
+def structure_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Variables]:
+    """Return the groups of planes and directions, if they take part."""
+    variables = {}
     if options.planes and scene.num_planes:
         chart = PLANE_CHARTS[options.plane_chart]
         variables["planes"] = Variables(chart, chart.from_ambient(scene.planes.hesse))
     if options.planes and scene.num_directions:
         chart = next(iter(DIRECTION_CHARTS.values()))
         variables["directions"] = Variables(chart, chart.from_ambient(scene.directions.vectors))
-    if not options.refine_landmarks:
-        variables = {name: replace(group, constant=True) for name, group in variables.items()}
-    return variables
+    return variables if options.refine_landmarks else _held(variables)
+
+
+def _held(variables: dict[str, Variables]) -> dict[str, Variables]:
+    return {name: replace(group, constant=True) for name, group in variables.items()}
 
 
 def _point_variables(scene: Scene, chart_name: str = "auto") -> Variables:
@@ -268,4 +296,6 @@ __all__ = [
     "disassemble",
     "first_camera_gauge",
     "gauge_of",
+    "observations_of_frames",
+    "structure_variables",
 ]

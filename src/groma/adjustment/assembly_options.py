@@ -85,6 +85,9 @@ class AssemblyOptions:
     #: Relations between landmarks as distances (``metric``, weighted by ``structure_sigma_px``) or as differences of
     #: pixels (``pixels``, weighted by the noise of the images). Those with a standard deviation are always distances.
     structure_form: str = "metric"
+    #: Points on lines tie points to lines, and only one of the two can be eliminated. With more lines than this they
+    #: are measured in pixels instead, which leaves points and lines uncoupled. The solver keeps no more unasked.
+    max_coupled_lines: int = 4000
     #: Loss of what comes from matching, and of the relations between landmarks.
     loss: Loss = field(default_factory=Trivial)
     #: Another loss of the relations between landmarks.

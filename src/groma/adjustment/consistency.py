@@ -28,7 +28,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from groma._typing import FloatArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
@@ -210,8 +210,8 @@ def _row(
     mean, half_variance = np.mean(spreads, axis=0)
     degrees = runs * mean**2 / half_variance
     average = float(values.mean())
-    low, high = (float(dof / degrees * chi2.ppf(0.5 + side * BAND / 2, degrees)) for side in (-1, 1))
-    least, most = (float(dof / degrees * chi2.ppf(0.5 + side * LIMIT / 2, degrees)) for side in (-1, 1))
+    low, high = (float(dof / degrees * 2.0 * gammaincinv(0.5 * degrees, 0.5 + side * BAND / 2)) for side in (-1, 1))
+    least, most = (float(dof / degrees * 2.0 * gammaincinv(0.5 * degrees, 0.5 + side * LIMIT / 2)) for side in (-1, 1))
     return ConsistencyRow(
         gauge, kind, dof, len(values), average, low, high, low <= average <= high, least <= average <= most
     )

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.adjustment.fit import noise_of
+from groma.adjustment.fit import FIT, noise_of
 from groma.cameras import CameraModel, in_model
 from groma.cameras import model as camera_model
 from groma.factors.contract import Factor, Ref
@@ -45,9 +45,6 @@ class LensGates:
     false_alarm: float = gate(
         1e-6, "probability", "of rings of radial residuals that noise alone exceeds", "convention: five sigma"
     )
-    outlier: float = gate(
-        3e-3, "probability", "of a residual that noise exceeds; others are left out", "convention: 3 sigma"
-    )
     share: float = gate(
         0.1,
         "share",
@@ -55,8 +52,8 @@ class LensGates:
         "convention: a tenth",
     )
     rings: int = gate(16, "rings", "of equal area around the principal point", "convention: as many as a histogram has")
-    most: int = gate(200_000, "observations", "that a lens is estimated from", "cost: more tell no more")
-    steps: int = gate(4, "steps", "with free distortion", "cost: the first brings most")
+    max_observations: int = gate(200_000, "observations", "that a lens is estimated from", "cost: more tell no more")
+    max_iterations: int = gate(4, "steps", "with free distortion", "cost: the first brings most")
 
 
 LENS = LensGates()
@@ -79,8 +76,8 @@ def unmodelled_distortion(problem: Problem, threads: int | None = None, gates: L
     seen = [f for f in problem.factors if isinstance(f, PointReprojection) and f.intrinsics.group in groups]
     if not any(radial_field(f, problem, gates) for f in seen):
         return None
-    options = SolverOptions(max_iterations=gates.steps, threads=threads)
-    begun = _of_points(problem, gates.most)
+    options = SolverOptions(max_iterations=gates.max_iterations, threads=threads)
+    begun = _of_points(problem, gates.max_observations)
     if begun.num_residuals < problem.num_residuals:  # a part of the measurements finds another minimum
         begun = solve(begun, options).problem
     freed = solve(_with_free_lens(begun, groups), options).problem
@@ -101,7 +98,7 @@ def radial_field(factor: PointReprojection, problem: Problem, gates: LensGates =
     radius = np.sqrt(np.einsum("ni,ni->n", away, away))
     along = np.einsum("ni,ni->n", residual, away) / np.maximum(radius, 1e-12)
     square = np.einsum("ni,ni->n", residual, residual)
-    limit = chi_square_gate(gates.outlier, 2) * noise_of(square) ** 2
+    limit = chi_square_gate(FIT.outlier, 2) * noise_of(square) ** 2
     counts: BoolArray = (square < limit) & (square > 0.0)
     if not counts.any():
         return False

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import groma
-from groma.cli.commands import adjust, convert, demo, evaluate, map, report, selfcheck, synth, track, view, warmup
+from groma.cli.commands import adjust, convert, demo, evaluate, localize, map, report, selfcheck, synth, track, view, warmup
 from groma.cli.shared.guard import guard
 
 app = typer.Typer(
@@ -25,6 +25,7 @@ _COMMANDS: _Commands = (
     ("demo", demo.demo, "Map photographs that are shipped with groma: where to begin."),
     ("map", map.map_, "Photographs to points, lines, planes and poses."),
     ("track", track.track, "Follow a camera through a sequence, and map on the way."),
+    ("localize", localize.localize, "Where photographs were taken, in a map that is there already."),
     ("adjust", adjust.adjust, "Bundle adjustment of a COLMAP model, BAL file or archive."),
     ("convert", convert.convert, "From one file format to another."),
     ("report", report.report, "A scene as one HTML page that needs no network."),

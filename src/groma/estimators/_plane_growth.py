@@ -6,10 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators._chance import log10_poisson_tail
 from groma.estimators._plane_candidates import Features
 from groma.estimators._plane_loops import (
     ball_loop,
@@ -186,7 +186,7 @@ class Grower:
         )  # fmt: skip
         if found[0] == 0:
             return self._log_tried
-        return float(stats.poisson.logsf(found[0] - 4, found[1])) / np.log(10.0) + self._log_tried  # three fix it
+        return log10_poisson_tail(found[0] - 4, found[1]) + self._log_tried  # three fix it
 
 
 def connected_to(places: FloatArray, tested: FloatArray, spacing: FloatArray, plane: FloatArray) -> BoolArray:

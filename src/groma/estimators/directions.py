@@ -26,10 +26,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import stats
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
+from groma.estimators._chance import chi_square_quantile, log10_poisson_tail
 from groma.estimators._direction_features import Parallel, Perpendicular, crossings
 from groma.gates import gate
 from groma.geometry.algebra import dot, norm, perpendicular, unit, vectors
@@ -243,7 +243,7 @@ def orthogonal_pairs(
     cosine = dot(directions[first], directions[second])
     variance = np.einsum("mi,mij,mj->m", directions[first], covariance[second], directions[first])
     variance += np.einsum("mi,mij,mj->m", directions[second], covariance[first], directions[second])
-    passed = cosine**2 < stats.chi2.ppf(level, 1) * (variance + sigma**2)
+    passed = cosine**2 < chi_square_quantile(level, 1) * (variance + sigma**2)
     passed &= variance < max_sigma**2
     return np.column_stack([first, second])[passed]
 
@@ -262,9 +262,9 @@ def _search(
 ) -> DirectionSet:
     """Take directions one after the other; see the module."""
     rng = np.random.default_rng(options.seed)
-    gate = float(stats.chi2.ppf(options.level, features.freedom))
+    gate = chi_square_quantile(options.level, features.freedom)
     # Features out to where one in 10^4 ends are taken out together: what is left must not repeat the direction.
-    wide = float(stats.chi2.ppf(DIRECTIONS.taken, features.freedom))
+    wide = chi_square_quantile(DIRECTIONS.taken, features.freedom)
     tried = max(len(features), 2) ** (3 - features.freedom)
     remaining = np.arange(len(features))
     found: list[FloatArray] = []
@@ -293,7 +293,7 @@ def _search(
             inside = pool.squared(direction[None])[0] < gate
             count = int(inside.sum())
             expected = float(np.broadcast_to(pool.chance(direction[None], gate), (1, len(pool))).sum())
-            tail = float(stats.poisson.logsf(count - 1, expected)) / np.log(10) + np.log10(tried)
+            tail = log10_poisson_tail(count - 1, expected) + np.log10(tried)
             spread = count if groups is None else len(np.unique(groups[remaining[inside]]))
             certain = float(np.linalg.eigvalsh(covariance)[-1]) < options.max_sigma**2
             strong = tail < np.log10(options.max_false_alarms) and count >= least

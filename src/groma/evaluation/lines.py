@@ -45,6 +45,7 @@ from groma.evaluation.poses import evaluate_poses
 from groma.geometry.algebra import finite_rows
 from groma.io.geometry import Geometry
 from groma.scene import Scene
+from groma.scene.line_intervals import line_pieces
 
 _CHUNK = 100_000
 
@@ -148,12 +149,12 @@ def evaluate_lines(
     InputError
         If geometry without poses is to be aligned, and as :func:`score_lines`.
     """
-    segments = estimate.segments if isinstance(estimate, Geometry) else estimate.lines.segments
+    segments = estimate.segments if isinstance(estimate, Geometry) else line_pieces(estimate)[0]
     if align:
         if isinstance(estimate, Geometry) or isinstance(reference, Geometry):
             raise InputError("Alignment takes the poses of two scenes; geometry alone has none. Pass align=False.")
         segments = evaluate_poses(estimate, reference).alignment.points(segments)
-    target = reference if isinstance(reference, Geometry) else Geometry(segments=reference.lines.segments)
+    target = reference if isinstance(reference, Geometry) else Geometry(segments=line_pieces(reference)[0])
     return score_lines(segments, target, thresholds)
 
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
@@ -117,6 +116,8 @@ def match_planes(
     scale = max_offset if np.isfinite(max_offset) else max(float(offset.max(initial=0)), 1e-300)
     # A forbidden pair costs more than all allowed ones together.
     forbidden = 2.0 * (min(allowed.shape) + 1)
+    from scipy.optimize import linear_sum_assignment  # takes a third of a second to import
+
     rows, columns = linear_sum_assignment(np.where(allowed, angle / max_angle_deg + offset / scale, forbidden))
     kept = allowed[rows, columns]
     pairs = np.column_stack([rows[kept], columns[kept]])

@@ -9,11 +9,13 @@ Pixels count from the corner of the image (first pixel's centre at 0.5, 0.5).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.images import GrayImage
 from groma.gates import gate
@@ -45,6 +47,29 @@ class PointTrackGates:
 
 #: The numbers in use.
 POINT_TRACKS = PointTrackGates()
+
+
+# ------------------------------------------------------------------------------------------------------------ Kernels
+
+
+@loop
+def _correlate_all(first, second, out):
+    """Write the correlation of the rows of two tables of grey levels; sums of whole numbers are exact."""
+    count = first.shape[1]
+    for i in range(first.shape[0]):
+        a = b = aa = bb = ab = np.int64(0)
+        for k in range(count):
+            x, y = np.int64(first[i, k]), np.int64(second[i, k])
+            a += x
+            b += y
+            aa += x * x
+            bb += y * y
+            ab += x * y
+        size = math.sqrt(float(aa * count - a * a) * float(bb * count - b * b))
+        out[i] = float(ab * count - a * b) / max(size, 1e-6)
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
 
 
 def follow(
@@ -111,18 +136,15 @@ def follow(
 def _alike(image_1: GrayImage, image_2: GrayImage, first, second, window: int) -> FloatArray:
     """Correlation (N,) of the patches around points (N, 2) of two images, in OpenCV's pixels."""
     reach = np.arange(window, dtype=np.float32) - window // 2
-    offset = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2)
+    offset = np.stack(np.meshgrid(reach, reach)).reshape(2, 1, -1)
     patches = []
     for image, places in ((image_1, first), (image_2, second)):
-        at = places[:, None] + offset
-        values = cv2.remap(
-            image, np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1]), cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        ).astype(np.float32)  # fmt: skip
-        patches.append(values - values.mean(axis=1, keepdims=True))
-    a, b = patches
-    size = np.sqrt(np.einsum("nk,nk->n", a, a) * np.einsum("nk,nk->n", b, b))
-    return np.einsum("nk,nk->n", a, b) / np.maximum(size, 1e-6)
+        at = places.T[..., None] + offset
+        values = cv2.remap(image, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        patches.append(np.asarray(values, np.uint8))
+    out = np.zeros(len(first))
+    _correlate_all(*patches, out)
+    return out
 
 
 def spread(

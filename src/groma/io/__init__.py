@@ -6,25 +6,38 @@ from groma.io.atomic import atomic_output
 from groma.io.bal import read_bal, write_bal
 from groma.io.colmap.model import from_pycolmap, read_colmap, to_pycolmap, write_colmap
 from groma.io.g2o import read_g2o, write_g2o
+from groma.io.interchange.bundler import read_bundler
+from groma.io.interchange.nvm import read_nvm
+from groma.io.interchange.openmvg import read_openmvg
+from groma.io.interchange.opensfm import OpenSfmReconstruction, read_opensfm, read_opensfm_reconstructions
+from groma.io.interchange.transforms import Transforms, read_transforms, write_transforms
 from groma.io.limap.structures import Structures, structures_of
 from groma.io.ply import write_geometry, write_obj, write_ply
 from groma.io.registry import SceneFormat, check_target, formats, read_scene, register_format, write_scene
 from groma.io.trajectories import Trajectory, read_trajectory, read_tum, write_trajectory, write_tum
 
 __all__ = [
+    "OpenSfmReconstruction",
     "SceneFormat",
     "Structures",
     "Trajectory",
+    "Transforms",
     "atomic_output",
     "check_target",
     "formats",
     "from_pycolmap",
     "read_archive",
     "read_bal",
+    "read_bundler",
     "read_colmap",
     "read_g2o",
+    "read_nvm",
+    "read_openmvg",
+    "read_opensfm",
+    "read_opensfm_reconstructions",
     "read_scene",
     "read_trajectory",
+    "read_transforms",
     "read_tum",
     "register_format",
     "structures_of",
@@ -38,5 +51,6 @@ __all__ = [
     "write_ply",
     "write_scene",
     "write_trajectory",
+    "write_transforms",
     "write_tum",
 ]

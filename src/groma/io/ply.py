@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """PLY and OBJ files of the geometry of a scene, for viewers and modellers: points, lines, pieces of planes.
 
-Both files hold vertices with colours first: points, then the ends of the segments, then the corners of the planes. The
+Both files hold vertices with colours first: points, then the ends of the segments (one for every interval that
+images support), then the corners of the planes. The
 pieces of planes are the convex hulls of what lies on them (:mod:`groma.scene.patches`). Programs differ in what they
 read: all of them read vertices and faces with the colours of vertices; edges of PLY are read by MeshLab and
 Blender, ``l`` of OBJ by Blender, MeshLab and CloudCompare. Faces are triangles in PLY, because CloudCompare reads no
@@ -24,6 +25,7 @@ from groma.errors import InputError
 from groma.io.atomic import atomic_output
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
+from groma.scene.line_intervals import line_pieces
 from groma.scene.patches import PALETTE, patch_groups, plane_patches, triangle_fans
 
 Part = Literal["points", "lines", "planes"]
@@ -136,18 +138,17 @@ def _geometry(scene: Scene, parts: Collection[Part]) -> _Geometry:
     if isinstance(parts, str) or unknown or not parts:
         raise InputError(f"parts must be some of {', '.join(PARTS)}; got {parts!r}.")
     num_points = scene.num_points if "points" in parts else 0
-    num_lines = scene.num_lines if "lines" in parts else 0
+    pieces, line = line_pieces(scene) if "lines" in parts else (np.zeros((0, 2, 3)), np.zeros(0, np.int64))
+    num_lines = len(line)
     polygons, members = plane_patches(scene) if "planes" in parts else ([], np.zeros(0, np.int64))
     begin = num_points + 2 * num_lines + np.cumsum([0, *(len(corners) for corners in polygons)])
     points = scene.points.color[:num_points]
     return _Geometry(
-        places=np.concatenate(
-            [scene.points.xyz[:num_points], scene.lines.segments[:num_lines].reshape(-1, 3), *polygons]
-        ),
+        places=np.concatenate([scene.points.xyz[:num_points], pieces.reshape(-1, 3), *polygons]),
         colours=np.concatenate(
             [
                 points if points.any() else np.full_like(points, _POINT_GREY),
-                np.repeat(_line_colours(scene)[:num_lines], 2, axis=0),
+                np.repeat(_line_colours(scene)[line], 2, axis=0),
                 np.repeat(PALETTE[patch_groups(members)], [len(corners) for corners in polygons], axis=0),
             ]
         ),

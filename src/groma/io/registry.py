@@ -81,12 +81,12 @@ def formats() -> tuple[SceneFormat, ...]:
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene:
-    """Read a scene: the folder of a COLMAP model, a BAL file, a groma archive or a registered format, by content.
+    """Read a scene: a COLMAP model, a groma archive, a BAL file or one of another program, told by its content.
 
     Parameters
     ----------
     path : path
-        A folder (with the model in it, in ``sparse`` or in ``sparse/0``) or a file.
+        A folder (with the model in it, in ``sparse`` or in ``sparse/0``) or a file; see the page *File formats*.
 
     Returns
     -------
@@ -131,9 +131,11 @@ def write_scene(
         What to write.
     path : path
         Where. With ``format="auto"`` the name says the format: ``.npz`` archive, ``.txt``, ``.bz2`` or ``.gz`` BAL,
-        ``.ply`` and ``.obj`` geometry only (points, lines, pieces of planes), no suffix a COLMAP model in a new folder.
+        ``.json`` cameras, poses and points for nerfstudio, ``.ply`` and ``.obj`` geometry only (points, lines, pieces
+        of planes), no suffix a COLMAP model in a new folder.
     format : str
-        ``colmap``, ``colmap_text``, ``archive``, ``bal``, ``ply``, ``obj`` or a registered one, to override the name.
+        ``colmap``, ``colmap_text``, ``archive``, ``bal``, ``transforms``, ``ply``, ``obj`` or a registered one, to
+        override the name.
     force : bool
         Replace what is there.
     like : Structures, optional

@@ -40,6 +40,7 @@ from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
 from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider, explain, map_lines
+from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.photographs import (
@@ -351,7 +352,8 @@ def _adjusted(
 def _result(
     points: Scene, before: Scene, adjusted: AdjustResult, weighted: AdjustOptions, line_map: LineMap
 ) -> MapResult:
-    scene, before = without_unused(adjusted.scene, before)
+    scene, before = without_unused(with_supported_intervals(adjusted.scene), before)
+    before = before.replace(line_intervals=scene.line_intervals)
     missing = [] if line_map.num_lines else ["No line was mapped; see what became of the segments."]
     return MapResult(
         scene=scene,

@@ -111,6 +111,8 @@ class MapResult:
             Folder on the same disk in which the results are built; by default beside ``folder``.
         """
         numbers = dict(self.summary() if summary is None else summary)
+        if isinstance(images, str | os.PathLike):
+            numbers["images"] = os.path.abspath(images)  # where groma localize looks for them
         with atomic_output(folder, force, work) as draft:
             write_scene(self.scene, draft, format="colmap")
             write_scene(self.scene, draft / "scene.npz")

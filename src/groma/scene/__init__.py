@@ -4,6 +4,7 @@
 from groma.scene.camera import Cameras, Rigs, Sensors
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
+from groma.scene.line_intervals import LineIntervals
 from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.scene import Scene
@@ -16,6 +17,7 @@ __all__ = [
     "Images",
     "Keypoints",
     "LineDepths",
+    "LineIntervals",
     "LineObservations",
     "Lines",
     "PlaneObservations",

@@ -13,7 +13,7 @@ all references are checked when it is made. Every change gives a new scene.
     line_observations  -> images, lines           relations -> points, lines, planes, directions
     point_depths       -> images, points          right_columns -> point_observations
     plane_observations -> images, planes          line_depths   -> line_observations
-    pose_priors        -> frames
+    pose_priors        -> frames                  line_intervals -> lines
 
 Each column declares in its table what it refers to and how it changes when the world moves (see
 :func:`groma.scene.table.column`); checks, selections and transforms here go by that.
@@ -34,6 +34,7 @@ from groma.geometry import quaternion, se3
 from groma.scene.camera import CAMERA, Cameras, Rigs, Sensors
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
+from groma.scene.line_intervals import LineIntervals
 from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
@@ -64,6 +65,8 @@ class Scene:
     keypoints: Keypoints = field(default_factory=Keypoints)
     #: 3D lines.
     lines: Lines = field(default_factory=Lines)
+    #: Where along them lines are supported, of those that have gaps.
+    line_intervals: LineIntervals = field(default_factory=LineIntervals)
     #: Lines seen in images.
     line_observations: LineObservations = field(default_factory=LineObservations)
     #: Planes.

@@ -11,6 +11,7 @@ from groma.problem.variables import Variables
 from groma.solver.linear.choice import linear_solver_names
 
 METHODS = ("levenberg_marquardt", "gauss_newton")
+SHARED_SYSTEMS = ("auto", "formed", "products")
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,10 @@ class SolverOptions:
     #: How the reduced system is solved: ``auto``, ``dense``, ``sparse``, ``pcg``, or a solver that was registered
     #: (:mod:`groma.solver.linear.contract`).
     linear_solver: str = "auto"
+    #: Where landmarks come in shards: ``formed``, every process holds the whole reduced system; ``products``, blocks
+    #: off its diagonal stay with their shards, and conjugate gradients sum products with them; ``auto``: products where
+    #: there are very many cameras (:data:`groma.solver.reduce.shards.MAX_FORMED`).
+    shared_system: str = "auto"
     #: Steps of every landmark on its own after each accepted joint step; a step that does not help is undone.
     landmark_steps: int = 0
     #: The groups of landmarks that take them; None: all that are eliminated.
@@ -54,9 +59,15 @@ class SolverOptions:
                 f"There is no strategy any more (got {strategy!r}): steps are damped as method='levenberg_marquardt' "
                 "says, or not at all, method='gauss_newton'."
             )
-        for name, allowed in {"method": METHODS, "linear_solver": linear_solver_names()}.items():
+        choices = {"method": METHODS, "linear_solver": linear_solver_names(), "shared_system": SHARED_SYSTEMS}
+        for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
+        if self.shared_system == "products" and self.linear_solver not in ("auto", "pcg"):
+            raise InputError(
+                f"shared_system='products' is for conjugate gradients; got linear_solver={self.linear_solver!r}. Leave "
+                "one of them out."
+            )
         if self.initial_damping is not None and not self.initial_damping > 0.0:
             raise InputError(
                 f"initial_damping must be positive; got {self.initial_damping}. Steps without damping are "

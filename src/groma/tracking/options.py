@@ -46,7 +46,8 @@ class TrackOptions:
     adjust_at_end: bool = True
     #: Use relations between landmarks that the data support: lines on planes, parallel and perpendicular planes.
     relations: bool = True
-    #: Adjust the window in a thread of its own; its result is taken up two frames later, so runs repeat exactly.
+    #: Work in several threads; the result is the same. A keyframe and the adjustment of its window are taken up two
+    #: frames later, with threads or without.
     threaded: bool = True
     #: Tuned numbers: thresholds, with unit, meaning and origin.
     gates: TrackingGates = field(default_factory=TrackingGates)

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from groma.errors import GromaError, InputError
 from groma.evaluation.trajectory import TrajectoryScores, score_trajectory
 from groma.io import atomic_output, write_scene
 from groma.io.sequences import Sequence, open_sequence
+from groma.io.sequences.frame import Frame
 from groma.io.trajectories import write_tum
 from groma.tracking.journal import Journal
 from groma.tracking.options import TrackOptions
@@ -186,8 +189,8 @@ def _follow(
     """
     total = sequence.num_frames or 0
     try:
-        for frame in sequence:
-            tracked = tracker.process(frame)
+        for frame, following in _read_ahead(sequence, tracker.options.threaded):
+            tracked = tracker.process(frame, following)
             frames.append(tracked)
             if journal is not None:
                 journal.frame(tracked)
@@ -204,6 +207,25 @@ def _follow(
     except KeyboardInterrupt:
         return tracker, False
     return tracker, True
+
+
+def _read_ahead(sequence: Sequence, threaded: bool) -> Iterator[tuple[Frame, Frame | None]]:
+    """Yield each frame with the one after it, which is read in another thread while earlier ones are tracked.
+
+    A frame that cannot be read raises in its turn.
+    """
+    if not threaded:
+        yield from ((frame, None) for frame in sequence)
+        return
+    frames = iter(sequence)
+    reader = ThreadPoolExecutor(1, thread_name_prefix="groma-read")
+    try:
+        waiting = deque(reader.submit(next, frames, None) for _ in range(2))
+        while (frame := waiting.popleft().result()) is not None:
+            waiting.append(reader.submit(next, frames, None))
+            yield frame, None if waiting[0].exception() else waiting[0].result()
+    finally:
+        reader.shutdown(wait=True, cancel_futures=True)
 
 
 def _compared(result: TrackResult, sequence: Sequence) -> tuple[TrajectoryScores | None, str]:

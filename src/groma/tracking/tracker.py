@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import InputError
+from groma.execution import work_with
 from groma.geometry import se3
 from groma.io.sequences.frame import Frame, SequenceCamera
 from groma.io.trajectories import Trajectory
@@ -26,10 +28,11 @@ from groma.solver.report import SolveReport
 from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.submaps import about_submaps
 from groma.tracking.ending import Ending
-from groma.tracking.frame.camera import TrackCamera, back
+from groma.tracking.frame.ahead import LookAhead
+from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.checks import FrameChecks
 from groma.tracking.frame.coarse_alignment import turned, turned_prediction
-from groma.tracking.frame.features import FrameFeatures, grid_pixels
+from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.frame.rectification import RightTurn
 from groma.tracking.map.keyframes import Followed, keyframe_nearby, wants_keyframe
 from groma.tracking.map.points import find_again
@@ -48,7 +51,7 @@ from groma.tracking.outcome import (
     TrackResult,
 )
 from groma.tracking.pose.estimate import PoseEstimate
-from groma.tracking.pose.following import Attempt, follow_frame
+from groma.tracking.pose.following import Attempt, find_points_again, follow_frame
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import Found, promote
@@ -81,6 +84,7 @@ class Tracker:
         self._motion = MotionModel(self.options.gates.motion)
         self._initialiser: Initialiser | None = None
         self._mapper = Mapper(self.camera, self.options, right_turn)
+        self._ahead = LookAhead(self.camera, self.options, self._mapper.right)
         self._present = Present()
         self._history = History()
         self._verification = PoseVerification(self.camera, self.options)
@@ -89,6 +93,8 @@ class Tracker:
         self._guess = np.zeros((0, 0), np.uint8), self._present.pose
         #: What happened to the track between its maps, for the reader.
         self._breaks: list[tuple[float, float]] = []
+        #: Whether the frame before had to be searched.
+        self._searched = False
         self._finished = False
 
     @property
@@ -107,8 +113,15 @@ class Tracker:
 
     # ------------------------------------------------------------------------------------------------- each frame
 
-    def process(self, frame: Frame) -> TrackedFrame:
+    def process(self, frame: Frame, following: Frame | None = None) -> TrackedFrame:
         """Track one frame; frames must come in order of time.
+
+        Parameters
+        ----------
+        frame
+            The frame.
+        following
+            The frame after it, if it is there already: its planes are found meanwhile. The result is the same.
 
         Returns
         -------
@@ -129,19 +142,21 @@ class Tracker:
         if reason:
             return self._skip(frame, reason, began)
         present, mapper = self._present, self._mapper
-        data = FrameFeatures(frame, self.camera, self.options, mapper.right)
+        data = self._ahead.take(frame)
         mapper.advance(present, watch)
+        self._ahead.announce(following, mapper.frame_pool, mapper.workers if self._searched else None)
         if not self.map.keyframes:
             return self._start(data, began, watch)
         attempt, found = self._follow(data, watch), None
-        if attempt.estimate is None:
+        self._searched = attempt.estimate is None
+        if self._searched:
             attempt, found = self._search(data, attempt, watch)
         estimate, followed = attempt.estimate, attempt.followed
         if estimate is None:
             return self._lose(data, attempt.predicted, began, watch)
         pose, status = estimate.pose, FOUND if self._lost_for else TRACKED
         with watch("again"):
-            followed = self._find_again(data, pose, followed)
+            followed = find_points_again(self.map, data, pose, followed)
         self._motion.update(present.pose if self._lost_for == 0 else None, pose, frame.timestamp)
         if estimate.weak and status == TRACKED:
             status = WEAK
@@ -158,7 +173,7 @@ class Tracker:
         ):
             mapper.choose(present, data)
             is_keyframe = True
-            if found is not None or not mapper.threaded:
+            if found is not None:
                 # What was found by features alone cannot be followed; the next frame needs this one's landmarks.
                 mapper.make_keyframe(present, watch)
         return self._report(frame, status, estimate, is_keyframe, began, watch)
@@ -173,8 +188,9 @@ class Tracker:
         with watch("turn"):
             predicted, prior_sigma = self._with_turn(data, predicted, prior_sigma)
         estimate, followed = follow_frame(
-            self.map, present.data, data, present.followed, present.pose, predicted, prior_sigma, watch
-        )
+            self.map, present.data, data, present.followed, present.pose, predicted, prior_sigma, watch,
+            self._mapper.frame_pool,
+        )  # fmt: skip
         if estimate is None:
             return Attempt(predicted, prior_sigma, followed=followed)
         trusted = self._verification.trusts(self.map, data, estimate)
@@ -190,7 +206,7 @@ class Tracker:
         if self._lost_for == 0:
             # The frame before is the nearest there is to look for.
             mapper.keep_present(present, watch)
-        with watch("find"):
+        with watch("find"), work_with(None if mapper.threaded else 1):
             found = self._find(data, attempt.predicted, attempt.prior_sigma, unconfirmed)
         if found is not None and not (
             attempt.trusted and unconfirmed is not None and self._verification.score(unconfirmed) >= found.score
@@ -219,19 +235,11 @@ class Tracker:
         tracks = tracks.take(points.alive[tracks.index])
         better = turned_prediction(
             self.camera, present.data.gray, data.gray, (tracks.pixel, points.xyz[tracks.index]),
-            self._spread(present.data, present.pose), present.pose, predicted, gates,
+            partial(present.data.spread_places, present.pose), present.pose, predicted, gates,
         )  # fmt: skip
         if better is None:
             return predicted, prior_sigma
         return better, np.maximum(prior_sigma, [0.0] * 3 + [gates.sigma] * 3)
-
-    def _spread(self, data: FrameFeatures, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixels spread over a frame and their places, where it has a depth image."""
-        if data.depth is None:
-            return np.zeros((0, 2)), np.zeros((0, 3))
-        known = np.isfinite(data.depth_grid)
-        pixel = grid_pixels(self.camera, self.options.gates.depth)[known]
-        return pixel, back(pose, self.camera.bearings(pixel) * data.depth_grid[known, None])
 
     def _find(self, data, predicted, prior_sigma, unconfirmed: PoseEstimate | None) -> Found | None:
         """Find a pose by described features: near the last keyframes first, then anywhere."""
@@ -244,14 +252,6 @@ class Tracker:
         if found is None or self._lost_for > self._gates.lost_frames:
             return found
         return found if self._verification.is_near(found.estimate.pose, predicted, prior_sigma) else None
-
-    def _find_again(self, data: FrameFeatures, pose: FloatArray, followed: Followed) -> Followed:
-        """Look for points of the map that are in view but not followed."""
-        room, gates = self.options.num_points - len(followed.points), self.options.gates.points
-        if not self.options.points or room < gates.again_room * self.options.num_points:
-            return followed
-        found = find_again(self.map, self.camera, data.gray, pose, followed.points, room, gates)
-        return Followed(followed.points.joined(found), followed.lines)
 
     def _visit_nearby(self, data: FrameFeatures) -> bool:
         """Follow an older keyframe that stands for the present pose; return whether there is one, still seen well."""

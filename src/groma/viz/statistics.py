@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.scene.line_intervals import supported_lengths
 from groma.viz.drawable import drawable, rms_by_group
 
 if TYPE_CHECKING:
     from groma.scene import Scene
-    from groma.viz.drawable import Drawable
+    from groma.scene.line_intervals import supported_lengths
+from groma.viz.drawable import Drawable
 
 
 @dataclass(frozen=True)
 class LineStatistics:
     """Numbers of L lines and their M observations, in the order of the scene."""
 
-    #: (L,) lengths of the segments, scene units.
+    #: (L,) lengths of what images support of the lines, scene units.
     length: FloatArray
     #: (L,) numbers of different images that observe them.
     num_images: IntArray
@@ -57,7 +59,7 @@ def line_statistics(scene: Scene, shown: Drawable | None = None) -> LineStatisti
     squares = 0.5 * np.einsum("mei,mei->m", ends, ends)
     far = np.sqrt(squares)
     return LineStatistics(
-        length=np.linalg.norm(scene.lines.segments[:, 1] - scene.lines.segments[:, 0], axis=1),
+        length=supported_lengths(scene),
         num_images=images_of(seen.line_idx, seen.image_idx, scene.num_lines),
         residual_px=rms_by_group(far, seen.line_idx, scene.num_lines, empty=np.nan),
         end_residuals=ends,

@@ -25,7 +25,7 @@ from groma.adjustment.parts.checkpoint import FOLDER, Checkpoint, key_of
 from groma.adjustment.parts.cut import parts_of
 from groma.adjustment.parts.memory import room_for_parts
 from groma.adjustment.parts.opened import open_parts
-from groma.adjustment.parts.run import Run, Solved, Squares
+from groma.adjustment.parts.run import Run, Solved, Squares, Written
 from groma.adjustment.parts.together import agreed
 from groma.adjustment.report import AdjustReport, not_converged
 from groma.errors import InputError, OutputError
@@ -60,14 +60,14 @@ def adjust_parts(
     reducer: Reducer | None = None,
     **assembly: object,
 ) -> PartsResult:
-    """Adjust the cameras, points and lines of all parts together.
+    """Adjust the cameras, points, lines, planes and directions of all parts together.
 
     A run that was killed goes on after its last step, if it is started again with the same parts, output and options.
 
     Parameters
     ----------
     parts : sequence of path
-        Archives with the same cameras and images, each with landmarks of its own.
+        Archives with the same cameras, images and planes, each with points and lines of its own.
     output : path
         Folder for the adjusted archives, which keep their names.
     loss : Loss or sequence of Loss, optional
@@ -94,12 +94,12 @@ def adjust_parts(
     Raises
     ------
     InputError
-        If the parts do not have the same images, or there is nothing to adjust.
+        If the parts do not have the same images and planes, or there is nothing to adjust.
     OutputError
         If archives exist in ``output`` already, or cannot be written.
     """
     reducer, options = reducer or Alone(), options or SolverOptions()
-    chosen = AssemblyOptions(**{"planes": False, **assembly})  # type: ignore[arg-type]
+    chosen = AssemblyOptions(**assembly)  # type: ignore[arg-type]
     paths = [Path(part) for part in parts]
     with agreed(reducer):
         _check_names(paths)
@@ -116,11 +116,11 @@ def adjust_parts(
             _prepare(Path(output), paths, begin is not None, force)
     run = Run(opened, losses, options, progress, reducer, room_for_parts(keep, reducer), checkpoint)
     solved = run.solve(begin)
-    after = run.write(solved, Path(output))
+    written = run.write(solved, Path(output))
     with agreed(reducer):
         if reducer.rank == 0:
             _tidy(Path(output), paths, checkpoint)
-    return _result(run, Path(output), solved, after)
+    return _result(run, Path(output), solved, written)
 
 
 def _check_names(paths: Sequence[Path]) -> None:
@@ -156,9 +156,9 @@ def _tidy(output: Path, paths: Sequence[Path], checkpoint: Checkpoint) -> None:
     checkpoint.remove()
 
 
-def _result(run: Run, output: Path, solved: Solved, after: Squares) -> PartsResult:
+def _result(run: Run, output: Path, solved: Solved, written: Written) -> PartsResult:
     """Say what an adjustment did."""
-    opened, before = run.opened, [fact["squares"] for fact in run.opened.facts]
+    opened, before, after = run.opened, [fact["squares"] for fact in run.opened.facts], written.squares
     measurements: dict[str, int] = {}
     for fact in opened.facts:
         for name, count in fact["measurements"].items():
@@ -169,12 +169,13 @@ def _result(run: Run, output: Path, solved: Solved, after: Squares) -> PartsResu
         num_images=opened.num_images,
         num_points=opened.total("points"),
         num_lines=opened.total("lines"),
-        num_planes=0,
+        num_planes=opened.num_planes,
         num_observations=opened.total("observations"),
         rmse_px={kind: {"before": _rms(before, kind), "after": _rms(after, kind)} for kind in _kinds(before)},
         inliers={},
         sigma0=None,
         solve=solved.report,
+        relations=written.relations,
         warnings=warnings,
         stages=solved.stages,
         num_measurements=measurements,

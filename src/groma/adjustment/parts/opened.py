@@ -8,7 +8,6 @@ number of them.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,13 +15,18 @@ from typing import Any
 
 import numpy as np
 
+from groma._typing import IntArray
 from groma.adjustment.assemble import (
     Assembly,
     AssemblyOptions,
     assemble,
     camera_variables,
+    first_camera_gauge,
     gauge_of,
+    observations_of_frames,
+    structure_variables,
 )
+from groma.adjustment.parts.same import check_same_scene
 from groma.adjustment.parts.together import agreed, exchange
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.stages import with_loss
@@ -34,14 +38,15 @@ from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene, Similarity
 from groma.scene.local_frame import local_frame
+from groma.solver.reduce import exact_sums
 from groma.solver.reduce.contract import Reducer
 from groma.solver.reduce.shard import Shard
 from groma.solver.steps import States
 
 #: Groups of landmarks.
 LANDMARKS = ("points", "lines")
-#: These and the groups of cameras, by the first part of their names.
-GROUPS = (*LANDMARKS, "frames", "sensors", "intrinsics")
+#: Groups that all parts share, by the first part of their names.
+SHARED = ("frames", "sensors", "intrinsics", "planes", "directions")
 
 
 @dataclass(frozen=True)
@@ -82,14 +87,19 @@ class OpenParts:
         scene = self.read(part)
         made = assemble(scene, self.options)
         own = {} if states is None else self.states_of(part, states)
+        # A part may have no factors of planes, for example; they move all the same.
+        shared = {name: group for name, group in self.variables.items() if _is_shared(name)}
         variables = {
-            name: replace(group, state=own.get(name, group.state)) for name, group in made.problem.variables.items()
+            name: replace(group, state=own.get(name, group.state))
+            for name, group in (shared | dict(made.problem.variables)).items()
         }
         problem = Problem(variables, made.problem.factors)
-        return scene, replace(made, problem=problem if loss is None else with_loss(problem, loss))
+        if loss is not None:
+            problem = with_loss(problem, loss, self.options.relation_loss)
+        return scene, replace(made, problem=problem)
 
     def states_of(self, part: Part, states: States) -> States:
-        """Return the states of the cameras and of the landmarks of a part."""
+        """Return the states of what all parts share and of the landmarks of a part."""
         return {
             name: state[part.rows.get(name, slice(None))]
             for name, state in states.items()
@@ -99,6 +109,11 @@ class OpenParts:
     def shards(self, loss: Loss) -> list[Shard]:
         """Return the parts of this process for a solve under a loss."""
         return [Shard(part.rows, _Reader(self, part, loss)) for part in self.parts]
+
+    @property
+    def num_planes(self) -> int:
+        """Number of planes that take part."""
+        return len(self.variables.get("planes", ()))
 
     def total(self, name: str) -> int:
         """Return the sum of a number over all parts."""
@@ -123,48 +138,66 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
     Raises
     ------
     InputError
-        On all processes, if one of them cannot read its parts, sees others than the rest, or finds cameras that are
-        not those of the first part; or if there is nothing to adjust.
+        On all processes, if one of them cannot read its parts, sees others than the rest, or finds cameras or planes
+        that are not those of the first part; or if there is nothing to adjust.
     """
+    # Lines in the reduced system would be on all processes: points are tied to lines in pixels.
+    options = replace(options, max_coupled_lines=0)
     with agreed(reducer):
         sizes = [path.stat().st_size for path in paths]
     _check_same(reducer, [[path.name, size] for path, size in zip(paths, sizes, strict=True)])
     with agreed(reducer):
         head = read_archive(paths[0])
         near = local_frame(head)
-    owner = _owners(sizes, reducer.size)
-    groups: dict[str, list[Variables]] = {}
-    held: dict[str, Variables] = {}
-    parts, facts = [], {}
+        head = head if near is None else head.transformed(near)
+    mine = np.flatnonzero(_owners(sizes, reducer.size) == reducer.rank)
     with agreed(reducer):
-        for number in np.flatnonzero(owner == reducer.rank).tolist():
-            scene = _read(paths[number], near)
-            _check_cameras(paths[number], scene, paths[0], head if near is None else head.transformed(near))
-            made = assemble(scene, options)
-            rows = {}
-            for name in LANDMARKS:
-                if name in made.problem.variables:
-                    group = made.problem.variables[name]
-                    begin = sum(map(len, groups.setdefault(name, [])))
-                    rows[name] = slice(begin, begin + len(group))
-                    groups[name].append(group)
-            parts.append(Part(paths[number], rows))
-            held |= {name: made.problem.variables[name] for name in _held_besides(made)}
-            facts[number] = _facts(scene, options, made)
-    told = {int(number): fact for own in exchange(reducer, facts) for number, fact in own.items()}
+        parts, own, facts, count = _read_own(paths, mine.tolist(), options, (head, near))
+    told = {int(number): fact for part in exchange(reducer, facts) for number, fact in part.items()}
     ordered = tuple(told[number] for number in sorted(told))
     with agreed(reducer):
-        if not any(fact["points"] or fact["lines"] for fact in ordered):
-            raise InputError("There is nothing to adjust: no part has points or lines with observations.")
+        if not any(fact["kept"] for fact in ordered):
+            raise InputError("There is nothing to adjust: no part has points, lines or planes with observations.")
     options = replace(options, gauge=_gauge(options, ordered))
-    cameras = camera_variables(head if near is None else head.transformed(near), options)
+    held = first_camera_gauge(head, _sum_of(count, reducer), any(fact["metric"] for fact in ordered))
+    shared = {**camera_variables(head, options, held), **structure_variables(head, options)}
     used = {name for fact in ordered for name in fact["kept"]}
     with agreed(reducer):
-        if unknown := sorted(used - cameras.keys()):
+        if unknown := sorted(used - shared.keys()):
             raise InputError(f"Parts cannot share these variables: {', '.join(unknown)}. Leave their options out.")
-    variables = {name: group for name, group in cameras.items() if name in used} | held
-    variables |= {name: _joined(groups[name]) for name in LANDMARKS if name in groups}
+    variables = {name: group for name, group in shared.items() if name in used} | own
     return OpenParts(tuple(paths), tuple(parts), variables, options, near, ordered, head.num_images)
+
+
+def _read_own(
+    paths: Sequence[Path], mine: list[int], options: AssemblyOptions, first: tuple[Scene, Similarity | None]
+) -> tuple[list[Part], dict[str, Variables], dict[int, dict[str, Any]], IntArray]:
+    """Return the parts of this process, variables of theirs alone, facts by part, and observations of each frame."""
+    head, near = first
+    groups: dict[str, list[Variables]] = {}
+    held: dict[str, Variables] = {}
+    parts, facts, count = [], {}, np.zeros(head.num_frames, np.int64)
+    for number in mine:
+        scene = _read(paths[number], near)
+        check_same_scene(paths[number], scene, paths[0], head, options.planes)
+        made = assemble(scene, options)
+        rows = {}
+        for name in LANDMARKS:
+            if name in made.problem.variables:
+                group = made.problem.variables[name]
+                begin = sum(map(len, groups.setdefault(name, [])))
+                rows[name] = slice(begin, begin + len(group))
+                groups[name].append(group)
+        parts.append(Part(paths[number], rows))
+        held |= {name: made.problem.variables[name] for name in _held_besides(made)}
+        facts[number] = _facts(scene, options, made)
+        count += observations_of_frames(scene)
+    return parts, held | {name: _joined(group) for name, group in groups.items()}, facts, count
+
+
+def _sum_of(count: IntArray, reducer: Reducer) -> IntArray:
+    """Return the sum over processes."""
+    return exact_sums.rounded(reducer.sum(count.astype(complex))).astype(np.int64)
 
 
 def _read(path: Path, near: Similarity | None) -> Scene:
@@ -182,6 +215,7 @@ def _facts(scene: Scene, options: AssemblyOptions, made: Assembly) -> dict[str, 
         "measurements": made.num_measurements,
         "kept": sorted(made.problem.variables.keys() - set(LANDMARKS) - _held_besides(made)),
         "priors": len(scene.pose_priors) > 0,
+        "metric": scene.is_metric,
         "gauge": gauge_of(scene, options) if options.gauge == "auto" else options.gauge,
         "squares": {kind: [float(values.sum()), len(values)] for kind, values in squares.items()},
         "notes": list(made.notes),
@@ -191,7 +225,11 @@ def _facts(scene: Scene, options: AssemblyOptions, made: Assembly) -> dict[str, 
 def _held_besides(made: Assembly) -> set[str]:
     """Return the groups that a term adds and that do not move, such as the places of second cameras of stereo pairs."""
     groups = made.problem.variables.items()
-    return {name for name, group in groups if group.is_constant and name.partition("/")[0] not in GROUPS}
+    return {name for name, group in groups if group.is_constant and not (_is_shared(name) or name in LANDMARKS)}
+
+
+def _is_shared(name: str) -> bool:
+    return name.partition("/")[0] in SHARED
 
 
 def _gauge(options: AssemblyOptions, facts: Sequence[dict[str, Any]]) -> str:
@@ -221,22 +259,6 @@ def _check_same(reducer: Reducer, listing: list[list[Any]]) -> None:
                     f"Rank 0 sees {len(told[0])} parts and rank {rank} sees {len(other)}, or files of other sizes. All "
                     "machines need the same folder, for example on a disk they share."
                 )
-
-
-def _check_cameras(path: Path, scene: Scene, first: Path, head: Scene) -> None:
-    if path != first and _cameras_digest(scene) != _cameras_digest(head):
-        raise InputError(
-            f"{path} has other images or cameras than {first}, or other poses. All parts need the same ones: cut one "
-            "scene with groma convert --parts."
-        )
-
-
-def _cameras_digest(scene: Scene) -> str:
-    state = hashlib.sha256(repr((scene.images.names, scene.cameras.models)).encode())
-    poses = scene.frames.rig_from_world, scene.sensors.cam_from_rig
-    for array in (scene.cameras.params, scene.images.frame_idx, *poses):
-        state.update(np.ascontiguousarray(array).tobytes())
-    return state.hexdigest()
 
 
 def _joined(groups: list[Variables]) -> Variables:

@@ -16,6 +16,7 @@ from groma.adjustment.parts.checkpoint import Checkpoint, Progressed, reports_of
 from groma.adjustment.parts.opened import LANDMARKS, OpenParts
 from groma.adjustment.parts.together import agreed, exchange
 from groma.adjustment.pixel_residuals import squared_residuals_px
+from groma.adjustment.relation_outcome import drop_failed_relations
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
 from groma.adjustment.stages import one_after_another, stage_entries
@@ -42,6 +43,17 @@ class Solved:
     states: States
     report: SolveReport
     stages: tuple[dict[str, Any], ...]
+    #: The loss of the last of them.
+    loss: Loss
+
+
+@dataclass(frozen=True)
+class Written:
+    """What is known of all parts when they are written."""
+
+    squares: Squares
+    #: By kind, how many relations between landmarks hold, and how many the loss gave up.
+    relations: dict[str, dict[str, int]]
 
 
 @dataclass(frozen=True)
@@ -81,7 +93,7 @@ class Run:
         report = replace(report, initial_cost=reports[0].initial_cost)
         if loss != losses[0]:  # costs under different losses cannot be compared
             report = replace(report, initial_cost=self._evaluate(start, loss).initial_cost)
-        return Solved(states, report, stage_entries(losses, reports))
+        return Solved(states, report, stage_entries(losses, reports), loss)
 
     def _stage(
         self, states: States, loss: Loss, last: bool, earlier: list[SolveReport]
@@ -100,7 +112,7 @@ class Run:
             options,
             max_iterations=options.max_iterations - spent,
             function_tolerance=options.function_tolerance if last else stage_tolerance(loss),
-            initial_damping=options.initial_damping or damping_after(earlier, loss),
+            initial_damping=options.initial_damping or damping_after(earlier, loss) or None,
         )
         solution = solve_shards(
             {name: group.with_state(states[name]) for name, group in self.opened.variables.items()},
@@ -161,13 +173,13 @@ class Run:
         median = 2.0 ** (BIN_RANGE[0] + (middle + 0.5) * (BIN_RANGE[1] - BIN_RANGE[0]) / BINS)
         return max(loss.scale, LAST_SCALE_SIGMAS * float(np.sqrt(median / MEDIAN_SQUARE)))
 
-    def write(self, solved: Solved, output: Path) -> Squares:
-        """Write the parts of this process; return the squared residuals of all parts."""
+    def write(self, solved: Solved, output: Path) -> Written:
+        """Write the parts of this process; return squared residuals and relations of all parts."""
         own, opened = {}, self.opened
         with agreed(self.reducer):
             for part in opened.parts:
-                scene, made = opened.assembled(part, solved.states)
-                adjusted = disassemble(scene, made.problem)
+                scene, made = opened.assembled(part, solved.states, solved.loss)
+                adjusted, relations = drop_failed_relations(disassemble(scene, made.problem), made.problem)
                 if "lines" in part.rows and self.checkpoint.moved[part.rows["lines"]].any():
                     moved = np.flatnonzero(self.checkpoint.moved[part.rows["lines"]])
                     adjusted = with_seen_ends(adjusted, moved)
@@ -175,9 +187,15 @@ class Run:
                     adjusted = adjusted.transformed(opened.near.inverse())
                 write_archive(adjusted, output / part.path.name, force=True)
                 squares = squared_residuals_px(made)
-                own[part.path.name] = {kind: [float(v.sum()), len(v)] for kind, v in squares.items()}
+                squares = {kind: [float(v.sum()), len(v)] for kind, v in squares.items()}
+                own[part.path.name] = {"squares": squares, "relations": relations}
         told = {name: found for facts in exchange(self.reducer, own) for name, found in facts.items()}
-        return [told[path.name] for path in opened.paths]
+        outcome: dict[str, dict[str, int]] = {}
+        for path in opened.paths:
+            for kind, counts in told[path.name]["relations"].items():
+                total = outcome.setdefault(kind, dict.fromkeys(counts, 0))
+                outcome[kind] = {name: total[name] + count for name, count in counts.items()}
+        return Written([told[path.name]["squares"] for path in opened.paths], outcome)
 
 
-__all__ = ["Run", "Solved", "Squares"]
+__all__ = ["Run", "Solved", "Squares", "Written"]

@@ -7,7 +7,13 @@ import os
 from dataclasses import fields
 from typing import Any
 
-from groma.adjustment.adjust import AdjustOptions, assembly_options_of, losses_of, start_tolerance_of
+from groma.adjustment.adjust import (
+    AdjustOptions,
+    assembly_options_of,
+    losses_of,
+    relation_loss_of,
+    start_tolerance_of,
+)
 from groma.factors.losses import Loss
 from groma.io.archive import read_archive
 from groma.solver.options import SolverOptions
@@ -22,7 +28,7 @@ def settings_of(
     """
     scene = read_archive(part)
     losses = losses_of(scene, options)
-    assembly = assembly_options_of(scene, options, losses[-1], None)
+    assembly = assembly_options_of(scene, options, losses[-1], relation_loss_of(scene, options))
     solver = SolverOptions(
         max_iterations=options.max_iterations,
         function_tolerance=options.function_tolerance,
@@ -30,8 +36,8 @@ def settings_of(
         linear_solver=options.linear_solver,
         threads=options.threads,
     )
-    values = {item.name: getattr(assembly, item.name) for item in fields(assembly) if "loss" not in item.name}
-    return losses, solver, values | {"planes": False}
+    values = {item.name: getattr(assembly, item.name) for item in fields(assembly) if item.name != "loss"}
+    return losses, solver, values
 
 
 __all__ = ["settings_of"]

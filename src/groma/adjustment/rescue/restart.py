@@ -206,7 +206,9 @@ def with_seen_ends(scene: Scene, lines: IntArray) -> Scene:
     backward = ((X[:, 1] - X[:, 0]) * plucker[:, 3:]).sum(axis=1) < 0.0
     X[backward] = X[backward, ::-1]
     segments[chosen] = X
-    return scene.replace(lines=scene.lines.replace(segments=segments))
+    table = scene.line_intervals
+    kept = table.take(~np.isin(table.line_idx, chosen))  # what was seen of the others is no longer there
+    return scene.replace(lines=scene.lines.replace(segments=segments), line_intervals=kept)
 
 
 def viewing_rays(scene: Scene, rows: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -29,9 +29,6 @@ RELATION_FACTORS = {
     "parallel_planes": "parallel_planes",
     "orthogonal_planes": "perpendicular_planes",
 }
-#: Points on lines tie points to lines, and only one of the two can be eliminated. With more lines than this they are
-#: measured in pixels instead, which leaves points and lines uncoupled. The solver keeps no more of its own accord.
-MAX_COUPLED_LINES = 4000
 
 
 def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
@@ -87,7 +84,7 @@ def _weights(draft: Draft, kind: str, of: str, rows: IntArray) -> FloatArray:
 def metric_rows(draft: Draft, kind: str) -> IntArray:
     """Return the relations of a kind that are measured in lengths: all, or those with a standard deviation."""
     count = len(getattr(draft.scene.relations, kind))
-    if kind == "point_on_line" and draft.scene.num_lines > MAX_COUPLED_LINES:
+    if kind == "point_on_line" and draft.scene.num_lines > draft.options.max_coupled_lines:
         return np.zeros(0, np.int64)
     if draft.options.structure_form == "metric":
         return np.arange(count)

@@ -10,6 +10,7 @@ from groma.cli.shared import options as _options
 from groma.cli.shared import output as _output
 from groma.cli.shared.console import Console
 from groma.cli.shared.input import check_inputs
+from groma.cli.shared.parts import is_parts
 from groma.errors import InputError
 
 
@@ -20,7 +21,8 @@ def convert(
         typer.Argument(
             metavar="OUTPUT",
             help="Its name says the format: a folder for a COLMAP model, .npz for a groma archive, .txt, .bz2 or .gz "
-            "for BAL, .ply or .obj for geometry only: points, lines and pieces of planes.",
+            "for BAL, .json for nerfstudio and instant-ngp: cameras, poses and points, .ply or .obj for geometry only: "
+            "points, lines and pieces of planes.",
         ),
     ],
     parts: Annotated[
@@ -41,7 +43,7 @@ def convert(
     quiet: _options.Quiet = False,
     verbose: _options.Verbose = False,
 ) -> None:
-    """Read a scene and write it in another format, or cut it into parts."""
+    """Read a scene and write it in another format, or cut it into parts; a folder of parts is joined to one scene."""
     console = Console(quiet, verbose, json_target, threads)
     if part_size is not None and not parts:
         raise InputError("--part-size is the size of parts. Add --parts, or leave it out.")
@@ -52,23 +54,38 @@ def convert(
 
 
 def _convert(source: Path, target: Path, console: Console, force: bool) -> dict[str, Any]:
-    from groma.io.convert import convert as convert_scene
     from groma.scene.counts import counts_of, sentence_of
 
-    scene = convert_scene(source, target, force)
+    if is_parts(source):
+        from groma.adjustment.parts import join_parts, parts_of
+        from groma.io import write_scene
+
+        scene = join_parts(parts_of(source))
+        write_scene(scene, target, force=force)
+    else:
+        from groma.io.convert import convert as convert_scene
+
+        scene = convert_scene(source, target, force)
+    if target.suffix.lower() == ".json":  # cameras, poses and points
+        scene = scene.points_only().keep(point_observations=[])
     console.say(f"Wrote {target}: {sentence_of(scene, geometry=target.suffix.lower() in ('.ply', '.obj'))}")
     return counts_of(scene)
 
 
 def _cut(source: Path, target: Path, console: Console, force: bool, part_size: int | None) -> dict[str, Any]:
     from groma._counted import counted
-    from groma.adjustment.parts import PART_SIZE, write_parts
+    from groma.adjustment.parts import PART_SIZE, num_ties_cut, write_parts
     from groma.io import read_scene
     from groma.scene.counts import counts_of
 
-    scene = read_scene(source)
-    paths = write_parts(scene, target, part_size or PART_SIZE, force)
+    if is_parts(source):
+        raise InputError(f"{source} is a folder of parts already. Leave --parts out to join them.")
+    scene, part_size = read_scene(source), part_size or PART_SIZE
+    paths = write_parts(scene, target, part_size, force)
     console.say(f"Wrote {target}: {counted(len(paths), 'parts')}, {counted(scene.num_observations, 'observations')}")
-    if scene.num_planes or len(scene.relations):
-        console.warn("Planes and relations between landmarks are not adjusted in parts: relations are left out.")
+    if cut := num_ties_cut(scene, part_size):
+        console.warn(
+            f"{cut:,} of {counted(len(scene.relations.point_on_line), 'points on lines')} are left out: the line is in "
+            "another part."
+        )
     return {**counts_of(scene), "num_parts": len(paths)}

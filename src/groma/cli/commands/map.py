@@ -7,9 +7,11 @@ from typing import Annotated
 import typer
 
 from groma.cli.shared import options as _options
+from groma.cli.shared.ranks import led_by_first_rank
 from groma.errors import InputError
 
 
+@led_by_first_rank
 def map_(
     images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of photographs, and of folders of them.")],
     output: Annotated[

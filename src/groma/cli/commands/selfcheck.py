@@ -67,9 +67,10 @@ def _check_derivatives(console: "Console", golden: Path | None, seed: int) -> tu
 
 
 def _check_covariances(console: "Console", runs: int, seed: int) -> tuple[bool, dict[str, Any]]:
-    from groma.adjustment.consistency import consistency
+    from groma.adjustment.consistency import ConsistencyReport, consistency
+    from groma.localization.consistency import localization_consistency
 
-    outcome = consistency(runs, seed)
+    outcome = ConsistencyReport(runs, seed, consistency(runs, seed).rows + localization_consistency(runs, seed))
     console.say("Normalised estimation error squared: its average should be the degrees of freedom.")
     console.say(f"{'gauge':<8}{'kind':<12}{'expected':>9}{'average':>9}{'95 % band':>19}{'errors':>9}")
     for row in outcome.rows:

@@ -41,5 +41,8 @@ LineDetector = Annotated[
 ]
 Input = Annotated[
     Path,
-    typer.Argument(metavar="INPUT", help="COLMAP model folder, BAL file (.txt, .bz2, .gz) or groma archive (.npz)."),
+    typer.Argument(
+        metavar="INPUT",
+        help="COLMAP model folder, groma archive (.npz), BAL, Bundler, VisualSFM, OpenMVG, OpenSfM or nerfstudio file.",
+    ),
 ]

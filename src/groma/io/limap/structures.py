@@ -24,6 +24,9 @@ for every image, with its number of 2D points, and indices within bounds; it is 
 groups that have points (its own neither), so beside a text model 2D groups are written without them; their 3D groups
 have them.
 
+A line of which intervals are supported becomes one 3D line for each interval, with the segments that cover it as its
+track (:func:`groma.scene.line_intervals.one_line_per_interval`); read back, they are lines of their own.
+
 Two things of a scene have no place in these files: a line's Plücker vector, where it is not exactly that of its end
 points, and identifiers of planes and directions that occur in both. Where they matter ``groma.npz`` lies beside,
 a groma archive of the bare landmarks; it counts for a line only while its end points are unchanged.
@@ -42,7 +45,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import FileFormatError, InputError
 from groma.io.archive import read_archive, write_archive
 from groma.io.atomic import atomic_output
-from groma.io.colmap.files import find_model
+from groma.io.colmap.files import find_model, is_model
 from groma.io.limap.files import (
     NAMES,
     PLANE,
@@ -60,6 +63,7 @@ from groma.io.limap.read import read_files
 from groma.io.limap.write import write_files
 from groma.io.reading import existing, reading
 from groma.scene import Directions, LineObservations, Lines, Planes, Relations, Scene
+from groma.scene.line_intervals import one_line_per_interval
 
 _KIND = "folder of LIMAP structures"
 _EXACT = "groma.npz"
@@ -99,14 +103,14 @@ def structures_of(source: str | os.PathLike[str]) -> Structures | None:
     Parameters
     ----------
     source : path
-        What :func:`groma.io.read_scene` read: the folder of a model, or the folder it lies in. A file has none.
+        What :func:`groma.io.read_scene` read: the folder of a model, or the folder it lies in. Nothing else has them.
 
     Raises
     ------
     FileFormatError
-        If the folder holds no COLMAP model, or the structures are damaged.
+        If the structures are damaged.
     """
-    if not Path(source).is_dir():
+    if not Path(source).is_dir() or not is_model(Path(source)):
         return None
     folder = find_model(source)[0] / "structures"
     return read_limap(folder) if folder.is_dir() and _form(folder) is not None else None
@@ -162,6 +166,7 @@ def write_beside(scene: Scene, model: Path, form: Form, like: Structures | None 
     """Write what a COLMAP model cannot hold into its folder, where there is any of it."""
     if like is None and not (scene.num_lines or scene.num_planes or scene.num_directions):
         return
+    scene = one_line_per_interval(scene)
     folder = model / "structures"
     folder.mkdir()
     structures = from_scene(scene, like)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.lines.outcomes import REMEDIES, WORDS, Outcome
 from groma.scene import LineObservations, Lines, Relations, Scene
 
@@ -63,11 +64,12 @@ class LineMap:
         measured = np.concatenate([np.zeros((0, 4)), *(one.ends for one in segments)])[first]
         sigma = np.concatenate([np.zeros(0), *(one.sigma for one in segments)])[first]
         usual = float(np.median(sigma)) if len(sigma) else 1.0
-        return scene.keep(lines=[]).replace(
+        lines = scene.keep(lines=[]).replace(
             lines=Lines.through(self.segments),
             line_observations=LineObservations(self.image_idx, self.line_idx, measured, sigma / usual),
             relations=Relations(point_on_plane=scene.relations.point_on_plane),
         )
+        return with_supported_intervals(lines)
 
 
 def explain(line_map: LineMap) -> str:

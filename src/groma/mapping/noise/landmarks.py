@@ -21,6 +21,7 @@ from groma.gates import gate
 from groma.geometry import quaternion
 from groma.geometry.algebra import apply, dot, norm, perpendicular, ratio, unit
 from groma.scene import Scene
+from groma.scene.line_intervals import shares_on_lines
 
 
 @dataclass(frozen=True)
@@ -165,16 +166,7 @@ def pixel_differences(scene: Scene, image_idx: IntArray, first: FloatArray, seco
 
 def _share_on_line(scene: Scene, image_idx: IntArray, measured: FloatArray, ends: FloatArray) -> FloatArray:
     """Where on the segments (0 first end, 1 second) the points closest to the rays of pixels lie."""
-    poses = scene.cam_from_world[image_idx]
-    bearing = np.full((len(measured), 3), np.nan)
-    for name, rows, params in _by_model(scene, image_idx):
-        bearing[rows] = camera_model(name).unproject(params, measured[rows])
-    ray = quaternion.rotate(quaternion.conjugate(poses[:, :4]), bearing)
-    center = -quaternion.rotate(quaternion.conjugate(poses[:, :4]), poses[:, 4:])
-    along = ends[:, 1] - ends[:, 0]
-    normal = np.cross(np.cross(along, ray), ray)
-    slope = dot(normal, along)
-    share = ratio(dot(normal, center - ends[:, 0]), slope, np.abs(slope) > 1e-12 * dot(along, along))
+    share = shares_on_lines(scene, image_idx, measured, ends, min_squared_sine=1e-12)
     # Rays nearly along the line say nothing; far points would only disturb.
     return np.where(np.abs(share - 0.5) < GATES.max_share, share, np.nan)
 

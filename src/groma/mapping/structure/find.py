@@ -237,7 +237,16 @@ def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
     line_usable = (lines_seen >= options.min_views) & (lines.misfit < options.max_misfit)
     line_usable &= norm(scene.lines.segments[:, 1] - scene.lines.segments[:, 0]) > 0.0
     spacing = spacings(scene.points.xyz, scene.lines.segments)
-    return Landmarks(scene.points.xyz, points, point_usable, scene.lines.segments, lines, line_usable, *spacing)
+    return Landmarks(
+        scene.points.xyz,
+        points,
+        point_usable,
+        scene.lines.segments,
+        lines,
+        line_usable,
+        *spacing,
+        scene.line_intervals,
+    )
 
 
 def _only(planes: PlaneSet, kept: np.ndarray) -> tuple[PlaneSet, IntArray]:

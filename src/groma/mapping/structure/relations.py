@@ -21,6 +21,7 @@ from groma.gates import chi_square_gate, gate
 from groma.geometry.algebra import dot, norm, perpendicular, unit
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.noise.landmarks import LineNoise, PointNoise
+from groma.scene import LineIntervals
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,8 @@ class Landmarks:
     #: (P,) and (L, 2) distances at which points and segment ends have their neighbours.
     point_spacing: FloatArray
     end_spacing: FloatArray
+    #: Where the segments are supported.
+    intervals: LineIntervals
 
 
 @dataclass(frozen=True)
@@ -163,7 +166,7 @@ def along_directions(
 
 
 def on_lines(marks: Landmarks, level: float, least: float, gates: RelationGates = RelationGates()) -> Pairs:
-    """Points on lines: on the segments, not on their continuations."""
+    """Points on lines: where images support them, not in gaps nor beyond their ends."""
     rows = np.flatnonzero(marks.line_usable)
     tested = np.flatnonzero(marks.point_usable)
     if len(rows) == 0 or len(tested) == 0:
@@ -173,7 +176,7 @@ def on_lines(marks: Landmarks, level: float, least: float, gates: RelationGates 
     start, along = marks.segments[line, 0], marks.segments[line, 1] - marks.segments[line, 0]
     share = dot(marks.points[point] - start, along) / dot(along, along)
     offset = marks.points[point] - start - share[:, None] * along
-    inside = (share > -gates.line_margin) & (share < 1.0 + gates.line_margin)
+    inside = marks.intervals.covers(line, share, gates.line_margin)
     point, line, share, offset = point[inside], line[inside], share[inside], offset[inside]
     across = marks.line_noise.across[line]
     components = np.einsum("nai,ni->na", across, offset)

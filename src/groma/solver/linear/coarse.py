@@ -28,6 +28,7 @@ from groma._typing import FloatArray, IntArray
 from groma.problem.gauge import gauge_directions
 from groma.problem.layout import Layout
 from groma.problem.sorting import argsort_by
+from groma.solver.linear.elsewhere import Elsewhere
 
 #: Cameras in a cluster, unless that makes more clusters than MAX_CLUSTERS.
 CLUSTER_SIZE = 24
@@ -117,10 +118,12 @@ _ONE, _MODES = width(1), width(7)
 class CoarseSpace:
     """Clusters of the cameras of one layout, and how they move; ``kept_class`` is that of the cameras."""
 
-    def __init__(self, layout: Layout, kept_class: int) -> None:
-        self._layout, self.kept_class = layout, kept_class
+    def __init__(self, layout: Layout, kept_class: int, elsewhere: Elsewhere | None = None) -> None:
+        self._layout, self.kept_class, self._elsewhere = layout, kept_class, elsewhere
         self._kept = layout.kept[kept_class]
         rows, columns = layout.blocks[kept_class, kept_class]
+        if elsewhere is not None:
+            rows, columns = map(np.concatenate, zip((rows, columns), elsewhere.pairs(kept_class), strict=True))
         self._cluster = _clusters(rows, columns, self._kept.count)
         self.count = int(self._cluster.max()) + 1
         self._state: FloatArray | None = None
@@ -139,16 +142,15 @@ class CoarseSpace:
         """
         if self._state is None:
             return
-        w = self._kept.width
         P = self._motions(self._state)
         if self._factor is not None and np.abs(P - self._P).max() < SAME_MOTIONS * np.abs(P).max():
             return
         self._P = P
         rows, columns = self._layout.blocks[self.kept_class, self.kept_class]
         n = self.count
-        A = np.zeros(n * n * 49)
-        Q = np.empty(w * 7)
-        _coarse_matrix(S.reshape(-1), rows, columns, self._cluster, self._P, A, Q, width(w), _MODES)
+        A = coarse_products(S, rows, columns, self._cluster, self._P)
+        if self._elsewhere is not None:
+            A += self._elsewhere.coarse(self.kept_class, self._cluster, self._P)
         A = A.reshape(n, n, 7, 7).transpose(0, 2, 1, 3).reshape(7 * n, 7 * n)
         A = A + A.T
         diagonal = A.diagonal()
@@ -178,7 +180,15 @@ class CoarseSpace:
         _prolong(self._P, self._cluster, y, z, block_width, _MODES)
 
 
-def coarse_space(layout: Layout) -> CoarseSpace | None:
+def coarse_products(S: FloatArray, rows: IntArray, columns: IntArray, cluster: IntArray, P: FloatArray) -> FloatArray:
+    """Return half of P^T S P for upper blocks S (n, w, w), flat, by pairs of clusters; with its transpose the whole."""
+    w, clusters = S.shape[-1], int(cluster.max()) + 1
+    A, Q = np.zeros(clusters * clusters * 49), np.empty(w * 7)
+    _coarse_matrix(S.reshape(-1), rows, columns, cluster, P, A, Q, width(w), _MODES)
+    return A
+
+
+def coarse_space(layout: Layout, elsewhere: Elsewhere | None = None) -> CoarseSpace | None:
     """Return the coarse space of the largest class of cameras; None where there are too few."""
     variables = layout.problem.variables
     cameras = [
@@ -188,7 +198,7 @@ def coarse_space(layout: Layout) -> CoarseSpace | None:
     ]
     if not cameras or max(cameras)[0] < MIN_CLUSTERS * CLUSTER_SIZE:
         return None
-    return CoarseSpace(layout, max(cameras)[1])
+    return CoarseSpace(layout, max(cameras)[1], elsewhere)
 
 
 def _clusters(rows: IntArray, columns: IntArray, count: int) -> IntArray:

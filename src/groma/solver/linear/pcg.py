@@ -19,6 +19,7 @@ from groma.problem.layout import Layout
 from groma.solver.linear.blocks import Blocks, add_block_products, products, split
 from groma.solver.linear.coarse import CoarseSpace, coarse_space
 from groma.solver.linear.contract import is_pose_graph, keeps_poses_alone, register_linear_solver
+from groma.solver.linear.elsewhere import Elsewhere
 
 #: Bytes of a product with S, measured on one core.
 BYTES_PER_SECOND = 6e9
@@ -88,7 +89,7 @@ def _advance(x, r, p, Sp, b, alpha):
 
 @register_linear_solver("pcg")
 class ConjugateGradients:
-    """Preconditioned conjugate gradients on the blocks."""
+    """Preconditioned conjugate gradients on the blocks, and on those that are elsewhere, if there are any."""
 
     name = "pcg"
     #: Stop when one more iteration improves the quadratic model by less than this share of its mean improvement.
@@ -98,14 +99,14 @@ class ConjugateGradients:
     mixed_tolerance = 0.01
     max_iterations = 500
 
-    def __init__(self, layout: Layout) -> None:
-        self._layout = layout
+    def __init__(self, layout: Layout, elsewhere: Elsewhere | None = None) -> None:
+        self._layout, self._elsewhere = layout, elsewhere
         self.num_iterations = 0
         self.residual: list[FloatArray] | None = None
 
     @cached_property
     def _coarse(self) -> CoarseSpace | None:
-        return coarse_space(self._layout)
+        return coarse_space(self._layout, self._elsewhere)
 
     def expected_seconds(self) -> float:
         """Return the time of the products with S in as many iterations as a step takes."""
@@ -128,7 +129,8 @@ class ConjugateGradients:
         precondition = self._preconditioner(blocks, r, z)
         if precondition is None:
             return None
-        sums = products(layout, blocks, split(layout, p), split(layout, Sp))
+        p_parts, Sp_parts = split(layout, p), split(layout, Sp)
+        sums = products(layout, blocks, p_parts, Sp_parts)
         rz = rz_begin = precondition()
         p[:] = z
         model = 0.0
@@ -139,6 +141,8 @@ class ConjugateGradients:
             Sp[:] = 0.0
             for arguments in sums:
                 add_block_products(*arguments)
+            if self._elsewhere is not None:
+                self._elsewhere.add_products(p_parts, Sp_parts)
             curvature = float(p @ Sp)
             if not curvature > 0.0:
                 if k == 1:

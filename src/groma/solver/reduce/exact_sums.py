@@ -15,21 +15,50 @@ D. E. Knuth, *The Art of Computer Programming*, vol. 2, section 4.2.2, theorem B
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from groma._typing import ComplexArray, FloatArray
+from groma._numba import exact_kernel, loop
+from groma._typing import ComplexArray, FloatArray, IntArray
+
+# ---------------------------------------------------------------------------------------------------------- Kernels
 
 
-def add(sums: ComplexArray, values: FloatArray, where: Any = ...) -> None:
-    """Add values to the sums at ``where``, in place; no place comes twice."""
-    high = sums.real[where]
-    with np.errstate(invalid="ignore"):  # infinite costs
-        total = high + values
-        back = total - high
-        sums.imag[where] += (high - (total - back)) + (values - back)
-    sums.real[where] = total
+@exact_kernel
+def _add(sums, at, value):
+    """Add a value to the pair at ``at``."""
+    high = sums[at]
+    total = high + value
+    back = total - high
+    sums[at + 1] += (high - (total - back)) + (value - back)
+    sums[at] = total
+
+
+@loop
+def _add_all(sums, values):
+    """Add values (n,) to n pairs, flat."""
+    for i in range(values.shape[0]):
+        _add(sums, 2 * i, values[i])
+
+
+@loop
+def _add_rows(sums, rows, values, size):
+    """Add values, flat, to rows of ``size`` pairs each."""
+    for i in range(rows.shape[0]):
+        first = np.int64(rows[i]) * size
+        for k in range(size):
+            _add(sums, 2 * (first + k), values[i * size + k])
+
+
+# ----------------------------------------------------------------------------------------------------------- Public
+
+
+def add(sums: ComplexArray, values: FloatArray, rows: IntArray | None = None) -> None:
+    """Add values to contiguous sums, or to some rows of them, in place."""
+    flat, values = sums.reshape(-1).view(np.float64), np.ascontiguousarray(values)
+    if rows is None:
+        _add_all(flat, values.reshape(-1))
+    elif len(rows):
+        _add_rows(flat, np.ascontiguousarray(rows, np.int64), values.reshape(-1), values[0].size)
 
 
 def add_sums(sums: ComplexArray, others: ComplexArray) -> None:
@@ -42,7 +71,11 @@ def add_sums(sums: ComplexArray, others: ComplexArray) -> None:
 
 def rounded(sums: ComplexArray) -> FloatArray:
     """Return sums as plain floats."""
-    return np.where(np.isfinite(sums.imag), sums.real + sums.imag, sums.real)
+    total = sums.real + sums.imag
+    lost = ~np.isfinite(sums.imag)
+    if lost.any():
+        total[lost] = sums.real[lost]
+    return total
 
 
 __all__ = ["add", "add_sums", "rounded"]

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,9 @@ LAUNCHERS = (
     ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
     ("PMIX_RANK", "SLURM_STEP_NUM_TASKS"),
 )
+
+#: Numbers in one message, because MPI makes copies of it; and numbers added at once.
+SUMMED_AT_ONCE, ADDED_AT_ONCE = 1 << 19, 1 << 14
 
 
 def started_as(environment: Mapping[str, str] = os.environ) -> tuple[int, int]:
@@ -64,12 +69,17 @@ class Ranks:
             )
         self.num_neighbours, self.num_cores = self._share_of_machine()
         self._add: Any = MPI.Op.Create(_add, commute=True)
-        #: Bytes that this rank gave to the last sum: what it sends and receives in a step, up to twice.
-        self.bytes_per_sum = 0
+        #: Bytes that this rank gave to the largest sum, and to all: what it sends and receives, up to twice.
+        self.bytes_per_sum = self.bytes_summed = 0
 
     def sum(self, values: ComplexArray) -> ComplexArray:  # noqa: D102
-        self.bytes_per_sum = values.nbytes
-        self._world.Allreduce(self._mpi.IN_PLACE, values, op=self._add)
+        self.bytes_per_sum, self.bytes_summed = (
+            max(self.bytes_per_sum, values.nbytes),
+            self.bytes_summed + values.nbytes,
+        )
+        flat = values.reshape(-1)
+        for first in range(0, len(flat), SUMMED_AT_ONCE):
+            self._world.Allreduce(self._mpi.IN_PLACE, flat[first : first + SUMMED_AT_ONCE], op=self._add)
         return values
 
     def union(self, numbers: IntArray) -> IntArray:  # noqa: D102
@@ -90,6 +100,13 @@ class Ranks:
         machine.Free()
         return ranks, max(1, min(len(own), len(there) // ranks))
 
+    def others_as_executor(self) -> AbstractContextManager[Executor | None]:
+        """Return a context: on rank 0 an executor of which all others are the workers, on these None, at its end."""
+        from mpi4py.futures import MPICommExecutor
+
+        context: Any = MPICommExecutor(self._world, root=0)
+        return context
+
     def abort(self) -> None:
         """End all ranks at once: one of them cannot go on, and the others would wait for it."""
         self._world.Abort(1)
@@ -107,8 +124,11 @@ def reducer_of_launcher() -> Reducer:
 
 
 def _add(others: Any, sums: Any, _datatype: Any) -> None:
-    """Add exact sums in buffers of MPI, in place."""
-    exact_sums.add_sums(np.frombuffer(sums, np.complex128), np.frombuffer(others, np.complex128))
+    """Add exact sums in buffers of MPI, in place; piece by piece, so that they stay in cache."""
+    total, more = np.frombuffer(sums, np.complex128), np.frombuffer(others, np.complex128)
+    for first in range(0, len(total), ADDED_AT_ONCE):
+        part = slice(first, first + ADDED_AT_ONCE)
+        exact_sums.add_sums(total[part], more[part])
 
 
 __all__ = ["LAUNCHERS", "Ranks", "reducer_of_launcher", "started_as"]

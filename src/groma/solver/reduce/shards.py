@@ -34,7 +34,6 @@ from groma.problem.variables import Variables
 from groma.solver.damped_problem import Trial
 from groma.solver.levenberg_marquardt import damping_from, predicted_decrease
 from groma.solver.linear.blas import one_blas_thread
-from groma.solver.linear.choice import linear_solver
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.options import SolverOptions, first_damping
 from groma.solver.reduce.alone import Alone
@@ -50,6 +49,8 @@ from groma.solver.termination import Termination
 
 #: Damping of the first step where the options give none.
 FIRST_DAMPING = 1e-5
+#: With more cameras than this the reduced system is not formed: it would take 2 GB and more on every process.
+MAX_FORMED = 50_000
 #: How much longer a step is made, at most. Over 24 random scenes under a Cauchy loss shards were visited 1136 times in
 #: all without it, 781 times with it, 907 times with a limit of 3.
 MAX_STRETCH = 2.0
@@ -155,7 +156,12 @@ class ShardedProblem:
         self._kept = {
             name: group for name, group in variables.items() if name not in self._landmarks and not group.is_constant
         }
-        self._sums = SharedSystem(self._kept)
+        poses = sum(len(group) for group in self._kept.values() if group.manifold.kind == "pose")
+        wanted = options.shared_system
+        formed = wanted == "formed" or (
+            wanted == "auto" and (poses <= MAX_FORMED or options.linear_solver not in ("auto", "pcg"))
+        )
+        self._sums = SharedSystem(self._kept, self._reducer, formed)
         first = replace(options, initial_damping=options.initial_damping or FIRST_DAMPING)
         self._damping = damping_from(first_damping(variables, first))
         self._last_ratio = self._curvature = 1.0
@@ -203,7 +209,7 @@ class ShardedProblem:
         """Solve the shared system, and visit all shards: they are moved, and linearised where they come to be."""
         with self._watch("solve"):
             layout, S, rhs = self._sums.system(self.damping)
-            linear = linear_solver(layout, self._options.linear_solver)
+            linear = self._sums.solver(layout, self._options.linear_solver)
             linear.follow(self.states)
             step = linear.solve(S, rhs)
         self.linear_name, self.linear_iterations = linear.name, linear.num_iterations
@@ -287,7 +293,7 @@ class ShardedProblem:
     def _sum_up(self) -> FloatArray:
         """Sum the shared system, and what else was found, over all processes."""
         with self._watch("schur"):
-            return self._sums.reduce(self._reducer)
+            return self._sums.reduce()
 
     def _advance(self, step: list[FloatArray], factor: float) -> _Visit:
         """Visit all shards to move the states by a multiple of a step, and form the shared system there.

@@ -12,9 +12,13 @@ from groma.errors import ProblemError
 from groma.problem.layout import KeptClass, Layout, Member
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
+from groma.solver.linear.choice import linear_solver
+from groma.solver.linear.contract import LinearSolver
+from groma.solver.linear.pcg import ConjugateGradients
 from groma.solver.linear.schur import MIN_DIAGONAL, ReducedSystem
 from groma.solver.reduce import exact_sums
 from groma.solver.reduce.contract import Reducer
+from groma.solver.reduce.scattered import ScatteredBlocks
 from groma.solver.steps import States, largest_slope
 
 #: Numbers that are summed with the system: the cost and such.
@@ -29,12 +33,23 @@ class SharedSystem:
 
     Which blocks there are is agreed between processes at the first :meth:`reduce`. From then on all sums lie in one
     buffer, and are reduced in one go.
+
+    Parameters
+    ----------
+    kept : mapping
+        The variables.
+    reducer : Reducer
+        All processes.
+    formed : bool
+        Whether the system is formed on every process; otherwise blocks off the diagonal stay with their shards.
     """
 
-    def __init__(self, kept: Mapping[str, Variables]) -> None:
+    def __init__(self, kept: Mapping[str, Variables], reducer: Reducer, formed: bool = True) -> None:
+        self._reducer = reducer
         self._groups = list(kept)
         self._variables = kept
         self._sizes = [(len(group), group.manifold.dof) for group in kept.values()]
+        self._scattered = None if formed else ScatteredBlocks(self._sizes, reducer)
         self._number: dict[tuple[int, int], IntArray] = {}
         #: Exact sums, as shards are added: by group the diagonal blocks, curvature, gradient and right-hand side, the
         #: blocks off the diagonal by pairs of groups, and what else was found.
@@ -53,6 +68,8 @@ class SharedSystem:
         """Set all sums to zero; what was reduced before stays until the next :meth:`reduce`."""
         for sums in self._sums.values():
             sums[...] = 0.0
+        if self._scattered is not None:
+            self._scattered.clear()
 
     def largest_gradient(self) -> float:
         """Return the largest component of the gradient of the kept variables, each over the root of its curvature."""
@@ -69,6 +86,8 @@ class SharedSystem:
     def add(self, layout: Layout, system: ReducedSystem) -> None:
         """Add the part of a shard."""
         system.assemble(0.0)
+        if self._scattered is not None:
+            self._scattered.begin_shard()
         for c, kept in enumerate(layout.kept):
             diagonal = system.diagonal(c)
             # Blocks that this shard does not touch were given a one, so that they could be inverted.
@@ -89,7 +108,10 @@ class SharedSystem:
                 upper = rows < columns
                 blocks = np.where(upper[:, None, None], blocks, blocks.swapaxes(1, 2))
                 rows, columns = np.minimum(rows, columns), np.maximum(rows, columns)
-            self._add_blocks(a, b, rows.astype(np.int64) * self._sizes[b][0] + columns, blocks)
+            if self._scattered is None:
+                self._add_blocks(a, b, rows.astype(np.int64) * self._sizes[b][0] + columns, blocks)
+            else:
+                self._scattered.keep(a, b, rows, columns, blocks)
 
     def _add_blocks(self, a: int, b: int, number: IntArray, blocks: FloatArray) -> None:
         known = self._number.get((a, b), np.zeros(0, np.int64))
@@ -116,12 +138,12 @@ class SharedSystem:
             grown[np.searchsorted(number, self._number[a, b])] = self._sums["blocks", self._pair(a, b)]
         self._number[a, b], self._sums["blocks", self._pair(a, b)] = number, grown
 
-    def reduce(self, reducer: Reducer) -> FloatArray:
+    def reduce(self) -> FloatArray:
         """Sum over all processes, when the shards have been visited; return what else was found."""
         if self._buffer is None:
-            self._agree(reducer)
+            self._agree()
         assert self._buffer is not None
-        total = exact_sums.rounded(reducer.sum(self._buffer))
+        total = exact_sums.rounded(self._reducer.sum(self._buffer))
         parts, start = {}, 0
         for key, sums in self._sums.items():
             parts[key] = total[start : start + sums.size].reshape(sums.shape)
@@ -135,11 +157,11 @@ class SharedSystem:
         self._blocks = {(a, b): parts["blocks", self._pair(a, b)] for a, b in self._number}
         return parts["found", 0]
 
-    def _agree(self, reducer: Reducer) -> None:
+    def _agree(self) -> None:
         """Find which blocks there are on any process; put all sums into one buffer, in the same order everywhere."""
         for a in range(len(self._sizes)):
             for b in range(a, len(self._sizes)):
-                number = reducer.union(self._number.get((a, b), np.zeros(0, np.int64)))
+                number = self._reducer.union(self._number.get((a, b), np.zeros(0, np.int64)))
                 if len(number):
                     self._grow(a, b, number)
         self._number = {pair: self._number[pair] for pair in sorted(self._number)}
@@ -177,6 +199,10 @@ class SharedSystem:
         """Return the variable of each block."""
         count = self._sizes_of(member)[0]
         return np.arange(count) if member.block_of is None else np.argsort(member.block_of)
+
+    def solver(self, layout: Layout, name: str) -> LinearSolver:
+        """Return the solver of a name for the layout of :meth:`system`; where that is not formed, it is always pcg."""
+        return linear_solver(layout, name) if self._scattered is None else ConjugateGradients(layout, self._scattered)
 
     def system(self, damping: float) -> tuple[Layout, dict[tuple[int, int], FloatArray], list[FloatArray]]:
         """Return a layout of the kept variables, the damped blocks, and the right-hand side."""

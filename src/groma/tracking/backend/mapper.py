@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -58,10 +60,17 @@ class _Chosen:
         return self.age >= delay
 
 
+class _OnDemand:
+    """Stands for a future where there are no threads: the work is done when its result is asked for."""
+
+    def __init__(self, work: Callable[[], Any]) -> None:
+        self.result = work
+
+
 @dataclass
 class _Pending:
     job: AdjustmentJob
-    future: Future | None
+    future: Future | _OnDemand
     due: int
 
 
@@ -86,9 +95,11 @@ class Mapper:
         #: A frame that is to become a keyframe; its features are being found meanwhile.
         self.due: _Chosen | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="groma-adjust") if options.threaded else None
-        self._workers = ThreadPoolExecutor(2, thread_name_prefix="groma-detect") if options.threaded else None
+        self.workers = ThreadPoolExecutor(2, thread_name_prefix="groma-detect") if options.threaded else None
+        #: For what belongs to a frame, which keyframes must not hold up.
+        self.frame_pool = ThreadPoolExecutor(1, thread_name_prefix="groma-frame") if options.threaded else None
         self._pending: _Pending | None = None
-        self._search: tuple[LoopSearch, Future] | None = None
+        self._search: tuple[LoopSearch, Future | _OnDemand] | None = None
 
     @property
     def map(self) -> TrackMap:
@@ -110,7 +121,7 @@ class Mapper:
     @property
     def threaded(self) -> bool:
         """Whether features are found in other threads."""
-        return self._workers is not None
+        return self.workers is not None
 
     @property
     def busy(self) -> bool:
@@ -134,8 +145,8 @@ class Mapper:
     def choose(self, present: Present, data: FrameFeatures) -> None:
         """Choose the present frame as a keyframe; its features are found in other threads meanwhile."""
         data.keep_up()
-        if self._workers is not None:
-            data.prepare(self._workers)
+        if self.workers is not None:
+            data.prepare(self.workers)
         near = self.map.near
         relative = se3.compose(present.pose[None], se3.inverse(near.pose[None]))[0]
         self.due = _Chosen(data, near.index, relative, present.followed)
@@ -178,22 +189,18 @@ class Mapper:
         with watch("adjust"):
             job = window_job(self.map, self.camera, self.options.window, self.options.relations, self.metric)
             if job is not None:
-                if self._pool is None:
-                    job.solve()
-                    self.apply(present, job)
-                else:
-                    self._pending = _Pending(job, self._pool.submit(job.solve), DELAY)
+                self._pending = _Pending(job, self._begin(job.solve), DELAY)
         with watch("loop"):
             search = self._what_to_search() if self.options.close_loops else None
-            if search is not None:
-                if self._pool is None:
-                    self._close_loop(present, search, search.run())
-                elif self._search is None:
-                    self._search = (search, self._pool.submit(search.run))
+            if search is not None and self._search is None:
+                self._search = (search, self._begin(search.run))
         with watch("culling"):
             drop_unseen(self.map, self.options.gates.points.max_misses)
             busy = self._pending.job.keyframes if self._pending else []
             drop_repeating_keyframes(self.map, busy, self.options.gates.culling)
+
+    def _begin(self, work: Callable[[], Any]) -> Future | _OnDemand:
+        return _OnDemand(work) if self._pool is None else self._pool.submit(work)
 
     def take_up(self, present: Present, now: bool = False) -> None:
         """Take up the result of the thread when it is due."""
@@ -202,7 +209,6 @@ class Mapper:
             if self._pending.due > 0 and not now:
                 return
             pending, self._pending = self._pending, None
-            assert pending.future is not None
             pending.future.result()
             self.apply(present, pending.job)
 
@@ -287,7 +293,8 @@ class Mapper:
 
     def close(self) -> None:
         """End the threads."""
-        pools, self._pool, self._workers = (self._pool, self._workers), None, None
+        pools = self._pool, self.workers, self.frame_pool
+        self._pool = self.workers = self.frame_pool = None
         for pool in pools:
             if pool is not None:
                 pool.shutdown(wait=True, cancel_futures=True)

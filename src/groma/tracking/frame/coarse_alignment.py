@@ -8,6 +8,8 @@ counts only if the surroundings of the followed points then agree better than wh
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -170,7 +172,7 @@ def turned_prediction(
     before: npt.NDArray[np.uint8],
     now: npt.NDArray[np.uint8],
     followed: tuple[FloatArray, FloatArray],
-    spread: tuple[FloatArray, FloatArray],
+    spread: Callable[[], tuple[FloatArray, FloatArray]],
     previous: FloatArray,
     predicted: FloatArray,
     gates: TurnGates = DEFAULT.turns,
@@ -185,8 +187,9 @@ def turned_prediction(
         The frame before, whose pose is known, and the present one.
     followed : (n, 2), (n, 3)
         Pixels of followed points in the frame before, and where they are in the world: these ask for a turn.
-    spread : (m, 2), (m, 3)
-        The same spread over the image where depth is known there: these judge it, with the others.
+    spread : callable
+        Returns the same, (m, 2) and (m, 3), spread over the image where depth is known there: these judge it, with the
+        others. Asked where the prediction is not good.
     previous, predicted : (7,)
         Pose of the frame before, and the prediction for this one.
     gates
@@ -200,7 +203,7 @@ def turned_prediction(
 
     if len(followed[0]) >= gates.min_places and agree(predicted, *followed)[0] > gates.agrees:
         return None
-    every = np.concatenate([followed[0], spread[0]]), np.concatenate([followed[1], spread[1]])
+    every = tuple(np.concatenate(both) for both in zip(followed, spread(), strict=True))
     if len(every[0]) < gates.min_places:
         return None
     expected = agree(predicted, *every)[1]

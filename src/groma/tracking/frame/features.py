@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
-from functools import cached_property
+from threading import RLock
+from typing import Any, Generic, TypeVar, overload
 
 import cv2
 import numpy as np
@@ -15,9 +17,10 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
 from groma.features.images import GrayImage
+from groma.features.point_tracks import corners
 from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
-from groma.tracking.frame.camera import TrackCamera
+from groma.tracking.frame.camera import TrackCamera, back
 from groma.tracking.frame.depth import (
     DepthImage,
     depth_at,
@@ -38,6 +41,29 @@ from groma.tracking.gates import DEFAULT, DepthGates, FeatureGates
 from groma.tracking.options import TrackOptions
 
 Descriptors = npt.NDArray[np.uint8]
+_Found = TypeVar("_Found")
+
+
+class _FoundOnce(Generic[_Found]):
+    """A property that is worked out by whichever thread asks first, while others that ask wait for it."""
+
+    def __init__(self, find: Callable[[Any], _Found]) -> None:
+        self._find, self._name, self.__doc__ = find, find.__name__, find.__doc__
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> _FoundOnce[_Found]: ...
+
+    @overload
+    def __get__(self, instance: FrameFeatures, owner: type) -> _Found: ...
+
+    def __get__(self, instance: FrameFeatures | None, owner: type) -> _FoundOnce[_Found] | _Found:
+        if instance is None:
+            return self
+        found = vars(instance)  # what is found lies there under the same name, and is taken from there afterwards
+        with instance.lock_of(self._name):
+            if self._name not in found:
+                found[self._name] = self._find(instance)
+            return found[self._name]
 
 
 @dataclass(frozen=True)
@@ -93,43 +119,64 @@ class FrameFeatures:
         self._right_camera = right_camera or RightCamera(camera, options.gates.rectification, options.gates.features)
         self._turn = np.zeros(3)
         self._work: list[Future] = []
+        self._locks: dict[str, Any] = {}
 
-    @cached_property
+    @_FoundOnce
     def features(self) -> Features:
         """ORB features over several scales."""
         return describe(self.gray, self.options.num_features, self.depths, self.options.gates.features)
 
-    @cached_property
+    @_FoundOnce
     def detected(self) -> DetectedSegments:
         """Segments by the chosen detector."""
         segments = self.options.make_detector().detect(self.gray)
         inverse, sigma = self.inverse_depths(segments.ends)
         return DetectedSegments(segments, inverse, sigma)
 
+    @property
+    def corner_cell(self) -> int:
+        """Width of the cells of the image that get a point each, pixels."""
+        return max(12, int(math.sqrt(self.gray.size / self.options.num_points)))
+
+    @_FoundOnce
+    def corners(self) -> FloatArray:
+        """Corners (N, 2) worth following, strongest first."""
+        distance = self.options.gates.points.corner_distance * self.corner_cell
+        return corners(self.gray, self.options.num_points, distance)
+
+    def lock_of(self, name: str) -> Any:
+        """Return the lock of one thing to be found."""
+        return self._locks.setdefault(name, RLock())
+
     def prepare(self, pool: Executor) -> None:
         """Begin with what a keyframe needs, in other threads; :meth:`wait` ends it."""
-        if self._work:
+        wanted = {"features": True, "detected": self.options.lines, "corners": self.options.points}
+        names = [name for name, is_wanted in wanted.items() if is_wanted and name not in vars(self)]
+        self._work += [pool.submit(getattr, self, name) for name in names]
+
+    def prepare_ahead(self, pool: Executor, searching: Executor | None = None) -> None:
+        """Begin in other threads with what depends on this image alone; with what a search needs where one is given."""
+        if self.frame.right is not None:  # how that camera is turned may become known better meanwhile
             return
-        # Both kinds ask for depths, which are found first, once.
-        first = pool.submit(lambda: self.disparities if self.frame.depth is None else self.depth)
-        self._work.append(first)
-        self._work.append(pool.submit(lambda: (first.result(), self.features)))
-        if self.options.lines:
-            self._work.append(pool.submit(lambda: (first.result(), self.detected)))
+        pool.submit(getattr, self, "planes")
+        if searching is not None:
+            self.prepare(searching)
 
     def wait(self) -> None:
-        """Wait for what :meth:`prepare` began."""
+        """Wait for what :meth:`prepare` began; what nobody has begun yet is found when it is asked for."""
         for future in self._work:
-            future.result()
+            if not future.cancel():
+                future.result()
+        self._work.clear()
 
-    @cached_property
+    @_FoundOnce
     def planes(self) -> FramePlanes | None:
         """Planes of the depth image; None without one."""
         if self.depth is None or not self.options.planes:
             return None
         return frame_planes(self.camera, self.depth, self.options.max_depth, self.options.gates)
 
-    @cached_property
+    @_FoundOnce
     def depth(self) -> DepthImage | None:
         """The depth image; small holes are filled where most of it is missing."""
         if self.frame.depth is None:
@@ -149,7 +196,7 @@ class FrameFeatures:
             return np.where((depth > 0) & (depth < far), depth, np.nan)
         return np.full(len(pixels), np.nan)
 
-    @cached_property
+    @_FoundOnce
     def right(self) -> GrayImage | None:
         """The right image of a pair, its rows moved to those of the left image."""
         if self.frame.right is None:
@@ -160,24 +207,25 @@ class FrameFeatures:
 
     def keep_up(self) -> None:
         """Correct what was found in the right image, if how that is turned has become known better since."""
+        found = vars(self)
         old, new = self._turn, self._right_camera.turn.angles
-        if "right" not in self.__dict__ or np.array_equal(old, new):
+        if "right" not in found or np.array_equal(old, new):
             return
         for name in ("right", "disparities"):
-            self.__dict__.pop(name, None)
-        if "features" in self.__dict__:
+            found.pop(name, None)
+        if "features" in found:
             depth = retargeted_depths(self.camera, self.features.pixel, self.features.depth, old, new)
-            self.features = replace(self.features, depth=depth)
-        if "depth_grid" in self.__dict__:
+            found["features"] = replace(self.features, depth=depth)
+        if "depth_grid" in found:
             pixels = grid_pixels(self.camera, self.options.gates.depth)
-            self.depth_grid = retargeted_depths(self.camera, pixels, self.depth_grid, old, new)
-        if "detected" in self.__dict__:
+            found["depth_grid"] = retargeted_depths(self.camera, pixels, self.depth_grid, old, new)
+        if "detected" in found:
             ends = self.detected.segments.ends
             inverse = retargeted_ends(self.camera, ends, self.detected.inverse_depth, old, new)
-            self.detected = replace(self.detected, inverse_depth=inverse)
+            found["detected"] = replace(self.detected, inverse_depth=inverse)
         self._turn = new
 
-    @cached_property
+    @_FoundOnce
     def disparities(self) -> Disparities | None:
         """Dense disparities of a pair of images."""
         if self.right is None:
@@ -208,10 +256,18 @@ class FrameFeatures:
             lambda p: retargeted(self.camera, p, none, turn),
         )
 
-    @cached_property
+    @_FoundOnce
     def depth_grid(self) -> FloatArray:
         """Depths at :func:`grid_pixels`; NaN where unknown."""
         return self.depths(grid_pixels(self.camera, self.options.gates.depth))
+
+    def spread_places(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels spread over a frame with a pose, and their places in the world, where it has a depth image."""
+        if self.depth is None:
+            return np.zeros((0, 2)), np.zeros((0, 3))
+        known = np.isfinite(self.depth_grid)
+        pixel = grid_pixels(self.camera, self.options.gates.depth)[known]
+        return pixel, back(pose, self.camera.bearings(pixel) * self.depth_grid[known, None])
 
     def depth_sigma(self, depth: FloatArray) -> FloatArray:
         """Standard deviations of depths from :meth:`depths`."""

@@ -41,6 +41,14 @@ class StartGates:
     )
     max_residual: float = gate(3.5, "sigma", "a pixel beyond it disagrees", "derived from normal noise: 1 in 2 000")
     max_error: float = gate(1.0, "px", "distance from an epipolar line", "convention: one pixel")
+    max_depth: float = gate(
+        50.0, "median depths", "points beyond tell no position", "derived from their share in it: a thousandth or less"
+    )
+    least_cost: float = gate(
+        1e-4, "nats", "cost of a point that fits exactly", "convention: a hundredth of its standard deviation"
+    )
+    same_turn: float = gate(0.01, "rad", "two motions are one where they differ by less", "convention: half a degree")
+    same_shift: float = gate(0.1, "share", "and by less than this share of the motion", "convention: a tenth")
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from groma._typing import FloatArray, IntArray
-from groma.features.point_tracks import corners, spread
+from groma.features.point_tracks import spread
 from groma.geometry import se3
 from groma.scene.landmarks import Lines
 from groma.tracking.frame.camera import TrackCamera, back, into
@@ -148,14 +147,14 @@ def _add_points(
             tracks = tracks.joined(placed)
         # New points: described features first, then corners where there are none.
         room = max(options.num_points - len(tracks), 0)
-        cell = max(12, int(math.sqrt(data.gray.size / options.num_points)))
+        cell = data.corner_cell
         free = np.flatnonzero(features.point < 0)
         strongest = spread(features.pixel[free], features.response[free], tracks.pixel, data.gray.shape, room, cell)
         free = free[strongest]
         new = [features.pixel[free]]
         room -= len(free)
         if room > 0:
-            found = corners(data.gray, options.num_points, gates.corner_distance * cell)
+            found = data.corners
             taken = np.concatenate([tracks.pixel, new[0]])
             rank = -np.arange(len(found), dtype=float)
             new.append(found[spread(found, rank, taken, data.gray.shape, room, cell)])

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +17,7 @@ from groma.tracking.frame.measurements import LineMeasurements, Measurements, Pl
 from groma.tracking.map.keyframes import Followed, measure_points
 from groma.tracking.map.landmarks import DEAD
 from groma.tracking.map.lines import FollowedSegments, carried, coarse_flow, expected_segments, measured_edges
-from groma.tracking.map.points import PointTracks, follow_points
+from groma.tracking.map.points import PointTracks, find_again, follow_points
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
 from groma.tracking.pose.relocalise import match_planes
@@ -43,10 +45,13 @@ def follow_frame(
     predicted: FloatArray,
     prior_sigma: FloatArray,
     watch,
+    pool: Executor | None = None,
 ) -> tuple[PoseEstimate | None, Followed]:
-    """Return the pose of a frame that follows another, and what is still followed."""
+    """Return the pose of a frame that follows another, and what is still followed; lines beside points in a pool."""
     camera, options, gates = data.camera, data.options, data.options.gates
     tracks, segments = followed.points, followed.lines
+    of_lines = partial(follow_lines, track_map, before, data, segments)
+    following = pool.submit(of_lines) if pool is not None and options.lines and len(segments.index) else None
     with watch("points"):
         tracks = tracks.take(track_map.points.state[tracks.index] != DEAD)
         if options.points:
@@ -61,7 +66,8 @@ def follow_frame(
     with watch("lines"):
         lines = LineMeasurements.empty()
         if options.lines and len(segments.index):
-            segments = follow_lines(track_map, before, data, segments)
+            # What no thread has begun yet is done here.
+            segments = of_lines() if following is None or following.cancel() else following.result()
             lines = measure_lines(track_map, data, segments, few_points=len(measured) < gates.lines.few_points)
     with watch("planes"):
         planes = PlaneMeasurements.empty()
@@ -84,6 +90,16 @@ def follow_frame(
     points.visible[tracks.index] += 1
     line_table.visible[segments.index] += 1
     return estimate, Followed(tracks.take(keep), segments)
+
+
+def find_points_again(track_map: TrackMap, data: FrameFeatures, pose: FloatArray, followed: Followed) -> Followed:
+    """Look for points of the map that are in view but not followed, if there is room for many."""
+    options, gates = data.options, data.options.gates.points
+    room = options.num_points - len(followed.points)
+    if not options.points or room < gates.again_room * options.num_points:
+        return followed
+    found = find_again(track_map, data.camera, data.gray, pose, followed.points, room, gates)
+    return Followed(followed.points.joined(found), followed.lines)
 
 
 def carry(
@@ -183,4 +199,4 @@ def _find_lines_again(
     return segments.joined(FollowedSegments(rows[of[good]], found.ends[good], found.sigma[good], found.strength[good]))
 
 
-__all__ = ["Attempt", "carry", "follow_frame", "follow_lines", "measure_lines"]
+__all__ = ["Attempt", "carry", "find_points_again", "follow_frame", "follow_lines", "measure_lines"]

@@ -93,9 +93,9 @@ class Initialiser:
         for candidate in self._candidates:
             if len(candidate.poses) < len(views):
                 two = adjusted(self._camera, candidate, views[:2], sigma, gates.max_residual)
-                candidate = continued(self._camera, two, views[2], gates.max_residual * sigma)
+                candidate = continued(self._camera, two, views[2], sigma, gates)
             judged.append(adjusted(self._camera, candidate, views, sigma, gates.max_residual))
-        left = likely(judged, gates.max_behind)
+        left = likely(judged, gates)
         best = left[0]
         if best.agrees.sum() < max(gates.min_points, gates.min_inliers * len(best.agrees)):
             return self._restart(data)

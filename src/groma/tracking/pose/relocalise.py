@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
+from groma.execution import map_in_threads
 from groma.geometry import quaternion, se3
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.features import Descriptors, Features, FrameFeatures
@@ -28,6 +28,7 @@ from groma.tracking.map.planes import assign_planes
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
+from groma.tracking.pose.near_matches import pair_near
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,6 @@ def match_near(
     camera: TrackCamera,
     known: KnownFeatures,
     features: Features,
-    tree: KDTree,
     pose: FloatArray,
     radius: float,
     max_bits: int = DEFAULT.features.max_bits_near,
@@ -71,20 +71,8 @@ def match_near(
     """Pair known features with features of a frame (n, 2): near where a pose says, and most alike for both."""
     expected = camera.project(into(pose, known.places))
     rows = np.flatnonzero(camera.inside(expected, -radius))
-    if not len(rows) or not len(features.pixel):
-        return np.zeros((0, 2), np.int64)
-    near = KDTree(expected[rows]).sparse_distance_matrix(tree, radius, output_type="ndarray")
-    first, second = rows[near["i"]], near["j"]
-    bits = np.bitwise_count(known.descriptor[first] ^ features.descriptor[second]).sum(axis=1, dtype=np.int64)
-    alike = np.flatnonzero(bits <= max_bits)
-    # Nearest in the image among equals.
-    alike = alike[np.lexsort((near["v"][alike], bits[alike]))]
-    first, second = first[alike], second[alike]
-    best_of_first, best_of_second = np.full(len(known.of), -1), np.full(len(features.pixel), -1)
-    best_of_first[first[::-1]] = np.arange(len(first))[::-1]
-    best_of_second[second[::-1]] = np.arange(len(first))[::-1]
-    mutual = np.flatnonzero(best_of_first[first] == best_of_second[second])
-    return np.column_stack([first[mutual], second[mutual]])
+    pairs = pair_near(expected[rows], known.descriptor[rows], features.pixel, features.descriptor, radius, max_bits)
+    return np.column_stack([rows[pairs[:, 0]], pairs[:, 1]])
 
 
 def feature_places(track_map: TrackMap, camera: TrackCamera, keyframe: Keyframe, rows: IntArray) -> FloatArray:
@@ -111,7 +99,7 @@ def pose_from_matches(
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
             np.ascontiguousarray(places), np.ascontiguousarray(pixel - 0.5), camera.matrix_opencv, np.zeros(0),
-            iterationsCount=500, reprojectionError=max_error, confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
+            iterationsCount=500, reprojectionError=max_error, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
     except cv2.error:  # its last step asserts that the inliers, not known before, are spread well
         return None
@@ -150,7 +138,7 @@ def find_pose(
     """Find the pose of a frame near some keyframes; ``guesses`` are poses to be tried as well."""
     search = _Search(track_map, camera, data, known_features(track_map, camera, keyframes), predicted, prior_sigma)
     if guesses:
-        near = [search.proposal_near(guess) for guess in guesses]
+        near = map_in_threads(search.proposal_near, guesses)
         best = search.best_of([*guesses, *(pose for pose in near if pose is not None)])
         if best is not None and best.score >= data.options.gates.verification.strong:
             return best
@@ -164,14 +152,13 @@ class _Search:
         self.track_map, self.camera, self.data, self.known = track_map, camera, data, known
         self.predicted, self.prior_sigma = predicted, prior_sigma
         self.gates, self.all_gates = data.options.gates.finding, data.options.gates
-        self._tree = KDTree(data.features.pixel if len(data.features.pixel) else np.zeros((1, 2)))
         self._best: Found | None = None
         self._tried: list[FloatArray] = []
 
     def near(self, pose: FloatArray, radius: float) -> IntArray:
         """Pairs (n, 2) of known features and features of the frame, near where a pose says."""
         max_bits = self.all_gates.features.max_bits_near
-        return match_near(self.camera, self.known, self.data.features, self._tree, pose, radius, max_bits)
+        return match_near(self.camera, self.known, self.data.features, pose, radius, max_bits)
 
     def proposal_near(self, guess: FloatArray) -> FloatArray | None:
         """Pose from features matched in wide surroundings of where a guess says."""

@@ -39,10 +39,6 @@ from groma.tracking.map.map_scene import TRACKING
 
 _ASSEMBLY = replace(TRACKING, gauge="first_camera", loss=Cauchy(1.5))
 _SOLVER = SolverOptions(max_iterations=50, function_tolerance=1e-5, threads=1)
-#: Depth, in units of the usual one, beyond which a point tells little of a position.
-FAR = 50.0
-#: Cost of a point that no measurement undercuts: a hundredth of the standard deviation.
-SMALL = 1e-4
 IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
 
@@ -145,12 +141,15 @@ def adjusted(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigm
     return Candidate(poses, places, cost, np.asarray((squared < gate**2).all(axis=0)))
 
 
-def continued(camera: TrackCamera, candidate: Candidate, pixels: FloatArray, max_error: float) -> Candidate:
+def continued(
+    camera: TrackCamera, candidate: Candidate, pixels: FloatArray, sigma: float, gates: StartGates
+) -> Candidate:
     """Return a candidate with the pose of one more view: from where it shows the candidate's points, or the last one.
 
     Points too far away to tell a position are left out; their numbers would spoil a closed form.
     """
-    near = candidate.agrees & (candidate.places[:, 2] < FAR)
+    max_error = gates.max_residual * sigma
+    near = candidate.agrees & (candidate.places[:, 2] < gates.max_depth)
     poses = [candidate.poses[-1]]
     if near.sum() >= 4:
         places, seen, flags = candidate.places[near], pixels[near] - 0.5, cv2.SOLVEPNP_SQPNP
@@ -173,25 +172,28 @@ def _squared(camera: TrackCamera, pose: FloatArray, places: FloatArray, pixels: 
     return np.nan_to_num((away**2).sum(axis=-1), nan=np.inf)
 
 
-def likely(candidates: list[Candidate], max_behind: float) -> list[Candidate]:
+def likely(candidates: list[Candidate], gates: StartGates) -> list[Candidate]:
     """Return the candidates that are not ruled out, the best first, each motion once."""
     kept: list[Candidate] = []
     for candidate in sorted(candidates, key=lambda one: one.cost):
-        count = len(candidate.places)
-        if (
-            kept
-            and 0.5 * count * np.log((candidate.cost + SMALL * count) / (kept[0].cost + SMALL * count)) > max_behind
-        ):
+        if kept and _behind(candidate, kept[0], gates.least_cost) > gates.max_behind:
             break
-        if not any(_same(candidate.poses[-1], other.poses[-1]) for other in kept):
+        if not any(_same(candidate.poses[-1], other.poses[-1], gates) for other in kept):
             kept.append(candidate)
     return kept
 
 
-def _same(one: FloatArray, two: FloatArray) -> bool:
+def _behind(candidate: Candidate, best: Candidate, least_cost: float) -> float:
+    """By how many nats a candidate is less likely than another; see the formula above."""
+    count = len(candidate.places)
+    return 0.5 * count * float(np.log((candidate.cost + least_cost * count) / (best.cost + least_cost * count)))
+
+
+def _same(one: FloatArray, two: FloatArray, gates: StartGates) -> bool:
     """Whether two poses are one but for what an adjustment leaves."""
     turn = 2.0 * np.arccos(min(1.0, abs(float(one[:4] @ two[:4]))))
-    return turn < 0.01 and bool(np.linalg.norm(one[4:] - two[4:]) < 0.1 * np.linalg.norm(one[4:]))
+    shift, length = np.linalg.norm(one[4:] - two[4:]), np.linalg.norm(one[4:])
+    return bool(turn < gates.same_turn and shift < gates.same_shift * length)
 
 
 __all__ = ["IDENTITY", "Candidate", "adjusted", "continued", "intersected", "likely", "motions"]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.scene.line_intervals import line_pieces
 from groma.scene.patches import PALETTE, patch_groups
 from groma.viz import colours as _colours
 from groma.viz.framing import starting_view
@@ -28,7 +29,9 @@ def scene_data(scenes: Sequence[Scene], states: Sequence[Drawable]) -> dict[str,
     """Return the states of a scene for the 3D view, the last one being the one that counts."""
     scene, after = scenes[-1], states[-1]
     offset = _middle(after)
-    keep, lines = thin(len(after.points), MAX_POINTS), thin(len(after.segments), MAX_LINES)
+    owner = line_pieces(scene)[1]
+    keep, drawn = thin(len(after.points), MAX_POINTS), thin(len(owner), MAX_LINES)
+    lines = owner[drawn]
     view = starting_view(after, offset)
     numbers = [line_statistics(one, shown) for one, shown in zip(scenes, states, strict=True)]
     point_errors = [shown.point_errors[keep] for shown in states]
@@ -38,7 +41,7 @@ def scene_data(scenes: Sequence[Scene], states: Sequence[Drawable]) -> dict[str,
             {
                 "points": pack(shown.points[keep] - offset),
                 "errors": pack(errors) if np.isfinite(errors).any() else "",
-                "lines": pack(shown.segments[lines] - offset),
+                "lines": pack(line_pieces(scene, shown.segments)[0][drawn] - offset),
                 "line_errors": pack(far),
                 "planes": pack(np.concatenate([*_patches_of(one, after), np.zeros((0, 3))]) - offset),
                 "cameras": pack(_camera_axes(shown, offset)),

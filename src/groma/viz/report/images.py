@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.scene.line_intervals import one_line_per_interval
 from groma.viz.pack import pack, thin
 from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture, warn_of_names_outside
 from groma.viz.report.overlays import is_straight, projected_segments
@@ -39,7 +40,7 @@ def image_data(scene: Scene, states: Sequence[Drawable], images: ImageFiles | No
     """
     after = states[-1]
     num_points = len(scene.point_observations)
-    seen = scene.line_observations
+    seen, pieces = scene.line_observations, one_line_per_interval(scene)
     point_rows = _by_image(scene.point_observations.image_idx, scene.num_images, MAX_POINT_ROWS)
     segment_rows = _by_image(seen.image_idx, scene.num_images, MAX_SEGMENT_ROWS)
     samples = 2 if all(is_straight(name) for name in scene.cameras.models) else _SAMPLES
@@ -51,7 +52,7 @@ def image_data(scene: Scene, states: Sequence[Drawable], images: ImageFiles | No
     begin = {"rows": 0, "segments": 0}
     for place, image in enumerate(used.tolist()):
         mine = segment_rows[image]
-        projected.append(_projected(scene, image, seen.line_idx[mine], samples))
+        projected.append(_projected(pieces, image, pieces.line_observations.line_idx[mine], samples))
         left, top, width, height = _frame(after, image)
         end = {"rows": begin["rows"] + len(point_rows[image]), "segments": begin["segments"] + len(mine)}
         entries.append(

@@ -18,6 +18,7 @@ from groma import cameras
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
 from groma.geometry import se3
+from groma.scene.line_intervals import one_line_per_interval
 from groma.viz import colours as _colours
 from groma.viz.pictures import ImageFiles, Picture, data_address, image_file, read_picture
 from groma.viz.statistics import LineStatistics, line_statistics
@@ -225,10 +226,12 @@ def _figure(
         if picture is not None and left == upper == 0.0
         else ""
     )
-    lines = seen.line_idx[rows]
+    lines, pieces = seen.line_idx[rows], one_line_per_interval(scene)
     projected = "".join(
         f'<path class="projected" d="{_points(places)}"/>'
-        for places in _near_frame(projected_segments(scene, image, lines), left, upper, width, height)
+        for places in _near_frame(
+            projected_segments(pieces, image, pieces.line_observations.line_idx[rows]), left, upper, width, height
+        )
         if len(places) > 1
     )
     residual = numbers.observation_residual_px[rows]

@@ -30,6 +30,7 @@ _FORM = {
     "termination_sentence": str,
     "warnings?": [str],
     "stages?": [{"loss": str, "initial_cost": float, "first_step": int}],
+    "inliers?": {_ANY: {"limit_px": float, "share": {"before": float, "after": float}}},
     "relations?": {_ANY: {"held": int, "dropped": int}},
     "segments?": {_ANY: int},
     "explanation?": str,

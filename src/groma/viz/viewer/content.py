@@ -16,6 +16,7 @@ import numpy as np
 from groma import cameras
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.geometry import quaternion
+from groma.scene.line_intervals import line_pieces
 from groma.scene.similarity import Similarity
 from groma.viz import colours as _colours
 from groma.viz.colours import Colours
@@ -58,8 +59,9 @@ class ViewContent:
     points: FloatArray
     #: By mode: (P, 3), in the same order.
     point_colours: dict[str, Colours]
-    #: (L, 2, 3)
+    #: (S, 2, 3) what images support of the lines, and the line (S,) of each piece.
     segments: FloatArray
+    segment_line: IntArray
     #: K convex polygons (n, 3), and how many landmarks lie on each.
     patches: list[FloatArray]
     patch_members: IntArray
@@ -104,18 +106,19 @@ class ViewContent:
             Lines that can be hit.
         """
         distance, depth = ray_to_segments(origin, direction, self.segments)
-        distance[~shown] = np.inf
+        distance[~shown[self.segment_line]] = np.inf
         nearest = distance.min(initial=np.inf)
         if not nearest <= tolerance:
             return None
         # Of lines that are hit about equally well, the one in front.
         candidates = np.flatnonzero(distance <= nearest + 0.25 * tolerance)
-        return int(candidates[np.argmin(depth[candidates])])
+        return int(self.segment_line[candidates[np.argmin(depth[candidates])]])
 
 
 def view_content(scene: Scene) -> ViewContent:
     """Compute what the viewer draws of a scene."""
     shown = drawable(scene)
+    pieces, line = line_pieces(scene)
     frame, position, target = _frame(scene)
     order = np.random.default_rng(0).permutation(scene.num_points)
     errors = shown.point_errors[order]
@@ -135,7 +138,8 @@ def view_content(scene: Scene) -> ViewContent:
         view_from_world=frame,
         points=frame.points(scene.points.xyz[order]),
         point_colours=point_colours,
-        segments=frame.points(scene.lines.segments),
+        segments=frame.points(pieces),
+        segment_line=line,
         patches=[frame.points(patch) for patch in shown.patches],
         patch_members=shown.patch_members,
         directions=frame.directions(scene.directions.vectors),

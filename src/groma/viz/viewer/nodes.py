@@ -173,12 +173,13 @@ class SceneView:
         """Draw the lines as the panel says."""
         with self._lock:
             found = self.content.line_colours(self.line_mode.value)
-            kept = self.lines_shown()
+            kept, line = self.lines_shown(), self.content.segment_line
+            drawn = kept[line]
             self.legend.content = _view_words.legend(found.low, found.high, found.meaning, int(kept.sum()), len(kept))
             self.lines = self.server.scene.add_line_segments(
                 "/lines",
-                self.content.segments[kept].astype(np.float32),
-                _view_arrays.by_end(found.colours[kept]),
+                self.content.segments[drawn].astype(np.float32),
+                _view_arrays.by_end(found.colours[line[drawn]]),
                 thickness=self.line_width.value,
                 thickness_units="screen",
                 visible=self.shown["lines"].value,
@@ -302,13 +303,13 @@ class SceneView:
             self.selected = line
             content, seen = self.content, self.content.scene.line_observations
             rows = np.flatnonzero(seen.line_idx == line)
-            segment = content.segments[line]
+            pieces = content.segments[content.segment_line == line]
             images = np.unique(seen.image_idx[rows])
             rays = np.stack(
-                [content.camera_centers[images], np.broadcast_to(segment.mean(axis=0), (len(images), 3))], axis=1
+                [content.camera_centers[images], np.broadcast_to(pieces.mean(axis=(0, 1)), (len(images), 3))], axis=1
             )
             with self.server.atomic():
-                for name, places, width in (("line", segment[None], self.line_width.value + 5.0), ("rays", rays, 1.0)):
+                for name, places, width in (("line", pieces, self.line_width.value + 5.0), ("rays", rays, 1.0)):
                     if len(places):
                         self.server.scene.add_line_segments(
                             f"/selection/{name}",

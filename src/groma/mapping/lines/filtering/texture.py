@@ -24,7 +24,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.special import betaln, expit, gammaln, log_expit
 
 from groma._typing import BoolArray, FloatArray, IntArray
@@ -139,6 +138,8 @@ def edge_odds(
             slope[-2:] -= share * [(1.0 - is_edge).sum(), is_edge.sum()]
         prior = (weights**2 / spread**2).sum() + ((odds - prior_odds) ** 2).sum() / odds_sigma**2
         return value + 0.5 * prior, slope
+
+    from scipy.optimize import minimize  # takes a third of a second to import
 
     p = minimize(cost, np.concatenate([1.0 / spread, prior_odds]), jac=True, method="L-BFGS-B").x
     return lines @ p[:-2] + ratio + log_expit(p[-1]) - log_expit(p[-2])

@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Localised photographs against the truth, beside the peers on the same matches.
+
+    python benchmarks/localize.py stairs DATA                     one query with given matches, 20 seeds, and peers
+    python benchmarks/localize.py held-out MAP IMAGES TRUTH       photographs that are not in a map, points alone and with lines
+    python benchmarks/localize.py wrong MAP IMAGES OTHER...       photographs that must not be localised
+
+``DATA`` is ``localization_stairs/query_1.npz``; ``TRUTH`` a scene with the poses of all photographs in ``IMAGES``. Maps
+whose world is not that of the truth are aligned by the poses of their own images (``--align``). Times are process times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from groma.geometry import quaternion, so3
+from groma.io import read_scene
+from groma.localization.absolute_pose import PoseOptions, estimate_absolute_pose
+from groma.localization.camera import QueryCamera
+from groma.localization.localizer import LocalizeOptions, Localizer
+from groma.mapping.photographs import image_files, read_gray
+
+#: Shares of queries within these distances (metres) and angles (degrees) are told.
+LIMITS = ((0.01, 1.0), (0.02, 2.0), (0.05, 5.0))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    stairs_of = commands.add_parser("stairs")
+    stairs_of.add_argument("data", type=Path)
+    held_of = commands.add_parser("held-out")
+    wrong_of = commands.add_parser("wrong")
+    for one in (held_of, wrong_of):
+        one.add_argument("map", type=Path)
+        one.add_argument("images", type=Path)
+    held_of.add_argument("truth", type=Path)
+    held_of.add_argument("--align", action="store_true")
+    held_of.add_argument("--every", type=int, default=1, help="take every N-th query")
+    wrong_of.add_argument("others", type=Path, nargs="*")
+    wrong_of.add_argument("--limit", type=int, default=1000)
+    given = parser.parse_args()
+    if given.command == "stairs":
+        told = stairs(given.data)
+    elif given.command == "held-out":
+        told = held_out(given.map, given.images, given.truth, given.align, given.every)
+    else:
+        told = wrong(given.map, given.images, given.others, given.limit)
+    print(json.dumps(told, indent=1))
+
+
+# ----------------------------------------------------------------------------------------------------------- stairs
+
+
+def stairs(path: Path, seeds: int = 20) -> dict[str, object]:
+    """Median errors (cm, degrees) over seeds, and seconds, of groma and of peers on the same matches."""
+    data = np.load(path)
+    width, height = map(int, data["size"])
+    camera = QueryCamera(str(data["camera_model"]), data["camera_params"], width, height)
+    lines = data["match_segment2d"], data["map_lines3d"][data["match_line3d"]]
+    points = data["points2d"], data["points3d"]
+    true = np.concatenate([data["qvec_true"][[1, 2, 3, 0]], data["tvec_true"]])
+
+    def ours(seed: int, *more: np.ndarray) -> np.ndarray | None:
+        return estimate_absolute_pose(camera, *points, *more, options=PoseOptions(seed=seed)).cam_from_world
+
+    told: dict[str, object] = {}
+    for name, method in (
+        ("groma, points", ours),
+        ("groma, points and lines", lambda seed: ours(seed, *lines)),
+        ("PoseLib, points", lambda seed: _poselib(camera, points, None, seed)),
+        ("PoseLib, points and lines", lambda seed: _poselib(camera, points, lines, seed)),
+        ("pycolmap, points", lambda seed: _pycolmap(camera, points, seed)),
+    ):
+        method(0)
+        start = time.process_time()
+        poses = [method(seed + 1) for seed in range(seeds)]
+        seconds = (time.process_time() - start) / seeds
+        errors = np.array([_errors(pose, true) for pose in poses if pose is not None])
+        told[name] = {"cm": 100 * float(np.median(errors[:, 0])), "deg": float(np.median(errors[:, 1])), "seconds": seconds}
+    found = estimate_absolute_pose(camera, *points, *lines)
+    told["stated cm"] = 100 * float(np.linalg.norm(found.center_sigma))
+    told["stated deg"] = found.rotation_sigma_deg
+    told["verdict"] = f"{found.status}: {found.sentence}"
+    return told
+
+
+def _poselib(camera, points, lines, seed):
+    import poselib
+
+    K = {"model": camera.model, "width": camera.width, "height": camera.height, "params": camera.params.tolist()}
+    options = {"max_reproj_error": 6.8, "max_epipolar_error": 6.8, "seed": seed}
+    if lines is None:
+        found, _ = poselib.estimate_absolute_pose(*points, K, options, {})
+    else:
+        ends, ends3d = lines
+        places = (ends[:, 0], ends[:, 1], ends3d[:, 0], ends3d[:, 1])
+        found, _ = poselib.estimate_absolute_pose_pnpl(*points, *places, K, options, {})
+    return np.concatenate([found.q[[1, 2, 3, 0]], found.t])
+
+
+def _pycolmap(camera, points, seed):
+    import pycolmap
+
+    pycolmap.set_random_seed(seed)
+    K = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=camera.params.tolist())
+    found = pycolmap.estimate_and_refine_absolute_pose(*points, K)
+    if found is None:
+        return None
+    pose = found["cam_from_world"]
+    return np.concatenate([pose.rotation.quat, pose.translation])
+
+
+def _errors(pose: np.ndarray, true: np.ndarray) -> tuple[float, float]:
+    """Distance of the centres, and angle in degrees."""
+    R, R_true = (quaternion.to_matrix(one[None, :4])[0] for one in (pose, true))
+    shift = -R.T @ pose[4:] + R_true.T @ true[4:]
+    return float(np.linalg.norm(shift)), float(np.rad2deg(np.linalg.norm(so3.log((R @ R_true.T)[None])[0])))
+
+
+# --------------------------------------------------------------------------------------------------------- held out
+
+
+def held_out(map_: Path, images: Path, truth: Path, align: bool, every: int = 1) -> dict[str, object]:
+    """Errors of the photographs that a map does not have."""
+    true = read_scene(truth)
+    poses = dict(zip(true.images.names, true.cam_from_world, strict=True))
+    told: dict[str, object] = {}
+    for name, lines in (("points", False), ("points and lines", True)):
+        localizer = Localizer(map_, images, options=LocalizeOptions(lines=lines))
+        known = localizer.scene
+        moved = _alignment(known, poses) if align else np.eye(4)
+        names = sorted(set(poses) - set(known.images.names))[::every]
+        rows = []
+        for query in names:
+            path = next(path for path in (images / query, *images.rglob(Path(query).name)) if path.is_file())
+            start = time.process_time()
+            found = localizer.localize(path)
+            seconds = time.process_time() - start
+            if found.pose.cam_from_world is None:
+                rows.append((query, found.pose.status, None, None, None, seconds))
+                continue
+            here = _matrix(found.pose.cam_from_world) @ np.linalg.inv(moved)
+            pose = np.concatenate([quaternion.from_matrix(here[None, :3, :3])[0], here[:3, 3]])
+            sigma = float(np.linalg.norm(found.pose.center_sigma))
+            rows.append((query, found.pose.status, *_errors(pose, poses[query]), sigma, seconds))
+        told[name] = _summary(rows)
+    return told
+
+
+def _summary(rows: list[tuple]) -> dict[str, object]:
+    right = np.array([row[2:5] for row in rows if row[1] == "localized"], float).reshape(-1, 3)
+    within = {
+        f"{100 * far:g} cm, {angle:g} deg": float(((right[:, 0] <= far) & (right[:, 1] <= angle)).sum() / len(rows))
+        for far, angle in LIMITS
+    }
+    told: dict[str, object] = {"queries": len(rows), "localized": len(right), "shares": within}
+    if len(right):
+        told |= {
+            "median m": float(np.median(right[:, 0])), "worst m": float(right[:, 0].max()),
+            "median deg": float(np.median(right[:, 1])), "worst deg": float(right[:, 1].max()),
+            "median error over stated": float(np.median(right[:, 0] / right[:, 2])),
+        }  # fmt: skip
+    told["process seconds"] = float(np.median([row[5] for row in rows]))
+    told["each"] = [[row[0], row[1], *(None if x is None else round(x, 4) for x in row[2:5])] for row in rows]
+    return told
+
+
+def _alignment(scene, poses: dict[str, np.ndarray]) -> np.ndarray:
+    """The motion (4, 4) from the world of a map to that of the truth: mean turn, mean shift."""
+    pairs = [(_matrix(poses[name]), _matrix(pose)) for name, pose in zip(scene.images.names, scene.cam_from_world, strict=True)]
+    U, _, Vt = np.linalg.svd(sum((np.linalg.inv(true) @ own)[:3, :3] for true, own in pairs))
+    moved = np.eye(4)
+    moved[:3, :3] = U @ Vt
+    centers = [(np.linalg.inv(true)[:3, 3], np.linalg.inv(own)[:3, 3]) for true, own in pairs]
+    moved[:3, 3] = np.mean([true - moved[:3, :3] @ own for true, own in centers], axis=0)
+    return moved
+
+
+def _matrix(pose: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = quaternion.to_matrix(pose[None, :4])[0], pose[4:]
+    return matrix
+
+
+# ------------------------------------------------------------------------------------------------------------ wrong
+
+
+def wrong(map_: Path, images: Path, others: list[Path], limit: int) -> dict[str, object]:
+    """How many photographs that are not of a place are localised there, and which."""
+    localizer = Localizer(map_, images)
+    rng = np.random.default_rng(0)
+    told: dict[str, object] = {}
+    own = [read_gray(path) for path in localizer.files[: max(limit // 4, 1)]]
+    kinds = {
+        "mirrored": [np.ascontiguousarray(image[:, ::-1]) for image in own],
+        "upside down and mirrored": [np.ascontiguousarray(image[::-1]) for image in own],
+        "blocks in another order": [_shuffled(image, rng) for image in own],
+        "noise": [rng.integers(0, 256, own[0].shape, dtype=np.uint8) for _ in range(3)],
+        "blank": [np.full_like(own[0], level) for level in (0, 128, 255)],
+    }
+    kinds |= {str(folder): [read_gray(path) for path in image_files(folder)[:limit]] for folder in others}
+    for name, pictures in kinds.items():
+        found = [localizer.localize(_sized(picture, own[0].shape)).pose for picture in pictures]
+        told[name] = {
+            "trials": len(found),
+            **{status: sum(one.status == status for one in found) for status in ("localized", "uncertain", "failed")},
+            "sentences": sorted({f"{one.status}: {one.sentence}" for one in found if one.status != "failed"}),
+        }
+    return told
+
+
+def _sized(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A picture in the size of the map's images, so that the calibration of the map is taken for it."""
+    return cv2.resize(picture, shape[::-1], interpolation=cv2.INTER_AREA) if picture.shape != shape else picture
+
+
+def _shuffled(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The same image with its twelfths in another order."""
+    rows = [np.array_split(row, 4, axis=1) for row in np.array_split(image, 3, axis=0)]
+    side = min(block.shape[0] for row in rows for block in row), min(block.shape[1] for row in rows for block in row)
+    blocks = [block[: side[0], : side[1]] for row in rows for block in row]
+    order = rng.permutation(len(blocks))
+    return np.vstack([np.hstack([blocks[order[4 * row + column]] for column in range(4)]) for row in range(3)])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What happens by chance: quantiles and tails, without the half second that importing scipy.stats takes."""
+
+from __future__ import annotations
+
+import math
+
+from scipy.special import gammaincinv, pdtrc
+
+
+def chi_square_quantile(share: float, dof: int) -> float:
+    """Return the value that a share of all chi squares with so many degrees of freedom does not exceed."""
+    return 2.0 * float(gammaincinv(0.5 * dof, share))
+
+
+def log10_poisson_tail(count: float, mean: float) -> float:
+    """Return the logarithm of the probability of more than ``count`` events where ``mean`` are expected."""
+    if count < 0:
+        return 0.0
+    tail = float(pdtrc(count, mean))
+    return math.log(tail) / math.log(10.0) if tail > 0.0 else -math.inf
+
+
+__all__ = ["chi_square_quantile", "log10_poisson_tail"]

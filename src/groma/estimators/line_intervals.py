@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Which intervals of a line images support, from what each image's segments cover of it. Kernels only.
+
+At a place t of a line let c(t) be the number of images whose segments cover it, and d(t) the number of images that deny
+it: they show the line on both sides of t, but not there. Breaks no wider than the noise of segment ends are no breaks.
+The place is supported where at least two images show it, as many as the ends of a line need, and are not outvoted by
+the rule that decides on the ends (:mod:`groma.estimators.line_ends`):
+
+.. math:: c \ge 2, \qquad d < 3\, c.
+
+An interval between two supported ones is supported, too, where it is no wider than the noise of the ends, or where one
+image shows all of it and none denies it. What stands before a line in some images does not break it: it hides another
+part of it from every view. What is gone in all images does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._numba import kernel, loop
+from groma._typing import FloatArray, IntArray
+from groma.estimators.line_ends import LINE_ENDS, LineEndGates
+from groma.gates import numbers
+
+#: Images that must show a place of a line.
+_MIN_IMAGES = 2
+
+
+@kernel
+def _joined(image, low, high, size, same_end):
+    """Join what one image shows, across breaks within the noise of ends; return image, begin, end of each piece."""
+    count = len(image)
+    owner, first, last = np.empty(count, np.int64), np.empty(count), np.empty(count)
+    found = 0
+    by_place = np.argsort(low)
+    order = by_place[np.argsort(image[by_place], kind="mergesort")]
+    for k in order:
+        if found and owner[found - 1] == image[k] and low[k] <= last[found - 1] + same_end * size[k]:
+            last[found - 1] = max(last[found - 1], high[k])
+        else:
+            owner[found], first[found], last[found] = image[k], low[k], high[k]
+            found += 1
+    return owner[:found], first[:found], last[:found]
+
+
+@kernel
+def _votes(owner, first, last, place):
+    """Count the images that show a place, and those that deny it; pieces come by image."""
+    shown = denied = 0
+    k = 0
+    while k < len(owner):
+        here = before = after = False
+        begin = k
+        while k < len(owner) and owner[k] == owner[begin]:
+            here = here or (first[k] <= place and place <= last[k])
+            before = before or last[k] < place
+            after = after or first[k] > place
+            k += 1
+        if here:
+            shown += 1
+        elif before and after:
+            denied += 1
+    return shown, denied
+
+
+@kernel
+def _intervals(image, low, high, size, gates, begins, ends):
+    """Write the supported intervals of a line between 0 and 1; return their number."""
+    same_end, majority, _ = gates
+    owner, first, last = _joined(image, low, high, size, same_end)
+    noise = same_end * np.median(size)
+    cuts = np.sort(np.concatenate((first, last)))
+    found, bridged = 0, False
+    for k in range(len(cuts) - 1):
+        begin, end = max(cuts[k], 0.0), min(cuts[k + 1], 1.0)
+        if not begin < end:
+            continue
+        shown, denied = _votes(owner, first, last, 0.5 * (begin + end))
+        if shown >= _MIN_IMAGES and denied < majority * shown:
+            if found and (bridged or begin - ends[found - 1] <= noise):
+                ends[found - 1] = end
+            else:
+                begins[found], ends[found] = begin, end
+                found += 1
+            bridged = True
+        else:
+            bridged = bridged and shown > 0 and denied == 0
+    return _of_some_length(begins, ends, found, noise)
+
+
+@kernel
+def _of_some_length(begins, ends, found, noise):
+    """Drop intervals shorter than the noise of ends, and move the outermost ones to the ends of the line."""
+    kept = 0
+    for k in range(found):
+        if ends[k] - begins[k] > noise:
+            begins[kept], ends[kept] = begins[k], ends[k]
+            kept += 1
+    if kept:
+        if begins[0] <= noise:
+            begins[0] = 0.0
+        if ends[kept - 1] >= 1.0 - noise:
+            ends[kept - 1] = 1.0
+    return kept
+
+
+@loop
+def _all_intervals(pointers, image, low, high, size, gates, begins, ends, count):
+    """Loop of :func:`supported_intervals`."""
+    for n in range(len(pointers) - 1):
+        b, e = pointers[n], pointers[n + 1]
+        if e > b:
+            count[n] = _intervals(image[b:e], low[b:e], high[b:e], size[b:e], gates, begins[b:e], ends[b:e])
+
+
+def supported_intervals(
+    line_idx: IntArray, image_idx: IntArray, share: FloatArray, size: FloatArray, num_lines: int,
+    gates: LineEndGates = LINE_ENDS,
+) -> tuple[IntArray, FloatArray]:  # fmt: skip
+    """Return the line (K,) and the shares (K, 2) of all supported intervals, in order; lines without any have none.
+
+    Parameters
+    ----------
+    line_idx, image_idx : (N,) int
+        Line and image of each observed segment.
+    share : (N, 2) float64
+        From where to where on its line the segment reaches, 0 at the first end of the line, 1 at the second.
+    size : (N,) float64
+        Length of a pixel along the line at each segment, in the same unit.
+    num_lines : int
+        Number of lines.
+    gates : LineEndGates, optional
+        Noise of ends, and majorities.
+    """
+    order = np.argsort(line_idx, kind="stable")
+    pointers = np.searchsorted(line_idx[order], np.arange(num_lines + 1))
+    begins, ends = np.zeros(len(order)), np.zeros(len(order))
+    count = np.zeros(num_lines, np.int64)
+    columns = (np.ascontiguousarray(column[order], np.float64) for column in (share[:, 0], share[:, 1], size))
+    _all_intervals(pointers, np.ascontiguousarray(image_idx[order]), *columns, numbers(gates), begins, ends, count)
+    line = np.repeat(np.arange(num_lines), count)
+    row = pointers[line] + np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
+    return line, np.column_stack([begins[row], ends[row]])
+
+
+__all__ = ["supported_intervals"]

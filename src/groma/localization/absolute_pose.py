@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The pose of a camera from matches: proposed, refined, judged.
+
+What comes in are matches of points and segments of the image with points and lines of the world, many of them wrong,
+and the noise of both. What goes out is a pose, its covariance, which matches agree, and a verdict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import BoolArray, FloatArray
+from groma.geometry import quaternion
+from groma.localization.camera import QueryCamera
+from groma.localization.gates import VERDICT
+from groma.localization.hypotheses import max_errors, propose, straightened
+from groma.localization.matches import Matches
+from groma.localization.refinement import Refined, fitted, refine
+from groma.localization.verdict import Evidence, Status, evidence_of, judge, median_distance, moved
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """How a pose is looked for."""
+
+    #: Seed of the random samples.
+    seed: int = 0
+    #: Largest distance of a match from where a proposed pose puts it, pixels; by default from the stated noise.
+    max_error: float | None = None
+    #: Estimate focal length and distortion from the matches, too.
+    refine_lens: bool = False
+    #: Look for a second place that fits as well.
+    look_for_rival: bool = True
+    #: Focal lengths that are tried, over that of the camera: :data:`UNKNOWN_LENS` where nothing is known of it.
+    focal_factors: tuple[float, ...] = (1.0,)
+
+
+#: Focal lengths of phones to telephoto lenses, over the longer side of the image, in steps of a fifth.
+UNKNOWN_LENS = tuple(0.5 * 1.2**step for step in range(10))
+
+
+@dataclass(frozen=True, eq=False)
+class AbsolutePose:
+    """A pose and how far it is to be trusted."""
+
+    #: ``localized``: believed; ``uncertain``: found, but chance, another place, or directions that nothing
+    #: determines, are not excluded; ``failed``: none.
+    status: Status
+    #: Why, in words.
+    sentence: str
+    #: That the place is right.
+    probability: float
+    #: (7,) [qx qy qz qw tx ty tz]; None where none was found.
+    cam_from_world: FloatArray | None
+    #: (6, 6) of the left twist: shift in scene units, turn in radians, in the axes of the camera, with respect to the
+    #: map as it is.
+    covariance: FloatArray | None
+    #: (N,) and (M,) which matches agree.
+    point_inliers: BoolArray
+    line_inliers: BoolArray
+    #: The camera: as given, or estimated.
+    camera: QueryCamera
+    #: The matches that the masks tell of.
+    matches: Matches
+    #: Noise of the matches that agree, in units of what was stated.
+    sigma0: float = 1.0
+    #: Another pose that fits about as well, where there is one.
+    rival: FloatArray | None = None
+
+    @property
+    def center(self) -> FloatArray | None:
+        """(3,) camera centre in the world."""
+        pose = self.cam_from_world
+        return None if pose is None else -quaternion.rotate(quaternion.conjugate(pose[None, :4]), pose[None, 4:])[0]
+
+    @property
+    def center_covariance(self) -> FloatArray | None:
+        """(3, 3) of the camera centre in the world."""
+        if self.cam_from_world is None or self.covariance is None:
+            return None
+        R = quaternion.to_matrix(self.cam_from_world[None, :4])[0]
+        if not np.isfinite(self.covariance).all():
+            return np.full((3, 3), np.inf)
+        return R.T @ self.covariance[:3, :3] @ R
+
+    @property
+    def center_sigma(self) -> FloatArray | None:
+        """(3,) standard deviations of the camera centre along the axes of the world."""
+        covariance = self.center_covariance
+        return None if covariance is None else np.sqrt(np.diag(covariance))
+
+    @property
+    def rotation_sigma_deg(self) -> float | None:
+        """Standard deviation of the rotation, all axes together, degrees."""
+        if self.covariance is None:
+            return None
+        return float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]))))
+
+
+def estimate_absolute_pose(
+    camera: QueryCamera,
+    points2d: npt.ArrayLike | None = None,
+    points3d: npt.ArrayLike | None = None,
+    segments2d: npt.ArrayLike | None = None,
+    segments3d: npt.ArrayLike | None = None,
+    *,
+    sigma: tuple[float, float] = (1.0, 1.0),
+    covariances: tuple[npt.ArrayLike | None, npt.ArrayLike | None] = (None, None),
+    options: PoseOptions | None = None,
+) -> AbsolutePose:
+    """Estimate where a camera was from matches of points, of lines, or of both; many may be wrong.
+
+    Parameters
+    ----------
+    camera : QueryCamera
+        Calibration of the image.
+    points2d, points3d : (N, 2), (N, 3)
+        Points in the image (the first pixel's centre is 0.5, 0.5) and in the world.
+    segments2d, segments3d : (M, 2, 2), (M, 2, 3)
+        Ends of segments in the image, and two places on each line in the world; the ends need not correspond. Several
+        lines may claim one segment, and several points one pixel.
+    sigma : (float, float)
+        Standard deviations in the image, pixels: of a coordinate of a point, and of the end of a segment across it.
+    covariances : ((N, 3, 3), (M, 6, 6))
+        Of the points, and of (moment, direction) of the lines with a unit direction; None: they are exact.
+    options : PoseOptions, optional
+        How it is looked for.
+
+    Returns
+    -------
+    AbsolutePose
+        Also where no pose is found: its status then is ``failed``, and its sentence says why.
+    """
+    points, segments = np.asarray(_or_none(points2d, 2)), np.asarray(_or_none(segments2d, 2, 2))
+    matches = Matches(
+        points,
+        np.asarray(_or_none(points3d, 3)),
+        segments,
+        np.asarray(_or_none(segments3d, 2, 3)),
+        np.full(len(points), float(sigma[0])),
+        np.full(len(segments), float(sigma[1])),
+        None if covariances[0] is None else np.asarray(covariances[0], float),
+        None if covariances[1] is None else np.asarray(covariances[1], float),
+    )
+    return pose_from_matches(camera, matches, options)
+
+
+def pose_from_matches(
+    camera: QueryCamera,
+    matches: Matches,
+    options: PoseOptions | None = None,
+    places: int = 1,
+    guided: Callable[[Refined], Matches] | None = None,
+) -> AbsolutePose:
+    """Estimate a pose as :func:`estimate_absolute_pose` does.
+
+    Parameters
+    ----------
+    camera, matches, options
+        See there.
+    places
+        Parts of a map that the matches were looked for in; chance has so many opportunities.
+    guided : callable, optional
+        Returns more matches once a pose is near; they refine it, and are those that the result tells of. They are no
+        evidence that the place is right, because they were looked for where it says.
+    """
+    options = options or PoseOptions()
+    best = _best(camera, matches, options)
+    if best is None:
+        return _failed(camera, matches)
+    first = evidence_of(best, matches, places)
+    other = _rival(matches, best, options, places) if options.look_for_rival and first.significant else None
+    used = matches
+    if guided is not None and first.significant:
+        used = guided(best)
+        errors = _errors(used, options)
+        best = refine(best.camera, used, best.pose, errors, options.refine_lens)
+        first = evidence_of(fitted(best.camera, matches, best.pose, errors, options.refine_lens), matches, places)
+    covariance = best.covariance(used)
+    distance = median_distance(best.pose, _seen(used, best))
+    verdict = judge(best, covariance, distance, first, None if other is None else other[1])
+    failed = verdict.status == "failed"
+    return AbsolutePose(
+        verdict.status,
+        verdict.sentence,
+        verdict.probability,
+        None if failed else best.pose,
+        None if failed else covariance,
+        best.point_inliers,
+        best.line_inliers,
+        best.camera,
+        used,
+        best.sigma0,
+        None if other is None or verdict.status != "uncertain" else other[0].pose,
+    )
+
+
+def _errors(matches: Matches, options: PoseOptions) -> tuple[float, float]:
+    return max_errors(matches) if options.max_error is None else (options.max_error, options.max_error)
+
+
+def _best(camera: QueryCamera, matches: Matches, options: PoseOptions) -> Refined | None:
+    """The pose that most agrees with, refined; None where there is none. Of several focal lengths the best."""
+    errors = _errors(matches, options)
+    starts = [_with_focal_length(camera, factor) for factor in options.focal_factors]
+    found = [(propose(straightened(one, matches), errors, options.seed), one) for one in starts]
+    refined = [refine(one, matches, pose, errors, options.refine_lens) for pose, one in found if pose is not None]
+    return max(refined, key=lambda one: int(one.point_inliers.sum() + one.line_inliers.sum()), default=None)
+
+
+def _with_focal_length(camera: QueryCamera, factor: float) -> QueryCamera:
+    if factor == 1.0:
+        return camera
+    params = camera.params.copy()
+    params[list(camera.kind.focal_indices)] *= factor
+    return QueryCamera(camera.model, params, camera.width, camera.height)
+
+
+def _rival(
+    matches: Matches, best: Refined, options: PoseOptions, places: int
+) -> tuple[Refined, Evidence] | None:
+    """The best pose of what disagrees with the first, if it is another one."""
+    squares = [np.where(np.isfinite(one.square), one.square, np.inf) for one in (best.points, best.lines)]
+    left = [square > 4.0 * best.limit for square in squares]
+    rest = matches.take(left[0], left[1])
+    other = _best(best.camera, rest, replace(options, refine_lens=False, focal_factors=(1.0,)))
+    if other is None:
+        return None
+    found = evidence_of(other, rest, places)
+    way = moved(best.camera, best.pose, other.pose, _seen(rest, other))
+    is_other = way > VERDICT.distinct * max_errors(matches)[0]
+    return (other, found) if is_other and found.significant else None
+
+
+def _seen(matches: Matches, refined: Refined) -> FloatArray:
+    """Places (n, 3) in the world that agree with a pose."""
+    lines = matches.segments3d[refined.line_inliers].mean(axis=1)
+    return np.concatenate([matches.points3d[refined.point_inliers], lines])
+
+
+def _failed(camera: QueryCamera, matches: Matches) -> AbsolutePose:
+    number = matches.num_points + matches.num_lines
+    why = f"No pose agrees with enough of the {number} matches." if number else "Nothing of the map was found in it."
+    none = np.zeros(matches.num_points, bool), np.zeros(matches.num_lines, bool)
+    return AbsolutePose("failed", why, 0.0, None, None, *none, camera, matches)
+
+
+def _or_none(value: npt.ArrayLike | None, *shape: int) -> npt.ArrayLike:
+    return np.zeros((0, *shape)) if value is None else value
+
+
+__all__ = ["UNKNOWN_LENS", "AbsolutePose", "PoseOptions", "estimate_absolute_pose", "pose_from_matches"]

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The camera of a query: one calibration, and its pixels without distortion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from groma import cameras
+from groma._typing import FloatArray
+from groma.cameras import CameraModel
+from groma.errors import InputError
+from groma.geometry import se3
+from groma.scene import Cameras
+
+
+@dataclass(frozen=True, eq=False)
+class QueryCamera:
+    """A calibration: model, parameters, size of the image."""
+
+    #: A name of :func:`groma.cameras.models` whose images a plane can hold.
+    model: str
+    #: (k,) parameters in the order of the model.
+    params: FloatArray
+    #: Size of the image, pixels.
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        kind = cameras.model(self.model)
+        params = np.ascontiguousarray(self.params, dtype=np.float64).ravel()
+        object.__setattr__(self, "params", params)
+        if len(params) != kind.num_parameters:
+            raise InputError(
+                f"Camera model {kind.name} has {kind.num_parameters} parameters ({', '.join(kind.parameter_names)}); "
+                f"got {len(params)}. Pass them in this order."
+            )
+        if not np.isfinite(params).all() or not all(params[i] > 0 for i in kind.focal_indices):
+            raise InputError(f"Camera parameters must be finite, focal lengths positive; got {params.tolist()}.")
+        if min(self.width, self.height) < 1:
+            raise InputError(f"The size of an image must be positive, pixels; got {self.width} x {self.height}.")
+        if not kind.is_planar:
+            raise InputError(f"{kind.name} images are panoramas; cut them into perspective views to localise them.")
+
+    @property
+    def kind(self) -> CameraModel:
+        """The camera model."""
+        return cameras.model(self.model)
+
+    @property
+    def matrix(self) -> FloatArray:
+        """(3, 3) camera matrix of the image without distortion."""
+        return self.kind.camera_matrix(self.params)
+
+    @property
+    def area(self) -> float:
+        """Pixels of the image."""
+        return float(self.width * self.height)
+
+    def straight(self, pixels: npt.ArrayLike) -> FloatArray:
+        """Pixels (N, 2) without distortion; NaN where the model has none."""
+        return self.kind.undistort_pixels(self.params, np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2))
+
+    def project(self, cam_from_world: FloatArray, points: FloatArray) -> FloatArray:
+        """Pixels (N, 2) of points in the world; NaN behind the camera and where the model has none."""
+        R_t = se3.to_matrix(cam_from_world[None])[0]
+        inside = points @ R_t[:3, :3].T + R_t[:3, 3]
+        pixels = self.kind.project(self.params, np.ascontiguousarray(inside))
+        if not self.kind.sees_behind:
+            pixels[inside[:, 2] <= 0.0] = np.nan
+        return pixels
+
+    def inside(self, pixels: FloatArray, margin: float = 0.0) -> npt.NDArray[np.bool_]:
+        """Which pixels (N, 2) lie in the image, grown by a margin."""
+        with np.errstate(invalid="ignore"):
+            return ((pixels >= -margin) & (pixels <= np.array([self.width, self.height]) + margin)).all(axis=1)
+
+    def table(self) -> Cameras:
+        """The camera as the only row of a table."""
+        return Cameras(
+            np.array([1]), (self.model,), self.params[None], np.array([self.width]), np.array([self.height])
+        )
+
+    @staticmethod
+    def of(table: Cameras, row: int) -> QueryCamera:
+        """One camera of a scene."""
+        return QueryCamera(table.models[row], table.params_of(row), int(table.width[row]), int(table.height[row]))
+
+
+__all__ = ["QueryCamera"]

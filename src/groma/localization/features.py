@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What is found in a photograph: described points (SIFT) and described segments.
+
+Descriptors are the roots of SIFT's, whose products compare histograms better (R. Arandjelović, A. Zisserman, *Three
+things everyone should know to improve object retrieval*, 2012), in bytes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import FloatArray, IntArray
+from groma.features.contract import SegmentDetector
+from groma.features.images import GrayImage
+from groma.features.matching.descriptor import Descriptors, describe
+from groma.features.registry import DETECTORS
+from groma.features.segments import Segments
+from groma.gates import gate
+from groma.localization.camera import QueryCamera
+from groma.mapping.image_segments import Straightener
+
+Bytes = npt.NDArray[np.uint8]
+#: A descriptor of length one, in bytes, has about this length.
+_LENGTH = 512.0
+
+
+@dataclass(frozen=True)
+class FeatureGates:
+    """Which points and segments of a photograph are looked at."""
+
+    max_points: int = gate(4000, "points", "described in an image, the strongest", "cost: of matching")
+    contrast: float = gate(0.02, "1", "least contrast of a point, OpenCV's units", "convention: half of OpenCV's default")
+    sigma: float = gate(
+        0.2, "share", "noise of a point over the standard deviation of the blur it was found at",
+        "derived from residuals of triangulated points",
+    )  # fmt: skip
+    max_corners: int = gate(1000, "points", "corners described besides, the strongest", "cost: of matching")
+    corner_distance: float = gate(6.0, "px", "least distance of corners", "cost: of matching")
+    corner_scale: float = gate(4.0, "px", "scale at which places without one are described", "convention: half a patch")
+    min_sigma: float = gate(0.4, "px", "least noise of a point", "derived from residuals of triangulated points")
+
+
+FEATURES = FeatureGates()
+
+
+@dataclass(frozen=True, eq=False)
+class DescribedPoints:
+    """Points of an image."""
+
+    #: (n, 2) pixels, (n,) their standard deviations.
+    pixels: FloatArray
+    sigma: FloatArray
+    #: (n, 128) descriptors.
+    descriptors: Bytes
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def joined(self, other: DescribedPoints) -> DescribedPoints:
+        """These points and others."""
+        pairs = [(getattr(self, name), getattr(other, name)) for name in ("pixels", "sigma", "descriptors")]
+        return DescribedPoints(*(np.concatenate(pair) for pair in pairs))
+
+    @staticmethod
+    def empty() -> DescribedPoints:
+        """No points."""
+        return DescribedPoints(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8))
+
+
+@dataclass(frozen=True, eq=False)
+class DescribedImage:
+    """Points and segments of an image."""
+
+    points: DescribedPoints
+    segments: Segments
+    #: (m, 72) of the segments.
+    segment_descriptors: Descriptors
+
+
+def find_points(image: GrayImage, gates: FeatureGates = FEATURES) -> DescribedPoints:
+    """Find and describe blobs of any scale and direction."""
+    sift = cv2.SIFT_create(gates.max_points, contrastThreshold=gates.contrast)  # type: ignore[attr-defined]
+    return _described(*sift.detectAndCompute(image, None), gates)
+
+
+def find_corners(image: GrayImage, gates: FeatureGates = FEATURES) -> DescribedPoints:
+    """Find and describe corners, at one scale and upright: maps of sequences consist of such."""
+    found = cv2.goodFeaturesToTrack(image, gates.max_corners, 0.005, gates.corner_distance)
+    if found is None:
+        return DescribedPoints.empty()
+    return describe_places(image, found.reshape(-1, 2).astype(np.float64) + 0.5, gates)[0]
+
+
+def describe_places(
+    image: GrayImage, pixels: FloatArray, gates: FeatureGates = FEATURES
+) -> tuple[DescribedPoints, IntArray]:
+    """Describe given places (n, 2), upright; those at the border are left out: also return the rows that are left."""
+    size = 2.0 * gates.corner_scale
+    places = [
+        cv2.KeyPoint(float(u) - 0.5, float(v) - 0.5, size, 0.0, 1.0, 0, row) for row, (u, v) in enumerate(pixels)
+    ]
+    kept, described = cv2.SIFT_create().compute(image, places)  # type: ignore[attr-defined]
+    return _described(kept, described, gates), np.array([one.class_id for one in kept], np.int64)
+
+
+def _described(found, described, gates: FeatureGates) -> DescribedPoints:
+    if described is None or not len(found):
+        return DescribedPoints.empty()
+    pixels = np.array([one.pt for one in found], np.float64) + 0.5
+    scale = 0.5 * np.array([one.size for one in found], np.float64)  # OpenCV tells the diameter
+    root = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))
+    octets = np.minimum(np.round(_LENGTH * root), 255.0).astype(np.uint8)
+    return DescribedPoints(pixels, np.maximum(gates.sigma * scale, gates.min_sigma), octets)
+
+
+def unit(descriptors: Bytes) -> npt.NDArray[np.float32]:
+    """Descriptors (n, 128) as vectors of length one."""
+    values = descriptors.astype(np.float32)
+    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), np.float32(1e-6))
+
+
+def find_features(image: GrayImage, camera: QueryCamera, lines: bool = True, min_length: float = 15.0) -> DescribedImage:
+    """Find and describe points and segments; segments without the distortion of the lens."""
+    segments = Segments.empty()
+    if lines:
+        detector = DETECTORS.make("lsd", min_length=min_length, max_segments=0)
+        segments = _segments(image, camera, detector)
+    return DescribedImage(find_points(image).joined(find_corners(image)), segments, describe(image, segments))
+
+
+def _segments(image: GrayImage, camera: QueryCamera, detector: SegmentDetector) -> Segments:
+    straightener = _straightener(camera.model, tuple(camera.params.tolist()), image.shape[1], image.shape[0])
+    return detector.detect(image) if straightener is None else straightener.detect(detector, image)
+
+
+@lru_cache(maxsize=2)
+def _straightener(model: str, params: tuple[float, ...], width: int, height: int) -> Straightener | None:
+    from groma import cameras
+
+    return Straightener.of(cameras.model(model), np.array(params), width, height)
+
+
+__all__ = ["FEATURES", "Bytes", "DescribedImage", "DescribedPoints", "FeatureGates", "describe_places", "find_corners", "find_features", "find_points", "unit"]

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The numbers of localisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from groma.gates import gate
+
+
+@dataclass(frozen=True)
+class HypothesisGates:
+    """Which poses are proposed from few matches."""
+
+    outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
+    slack: float = gate(
+        2.0, "1", "of that residual for poses from few matches", "derived from noise: such poses are noisier themselves"
+    )
+    confidence: float = gate(0.9999, "probability", "that one sample held no outlier", "convention: PoseLib's default")
+    max_trials: int = gate(20_000, "samples", "drawn at most", "cost: half a second")
+    min_matches: int = gate(4, "matches", "a pose is not looked for in fewer", "derived from P3P: three and one more")
+
+
+@dataclass(frozen=True)
+class RefinementGates:
+    """How a pose is fitted to what agrees with it."""
+
+    outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
+    wide_loss: float = gate(1.5, "sigma", "scale of the Cauchy loss of the first stage", "chosen on tracked sequences")
+    last_loss: float = gate(
+        1.9, "sigma", "scale of the Geman-McClure loss that follows, of many matches", "chosen on stairs of 7-Scenes"
+    )
+    cells: int = gate(8, "cells", "per longer side: errors within one may be alike", "derived from sizes of surfaces")
+    stated_weight: float = gate(
+        10.0, "observations", "that the stated noise counts for beside the noise that residuals show",
+        "derived from chi-square: its estimate is then good to 40 % by itself",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class VerdictGates:
+    """When a pose is believed."""
+
+    cells: int = gate(
+        32, "cells", "per longer side: what agrees in one cell counts once", "derived from the reach of a descriptor"
+    )
+    search_share: float = gate(
+        0.25, "share", "of the longer side: extent of what a segment could be taken for", "derived from guided search"
+    )
+    right: float = gate(0.999, "probability", "that the pose is right, for it to be believed", "convention: 1 in 1000")
+    chance: float = gate(0.5, "probability", "that it is right, for a pose to be told at all", "convention: even odds")
+    center: float = gate(
+        0.1, "share", "of the median distance: largest standard deviation of the centre", "convention: a tenth"
+    )
+    turn: float = gate(0.1, "rad", "largest standard deviation of the rotation", "convention: a tenth")
+    distinct: float = gate(
+        5.0, "thresholds", "by which another pose moves what is seen, in the median", "derived from noise: well beyond"
+    )
+
+
+#: The numbers in use.
+HYPOTHESES, REFINEMENT, VERDICT = HypothesisGates(), RefinementGates(), VerdictGates()
+__all__ = ["HYPOTHESES", "REFINEMENT", "VERDICT", "HypothesisGates", "RefinementGates", "VerdictGates"]

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Photographs in a map: retrieval, matching, pose, guided matching, verdict."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import IntArray
+from groma.errors import InputError
+from groma.features.images import GrayImage, to_gray
+from groma.gates import gate
+from groma.io import read_scene
+from groma.localization.absolute_pose import UNKNOWN_LENS, AbsolutePose, PoseOptions, pose_from_matches
+from groma.localization.camera import QueryCamera
+from groma.localization.candidates import described_alike, found_near
+from groma.localization.features import DescribedImage, find_features
+from groma.localization.hypotheses import max_errors
+from groma.localization.map_images import image_paths, images_in_summary
+from groma.localization.map_index import MapIndex, images_told, kept_index
+from groma.localization.matches import Matches
+from groma.localization.refinement import Refined
+from groma.localization.retrieval import VladRetrieval
+from groma.mapping.photographs import check_cameras, read_gray
+from groma.scene import Scene
+
+
+@dataclass(frozen=True)
+class LocalizerGates:
+    """How much of a map a query is compared with."""
+
+    images: int = gate(8, "images", "of the map, the most alike, matched with a query", "cost: of matching")
+    near: int = gate(5, "images", "of those, whose points and lines are looked for near a pose", "cost: of matching")
+
+
+GATES = LocalizerGates()
+
+
+@dataclass(frozen=True)
+class LocalizeOptions:
+    """How photographs are localised."""
+
+    #: Use lines besides points.
+    lines: bool = True
+    #: Shortest segment, pixels.
+    min_segment_length: float = 15.0
+    #: Numbers of the retrieval.
+    gates: LocalizerGates = field(default_factory=LocalizerGates)
+    #: Of the poses: see there.
+    pose: PoseOptions = field(default_factory=PoseOptions)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizedImage:
+    """A photograph and where it was taken."""
+
+    pose: AbsolutePose
+    #: Points and lines of the map that its matches show, as rows of the index and of the map.
+    point: IntArray
+    line: IntArray
+    #: Seconds that it took: finding features, and the rest.
+    feature_seconds: float
+    seconds: float
+
+
+class Localizer:
+    """Places photographs in a map.
+
+    Parameters
+    ----------
+    map_ : path or Scene
+        OUT of ``groma map`` or ``groma track``, a COLMAP model, or a scene.
+    images : path, optional
+        Folder of the photographs of the map, or a folder above. By default where they were when the map was described,
+        or made.
+    index : path, optional
+        File in which the descriptions of the map are kept, so that they are made once. By default beside the map; a
+        scene without a file is described anew.
+    options : LocalizeOptions, optional
+        Lines, retrieval, poses.
+    progress : callable, optional
+        Called with the name of a stage, what is done and what there is to do.
+    """
+
+    def __init__(
+        self,
+        map_: str | os.PathLike[str] | Scene,
+        images: str | os.PathLike[str] | None = None,
+        index: str | os.PathLike[str] | None = None,
+        options: LocalizeOptions | None = None,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> None:
+        say = progress or (lambda stage, done, total: None)
+        self.options = options or LocalizeOptions()
+        self.scene = map_ if isinstance(map_, Scene) else read_scene(map_)
+        check_map(self.scene)
+        if index is None and not isinstance(map_, Scene):
+            index = index_file(Path(map_))
+        path = None if index is None else Path(index)
+        #: Files of the images of the map, in their order.
+        self.files = image_paths(self.scene, _folder(map_, images, path))
+        #: The descriptions; and what could not be done as wanted, in words.
+        self.index, self.warning = kept_index(self.scene, self.files, path, say)
+        self._retrieval = VladRetrieval(self.index.vocabulary)
+
+    def camera_of_map(self, width: int, height: int) -> QueryCamera | None:
+        """The camera of the map for images of this size; None where there is none, or more than one."""
+        table = self.scene.cameras
+        rows = np.flatnonzero((table.width == width) & (table.height == height))
+        found = [QueryCamera.of(table, int(row)) for row in rows]
+        alike = found and all(
+            one.model == found[0].model and np.allclose(one.params, found[0].params, rtol=1e-2) for one in found
+        )
+        return found[0] if alike else None
+
+    def localize(
+        self,
+        image: str | os.PathLike[str] | npt.NDArray[np.generic],
+        camera: QueryCamera | None = None,
+        refine_lens: bool = False,
+    ) -> LocalizedImage:
+        """Find where a photograph was taken.
+
+        Parameters
+        ----------
+        image : path or (H, W) or (H, W, 3) uint8
+            The photograph.
+        camera : QueryCamera, optional
+            Its calibration; by default that of the map for images of this size, else it is estimated.
+        refine_lens : bool
+            Estimate focal length and distortion, from those of the camera.
+        """
+        gray = to_gray(image) if isinstance(image, np.ndarray) else read_gray(Path(image))
+        height, width = gray.shape
+        options = replace(self.options.pose, refine_lens=refine_lens)
+        camera = camera or self.camera_of_map(width, height)
+        if camera is None:
+            camera = unknown_camera(width, height)
+            options = replace(options, refine_lens=True, focal_factors=UNKNOWN_LENS)
+        if (camera.width, camera.height) != (width, height):
+            raise InputError(
+                f"The image has {width}x{height} pixels, its camera {camera.width}x{camera.height}. Pass the "
+                "calibration of this size."
+            )
+        return self._localize(gray, camera, options)
+
+    def _localize(self, gray: GrayImage, camera: QueryCamera, options: PoseOptions) -> LocalizedImage:
+        start = time.perf_counter()
+        query = find_features(gray, camera, self.options.lines, self.options.min_segment_length)
+        described = time.perf_counter()
+        images = self._alike(query)
+        found, count = described_alike(query, self.scene, self.index, images, self.options.lines)
+        near = images[np.argsort(-count, kind="stable")[: self.options.gates.near]]
+        last = [found]
+
+        def guided(best: Refined) -> Matches:
+            sigma = best.sigma0 * max(1.0, float(np.median(query.points.sigma)) if len(query.points) else 1.0)
+            reach = max_errors(Matches(point_sigma=np.zeros(0)))[0] * sigma
+            last[0] = found_near(
+                query, self.scene, self.index, near, best.camera, best.pose, (reach, reach), self.options.lines
+            )
+            return last[0].matches(query, self.scene, self.index)
+
+        pose = pose_from_matches(
+            camera, found.matches(query, self.scene, self.index), options, max(len(images), 1), guided
+        )
+        done = time.perf_counter()
+        return LocalizedImage(pose, last[0].points[:, 1], last[0].lines[:, 1], described - start, done - described)
+
+    def _alike(self, query: DescribedImage) -> IntArray:
+        """The images of the map to match with, the most alike first."""
+        wanted = self.options.gates.images
+        if len(self.index.image) <= wanted:
+            return np.arange(len(self.index.image))
+        described = self._retrieval.gather(query.points.descriptors)
+        return np.argsort(-self._retrieval.similarity(described, self.index.image), kind="stable")[:wanted]  # type: ignore[arg-type]
+
+
+def _folder(map_: object, images: str | os.PathLike[str] | None, index: Path | None) -> Path:
+    """Folder of the photographs of a map: as given, else as the description or the summary of the map tells."""
+    if images is not None:
+        return Path(images)
+    told = None if index is None else images_told(index)
+    if told is None and not isinstance(map_, Scene):
+        told = images_in_summary(Path(str(map_)))
+    if told is None:
+        raise InputError("Where the photographs of the map are is not known. Pass their folder with --images.")
+    return told
+
+
+def unknown_camera(width: int, height: int) -> QueryCamera:
+    """Return a camera as wide as its image is long, in a model with one distortion: where an estimate begins."""
+    params = np.array([max(width, height), 0.5 * width, 0.5 * height, 0.0], float)
+    return QueryCamera("SIMPLE_RADIAL", params, width, height)
+
+
+def index_file(map_: Path) -> Path:
+    """Return the file beside a map in which its descriptions are kept."""
+    path = map_.absolute()
+    return path.with_name(f"{path.name}.index.npz")
+
+
+def check_map(scene: Scene) -> None:
+    """Check that a map has images with poses, and that a plane holds their views."""
+    if not scene.num_images:
+        raise InputError("The map has no images with poses. Pass an output of groma map or groma track.")
+    check_cameras(scene.cameras.models)
+
+
+__all__ = ["GATES", "LocalizeOptions", "LocalizedImage", "Localizer", "LocalizerGates", "index_file", "unknown_camera"]

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where the photographs of a map are."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from pathlib import Path
+
+from groma.bounded.names import stays_inside
+from groma.errors import InputError
+from groma.io.endings import IMAGES
+from groma.scene import Scene
+
+
+def image_paths(scene: Scene, folder: Path) -> list[Path]:
+    """Return the files of the images of a map: by name in a folder, else by the last part of the name below it.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, or cannot be told from others.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder. Pass the photographs of the map with --images.")
+    names = scene.images.names
+    found = [folder / name if stays_inside(name) else Path() for name in names]
+    missing = [row for row, path in enumerate(found) if not path.is_file()]
+    below: defaultdict[str, list[Path]] = defaultdict(list)
+    for path in folder.rglob("*") if missing else ():
+        if path.suffix.lower() in IMAGES:
+            below[path.name].append(path)
+    for row in missing:
+        alike = below[Path(names[row]).name]
+        if len(alike) != 1:
+            raise InputError(
+                f"{len(missing)} of the {len(names)} images of the map are not in {folder}, for example {names[row]!r}. "
+                "Pass the folder that their names begin in with --images."
+            )
+        found[row] = alike[0]
+    return found
+
+
+def images_in_summary(map_: Path) -> Path | None:
+    """Return the folder of photographs that the summary of a map tells, if it is there."""
+    try:
+        told = json.loads((map_ / "summary.json").read_text(encoding="utf-8")).get("images")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return Path(told) if isinstance(told, str) and Path(told).is_dir() else None
+
+
+__all__ = ["image_paths", "images_in_summary"]

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What of a map is needed to find photographs in it: built once, kept in a file beside the map.
+
+For each image of the map: descriptors of the points that have a place in the world, descriptors of the segments that
+show lines of the map, and one descriptor of the whole image. For each point and line: its covariance.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from groma._typing import FloatArray, IntArray
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.fit import noise_of
+from groma.bounded.arrays import opened_arrays
+from groma.errors import FileFormatError, InputError, OutputError
+from groma.execution import map_work
+from groma.features.matching.descriptor import describe
+from groma.features.segments import Segments
+from groma.io import atomic_output
+from groma.localization.features import Bytes, DescribedPoints, describe_places, find_points
+from groma.localization.records import landmark_covariances, residual_squares
+from groma.localization.retrieval import VladRetrieval
+from groma.localization.triangulation import triangulate_features
+from groma.mapping.lines.neighbors import covisible_neighbors
+from groma.mapping.photographs import read_gray
+from groma.scene import Scene
+
+#: Of the layout of the file; another one is built anew.
+_VERSION = 1
+#: Images that the features of an image are matched with.
+_NEIGHBORS = 12
+
+#: What a damaged file of arrays raises.
+_UNREADABLE = (OSError, KeyError, ValueError, zipfile.BadZipFile, FileFormatError)
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class MapIndex:
+    """Described points, lines and images of a map."""
+
+    #: (P, 3) places of points in the world, (P, 3, 3) their covariances.
+    xyz: FloatArray
+    point_covariance: FloatArray
+    #: (I + 1,) where the features of each image begin; (F,) their points, (F, 2) pixels, (F, 128) descriptors.
+    begin: IntArray
+    point: IntArray
+    pixel: FloatArray
+    descriptor: Bytes
+    #: (L, 6, 6) covariances of (moment, direction) of the lines of the map; NaN for those that are not determined.
+    line_covariance: FloatArray
+    #: (I + 1,) where the segments of each image begin; (S,) rows of the map's line observations, (S, 72) descriptors.
+    segment_begin: IntArray
+    segment: IntArray
+    segment_descriptor: npt.NDArray[np.float32]
+    #: (K, 128) words, (I, K * 128) descriptions of images.
+    vocabulary: npt.NDArray[np.float32]
+    image: npt.NDArray[np.float32]
+
+    def write(self, path: Path, digest: str, folder: Path) -> None:
+        """Write the index whole or not at all; ``digest`` is that of the map, ``folder`` holds its photographs."""
+        arrays = {item.name: getattr(self, item.name) for item in fields(self)}
+        with atomic_output(path, force=True) as draft, draft.open("wb") as file:
+            np.savez(file, digest=np.array(digest), folder=np.array(str(folder)), **arrays)
+
+
+def read_index(path: Path, digest: str) -> MapIndex | None:
+    """Read an index; None where there is none, where it is damaged, and where it belongs to another map."""
+    try:
+        with opened_arrays(path) as members:
+            if str(members.read("digest")) != digest:
+                return None
+            return MapIndex(**{item.name: members.read(item.name) for item in fields(MapIndex)})
+    except _UNREADABLE:
+        return None
+
+
+def images_told(path: Path) -> Path | None:
+    """Return the folder of photographs that an index tells, if it is there."""
+    try:
+        with opened_arrays(path) as members:
+            folder = Path(str(members.read("folder")))
+    except _UNREADABLE:
+        return None
+    return folder if folder.is_dir() else None
+
+
+def digest_of(scene: Scene, files: Sequence[Path]) -> str:
+    """Return a number that changes with the map, and with the files of its images."""
+    told = hashlib.sha256(str(_VERSION).encode())
+    for name, file in zip(scene.images.names, files, strict=True):
+        told.update(f"{name} {file.stat().st_size}".encode())
+    for array in (
+        scene.cam_from_world, scene.cameras.params, scene.points.xyz, scene.lines.plucker,
+        scene.line_observations.segment, scene.point_observations.pixel,
+    ):  # fmt: skip
+        told.update(np.ascontiguousarray(array).tobytes())
+    return told.hexdigest()
+
+
+def build_index(scene: Scene, files: Sequence[Path], say: Progress) -> MapIndex:
+    """Describe a map.
+
+    Raises
+    ------
+    InputError
+        If an image of the map cannot be read, or none of its points can be described.
+    """
+    work = [(file, *_seen_in(scene, image)) for image, file in enumerate(files)]
+    found = map_work(_describe_image, work, partial(say, "describing the images of the map"))
+    neighbors = covisible_neighbors(scene, _NEIGHBORS)
+    pairs = [(min(i, j), max(i, j)) for i, row in enumerate(neighbors) for j in row.tolist()]
+    pairs = np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)
+    features = [one.features for one in found]
+    made = triangulate_features(scene, features, pairs, partial(say, "placing the points of the map"))
+    own_covariance, line_covariance = _covariances(scene, "points"), _covariances(scene, "lines")
+    rows, offset = [], np.concatenate([[0], np.cumsum([len(one) for one in features])])
+    known = np.isfinite(own_covariance).all(axis=(1, 2))
+    points, pixels, descriptors = [], [], []
+    for image, one in enumerate(found):
+        point = made.point[offset[image] : offset[image + 1]]
+        placed, own = point >= 0, known[one.point]
+        points.append(np.concatenate([point[placed], one.point[own] + len(made.xyz)]))
+        pixels.append(np.concatenate([one.features.pixels[placed], one.own.pixels[own]]))
+        descriptors.append(np.concatenate([one.features.descriptors[placed], one.own.descriptors[own]]))
+        rows.append(one.segment)
+    if not sum(map(len, points)) and not scene.num_lines:
+        raise InputError("Nothing in the images of the map can be described: no points, no lines. Pass another map.")
+    retrieval = VladRetrieval.learned([one.descriptors for one in features])
+    return MapIndex(
+        np.concatenate([made.xyz, scene.points.xyz]),
+        np.concatenate([made.covariance, np.nan_to_num(own_covariance)]),
+        np.concatenate([[0], np.cumsum([len(part) for part in points])]),
+        np.concatenate(points),
+        np.concatenate(pixels),
+        np.concatenate(descriptors),
+        line_covariance,
+        np.concatenate([[0], np.cumsum([len(part) for part in rows])]),
+        np.concatenate(rows),
+        np.concatenate([one.segment_descriptors for one in found]),
+        retrieval.vocabulary,
+        np.stack([retrieval.gather(one.descriptors) for one in features]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _ImageOfMap:
+    """What is described in one image of a map."""
+
+    features: DescribedPoints
+    #: Places of points of the map, and which.
+    own: DescribedPoints
+    point: IntArray
+    #: Rows of line observations, and their descriptors.
+    segment: IntArray
+    segment_descriptors: npt.NDArray[np.float32]
+
+
+def _seen_in(scene: Scene, image: int) -> tuple[FloatArray, IntArray, FloatArray, IntArray]:
+    """What an image sees of the map: pixels and numbers of points; ends and rows of segments."""
+    points, lines = scene.point_observations, scene.line_observations
+    rows, segments = np.flatnonzero(points.image_idx == image), np.flatnonzero(lines.image_idx == image)
+    return points.pixel[rows], points.point_idx[rows], lines.segment[segments], segments
+
+
+def _describe_image(work: tuple[Path, FloatArray, IntArray, FloatArray, IntArray]) -> _ImageOfMap:
+    path, pixels, points, ends, rows = work
+    image = read_gray(path)
+    own, kept = describe_places(image, pixels)
+    descriptors = describe(image, Segments.from_ends(ends)).astype(np.float32)
+    return _ImageOfMap(find_points(image), own, points[kept], rows, descriptors)
+
+
+def _covariances(scene: Scene, kind: str) -> FloatArray:
+    """Covariances of the points or lines of a map with its poses held, at the noise that its residuals show."""
+    count = len(getattr(scene, kind))
+    other = {"points": "lines", "lines": "points"}[kind]
+    alone = scene.keep(**{other: []}, planes=[], directions=[])
+    table = alone.point_observations if kind == "points" else alone.line_observations
+    if not count or not len(table):
+        return np.full((count, 6, 6) if kind == "lines" else (count, 3, 3), np.nan)
+    problem = assemble(alone, AssemblyOptions(refine_poses=False, point_chart="euclidean", gauge="free")).problem
+    noise = noise_of(residual_squares(problem, kind, len(table)))
+    return landmark_covariances(problem, kind, count) * noise**2
+
+
+def kept_index(scene: Scene, files: Sequence[Path], path: Path | None, say: Progress) -> tuple[MapIndex, str]:
+    """Return the index of a map, from its file or built and kept there; and a sentence if it cannot be kept."""
+    if path is None:
+        return build_index(scene, files, say), ""
+    digest = digest_of(scene, files)
+    index = read_index(path, digest)
+    if index is not None:
+        return index, ""
+    index = build_index(scene, files, say)
+    try:
+        index.write(path, digest, _common_folder(scene, files))
+    except OutputError as error:
+        return index, f"The descriptions of the map cannot be kept, and are made again next time: {error}"
+    return index, ""
+
+
+def _common_folder(scene: Scene, files: Sequence[Path]) -> Path:
+    """The folder that the names of images begin in, or that all of their files are in."""
+    first = files[0].absolute()
+    folder = first.parents[len(Path(scene.images.names[0]).parts) - 1]
+    every = all(file.absolute() == folder / name for name, file in zip(scene.images.names, files, strict=True))
+    return folder if every else Path(os.path.commonpath([file.absolute().parent for file in files]))
+
+
+__all__ = ["MapIndex", "build_index", "digest_of", "images_told", "kept_index", "read_index"]

@@ -1,0 +1,329 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Fit a pose to matches: points and lines together, each weighted by its noise and by that of its landmark.
+
+The landmarks are held. What is not known of them is seen through the derivative of the residual by the landmark,
+:math:`J_X`, and is added to the noise of the image,
+
+.. math:: \Sigma = \sigma^2 I + J_X\, \Sigma_X\, J_X^\top ,
+
+which is what eliminating landmarks with such priors would leave, to first order. The noise that the residuals show
+multiplies all of it.
+
+Errors of neighbouring matches are seldom independent: they share a surface, an image of the map, a lens. The covariance
+of the pose is therefore the larger of the usual inverse :math:`H^{-1}` and the one that adds gradients within cells of
+the image before it squares them (clustered sandwich),
+
+.. math:: H^{-1} \Big( \sum_{c} g_c g_c^\top \Big) H^{-1}, \qquad g_c = \sum_{i \in c} J_i^\top W_i r_i .
+
+Reference: K.-Y. Liang, S. Zeger, *Longitudinal data analysis using generalized linear models*, 1986, eq. (7).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.adjustment.assemble import assemble
+from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.fit import MEDIAN_SQUARE
+from groma.adjustment.stages import with_loss
+from groma.factors.contract import Factor
+from groma.factors.losses import Cauchy, GemanMcClure
+from groma.gates import chi_square_gate
+from groma.geometry import se3
+from groma.localization.camera import QueryCamera
+from groma.localization.gates import REFINEMENT, RefinementGates
+from groma.localization.matches import Matches, nearest_claims
+from groma.localization.records import landmark_rows, records, residual_squares, times
+from groma.problem.problem import Problem
+from groma.scene import LineObservations, Lines, PointObservations, Points, Scene
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
+
+_ASSEMBLY = AssemblyOptions(
+    point_chart="euclidean", drop_behind=False, require_in_front=True, gauge="free", refine_landmarks=False
+)
+_POSE = SolverOptions(max_iterations=12, function_tolerance=1e-5, initial_damping=1e-6, threads=1, eliminate=("frames",))
+#: Information of scaled unknowns below which they are not determined.
+_SINGULAR = 1e-10
+_LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """What a pose leaves of the matches, in standard deviations, and what it says about the pose."""
+
+    #: (n, 2) whitened residuals, NaN where a match has no image; (n, 2, 6 + k) their derivatives by the left twist, and
+    #: by what is estimated of the lens.
+    value: FloatArray
+    by_pose: FloatArray
+    #: (n,) square pixels of an ellipse of one standard deviation, over pi: root of the determinant of the noise.
+    spread: FloatArray
+
+    @property
+    def square(self) -> FloatArray:
+        """(n,) squared lengths; infinite where a match has no image."""
+        square = (self.value**2).sum(axis=1)
+        return np.where(np.isfinite(square), square, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A pose fitted to what agrees with it."""
+
+    #: (7,) cam_from_world, and the camera: as given, or estimated.
+    pose: FloatArray
+    camera: QueryCamera
+    points: Residuals
+    lines: Residuals
+    #: Which matches agree; of several that claim the same, the nearest.
+    point_inliers: BoolArray
+    line_inliers: BoolArray
+    #: Noise that the residuals show, in units of what was stated, and the squared residual that agrees.
+    sigma0: float
+    limit: float
+
+    def covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
+        """(6, 6) covariance of the left twist; infinite where the matches do not determine the pose."""
+        chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
+        J = np.concatenate([found.by_pose[kept] for found, kept in chosen])
+        r = np.concatenate([found.value[kept] for found, kept in chosen])
+        scale = np.sqrt((J**2).sum(axis=(0, 1)))
+        if not (scale > 0.0).all():
+            return np.full((6, 6), np.inf)
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->ij", J / scale, J / scale))
+        if not values[0] > _SINGULAR:
+            return np.full((6, 6), np.inf)
+        pull, sigma = _pull(r, J.shape[2], gates)
+        root = sigma * vectors / np.sqrt(values) / scale[:, None]
+        middle = matches.segments2d.mean(axis=1)[self.line_inliers]
+        cell = cells_of(np.concatenate([matches.points2d[self.point_inliers], middle]), self.camera, gates.cells)
+        count, dof = int(cell.max()) + 1, len(scale)
+        gradient = np.zeros((count, dof))
+        np.add.at(gradient, cell, np.einsum("nki,nk->ni", J @ (root / sigma), pull / sigma))
+        if count > dof:
+            shared, axes = np.linalg.eigh(gradient.T @ gradient * (count / (count - dof)))
+            by_chance = (1.0 + np.sqrt(dof / count)) ** 2  # the largest such eigenvalue of independent errors
+            root = root @ axes * np.sqrt(np.where(shared > by_chance, shared, 1.0))
+        return (root @ root.T)[:6, :6]
+
+
+def _pull(residual: FloatArray, unknowns: int, gates: RefinementGates) -> tuple[FloatArray, float]:
+    r"""Return what each residual (n, 2) pulls under the last loss, and the standard deviation of an observation for an
+    estimate by it.
+
+    With the weight w(s) of a squared norm s, and pulls :math:`\psi = w r`, an M-estimate has the covariance of least
+    squares with the variance :math:`E[\psi^2] / E[\psi']^2`; pulls are divided by :math:`E[\psi']`, too. Both means are
+    those of the residuals and, counted as some more observations, those of normal noise as stated.
+    """
+    scale = last_scale(len(residual), gates)
+    c = scale**2
+    square = (residual**2).sum(axis=1, keepdims=True)
+    weight = (1.0 + square / c) ** -2
+    stiffness = weight - 4.0 * residual**2 / c * (1.0 + square / c) ** -3
+    square_of_normal, stiffness_of_normal = _of_normal_noise(scale)
+    stated = 2.0 * gates.stated_weight
+    mean = (float(stiffness.sum()) + stated * stiffness_of_normal) / (residual.size + stated)
+    mean = max(mean, float(weight.mean()) ** 2)  # of far outliers it may vanish
+    pull = weight * residual
+    free = max(residual.size - unknowns, 0)
+    variance = (float((pull**2).sum()) + stated * square_of_normal) / (free + stated)
+    return pull / mean, float(np.sqrt(variance)) / mean
+
+
+@lru_cache(maxsize=256)
+def _of_normal_noise(scale: float) -> tuple[float, float]:
+    """Mean square of a pull, and mean derivative, of a coordinate of normal noise under a Geman-McClure loss."""
+    node, share = np.polynomial.laguerre.laggauss(40)
+    square, c = 2.0 * node, scale**2  # chi square of two degrees
+    weight = (1.0 + square / c) ** -2
+    stiffness = weight - 2.0 * square / c * (1.0 + square / c) ** -3
+    return float(share @ (weight**2 * square)) / 2.0, float(share @ stiffness)
+
+
+def cells_of(pixels: FloatArray, camera: QueryCamera, cells: int) -> IntArray:
+    """Number pixels (N, 2) by the cell of the image that they lie in, cells without any left out."""
+    side = max(camera.width, camera.height) / cells
+    place = np.floor(pixels / side).astype(np.int64)
+    return np.unique(place, axis=0, return_inverse=True)[1].ravel().astype(np.int64)
+
+
+def refine(
+    camera: QueryCamera,
+    matches: Matches,
+    start: FloatArray,
+    max_error: tuple[float, float],
+    refine_lens: bool = False,
+    gates: RefinementGates = REFINEMENT,
+) -> Refined:
+    """Fit a pose.
+
+    Parameters
+    ----------
+    camera, matches
+        The camera, and what may be seen.
+    start : (7,)
+        cam_from_world.
+    max_error
+        Matches of points and lines further from there, pixels, say nothing about the noise.
+    refine_lens
+        Estimate focal length and distortion, too.
+    gates
+        Numbers of the fit.
+    """
+    pose, agree = start, 0
+    for stage in ("wide", "last"):
+        problem = _problem(camera, matches, pose, refine_lens)
+        loss = Cauchy(gates.wide_loss) if stage == "wide" else GemanMcClure(last_scale(agree, gates))
+        problem = solve(with_loss(problem, loss), _LENS if refine_lens else _POSE).problem
+        estimated = _camera_of(problem, camera) if refine_lens else camera
+        if estimated is None:
+            break
+        pose, camera = problem.variables["frames"].state[0], estimated
+        squares = [
+            residual_squares(problem, name, len(rows))
+            for name, rows in (("points", matches.points2d), ("lines", matches.segments2d))
+        ]
+        agree = int((np.concatenate(squares) <= chi_square_gate(gates.outlier, 2)).sum())
+    return fitted(camera, matches, pose, max_error, refine_lens, gates)
+
+
+def last_scale(agree: int, gates: RefinementGates = REFINEMENT) -> float:
+    """Return the scale of the last loss for so many matches that agree, standard deviations.
+
+    Where there are hardly more than the pose needs, a narrow loss picks those that happen to fit each other.
+    """
+    return gates.last_loss * (1.0 + gates.stated_weight / max(2 * agree - 6, 1))
+
+
+def fitted(
+    camera: QueryCamera,
+    matches: Matches,
+    pose: FloatArray,
+    max_error: tuple[float, float],
+    refine_lens: bool = False,
+    gates: RefinementGates = REFINEMENT,
+) -> Refined:
+    """Say which matches agree with a pose as it is; parameters as of :func:`refine`."""
+    problem = _problem(camera, matches, pose, False)
+    sigma0 = _noise(problem, matches, max_error, gates)
+    lens = _lens_columns(camera) if refine_lens else []
+    points = residuals(problem, "points", matches.num_points, lens)
+    lines = residuals(problem, "lines", matches.num_lines, lens)
+    limit = chi_square_gate(gates.outlier, 2) * sigma0**2
+    near = (points.square <= limit, (lines.square <= limit) & _in_front(camera, matches, pose))
+    agree = [
+        nearest_claims(claim, found.square, inside)
+        for claim, found, inside in zip(matches.claims(), (points, lines), near, strict=True)
+    ]
+    return Refined(pose, camera, points, lines, agree[0], agree[1], sigma0, limit)
+
+
+def _in_front(camera: QueryCamera, matches: Matches, pose: FloatArray) -> BoolArray:
+    """Which lines (M,) are in front of the camera where their segments are.
+
+    The plane of a line and a segment is the same behind the camera, where a mirrored image would be seen.
+    """
+    if not matches.num_lines:
+        return np.zeros(0, bool)
+    R_t = se3.to_matrix(pose[None])[0]
+    ends = matches.segments3d @ R_t[:3, :3].T + R_t[:3, 3]
+    start, way = ends[:, 0], ends[:, 1] - ends[:, 0]
+    ray = camera.kind.unproject(camera.params, np.ascontiguousarray(matches.segments2d.mean(axis=1)))
+    along = np.einsum("ni,ni->n", way, ray)
+    square = np.einsum("ni,ni->n", way, way)
+    # How far along the ray it is nearest to the line; the denominator is not negative.
+    return np.einsum("ni,ni->n", start, ray) * square > np.einsum("ni,ni->n", start, way) * along
+
+
+def residuals(problem: Problem, landmarks: str, count: int, lens: Sequence[int] = ()) -> Residuals:
+    """Whitened residuals of the matches of one kind, ``points`` or ``lines``; each match has a landmark of its own.
+
+    ``lens`` are the parameters of the camera that are estimated, too.
+    """
+    value, by_pose, spread = np.full((count, 2), np.nan), np.zeros((count, 2, 6 + len(lens))), np.ones(count)
+    for factor in problem.factors:
+        rows = landmark_rows(factor, landmarks)
+        if rows is None:
+            continue
+        size = next((problem.variables[r.group].manifold.dof for slot, r in factor.references() if slot.name == "intrinsics"), 0)
+        record = records(problem, factor, {"pose": 6, "intrinsics": size} if lens and size else {"pose": 6})
+        kept = [*range(6), *(6 + k for k in lens if size)]
+        weight = np.broadcast_to(times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))
+        white = weight @ record
+        seen = (record != 0.0).any(axis=(1, 2))  # what cannot be evaluated is zero
+        value[rows[seen]] = white[seen, :, -1]
+        by_pose[rows[seen], :, : len(kept)] = white[seen][:, :, kept]
+        spread[rows] = 1.0 / np.abs(np.linalg.det(weight))
+    return Residuals(value, by_pose, spread)
+
+
+def _lens_columns(camera: QueryCamera) -> list[int]:
+    return sorted((*camera.kind.focal_indices, *camera.kind.extra_indices))
+
+
+def _problem(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool) -> Problem:
+    """The problem of one pose; what is not known of the landmarks is added to the noise of the image."""
+    image = np.zeros(matches.num_points, np.int64), np.zeros(matches.num_lines, np.int64)
+    scene = Scene.from_images(
+        camera.table(), ["query"], [0], pose[None],
+        points=Points.at(matches.points3d),
+        point_observations=PointObservations.numbered(
+            image[0], np.arange(matches.num_points), matches.points2d, matches.point_sigma
+        ),
+        lines=Lines.through(matches.segments3d),
+        line_observations=LineObservations(
+            image[1], np.arange(matches.num_lines), matches.segments2d.reshape(-1, 4), matches.segment_sigma
+        ),
+    )  # fmt: skip
+    problem = assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem
+    covariances = {"points": matches.point_covariance, "lines": matches.line_covariance}
+    return Problem(problem.variables, [_with_landmarks(problem, factor, covariances) for factor in problem.factors])
+
+
+def _with_landmarks(problem: Problem, factor: Factor, covariances: dict[str, FloatArray | None]) -> Factor:
+    """Return a factor whose noise holds that of its landmarks, too."""
+    for name, covariance in covariances.items():
+        rows = landmark_rows(factor, name)
+        if rows is None or covariance is None or not covariance.any():
+            continue
+        size = covariance.shape[1]
+        J = records(problem, factor, {name[:-1]: size})[..., :size]
+        image = np.linalg.inv(times(factor.sqrt_information, np.eye(2)[None]))
+        noise = image @ np.swapaxes(image, 1, 2) + J @ covariance[rows] @ np.swapaxes(J, 1, 2)
+        return replace(factor, sqrt_information=np.linalg.inv(np.linalg.cholesky(noise)))
+    return factor
+
+
+def _noise(problem: Problem, matches: Matches, max_error: tuple[float, float], gates: RefinementGates) -> float:
+    """Noise that the residuals show beside what was stated, from those that are no outliers for sure.
+
+    The median of what lies below a limit is too small where noise reaches the limit; the limit is wide.
+    """
+    squares, sigmas = [], (matches.point_sigma, matches.segment_sigma)
+    for name, sigma, limit in zip(("points", "lines"), sigmas, max_error, strict=True):
+        assert sigma is not None
+        found = residuals(problem, name, len(sigma))
+        squares.append(found.square[found.square <= (limit / sigma) ** 2])
+    together = np.concatenate(squares)
+    if not len(together):
+        return 1.0
+    free = max(1.0 - 3.0 / len(together), 0.1)  # six of two times so many numbers went into the pose
+    shown = float(np.median(together)) / (MEDIAN_SQUARE * free)
+    return float(np.sqrt((gates.stated_weight + len(together) * shown) / (gates.stated_weight + len(together))))
+
+
+def _camera_of(problem: Problem, camera: QueryCamera) -> QueryCamera | None:
+    """The camera that was estimated; None where no lens is like that."""
+    state = problem.variables[f"intrinsics/{camera.model}"].state[0]
+    focal = state[list(camera.kind.focal_indices)]
+    if not (np.isfinite(state).all() and (focal > 0.0).all()):
+        return None
+    return QueryCamera(camera.model, state, camera.width, camera.height)
+
+
+__all__ = ["Refined", "Residuals", "cells_of", "fitted", "refine", "residuals"]

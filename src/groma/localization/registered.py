@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Queries as further images of their map, with what they see of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import TypeVar
+
+import numpy as np
+
+from groma import cameras as camera_models
+from groma._typing import IntArray
+from groma.errors import InputError
+from groma.localization.map_index import MapIndex
+from groma.localization.placed import PlacedImage
+from groma.scene import Cameras, Frames, Images, LineObservations, PointObservations, Points, Rigs, Scene, Sensors
+from groma.scene.camera import CAMERA
+from groma.scene.table import Table
+
+_Table = TypeVar("_Table", bound=Table)
+
+
+def with_queries(scene: Scene, index: MapIndex, queries: Sequence[PlacedImage]) -> Scene:
+    """Return a map with queries as images after its own, with cameras of their own, and the points that they see.
+
+    Raises
+    ------
+    InputError
+        If names are taken.
+    """
+    if not queries:
+        return scene
+    made = len(index.xyz) - scene.num_points  # of the index, before the points of the map
+    seen = np.unique(np.concatenate([one.point for one in queries]))
+    seen = seen[seen < made]
+    row = np.full(len(index.xyz), -1)
+    row[made:], row[seen] = np.arange(scene.num_points), scene.num_points + np.arange(len(seen))
+    points = Points(
+        scene.points.ids.max(initial=0) + 1 + np.arange(len(seen)),
+        index.xyz[seen], np.full((len(seen), 3), 160, np.uint8), np.full(len(seen), -1.0),
+    )  # fmt: skip
+    number = np.arange(scene.num_images, scene.num_images + len(queries))
+    tables = {"points": points, **_images(scene, queries), **_seen(queries, number, row)}
+    return scene.replace(**{name: _joined(getattr(scene, name), table) for name, table in tables.items()})
+
+
+def _images(scene: Scene, queries: Sequence[PlacedImage]) -> dict[str, Table]:
+    """Cameras, each alone on a rig, frames and images of queries."""
+    distinct = {_camera_key(one): one for one in queries}
+    which = np.array([list(distinct).index(_camera_key(one)) for one in queries])
+    every, count = np.arange(len(distinct)), len(queries)
+    taken = max(int(ids.max(initial=0)) for ids in (scene.cameras.ids, scene.rigs.ids, scene.sensors.sensor_ids))
+    ids = taken + 1 + every
+    width = max(camera_models.model(one.model).num_parameters for one in distinct.values())
+    params = np.zeros((len(distinct), width))
+    for row, one in enumerate(distinct.values()):
+        params[row, : len(one.params)] = one.params
+    size = np.stack([one.size for one in distinct.values()])
+    models = tuple(one.model for one in distinct.values())
+    sensors = Sensors(
+        len(scene.rigs) + every, np.full(len(every), CAMERA), ids, len(scene.cameras) + every,
+        np.tile([0, 0, 0, 1, 0, 0, 0.0], (len(every), 1)), np.ones(len(every), int), np.ones(len(every), int),
+    )  # fmt: skip
+    first = 1 + int(max(scene.images.ids.max(initial=0), scene.frames.ids.max(initial=0)))
+    number = first + np.arange(count)
+    frames = Frames(number, len(scene.rigs) + which, np.stack([one.pose for one in queries]))
+    return {
+        "cameras": Cameras(ids, models, params, size[:, 0], size[:, 1]),
+        "rigs": Rigs(ids),
+        "sensors": sensors,
+        "frames": frames,
+        "images": Images(
+            number, _names(scene, queries), len(scene.cameras) + which, scene.num_frames + np.arange(count),
+            len(scene.sensors) + which,
+        ),
+    }  # fmt: skip
+
+
+def _names(scene: Scene, queries: Sequence[PlacedImage]) -> tuple[str, ...]:
+    """Names of queries; those that an image of the map has, too, are put into a folder ``query``."""
+    taken = set(scene.images.names)
+    names = tuple(f"query/{one.name}" if one.name in taken else one.name for one in queries)
+    if len({*names, *taken}) < len(names) + len(taken):
+        raise InputError("Queries and images of the map have the same names. Put the queries into a folder above.")
+    return names
+
+
+def _seen(queries: Sequence[PlacedImage], number: IntArray, row: IntArray) -> dict[str, Table]:
+    """What queries see: ``number`` are their images, ``row`` the points of the scene, of rows of the index."""
+    of_points = np.repeat(number, [len(one.point) for one in queries])
+    of_lines = np.repeat(number, [len(one.line) for one in queries])
+    pixels, ends = (np.concatenate([getattr(one, name) for one in queries]) for name in ("pixel", "segment"))
+    point, line = (np.concatenate([getattr(one, name) for one in queries]) for name in ("point", "line"))
+    return {
+        "point_observations": PointObservations.numbered(of_points, row[point], pixels),
+        "line_observations": LineObservations(of_lines, line, ends, np.ones(len(line))),
+    }
+
+
+def _camera_key(one: PlacedImage) -> tuple[object, ...]:
+    return (one.model, *one.params.tolist(), *one.size.tolist())
+
+
+def _joined(table: _Table, other: _Table) -> _Table:
+    """Rows of two tables, one after the other."""
+    columns = {}
+    for item in fields(table):
+        first, second = getattr(table, item.name), getattr(other, item.name)
+        if isinstance(first, tuple):
+            columns[item.name] = (*first, *second)
+            continue
+        width = max(first.shape[1:], second.shape[1:])
+        parts = [np.zeros((len(part), *width), part.dtype) for part in (first, second)]
+        for part, values in zip(parts, (first, second), strict=True):
+            part[(slice(None), *(slice(0, size) for size in values.shape[1:]))] = values
+        columns[item.name] = np.concatenate(parts)
+    return type(table)(**columns)
+
+
+__all__ = ["with_queries"]

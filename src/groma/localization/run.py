@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Many photographs in one map: one after the other, each kept when it is finished, none stopping the others."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from groma.errors import GromaError, InputError
+from groma.io.endings import IMAGES
+from groma.localization.calibration import CalibrationChoice, calibration_of
+from groma.localization.localizer import Localizer
+from groma.localization.map_index import digest_of
+from groma.localization.placed import PlacedImage, placed, read_placed, unreadable
+from groma.mapping.folder_lock import lock_folder
+from groma.mapping.photographs import image_files, read_gray
+
+
+def query_files(queries: list[Path]) -> dict[str, Path]:
+    """Return the files of photographs by name: those in folders by their place there, single files by their own.
+
+    Raises
+    ------
+    InputError
+        If there are none, a folder holds none, or two have one name.
+    """
+    found: dict[str, Path] = {}
+    for path in queries:
+        files = image_files(path) if path.is_dir() else [path]
+        for file in files:
+            name = file.relative_to(path).as_posix() if path.is_dir() else file.name
+            if name in found and found[name].absolute() != file.absolute():
+                raise InputError(f"Two queries are named {name!r}: {found[name]} and {file}. Pass a folder above them.")
+            found[name] = file
+    if not found:
+        raise InputError(f"There are no queries. Pass photographs ({', '.join(IMAGES)}) or folders of them.")
+    return found
+
+
+def localize_images(
+    localizer: Localizer,
+    files: Mapping[str, Path],
+    work: Path,
+    choice: CalibrationChoice | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> list[PlacedImage]:
+    """Localise photographs.
+
+    Parameters
+    ----------
+    localizer
+        The map.
+    files
+        Photographs by name.
+    work
+        Folder where finished ones are kept; the same call goes on from there.
+    choice
+        Where calibrations come from.
+    progress
+        Called with the name of a stage, what is done and what there is to do.
+    """
+    say, choice = progress or (lambda stage, done, total: None), choice or CalibrationChoice()
+    told = f"{digest_of(localizer.scene, localizer.files)} {localizer.options} {choice}"
+    found = []
+    with lock_folder(work):
+        for done, (name, path) in enumerate(files.items()):
+            say("localising photographs", done, len(files))
+            file = work / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
+            digest = hashlib.sha256(f"{told} {_state_of(path)}".encode()).hexdigest()
+            one = read_placed(file, digest)
+            if one is None:
+                one = _localize(localizer, name, path, choice)
+                one.write(file, digest)
+            found.append(one)
+    return found
+
+
+def _localize(localizer: Localizer, name: str, path: Path, choice: CalibrationChoice) -> PlacedImage:
+    try:
+        image = read_gray(path)
+        size = image.shape[1], image.shape[0]
+        calibration = calibration_of(path, size, localizer.camera_of_map(*size), choice)
+        return placed(name, localizer.localize(image, calibration.camera, calibration.refine))
+    except GromaError as error:
+        return unreadable(name, str(error))
+
+
+def _state_of(path: Path) -> str:
+    try:
+        state = path.stat()
+    except OSError:
+        return str(path)
+    return f"{path.absolute()} {state.st_size} {state.st_mtime_ns}"
+
+
+__all__ = ["localize_images", "query_files"]

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Is the pose right: what agrees with it against what would by chance, and against the next best place.
+
+**Chance.** Under a pose that is wrong a match agrees with the probability :math:`p`, the share of the image that lies
+within its gate. What agrees in one cell of the image counts once, since neighbouring matches err together. Of
+:math:`n` cells with matches :math:`k` agree, and three of them fix the pose. The expected number of poses that so many
+cells agree with by chance is at most
+
+.. math:: \text{NFA} = (n - 3) \binom{n}{k} \binom{k}{3}\, p^{\,k-3} .
+
+For segments, each a cell of its own, :math:`p` is the share of the places within the reach of a search.
+
+**Another place.** Matches that disagree are searched for a second pose. Where one is found that chance does not
+explain, :math:`k_1` cells speak for the first and :math:`k_2` for the second. If both were equally good, each would
+fall to either with the same probability; the first is the right one with the probability that the sign test says.
+
+Reference: L. Moisan, B. Stival, *A probabilistic criterion to detect rigid point matches between two images and
+estimate the fundamental matrix*, 2004, eq. (9), for samples of three.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from groma._counted import counted
+from groma._typing import BoolArray, FloatArray
+from groma.geometry import se3
+from groma.localization.camera import QueryCamera
+from groma.localization.gates import VERDICT, VerdictGates
+from groma.localization.matches import Matches
+from groma.localization.refinement import Refined, cells_of
+
+Status = Literal["localized", "uncertain", "failed"]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """How much agrees with a pose, and how often that would happen by chance."""
+
+    #: Cells and segments that agree, of those that have matches.
+    agree: int
+    of: int
+    #: Natural logarithm of the expected number of poses that so much agrees with by chance.
+    log_alarms: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether less than one such pose is expected by chance."""
+        return self.log_alarms < 0.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is said of a pose."""
+
+    status: Status
+    #: That the place is right.
+    probability: float
+    sentence: str
+
+
+def evidence_of(
+    refined: Refined, matches: Matches, places: int = 1, gates: VerdictGates = VERDICT
+) -> Evidence:
+    """Return the evidence for a pose that was looked for in so many places."""
+    camera = refined.camera
+    by_chance = np.minimum(math.pi * refined.limit * refined.points.spread / camera.area, 0.5)
+    agree, chance = _by_cell(matches.points2d, refined.point_inliers, by_chance, camera, gates.cells)
+    reach = (gates.search_share * max(camera.width, camera.height)) ** 2
+    by_chance = np.minimum(math.pi * refined.limit * refined.lines.spread / reach, 0.5)
+    claim = matches.claims()[1]
+    line_agree, line_chance = _joined(claim, refined.line_inliers, by_chance)
+    agree, chance = np.concatenate([agree, line_agree]), np.concatenate([chance, line_chance])
+    n, k = len(agree), int(agree.sum())
+    if k <= 3:
+        return Evidence(k, n, math.inf)
+    mean = _mean_logarithm(chance, len(chance) - len(line_chance))[agree]
+    spent = np.sort(mean)[:3]  # those that say most were used up
+    total = math.log(max(n - 3, 1)) + _log_choose(n, k) + _log_choose(k, 3) + math.log(places)
+    return Evidence(k, n, total + float(mean.sum() - spent.sum()))
+
+
+def judge(
+    refined: Refined,
+    covariance: FloatArray,
+    distance: float,
+    first: Evidence,
+    second: Evidence | None,
+    gates: VerdictGates = VERDICT,
+) -> Verdict:
+    """Say whether a pose is right.
+
+    Parameters
+    ----------
+    refined, covariance
+        The pose.
+    distance
+        Median distance of the landmarks that agree.
+    first, second
+        Evidence for it, and for another place.
+    gates
+        Numbers of the decision.
+    """
+    chance = 1.0 / (1.0 + math.exp(min(first.log_alarms, 700.0)))
+    rival = _as_good(first, second)
+    probability = chance * (1.0 - rival)
+    agree = f"{counted(int(refined.point_inliers.sum()), 'points')} and " + counted(
+        int(refined.line_inliers.sum()), "lines"
+    )
+    if chance < gates.chance:
+        return Verdict("failed", probability, f"No pose: only {agree} agree with the best one, as may happen by chance.")
+    if rival > 1.0 - gates.right and second is not None:
+        return Verdict(
+            "uncertain",
+            probability,
+            f"Two places fit about equally well: {first.agree} measurements speak for this one, {second.agree} for "
+            "another. They may look alike.",
+        )
+    if probability < gates.right:
+        return Verdict("uncertain", probability, f"{agree} agree, which may happen by chance once in {1 / max(1 - chance, 1e-9):.0f}.")
+    sigma = np.sqrt(np.diag(covariance))
+    if not (np.isfinite(sigma).all() and sigma[3:].max() <= gates.turn and sigma[:3].max() <= gates.center * distance):
+        return Verdict("uncertain", probability, f"{agree} agree, but they do not determine the pose: {_open(sigma)}.")
+    return Verdict("localized", probability, f"{agree} agree.")
+
+
+def moved(camera: QueryCamera, first: FloatArray, second: FloatArray, places: FloatArray) -> float:
+    """Median way in pixels of what is seen at some places in the world, from one pose to another."""
+    way = np.linalg.norm(camera.project(first, places) - camera.project(second, places), axis=1)
+    return float(np.median(np.where(np.isfinite(way), way, np.inf))) if len(way) else math.inf
+
+
+def median_distance(pose: FloatArray, places: FloatArray) -> float:
+    """Median distance (scene units) of places in the world from a camera."""
+    R_t = se3.to_matrix(pose[None])[0]
+    return float(np.median(np.linalg.norm(places @ R_t[:3, :3].T + R_t[:3, 3], axis=1))) if len(places) else 0.0
+
+
+def _by_cell(
+    pixels: FloatArray, inliers: BoolArray, by_chance: FloatArray, camera: QueryCamera, cells: int
+) -> tuple[BoolArray, FloatArray]:
+    if not len(pixels):
+        return np.zeros(0, bool), np.zeros(0)
+    return _joined(cells_of(pixels, camera, cells), inliers, by_chance)
+
+
+def _joined(cell, inliers: BoolArray, by_chance: FloatArray) -> tuple[BoolArray, FloatArray]:
+    """Which cells agree, and how likely some match of each would by chance."""
+    count = int(cell.max()) + 1 if len(cell) else 0
+    agree = np.bincount(cell, inliers, count) > 0
+    none = np.bincount(cell, np.log1p(-by_chance), count)
+    return agree, -np.expm1(none)
+
+
+def _mean_logarithm(chance: FloatArray, points: int) -> FloatArray:
+    """Logarithm of the mean probability, of points and of lines by themselves: which cells agree is not chosen."""
+    mean = np.empty(len(chance))
+    for part in (slice(0, points), slice(points, None)):
+        if len(chance[part]):
+            mean[part] = math.log(max(float(chance[part].mean()), 1e-12))
+    return mean
+
+
+def _as_good(first: Evidence, second: Evidence | None) -> float:
+    """Probability that a second pose gets so few votes of both if both are equally good."""
+    if second is None or not second.significant:
+        return 0.0
+    from scipy.special import bdtr
+
+    return min(1.0, 2.0 * float(bdtr(second.agree, first.agree + second.agree, 0.5)))
+
+
+def _log_choose(n: int, k: int) -> float:
+    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
+
+
+def _open(sigma: FloatArray) -> str:
+    if not np.isfinite(sigma).all():
+        return "the camera could move without any of them noticing"
+    return f"its standard deviation is {np.linalg.norm(sigma[:3]):.3g} scene units and {np.rad2deg(np.linalg.norm(sigma[3:])):.2g} degrees"
+
+
+__all__ = ["Evidence", "Status", "Verdict", "evidence_of", "judge", "median_distance", "moved"]

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Pair described features with others that lie near an expected place, by the bits in which descriptors differ.
+
+In come places and binary descriptors of both; out come the pairs that are most alike for both partners, the nearest in
+the image among equals, and the most alike first.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from groma._numba import kernel, loop
+from groma._typing import FloatArray, IntArray
+
+# ------------------------------------------------------------------------------------------------------------ Kernels
+
+
+@kernel
+def _count_bits(x):
+    """Return the number of ones of a uint64; the compiler knows this form as one instruction."""
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@loop
+def _best_near(expected, first, pixel, second, radius, max_bits, partner, bits, distance):
+    """Write the best partner of each of both sides, or -1, with its bits and squared distance.
+
+    The rows of ``pixel`` are in order of v. ``partner``, ``bits`` and ``distance`` are of first and second, one after
+    the other.
+    """
+    count, words = expected.shape[0], first.shape[1]
+    rows = np.ascontiguousarray(pixel[:, 1])
+    for i in range(count):
+        u, v = expected[i, 0], expected[i, 1]
+        for j in range(np.searchsorted(rows, v - radius), rows.shape[0]):
+            if rows[j] > v + radius:
+                break
+            apart = (pixel[j, 0] - u) ** 2 + (rows[j] - v) ** 2
+            if apart > radius * radius:
+                continue
+            differ = np.int64(0)
+            for k in range(words):
+                differ += _count_bits(first[i, k] ^ second[j, k])
+            if differ > max_bits:
+                continue
+            for one, other in ((i, j), (count + j, i)):
+                if partner[one] < 0 or differ < bits[one] or (differ == bits[one] and apart < distance[one]):
+                    partner[one], bits[one], distance[one] = other, differ, apart
+
+
+# ------------------------------------------------------------------------------------------------------------- Public
+
+
+def pair_near(
+    expected: FloatArray,
+    first: np.ndarray,
+    pixel: FloatArray,
+    second: np.ndarray,
+    radius: float,
+    max_bits: int,
+) -> IntArray:
+    """Pair features with others near where they are expected.
+
+    Parameters
+    ----------
+    expected : (n, 2)
+        Where features are expected, pixels; finite.
+    first : (n, 32) uint8
+        Their descriptors.
+    pixel, second : (m, 2), (m, 32) uint8
+        The others.
+    radius : float
+        Largest distance, pixels.
+    max_bits : int
+        Most bits in which two descriptors differ.
+
+    Returns
+    -------
+    (k, 2) int
+        Rows of the pairs, the most alike first.
+    """
+    n, m = len(expected), len(pixel)
+    order = np.argsort(pixel[:, 1], kind="stable")
+    partner, bits, distance = np.full(n + m, -1), np.zeros(n + m, np.int64), np.zeros(n + m)
+    words = [np.ascontiguousarray(table).view(np.uint64) for table in (first, second[order])]
+    _best_near(
+        np.ascontiguousarray(expected), words[0], np.ascontiguousarray(pixel[order]), words[1],
+        float(radius), int(max_bits), partner, bits, distance,
+    )  # fmt: skip
+    rows = np.flatnonzero(partner[:n] >= 0)
+    rows = rows[partner[n + partner[rows]] == rows]
+    rows = rows[np.lexsort((distance[rows], bits[rows]))]
+    return np.column_stack([rows, order[partner[rows]]])
+
+
+__all__ = ["pair_near"]

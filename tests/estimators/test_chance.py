@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Quantiles and tails against scipy.stats, and that nothing imports that half second of code."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from groma.estimators._chance import chi_square_quantile, log10_poisson_tail
+
+
+@pytest.mark.parametrize("dof", [1, 2, 3, 7, 400])
+def test_quantiles_of_chi_squares(dof):
+    for share in (0.001, 0.5, 0.99, 0.9973, 1 - 1e-9):
+        assert chi_square_quantile(share, dof) == pytest.approx(stats.chi2.ppf(share, dof), rel=1e-12)
+
+
+@pytest.mark.filterwarnings("error")
+def test_tails_of_poisson():
+    for count in (-1, 0, 3, 40):
+        for mean in (1e-3, 0.5, 30.0):
+            expected = stats.poisson.logsf(count, mean) / np.log(10.0)
+            assert log10_poisson_tail(count, mean) == pytest.approx(expected, rel=1e-12)
+    assert log10_poisson_tail(400, 1e-3) == -np.inf
+
+
+@pytest.mark.parametrize("module", ["groma.mapping.map", "groma.tracking.sequence", "groma.adjustment.adjust"])
+def test_what_takes_long_to_import_is_not_imported(module):
+    heavy = "scipy.stats", "scipy.optimize", "scipy.integrate", "scipy.interpolate", "matplotlib", "rich", "pycolmap"
+    code = f"import sys, {module}; print(*[name for name in {heavy!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Photographs in a map: the embedded cabinet, by motion capture poses; from Python and from the command line."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from groma.cli.main import run
+from groma.errors import InputError
+from groma.evaluation import cabinet
+from groma.geometry import quaternion, so3
+from groma.io import read_scene, write_scene
+from groma.localization.camera import QueryCamera
+from groma.localization.localizer import LocalizeOptions, Localizer
+from groma.localization.map_index import read_index
+from groma.localization.retrieval import VladRetrieval
+from groma.features.contract import ImageRetrieval
+
+#: Images around one corner of the cabinet; every third is a query.
+FRAMES = [f"{number:04d}.jpg" for number in range(24, 45)]
+QUERIES = FRAMES[1::3]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with a map of some frames, their images, and the others as queries."""
+    folder = tmp_path_factory.mktemp("cabinet")
+    scene = read_scene(cabinet.folder() / "model")
+    names = list(scene.images.names)
+    rows = [names.index(name) for name in FRAMES if name not in QUERIES]
+    write_scene(scene.subset(rows), folder / "map.npz")
+    for kind, chosen in (("images", [name for name in FRAMES if name not in QUERIES]), ("queries", QUERIES)):
+        (folder / kind).mkdir()
+        for name in chosen:
+            shutil.copy(cabinet.folder() / "images" / name, folder / kind / name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def localizer(place):
+    """The map, described."""
+    return Localizer(place / "map.npz", place / "images")
+
+
+def _errors(found, truth, name):
+    row = list(truth.images.names).index(name)
+    R, R_true = (quaternion.to_matrix(pose[None, :4])[0] for pose in (found.cam_from_world, truth.cam_from_world[row]))
+    angle = np.rad2deg(np.linalg.norm(so3.log((R @ R_true.T)[None])[0]))
+    return np.linalg.norm(found.center - truth.cam_centers_in_world[row]), angle
+
+
+def test_frames_between_those_of_the_map_are_placed(place, localizer):
+    truth = read_scene(cabinet.folder() / "model")
+    found = {name: localizer.localize(place / "queries" / name).pose for name in QUERIES}
+    right = {name: pose for name, pose in found.items() if pose.status == "localized"}
+    assert len(right) >= 4
+    size = np.median(np.linalg.norm(truth.points.xyz - truth.points.xyz.mean(axis=0), axis=1))
+    for name, pose in right.items():
+        distance, angle = _errors(pose, truth, name)
+        assert distance < 0.05 * size, name
+        assert angle < 2.0, name
+
+
+def test_arrays_and_files_are_alike(place, localizer):
+    path = place / "queries" / QUERIES[3]
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    first, second = localizer.localize(path).pose, localizer.localize(image).pose
+    assert first.status == second.status == "localized"
+    assert np.array_equal(first.cam_from_world, second.cam_from_world)
+
+
+def test_what_is_not_in_the_map_is_not_found(place, localizer):
+    rng = np.random.default_rng(0)
+    image = cv2.imread(str(place / "queries" / QUERIES[3]), cv2.IMREAD_GRAYSCALE)
+    nothing = {
+        "black": np.zeros_like(image),
+        "grey": np.full_like(image, 128),
+        "noise": rng.integers(0, 256, image.shape, dtype=np.uint8),
+        "mirrored": np.ascontiguousarray(image[:, ::-1]),
+        "shuffled": np.ascontiguousarray(
+            rng.permutation(image.reshape(12, 40, 16, 40).swapaxes(1, 2).reshape(-1, 40, 40))
+            .reshape(12, 16, 40, 40).swapaxes(1, 2).reshape(image.shape)
+        ),
+    }  # fmt: skip
+    for name, picture in nothing.items():
+        assert localizer.localize(picture).pose.status != "localized", name
+
+
+def test_the_index_is_kept_and_made_anew_for_another_map(place, localizer):
+    path = place / "map.npz.index.npz"
+    before = path.stat().st_mtime_ns
+    again = Localizer(place / "map.npz")  # the images are where they were
+    assert path.stat().st_mtime_ns == before
+    assert np.array_equal(again.index.xyz, localizer.index.xyz)
+    assert read_index(path, "of another map") is None
+    other = place / "damaged.npz"
+    other.write_bytes(path.read_bytes()[:5000])
+    assert read_index(other, "any") is None
+
+
+def test_an_index_beside_nothing_that_can_be_written_is_not_kept(place, monkeypatch):
+    from groma.errors import OutputError
+    from groma.localization import map_index
+
+    def refuse(*_):
+        raise OutputError("Cannot write it.")
+
+    monkeypatch.setattr(map_index.MapIndex, "write", refuse)
+    found = Localizer(place / "map.npz", place / "images", index=place / "nowhere.npz")
+    assert "cannot be kept" in found.warning
+
+
+def test_retrieval_keeps_its_contract(place):
+    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted((place / "images").iterdir())[:4]]
+    from groma.localization.features import find_points
+
+    retrieval = VladRetrieval.learned([find_points(image).descriptors for image in images])
+    assert isinstance(retrieval, ImageRetrieval)
+    described = [retrieval.describe(image) for image in images]
+    for row, one in enumerate(described):
+        assert np.argmax(retrieval.similarity(one, described)) == row
+    assert np.isfinite(retrieval.similarity(retrieval.describe(np.zeros((60, 80), np.uint8)), described)).all()
+
+
+def test_maps_and_images_that_do_not_fit_are_refused(place, tmp_path):
+    with pytest.raises(InputError, match="--images"):
+        Localizer(place / "map.npz", place / "queries")
+    with pytest.raises(InputError, match="--images"):
+        Localizer(read_scene(place / "map.npz"))
+    camera = QueryCamera("PINHOLE", np.array([500.0, 500.0, 160.0, 120.0]), 320, 240)
+    with pytest.raises(InputError, match="pixels"):
+        Localizer(place / "map.npz", place / "images").localize(place / "queries" / QUERIES[0], camera)
+
+
+def test_command(place, tmp_path, capsys):
+    queries = tmp_path / "queries"
+    shutil.copytree(place / "queries", queries)
+    (queries / "bad.jpg").write_text("no image")
+    cv2.imwrite(str(queries / "black.png"), np.zeros((480, 640), np.uint8))
+    out = tmp_path / "out"
+    assert run(["localize", str(place / "map.npz"), str(queries), "-o", str(out), "--images", str(place / "images")]) == 0
+    assert "localized" in capsys.readouterr().out
+    told = json.loads((out / "localized.json").read_text())
+    assert sorted(told) == sorted([*QUERIES, "bad.jpg", "black.png"])
+    keys = {
+        "status", "qvec", "tvec", "center", "center_sigma", "rotation_sigma_deg", "num_point_inliers",
+        "num_line_inliers", "seconds", "sentence",
+    }  # fmt: skip
+    assert all(set(entry) == keys for entry in told.values())
+    assert told["bad.jpg"]["status"] == told["black.png"]["status"] == "failed"
+    right = [name for name, entry in told.items() if entry["status"] == "localized"]
+    rows = [line.split() for line in (out / "poses.txt").read_text().splitlines()]
+    assert [row[0] for row in rows] == right
+    for name, *numbers in rows:
+        assert [float(number) for number in numbers] == told[name]["qvec"] + told[name]["tvec"]
+    model = read_scene(out)
+    assert set(right) <= set(model.images.names)
+    image = list(model.images.names).index(right[0])
+    assert model.cam_centers_in_world[image] == pytest.approx(told[right[0]]["center"], abs=1e-6)
+    assert "Queries" in (out / "report.html").read_text()
+    assert not out.with_name("out.work").exists()
+
+
+def test_an_interrupted_run_goes_on(place, tmp_path, monkeypatch, capsys):
+    from groma.localization import localizer as module
+
+    arguments = ["localize", str(place / "map.npz"), str(place / "queries"), "-o", str(tmp_path / "out")]
+    arguments += ["--images", str(place / "images"), "--no-lines"]
+    calls, really = [], module.Localizer.localize
+
+    def counting(self, *given, **more):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return really(self, *given, **more)
+
+    monkeypatch.setattr(module.Localizer, "localize", counting)
+    assert run(arguments) == 130
+    assert "goes on" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert run(arguments) == 0
+    assert len(calls) == 1 + len(QUERIES)  # two were finished, one was begun twice
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--camera-model", "PINHOLE"], "belong together"),
+        (["--camera-model", "PINHOLE", "--camera-params", "1,2"], "has 4 parameters"),
+        (["--calibration", "magic"], "must be one of"),
+    ],
+)
+def test_wrong_options_end_in_one_line(place, tmp_path, more, words, capsys):
+    assert run(["localize", str(place / "map.npz"), str(place / "queries"), "-o", str(tmp_path / "out"), *more]) == 1
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+
+
+def test_queries_that_are_not_there_and_bad_maps_end_in_one_line(place, tmp_path, capsys):
+    empty, broken = tmp_path / "empty", tmp_path / "broken.npz"
+    empty.mkdir()
+    broken.write_bytes(b"not a scene")
+    for map_, queries in ((place / "map.npz", empty), (place / "map.npz", tmp_path / "none"), (broken, empty)):
+        assert run(["localize", str(map_), str(queries), "-o", str(tmp_path / "out")]) == 1
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_options_without_lines_use_none(place):
+    found = Localizer(place / "map.npz", place / "images", options=LocalizeOptions(lines=False))
+    pose = found.localize(place / "queries" / QUERIES[3]).pose
+    assert pose.status == "localized"
+    assert not pose.line_inliers.any()

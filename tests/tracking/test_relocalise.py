@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Parts of finding a pose: features paired near expected places, depths read, poses proposed among wrong matches."""
+
+import numpy as np
+import pytest
+
+from groma.geometry import se3
+from groma.tracking.frame.camera import TrackCamera, into
+from groma.tracking.frame.depth import depth_at
+from groma.tracking.gates import DEFAULT
+from groma.tracking.pose.near_matches import pair_near
+from groma.tracking.pose.relocalise import pose_from_matches
+
+CAMERA = TrackCamera(525.0, 525.0, 320.0, 240.0, 640, 480)
+
+
+def _pairs_by_hand(expected, first, pixel, second, radius, max_bits):
+    away = np.linalg.norm(expected[:, None] - pixel[None], axis=2)
+    bits = np.unpackbits(first[:, None] ^ second[None], axis=2).sum(axis=2)
+    cost = np.where((away <= radius) & (bits <= max_bits), bits + 1e-4 * away, np.inf)
+    best, other = cost.argmin(axis=1), cost.argmin(axis=0)
+    rows = [i for i in range(len(expected)) if np.isfinite(cost[i, best[i]]) and other[best[i]] == i]
+    rows.sort(key=lambda i: cost[i, best[i]])
+    return np.array([(i, best[i]) for i in rows])
+
+
+@pytest.mark.parametrize("radius", [6.0, 90.0])
+def test_pairs_are_the_most_alike_for_both(radius):
+    rng = np.random.default_rng(0)
+    pixel = rng.uniform((0, 0), (640, 480), (300, 2))
+    second = rng.integers(0, 256, (300, 32), dtype=np.uint8)
+    of = rng.integers(0, 300, 500)  # some are expected twice
+    expected = pixel[of] + rng.normal(0, 4.0, (500, 2))
+    first = second[of] ^ np.packbits(rng.random((500, 256)) < 0.1, axis=1)
+    found = pair_near(expected, first, pixel, second, radius, 64)
+    np.testing.assert_array_equal(found, _pairs_by_hand(expected, first, pixel, second, radius, 64))
+    assert len(found) > 50
+
+
+def test_nothing_pairs_with_nothing():
+    none, words = np.zeros((0, 2)), np.zeros((0, 32), np.uint8)
+    assert pair_near(none, words, none, words, 10.0, 64).shape == (0, 2)
+    one = np.array([[5.0, 5.0]]), np.zeros((1, 32), np.uint8)
+    assert pair_near(*one, none, words, 10.0, 64).shape == (0, 2)
+
+
+def test_a_pose_is_proposed_where_three_matches_of_four_are_wrong():
+    rng = np.random.default_rng(1)
+    found = 0
+    for _ in range(10):
+        places = rng.uniform((-2.0, -1.5, 1.5), (2.0, 1.5, 5.0), (240, 3))
+        pose = se3.exp(np.concatenate([0.2 * rng.normal(size=3), 0.1 * rng.normal(size=3)])[None])[0]
+        pixel = CAMERA.project(into(pose, places)) + rng.normal(size=(240, 2))
+        wrong = np.arange(240) >= 60
+        pixel[wrong] = rng.uniform((0, 0), (640, 480), (180, 2))
+        proposal = pose_from_matches(CAMERA, places, pixel)
+        if proposal is not None:
+            error = se3.log(se3.compose(proposal[0][None], se3.inverse(pose[None])))[0]
+            found += np.linalg.norm(error[:3]) < 0.1 and np.linalg.norm(error[3:]) < 0.03
+    assert found >= 9
+
+
+def test_depths_are_medians_of_what_is_known_and_alike():
+    rng = np.random.default_rng(2)
+    image = (2.0 + 0.01 * rng.normal(size=(60, 80))).astype(np.float32)
+    image[rng.random(image.shape) < 0.4] = 0.0
+    image[:, 40:] += np.where(image[:, 40:] > 0, 1.0, 0.0).astype(np.float32)
+    image[20:23, 10] = np.nan
+    pixels = rng.uniform(-2.0, 82.0, (400, 2))
+    found = depth_at(image, pixels, 2.9)
+    for (u, v), depth in zip(pixels, found, strict=True):
+        column, row = int(np.clip(int(u), 1, 78)), int(np.clip(int(v), 1, 58))
+        near = image[row - 1 : row + 2, column - 1 : column + 2].astype(float)
+        near = near[near > 0]
+        gates = DEFAULT.depth
+        good = len(near) >= max(gates.min_known, 1) and np.ptp(near) < gates.jump + gates.jump_share * near.min()
+        expected = np.median(near) if good and np.median(near) <= 2.9 else np.nan
+        np.testing.assert_equal(depth, expected)
+    assert 50 < np.isfinite(found).sum() < 350
