@@ -8,7 +8,7 @@ import pytest
 from problems import scene_problem
 
 from groma.problem.problem import Problem
-from groma.solver.covariance.clusters import clustered
+from groma.solver.covariance.clusters import clustered, with_kept
 from groma.solver.covariance.marginals import Covariances
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -61,6 +61,6 @@ def test_covariances_with_one_variable_are_blocks_of_the_joint_one():
     solution = solve(_with_noise(_exact(), 0, 0.0))
     covariances = Covariances(solution.problem)
     joint = covariances.joint([("poses", 2), ("poses", 3)])
-    found = covariances.with_kept("poses", 2)["poses"]
+    found = with_kept(covariances, "poses", 2)["poses"]
     np.testing.assert_allclose(found[2:].reshape(12, 6), joint[:, :6], atol=1e-9 * np.abs(joint).max())
     assert not found[:2].any()

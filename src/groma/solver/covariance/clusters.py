@@ -37,7 +37,7 @@ def clustered(covariances: Covariances, variable: Variable, landmarks: str, clus
         An eliminated group, and the cluster of each of its variables, counted from 0.
     """
     problem = covariances.problem
-    effect = covariances.with_kept(*variable)
+    effect = with_kept(covariances, *variable)
     size = problem.variables[variable[0]].manifold.dof
     sums = np.zeros((int(cluster.max(initial=-1)) + 1, size))
     for factor in problem.factors:
@@ -46,6 +46,22 @@ def clustered(covariances: Covariances, variable: Variable, landmarks: str, clus
             np.add.at(sums, cluster[own[0]], _pushes(problem, factor, effect, size))
     count = len(np.unique(cluster))
     return sums.T @ sums * (count / max(count - size, 1))
+
+
+def with_kept(covariances: Covariances, group: str, index: int) -> dict[str, FloatArray]:
+    """Return the covariances (count, dof, own dof) of the kept variables of all groups with one of them."""
+    layout, groups = covariances._layout, covariances.problem.variables
+    members = {member.group: (kept, member) for kept in layout.kept for member in kept.members}
+    rows = {}
+    for name, (kept, member) in members.items():
+        block = member.blocks(np.arange(len(groups[name])))[:, None]
+        rows[name] = kept.start + block * kept.width + member.offset + np.arange(groups[name].manifold.dof)
+    own = groups[group].manifold.dof
+    R = np.zeros((layout.num_kept_unknowns, own))
+    R[rows[group][index], np.arange(own)] = 1.0
+    free = ~np.concatenate(covariances._held)[:, None]
+    solved = covariances._solve(R * free) * free
+    return {name: solved[at] for name, at in rows.items()}
 
 
 def _pushes(problem: Problem, factor: Factor, effect: dict[str, FloatArray], size: int) -> FloatArray:
@@ -64,4 +80,4 @@ def _pushes(problem: Problem, factor: Factor, effect: dict[str, FloatArray], siz
     return out
 
 
-__all__ = ["clustered"]
+__all__ = ["clustered", "with_kept"]

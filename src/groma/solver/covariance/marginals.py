@@ -358,21 +358,6 @@ class Covariances:
         out[:, broken] = np.nan
         return 0.5 * (out + out.T)
 
-    def with_kept(self, group: str, index: int) -> dict[str, FloatArray]:
-        """Return the covariances (count, dof, own dof) of the kept variables of all groups with one of them."""
-        layout, own = self._layout, self.problem.variables[group].manifold.dof
-        members = {member.group: (kept, member) for kept in layout.kept for member in kept.members}
-        rows = {}
-        for name, (kept, member) in members.items():
-            variables = self.problem.variables[name]
-            block = member.blocks(np.arange(len(variables)))[:, None]
-            rows[name] = kept.start + block * kept.width + member.offset + np.arange(variables.manifold.dof)
-        R = np.zeros((layout.num_kept_unknowns, own))
-        R[rows[group][index], np.arange(own)] = 1.0
-        free = ~np.concatenate(self._held)[:, None]
-        solved = self._solve(R * free) * free
-        return {name: solved[at] for name, at in rows.items()}
-
     def derived(self, function: Callable[..., npt.ArrayLike], variables: Sequence[Variable]) -> Derived:
         """Return the value and covariance of a function of some variables.
 
