@@ -31,6 +31,7 @@ from groma.mapping.lines.build import MapLinesOptions, map_lines, segment_matche
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.map import MapOptions, adjust_points, map_segments
 from groma.scene import Scene
+from groma.scene.line_intervals import one_line_per_interval
 
 #: ``all``: every segment of a neighbour is a candidate. ``wide``: groma's matches of surroundings and points.
 MATCHING = ("all", "wide")
@@ -116,7 +117,16 @@ def _run_groma(task: Task, name: str, options: MapLinesOptions) -> list[LineSet]
         start = time.process_time()
         result = map_segments(points, task.segments, matches, stages)
         seconds = time.process_time() - start
-    return [mapped, LineSet(name, task.matching, result.scene.lines.segments, track, seconds)]
+    scene = one_line_per_interval(result.scene)
+    return [mapped, LineSet(name, task.matching, scene.lines.segments, _track(scene, task.segments), seconds)]
+
+
+def _track(scene: Scene, segments: list[Segments]) -> np.ndarray:
+    """Line, image and number within the image (T, 3) of each observed segment of a scene."""
+    number = [{ends.tobytes(): row for row, ends in enumerate(one.ends)} for one in segments]
+    seen = scene.line_observations
+    rows = [number[image][ends.tobytes()] for image, ends in zip(seen.image_idx, seen.segment, strict=True)]
+    return np.column_stack([seen.line_idx, seen.image_idx, np.array(rows, np.int64)])
 
 
 def run_limap(task: Task, python: str) -> list[LineSet]:

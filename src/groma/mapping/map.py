@@ -40,6 +40,7 @@ from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
 from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider, explain, map_lines
+from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE, left_out, with_confidence
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
@@ -108,6 +109,8 @@ class MapOptions:
     refine_points: bool = False
     lines: MapLinesOptions = field(default_factory=MapLinesOptions)
     structure: StructureOptions = field(default_factory=StructureOptions)
+    #: Smallest probability that a line is right, for it to stay in the map.
+    min_confidence: float = DEFAULT_CONFIDENCE
     #: Look for planes and common directions.
     find_planes: bool = True
     #: Move the poses; without, only landmarks are adjusted.
@@ -237,7 +240,7 @@ def map_segments(
     independent = math.sqrt(1.0 + weighted.line_end_correlation)
     scene = with_shared_noise(scene, weighted.point_sigma_px, weighted.line_sigma_px * independent)
     adjusted = stages.run(adjust_everything, scene, weighted)
-    return _result(points, scene, adjusted, weighted, line_map)
+    return _result(points, scene, adjusted, weighted, line_map, options.min_confidence)
 
 
 # --------------------------------------------------------------------------------------------------------------- stages
@@ -275,7 +278,7 @@ def measure_points(folder: Path, points: Scene, options: MapOptions, say: StageP
 
 
 # From here on every stage depends on all options.
-@stage("segments", SEGMENTS, lambda options: dataclasses.replace(options, threads=None))
+@stage("segments", SEGMENTS, lambda options: dataclasses.replace(options, threads=None, min_confidence=0.0))
 def find_segments(
     folder: Path, scene: Scene, line_matches: ExternalMatches | None, options: MapOptions, say: StageProgress
 ) -> list[Segments]:
@@ -350,10 +353,17 @@ def _adjusted(
 
 
 def _result(
-    points: Scene, before: Scene, adjusted: AdjustResult, weighted: AdjustOptions, line_map: LineMap
+    points: Scene,
+    before: Scene,
+    adjusted: AdjustResult,
+    weighted: AdjustOptions,
+    line_map: LineMap,
+    min_confidence: float,
 ) -> MapResult:
-    scene, before = without_unused(with_supported_intervals(adjusted.scene), before)
+    scene = with_confidence(with_supported_intervals(adjusted.scene))
     before = before.replace(line_intervals=scene.line_intervals)
+    kept = scene.lines.confidence >= min_confidence
+    scene, before = without_unused(scene.keep(lines=kept), before.keep(lines=kept))
     missing = [] if line_map.num_lines else ["No line was mapped; see what became of the segments."]
     return MapResult(
         scene=scene,
@@ -362,7 +372,7 @@ def _result(
         report=adjusted.report,
         adjusted_with=weighted,
         sigma_px={"points": weighted.point_sigma_px, "lines": weighted.line_sigma_px},
-        explanation=explain(line_map),
+        explanation=explain(line_map) + left_out(kept, min_confidence),
         outcomes={outcome.name.lower(): count for outcome, count in line_map.outcome_counts().items()},
         warnings=(*missing, *adjusted.report.warnings),
     )

@@ -64,6 +64,8 @@ class Lines(Table):
     plucker: FloatArray = column(np.float64, 6, world="lines")
     #: (L, 2, 3) end points of the segment, scene units.
     segments: FloatArray = column(np.float64, 2, 3, world="points")
+    #: (L,) probability that an edge runs along the line; -1 where unknown.
+    confidence: FloatArray = column(np.float64, fill=-1.0)
 
     def _check(self) -> None:
         check_unique("Lines.ids", self.ids)

@@ -158,7 +158,7 @@ def one_line_per_interval(scene: Scene) -> Scene:
     nearest = _owners(on, first, lambda rows, piece: _beyond(place[rows], share[piece]))
     columns["point_on_line"] = np.column_stack([point, nearest])
     return scene.replace(
-        lines=Lines(ids, scene.lines.plucker[line], pieces),
+        lines=Lines(ids, scene.lines.plucker[line], pieces, scene.lines.confidence[line]),
         line_observations=scene.line_observations.replace(line_idx=owner),
         relations=replace(relations, **columns),
         line_intervals=LineIntervals(),

@@ -67,13 +67,21 @@ _Thresholds = Annotated[
 def lines(
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene or line set to judge.")],
     reference: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
-            metavar="REF",
+            metavar="[REF]",
             help="Scene, line set or edge graph (.npz, .npy, .txt), mesh (.ply, .obj) or points taken for true.",
+            show_default=False,
         ),
-    ],
+    ] = None,
     threshold: _Thresholds = None,
+    silhouettes: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Masks of the object, named like the images of EST: how far lines leave them. REF is then optional.",
+        ),
+    ] = None,
     align: Annotated[
         bool, typer.Option("--align", help="First align EST to REF by the poses of images in both scenes.")
     ] = False,
@@ -83,11 +91,28 @@ def lines(
     quiet: _options.Quiet = False,
     verbose: _options.Verbose = False,
 ) -> None:
-    """Compare 3D line segments with a reference: how much of it is covered, how much of the lines is right."""
+    """Compare 3D line segments with a reference: how much of it is covered, how much of the lines is right.
+
+    With --silhouettes also, or only, with the silhouettes of the object, into which a true line projects from
+    everywhere.
+    """
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
-    check_inputs(estimate, reference)
+    check_inputs(estimate, reference, silhouettes)
+    if reference is None and silhouettes is None:
+        raise InputError("There is nothing to compare with. Pass a reference, --silhouettes FOLDER, or both.")
 
+    numbers: dict[str, object] = {}
+    if reference is not None:
+        numbers |= _compare_lines(console, estimate, reference, threshold, align)
+    if silhouettes is not None:
+        numbers["silhouettes"] = _compare_silhouettes(console, estimate, silhouettes)
+    _output.write_json(json_target, numbers, force)
+
+
+def _compare_lines(
+    console: Console, estimate: Path, reference: Path, threshold: list[float] | None, align: bool
+) -> dict[str, object]:
     from groma.evaluation.lines import evaluate_lines
     from groma.io import read_scene
     from groma.io.reference import read_reference
@@ -103,7 +128,22 @@ def lines(
         shares = [recall, scores.precision_count[tau], scores.precision_strict[tau], scores.precision_length[tau]]
         row = "  ".join(_percent(share, width) for share, width in zip(shares, (14, 14, 8, 6), strict=True))
         console.say(f"  {tau:9.4g}  {row}  {scores.inlier_length[tau]:13.6g}")
-    _output.write_json(json_target, scores.to_dict(), force)
+    return scores.to_dict()
+
+
+def _compare_silhouettes(console: Console, estimate: Path, folder: Path) -> dict[str, object]:
+    from groma.evaluation.silhouettes import LIMITS, evaluate_silhouettes, read_silhouettes
+    from groma.io import read_scene
+
+    scene = read_scene(estimate)
+    scores = evaluate_silhouettes(scene, read_silhouettes(folder, scene.images.names))
+    found = scores.to_dict()
+    console.say(f"{counted(scene.num_lines, 'lines')} in {counted(scores.num_views, 'views')} with a silhouette")
+    for limit in LIMITS:
+        count = int((scores.distance > limit).sum())
+        share = count / max(scene.num_lines, 1)
+        console.say(f"  leave it by more than {limit:2g} px: {count:6,} ({_percent(share, 0).strip()})")
+    return found
 
 
 def planes(

@@ -183,12 +183,12 @@ def _structure(document: dict[str, Any], views: list[_View], path: Path) -> tupl
     for point, (key, value, place) in enumerate(entries):
         ids.append(key)
         places.append(value.get("X"))
-        for entry in member(value, "observations", list, place):
-            observation = of_kind(entry, dict, place)
-            image = image_row.get(_key(observation, "key", place))
-            if image is not None:
-                pixel = member(member(observation, "value", dict, place), "x", list, place)
-                seen.append([image, point, *pixel])
+        observations = member(value, "observations", list, place)
+        try:
+            rows = [(image_row.get(entry["key"], -1), point, *entry["value"]["x"]) for entry in observations]
+        except (KeyError, TypeError) as error:
+            raise FileFormatError(f"{place}: expected observations with 'key' and 'value', 'x'. Correct it.") from error
+        seen += [row for row in rows if row[0] >= 0]
     return ids, table(places, (3,), f"{path}, X of the structure"), table(seen, (4,), f"{path}, an observation")
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 #: Half the size of the scene in the frame of the viewer.
 REACH = 5.0
 #: What lines can be coloured by.
-LINE_MODES = ("length", "reprojection error", "direction", "number of images")
+LINE_MODES = ("length", "reprojection error", "direction", "number of images", "confidence")
 #: Half the largest opening of a drawn camera, radians; wider ones are drawn with this one.
 _WIDEST = 1.2
 
@@ -87,6 +87,9 @@ class ViewContent:
             return _by_number(numbers.residual_px, " px", from_zero=True)
         if mode == "number of images":
             return _by_number(numbers.num_images.astype(float), " images")
+        if mode == "confidence":
+            known = np.where(self.scene.lines.confidence >= 0.0, self.scene.lines.confidence, np.nan)
+            return LineColours(_colours.ramp(known), "0 ", "1 ", "Probability to be right; grey: not known.")
         shared = len(self.scene.relations.line_along_direction) > 0
         meaning = (
             "One colour per shared direction; others grey." if shared else "Red along x, green along y, blue along z."

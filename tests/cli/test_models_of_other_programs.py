@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Commands take the files of other programs, and their folders, wherever they take COLMAP models."""
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from groma.cli.main import run
+from groma.io import read_scene
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "io"))
+_views = importlib.import_module("_views")
+_openmvg = importlib.import_module("test_openmvg")
+_transforms = importlib.import_module("test_transforms")
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with ``mvg/sfm_data.json`` and, poses alone, ``nerf/transforms.json``."""
+    monkeypatch.chdir(tmp_path)
+    for folder in ("mvg", "nerf"):
+        Path(folder).mkdir()
+    true = _views.views(5, 40)
+    _openmvg.write(tmp_path / "mvg", _openmvg.document(true, "pinhole", []))
+    _transforms.write(tmp_path / "nerf", {**_transforms.LENS, "frames": _transforms.frames(true)})
+    return tmp_path
+
+
+@pytest.mark.parametrize("source", ["mvg", "mvg/sfm_data.json"])
+def test_they_are_adjusted(here, source, capsys):
+    assert run(["adjust", source, "-o", "out", "--json", "r.json"]) == 0
+    assert json.loads(Path("r.json").read_text())["rmse_px"]["points"]["after"] < 1e-6
+    assert read_scene("out").num_images == 5
+
+
+def test_they_are_converted(here, capsys):
+    assert run(["convert", "mvg", "transforms.json"]) == 0
+    assert "5 images, 40 points\n" in capsys.readouterr().out  # observations have no place there
+    assert run(["convert", "transforms.json", "out.npz"]) == 0
+    assert read_scene("out.npz").num_points == 40
+    assert run(["convert", "nerf", "out"]) == 0
+    assert read_scene("out").num_images == 5
+
+
+def test_poses_alone_are_no_model_for_a_map(here, capsys):
+    Path("images").mkdir()
+    assert run(["map", "images", "--model", "nerf", "-o", "out"]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    assert run(["adjust", "nerf", "-o", "out"]) == 1
+    assert "nothing to adjust" in capsys.readouterr().err
+
+
+def test_damage_is_one_line(here, capsys):
+    text = Path("mvg/sfm_data.json").read_text()
+    Path("mvg/sfm_data.json").write_text(text[: len(text) // 2])
+    assert run(["convert", "mvg", "out.npz"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "sfm_data.json is not JSON from line" in said

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Covers the probability that a line is right: what it is computed from, how it orders lines, where it is kept."""
+
+import numpy as np
+import pytest
+
+from groma.io.archive import read_archive, write_archive
+from groma.mapping.lines.confidence import WEIGHTS, left_out, line_confidence, line_evidence, with_confidence
+from groma.mapping.map import MapOptions
+from groma.scene import Cameras, LineObservations, Lines, Scene, Similarity
+
+FOCAL = 500.0
+
+
+def scene_of(ends, centers, noise=0.3, seed=0, size=1000):
+    """Cameras that look along z at lines, which all of them observe with some noise."""
+    rng, ends, centers = np.random.default_rng(seed), np.asarray(ends, float), np.asarray(centers, float)
+    image, line = (index.ravel() for index in np.meshgrid(np.arange(len(centers)), np.arange(len(ends)), indexing="ij"))
+    local = ends[line] - centers[image, None]
+    pixels = FOCAL * local[..., :2] / local[..., 2:] + size / 2
+    poses = np.column_stack([np.tile([0.0, 0, 0, 1], (len(centers), 1)), -centers])
+    return Scene.from_images(
+        Cameras(ids=[1], models=("PINHOLE",), params=[[FOCAL, FOCAL, size / 2, size / 2]], width=[size], height=[size]),
+        [f"{k}.png" for k in range(len(centers))],
+        np.zeros(len(centers), int),
+        poses,
+        lines=Lines.through(ends),
+        line_observations=LineObservations(
+            image, line, (pixels + rng.normal(0, noise, pixels.shape)).reshape(len(line), 4)
+        ),
+    )
+
+
+def columns(scene):
+    return dict(zip(WEIGHTS, line_evidence(scene).T, strict=True))
+
+
+@pytest.fixture
+def scene():
+    rng = np.random.default_rng(3)
+    middle = np.column_stack([rng.uniform(-2, 2, (40, 2)), rng.uniform(8, 12, 40)])
+    along = rng.normal(size=(40, 3)) * [1, 1, 0.3]
+    centers = np.column_stack([np.linspace(-2, 2, 6), rng.uniform(-1, 1, 6), np.zeros(6)])
+    return scene_of(np.stack([middle - 0.5 * along, middle + 0.5 * along], axis=1), centers)
+
+
+def test_evidence_by_hand():
+    # Upright lines at depth 10, seen from 1 left and right: viewing planes 2 arctan(0.1) apart.
+    ends = [[[0.0, -1, 10], [0, 1, 10]], [[0, -9, 10], [0, 12, 10]]]
+    found = columns(scene_of(ends, [[-1.0, 0, 0], [1, 0, 0]], noise=0.0))
+    np.testing.assert_allclose(np.exp(found["images"]), 2.0)
+    np.testing.assert_allclose(np.exp(found["spread"]), np.sin(np.arctan(0.1)), rtol=1e-9)
+    np.testing.assert_allclose(np.exp(found["length"]), [100.0, 1050.0], rtol=1e-9)
+    # Both are seen by all images; the second leaves the frame, so that no image is expected to show it.
+    np.testing.assert_allclose(np.exp(found["support"]), [5.0, 5.0])
+    fewer = scene_of(ends, [[-1.0, 0, 0], [1, 0, 0], [0, 0, 1]], noise=0.0)
+    rows = fewer.line_observations.image_idx < 2
+    support = columns(fewer.keep(line_observations=rows))["support"]
+    np.testing.assert_allclose(np.exp(support), [2.5 / 1.5, 5.0])
+
+
+def test_evidence_has_no_unit_and_no_frame(scene):
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    moved = scene.transformed(Similarity(7.0, turn, np.array([3.0, -2, 5])))
+    np.testing.assert_allclose(line_evidence(moved), line_evidence(scene), atol=2e-3)  # a weak prior has a unit
+
+
+def test_uncertainty_is_the_standard_deviation_that_repetitions_have():
+    ends, centers = [[[0.0, -1, 10], [0, 1, 10]]], np.column_stack([np.linspace(-2, 2, 5), np.zeros((5, 2))])
+    stated = np.exp(columns(scene_of(ends, centers, noise=0.5))["uncertainty"])[0]
+    exact = scene_of(ends, centers, noise=0.0)
+    rng, x, depth = np.random.default_rng(1), centers[:, 0], []
+    for _ in range(300):  # upright lines: each end alone is x = f (X - c) / Z, solved for (X / Z, 1 / Z)
+        u = exact.line_observations.segment[:, 0] + rng.normal(0, 0.5, 5) - 500.0
+        b = np.linalg.lstsq(np.column_stack([np.ones(5), -x]), u / FOCAL, rcond=None)[0][1]
+        depth.append(1.0 / b)
+    assert stated * 10.0 == pytest.approx(np.std(depth), rel=0.5)  # the noise itself is estimated from five residuals
+
+
+def test_good_lines_are_more_probable_than_lines_of_unrelated_segments(scene):
+    seen, wrong = scene.line_observations, np.arange(10)
+    rng = np.random.default_rng(5)
+    shift = np.where(np.isin(seen.line_idx, wrong)[:, None], rng.normal(0, 6.0, (len(seen), 4)), 0.0)
+    spoiled = scene.replace(line_observations=seen.replace(segment=seen.segment + shift))
+    before, after = line_confidence(scene), line_confidence(spoiled)
+    assert (after[wrong] < 0.5 * before[wrong]).all()
+    ranks = np.argsort(np.argsort(after))
+    assert ranks[wrong].mean() < 7.0 and np.median(after[10:]) > 5.0 * np.median(after[wrong])
+    fewer = line_confidence(scene.keep(line_observations=seen.image_idx < 3))
+    assert (fewer < before).mean() > 0.9
+    signs = {name: np.sign(WEIGHTS[name]) for name in ("images", "uncertainty", "misfit", "length")}
+    assert signs == {"images": 1, "uncertainty": -1, "misfit": -1, "length": 1}
+
+
+def test_kept_in_archives(scene, tmp_path):
+    known = with_confidence(scene)
+    assert ((known.lines.confidence > 0) & (known.lines.confidence < 1)).all()
+    write_archive(known, tmp_path / "known.npz")
+    np.testing.assert_array_equal(read_archive(tmp_path / "known.npz").lines.confidence, known.lines.confidence)
+    write_archive(scene, tmp_path / "old.npz")
+    with np.load(tmp_path / "old.npz") as saved:
+        assert "lines.confidence" not in saved.files
+    assert (read_archive(tmp_path / "old.npz").lines.confidence == -1).all()
+    assert len(line_confidence(Scene())) == 0
+
+
+def test_what_was_left_out_is_said():
+    assert left_out(np.ones(3, bool), 0.5) == ""
+    assert left_out(np.array([True, False, False]), 0.7).startswith(" 2 lines were left out")
+    assert "below 0.5" in left_out(np.array([False]), 0.5)
+
+
+def test_the_command_has_the_default_of_the_library():
+    import typer.main
+
+    from groma.cli.app import app
+
+    command = typer.main.get_command(app).commands["map"]
+    default = next(option.default for option in command.params if option.name == "min_confidence")
+    assert default == MapOptions().min_confidence
