@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from groma.solver.report import SolveReport
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
 from groma.tracking.backend.loop_closure import LoopSearch, close_loop, search_for_loop
 from groma.tracking.backend.plane_outcome import PlaneOutcome, drop_what_failed
-from groma.tracking.backend.stereo_calibration import correct_map, estimate_turn, shift_between
+from groma.tracking.backend.stereo_calibration import correct_map, estimate_turn, shift_between, tells_yaw
 from groma.tracking.backend.submaps import Joint, find_joint, search_older_maps
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.features import FrameFeatures
@@ -89,8 +89,8 @@ class Mapper:
         #: The right camera of stereo pairs, and the number of keyframes that tell next how it is turned.
         self.right = RightCamera(camera, options.gates.rectification, options.gates.features, right_turn)
         self._next_look = options.gates.rectification.min_keyframes
-        #: What the first keyframes were made with; None once the track need not start over.
-        self._assumed = self.right.turn if right_turn is None else None
+        #: What the first keyframes were made with, and whether the track may still start over.
+        self._began_with, self._may_begin_anew = right_turn, right_turn is None
         #: How the right camera is turned, if so far from what was taken that the track should start over.
         self.better_turn: RightTurn | None = None
         self.metric = True
@@ -252,16 +252,15 @@ class Mapper:
         gates, living = self.options.gates.rectification, self.map.living()
         if not self.camera.baseline > 0 or len(living) < self._next_look:
             return
-        if len(living) == gates.min_keyframes and self._assumed is not None:
-            self._assumed = self.right.turn
         self._next_look = math.ceil(gates.growth * len(living))
-        turn, job = estimate_turn(self.map, self.camera, self.right.turn, gates)
-        if not turn.is_surer_than(self.right.turn):
+        self._began_with = self._began_with or self.right.turn
+        turn, job = estimate_turn(self.map, self.camera, self.right.turn, self.options)
+        if not turn.is_as_sure_as(self.right.turn, gates):
             return
-        if self._assumed is not None and len(living) >= gates.start_over_keyframes:
-            if shift_between(self.camera, self._assumed, turn) > gates.start_over:
+        if self._may_begin_anew and tells_yaw(self.camera, turn, gates):
+            self._may_begin_anew = False
+            if shift_between(self.camera, self._began_with, turn) > gates.start_over:
                 self.better_turn = turn
-            self._assumed = None
         if shift_between(self.camera, self.right.turn, turn) > gates.matters:
             last = self.map.last
             before = last.pose.copy()
@@ -272,6 +271,8 @@ class Mapper:
             self.right.turn = turn
             self._adjust_all()
             _follow_world(present, se3.compose(se3.inverse(last.pose[None]), before[None])[0])
+        else:
+            self.right.turn = replace(self.right.turn, covariance=turn.covariance)
 
     def _adjust_all(self) -> SolveReport | None:
         """Adjust all keyframes of the map together, twice: outliers are left out in between."""
@@ -309,10 +310,12 @@ class Mapper:
             return None, turn
         report = self._adjust_all()
         if self.camera.baseline > 0:
-            turn, job = estimate_turn(self.map, self.camera, self.right.turn, self.options.gates.rectification)
+            found, job = estimate_turn(self.map, self.camera, self.right.turn, self.options)
+            turn = found if found.is_as_sure_as(turn, self.options.gates.rectification) else turn
             if shift_between(self.camera, self.right.turn, turn) > self.options.gates.rectification.matters:
                 correct_map(self.map, self.camera, self.right.turn, turn, self.options, job)
                 report = self._adjust_all()
+            turn = turn.confirming(self._began_with or turn)
         return report, turn
 
     def adjust_with_planes(self, number: int) -> tuple[SolveReport | None, PlaneOutcome | None]:

@@ -6,6 +6,10 @@ roll (:mod:`groma.tracking.frame.rectification`). Yaw shifts all disparities ali
 :math:`\delta z / z = -\delta / d`: a wrong scale, other for near points than for far ones. Motion tells the shape of
 the scene without the pair, so near and far points together tell yaw: all keyframes and points are adjusted together
 with a right camera that may turn, against a prior of what rectification leaves and what the rows tell.
+
+Points that are followed agree to some extent with any yaw that was assumed when they were looked for. So described
+features tell yaw first (:mod:`groma.tracking.backend.described_tracks`), and followed points, which are more precise,
+once it is known so.
 """
 
 from __future__ import annotations
@@ -20,7 +24,9 @@ from groma.adjustment.terms.right_columns import RIGHT_CAMERAS
 from groma.errors import ProblemError
 from groma.geometry import quaternion, se3, so3
 from groma.scene import Lines
+from groma.solver.covariance.clusters import clustered
 from groma.solver.covariance.marginals import Covariances
+from groma.tracking.backend.described_tracks import described_tracks
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.features import grid_pixels
@@ -38,13 +44,15 @@ from groma.tracking.gates import RectificationGates
 from groma.tracking.map.map_scene import TRACKING
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
-from groma.tracking.pose.estimate import GATE
+
+#: Of the increments of a right camera.
+YAW = 4
 
 
 def estimate_turn(
-    track_map: TrackMap, camera: TrackCamera, turn: RightTurn, gates: RectificationGates
+    track_map: TrackMap, camera: TrackCamera, turn: RightTurn, options: TrackOptions
 ) -> tuple[RightTurn, AdjustmentJob | None]:
-    """Return how the right camera is turned, and the adjustment that told it, if one did.
+    """Return how the right camera is turned, and the adjustment of the map that told it, if one did.
 
     Parameters
     ----------
@@ -52,37 +60,57 @@ def estimate_turn(
         A map, and the camera of its keyframes.
     turn
         By which the right images of the map were turned back.
-    gates
-        What is known beforehand, and how much an estimate needs.
+    options
+        Their gates say what is known beforehand, and how much an estimate needs.
     """
+    gates = options.gates.rectification
     known = RightTurn.unknown(gates).joined(*_rows_of(track_map, camera, turn, gates))
     living = track_map.living()
-    if len(living) < gates.min_keyframes or _step(living) > gates.max_step:
+    if len(living) < gates.min_keyframes:
         return known, None
+    if tells_yaw(camera, turn, gates) and _step(living) <= gates.max_step:
+        found, job = _by_columns(track_map, camera, turn, known, gates, gates.min_views)
+        if job is not None:
+            return found, job
+    described = described_tracks(track_map, camera, options.gates, options.point_sigma_px)
+    return _by_columns(described, camera, turn, known, gates, 2)[0], None
+
+
+def tells_yaw(camera: TrackCamera, turn: RightTurn, gates: RectificationGates) -> bool:
+    """Whether yaw is known so well that a track need not begin anew for what is left."""
+    return bool(camera.fx**2 * turn.covariance[1, 1] < gates.start_over**2)
+
+
+def _by_columns(
+    track_map: TrackMap, camera: TrackCamera, turn: RightTurn, known: RightTurn, gates: RectificationGates, views: int
+) -> tuple[RightTurn, AdjustmentJob | None]:
+    """Adjust a map together with the right camera; points seen by ``views`` keyframes take part."""
+    living = track_map.living()
     held = np.arange(len(living)) == 0
     own = so3.exp(-turn.angles[None])[0]
     prior = RightTurnPrior(
         _log(own @ _exp(known.angles)), np.asarray(np.linalg.cholesky(np.linalg.inv(known.covariance)).T, np.float64)
     )
     options = replace(TRACKING, lines=False, planes=False, right_turn=prior)
-    job = job_of(track_map, camera, living, held, False, gates.max_iterations, options, gates.min_views)
+    job = job_of(track_map, camera, living, held, False, gates.max_iterations, options, views)
     if job is None or np.isfinite(job.point_table.right[:, 0]).sum() < gates.min_columns:
         return known, None
     job.function_tolerance = 1e-6
     job.solve()
     assert job.solved is not None
-    rotation = quaternion.to_matrix(job.solved.variables[RIGHT_CAMERAS].state[0, :4])
     try:
-        covariance = Covariances(job.solved).of(RIGHT_CAMERAS, 0)[0, 3:, 3:]
+        covariances = Covariances(job.solved)
     except ProblemError:
         return known, None
-    # What columns tell on their own counts for less where their errors are alike.
-    both, beforehand = np.linalg.inv(covariance), np.linalg.inv(known.covariance)
-    alike = _alike(job, camera, rotation, gates)
-    columns, pull = (both - beforehand) / alike, (both @ _log(rotation) - beforehand @ prior.angles) / alike
-    covariance = np.asarray(np.linalg.inv(columns + beforehand), np.float64)
-    angles = covariance @ (pull + beforehand @ prior.angles)
-    return RightTurn(_log(_exp(turn.angles) @ _exp(angles)), covariance), job
+    # What columns tell on their own of yaw counts for less where their errors are alike.
+    before, after = known.covariance[1, 1], covariances.of(RIGHT_CAMERAS, 0)[0, YAW, YAW]
+    information = 1.0 / after - 1.0 / before
+    if not information > 0.0:
+        return known, None
+    yaw = _log(_exp(turn.angles) @ quaternion.to_matrix(job.solved.variables[RIGHT_CAMERAS].state[0, :4]))[1]
+    own = (yaw / after - known.angles[1] / before) / information
+    alike = _alike(job, camera, covariances, gates)
+    return known.joined(np.array([0.0, own, 0.0]), np.diag([0.0, information / alike, 0.0])), job
 
 
 def _step(keyframes: list[Keyframe]) -> float:
@@ -103,28 +131,18 @@ def _rows_of(
     return fit_rows(camera, left[found], turned_pixels(camera, right[found], _exp(turn.angles)), gates)
 
 
-def _alike(job: AdjustmentJob, camera: TrackCamera, rotation: FloatArray, gates: RectificationGates) -> float:
-    """How much larger the variance of a mean column is than that of independent errors of the stated noise.
+def _alike(job: AdjustmentJob, camera: TrackCamera, covariances: Covariances, gates: RectificationGates) -> float:
+    """How much larger the variance of yaw is than if all errors were independent and of the stated noise.
 
-    The errors of neighbouring points are alike in all pairs, since most are what the lens model left; the sums of
-    cells of the image are independent. In the left images, which tell motion, neighbours drift alike in each of them.
+    What a point errs goes together in all keyframes, and lens models err alike for neighbours: points whose places in
+    the images have their middles in one cell are one sample.
     """
-    assert job.solved is not None
-    table = job.point_table
-    poses, places = job.solved.variables["frames"].state, job.solved.variables["points"].ambient()
-    at = se3.transform_points(poses[job.point_pose], places[np.searchsorted(job.points, table.index)])
-    column = camera.project((at - [camera.baseline, 0.0, 0.0]) @ rotation.T)[:, 0]
-    error = (column - table.right[:, 0]) / table.sigma
-    with np.errstate(invalid="ignore"):
-        good = np.abs(error) < GATE
-    if not good.any():
-        return 1.0
-    cells = cells_of(camera, table.pixel, gates)[good]
-    _, places_of = np.unique(np.column_stack([job.point_pose[good], cells]), axis=0, return_inverse=True)
-    left = ((camera.project(at) - table.pixel) / table.sigma[:, None])[good]
-    sums = [np.bincount(cells, weights=error[good])]
-    sums += [np.bincount(places_of.ravel(), weights=column) for column in np.clip(left, -GATE, GATE).T]
-    return max(float((of**2).sum()) for of in sums) / int(good.sum())
+    landmark = np.searchsorted(job.points, job.point_table.index)
+    middle = np.stack([np.bincount(landmark, weights=column) for column in job.point_table.pixel.T], axis=1)
+    middle /= np.bincount(landmark)[:, None]
+    cluster = np.unique(cells_of(camera, middle, gates), return_inverse=True)[1].ravel()
+    independent = covariances.of(RIGHT_CAMERAS, 0)[0, YAW, YAW]
+    return float(clustered(covariances, (RIGHT_CAMERAS, 0), "points", cluster)[YAW, YAW] / independent)
 
 
 def shift_between(camera: TrackCamera, old: RightTurn, new: RightTurn) -> float:
@@ -240,4 +258,4 @@ def _log(rotation: FloatArray) -> FloatArray:
     return so3.log(rotation[None])[0]
 
 
-__all__ = ["correct_map", "estimate_turn", "shift_between"]
+__all__ = ["correct_map", "estimate_turn", "shift_between", "tells_yaw"]

@@ -52,9 +52,18 @@ class RightTurn:
         covariance = np.asarray(np.linalg.inv(own + information), np.float64)
         return RightTurn(covariance @ (own @ self.angles + information @ other), covariance)
 
-    def is_surer_than(self, other: RightTurn) -> bool:
-        """Whether the angle that is hardest to tell, yaw, is known better than in another estimate."""
-        return bool(self.covariance[1, 1] <= other.covariance[1, 1])
+    def is_as_sure_as(self, other: RightTurn, gates: RectificationGates = DEFAULT.rectification) -> bool:
+        """Whether the angle that is hardest to tell, yaw, is known as well as in an earlier estimate."""
+        return bool(self.covariance[1, 1] <= gates.as_sure * other.covariance[1, 1])
+
+    def confirming(self, assumed: RightTurn) -> RightTurn:
+        """Return the estimate with what followed points cannot tell: in part they agree with what was assumed.
+
+        Up to half of an error stayed where it was measured; then as much is left as was found.
+        """
+        covariance = self.covariance.copy()
+        covariance[1, 1] += (self.angles[1] - assumed.angles[1]) ** 2
+        return RightTurn(self.angles, covariance)
 
     def numbers(self, camera: TrackCamera) -> dict[str, list[float]]:
         """Return angles (pitch, yaw, roll) and standard deviations as plain numbers.

@@ -140,7 +140,7 @@ class RectificationGates:
     )
     min_pairs: int = gate(30, "points", "points found in both images", "derived from five a cell")
     min_keyframes: int = gate(
-        3, "keyframes", "keyframes at which angles are first estimated", "cost: rows alone before"
+        2, "keyframes", "keyframes at which angles are first estimated", "cost: rows alone before"
     )
     max_step: float = gate(
         0.22,
@@ -148,7 +148,7 @@ class RectificationGates:
         "of the depth between keyframes; patches that grow by more slide",
         "chosen on KITTI 06, strides 1 to 3",
     )
-    min_columns: int = gate(200, "points", "columns that tell yaw", "chosen on KITTI 06")
+    min_columns: int = gate(100, "points", "columns that tell yaw", "derived from thirty in each of two pairs, twice")
     min_views: int = gate(
         4,
         "keyframes",
@@ -159,9 +159,10 @@ class RectificationGates:
     growth: float = gate(
         1.5, "ratio", "angles are estimated anew when so many more keyframes tell them", "cost: adds up"
     )
-    start_over_keyframes: int = gate(
-        8, "keyframes", "tell whether a sequence is tracked from its start again", "chosen on KITTI 06"
-    )
+    as_sure: float = gate(
+        1.5, "ratio", "of variances of yaw, up to which the estimate from more keyframes is the better one",
+        "derived from variances told by 15 cells: they differ by a half",
+    )  # fmt: skip
     start_over: float = gate(
         0.3,
         "px",
