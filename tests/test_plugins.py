@@ -174,7 +174,6 @@ def test_photographs_are_mapped_with_its_detector_and_matcher(python, tmp_path):
     scene = facade(tmp_path / "photos", 4)
     write_scene(scene, tmp_path / "model.npz")
     options = ["--model", "model.npz", "--no-planes", "--no-diagnosis", "--line-matcher", "nearest"]
-    options += ["--min-confidence", "0"]  # its segments end at whole pixels
     python("-m", "groma.cli.main", "map", "photos", "-o", "out", *options, "--line-detector", "hough")
     assert read_scene(tmp_path / "out" / "scene.npz").num_lines > 0
     _, complaint = python("-m", "groma.cli.main", "map", "photos", "-o", "no", "--line-detector", "huff", expected=1)

@@ -218,6 +218,11 @@ def _arrays() -> Iterator[_Made]:
     yield "kept_segments", {"s.npz": kept}, _one(SEGMENTS.read, "s.npz")
     names = ("image_idx", "segment_idx", "line_idx", "residual", "num_images", "median_residual", "uncertainty")
     line_map = dict.fromkeys(names, np.zeros(1)) | {"lines": np.zeros((1, 6)), "segments": np.zeros((1, 2, 3))}
+    line_map |= {
+        "supporters": np.zeros((1, 2), np.int64),
+        "rejection": np.zeros(1, np.int64),
+        "depth_ratios": np.zeros((1, 2)),
+    }
     line_map |= {f"{part}{end}": np.zeros(1, np.int64) for part in ("outcomes", "neighbors") for end in ("", ".counts")}
     yield "kept_line_map", {"l.npz": _npz(**line_map)}, _one(LINE_MAP.read, "l.npz")
 
