@@ -141,7 +141,8 @@ def find_pose(
         near = map_in_threads(search.proposal_near, guesses)
         best = search.best_of([*guesses, *(pose for pose in near if pose is not None)])
         if best is not None and best.score >= data.options.gates.verification.strong:
-            return best
+            # What repeats itself agrees with a wrong guess, too; what no guess suggests may agree with more.
+            keyframes = keyframes[:1]
     return search.best_of([pose for pose in map(search.proposal, keyframes) if pose is not None])
 
 
