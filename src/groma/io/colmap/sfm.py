@@ -127,7 +127,7 @@ def reconstruct_points(
         _check_room(folder)
         _enter_images(pycolmap, database, Path(images), names, options)
         _find_features(pycolmap, database, Path(images), names, options, say)
-        _match(pycolmap, database, names, options, say)
+        _match(pycolmap, database, names, list(pair_blocks(len(names))), options, say)
         models = []
         for angle in FIRST_PAIR_ANGLES:
             models = models or _reconstruct(pycolmap, database, Path(images), folder, len(names), options, angle, say)
@@ -212,12 +212,20 @@ def _find_features(
         )
 
 
-def _match(pycolmap: Any, database: Path, names: list[str], options: PointModelOptions, say: Progress) -> None:
+def _match(
+    pycolmap: Any,
+    database: Path,
+    names: list[str],
+    blocks: list[list[tuple[int, int]]],
+    options: PointModelOptions,
+    say: Progress,
+) -> None:
+    """Match pairs of images, which come in blocks of few images each."""
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.num_threads = options.threads or -1
     verification.ransac.random_seed = options.seed
     common = {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
-    total = sum(len(block) for block in pair_blocks(len(names)))
+    total = sum(map(len, blocks))
     if any(name.split() != [name] for name in names):
         # A list of pairs is cut at white space; these calls need none, but tell nothing before they end.
         say("matching points of image pairs", 0, total)
@@ -232,7 +240,7 @@ def _match(pycolmap: Any, database: Path, names: list[str], options: PointModelO
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = database.with_name("pairs.txt")
     done = 0
-    for block in pair_blocks(len(names)):
+    for block in blocks:
         say("matching points of image pairs", done, total)
         _check_room(database.parent, len(block) * _PAIR_ROOM)
         done += len(block)

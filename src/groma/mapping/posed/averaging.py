@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Poses that agree with motions between pairs of images and with the poses that were given.
+
+**Rotations.** With :math:`R_i` the rotation of camera i from the world and increments :math:`R_i \exp(\delta_i)`,
+
+.. math:: \min \sum_{ij} \rho\!\left(\frac{\lVert R_j^\top \log(R_j R_i^\top R_{ij}^\top) + \delta_j - \delta_i\rVert}
+          {\sigma_{ij}}\right) + \sum_i \rho\!\left(\frac{\lVert \log(\bar R_i^\top R_i) + \delta_i \rVert}{s}\right) .
+
+**Centres**, with the rotations held and :math:`u` the direction of a motion in the world,
+
+.. math:: \min \sum_{ij} \rho\!\left(\frac{\lVert (I - u u^\top)(c_i - c_j) \rVert}{\lVert c_i - c_j\rVert\,\sigma_{ij}}
+          \right) + \sum_i \rho\!\left(\frac{\lVert c_i - \bar c_i \rVert}{s}\right) .
+
+Both are solved by reweighting: first Huber's loss, which a minority of wrong motions or poses cannot bend, then
+Geman and McClure's, which lets go of them. The noise s of the given poses is estimated on the way from the median of
+their residuals, each divided by its redundancy: what is left of a pose's own error after it took part.
+
+References
+----------
+A. Chatterjee, V. Govindu, *Robust relative rotation averaging*, 2018. O. Ozyesil, A. Singer, *Robust camera location
+estimation by convex programming*, 2015. W. Foerstner, B. Wrobel, *Photogrammetric computer vision*, 2016, eq. (4.87),
+for redundancy numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array
+from scipy.sparse.linalg import splu
+
+from groma._typing import BoolArray, FloatArray
+from groma.gates import gate
+from groma.geometry import quaternion
+from groma.mapping.posed.motions import Motions
+
+#: Median of a squared normalised residual of three coordinates.
+_MEDIAN = 2.366
+
+
+@dataclass(frozen=True)
+class AveragingGates:
+    """How motions and given poses are weighed against each other."""
+
+    huber_steps: int = gate(15, "steps", "under Huber's loss", "cost: converged before")
+    last_steps: int = gate(15, "steps", "under Geman and McClure's loss", "cost: converged before")
+    scale: float = gate(4.0, "sigma", "of the last loss: where a motion or a pose is doubted", "convention: four sigma")
+    least_redundancy: float = gate(
+        0.05, "share", "below which a pose's residual tells nothing about its error", "convention: of geodesy"
+    )
+
+
+GATES = AveragingGates()
+
+
+@dataclass(frozen=True, eq=False)
+class Averaged:
+    """One kind of quantities that agree with motions and given values."""
+
+    #: (N, 4) rotations of the cameras from the world, or (N, 3) centres.
+    values: FloatArray
+    #: (N, 3) differences from the given ones.
+    residual: FloatArray
+    #: Standard deviation of a coordinate of the given ones.
+    sigma: float
+    #: (N,) redundancy of each given one, and (E,) weight that each motion was left with, from 0 to 1.
+    redundancy: FloatArray
+    kept: FloatArray
+
+
+def average_rotations(given: FloatArray, motions: Motions) -> Averaged:
+    """Return rotations (N, 4) that agree with motions and with given ones."""
+    rotations = _voted(given, motions)
+    first, second = motions.first, motions.second
+
+    def residuals(delta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        now = quaternion.multiply(rotations, quaternion.exp(delta))
+        between = quaternion.multiply(now[second], quaternion.conjugate(now[first]))
+        off = quaternion.log(quaternion.multiply(between, quaternion.conjugate(motions.rotation)))
+        in_world = quaternion.rotate(quaternion.conjugate(now[second]), off)
+        return in_world, quaternion.log(quaternion.multiply(quaternion.conjugate(given), now))
+
+    def solved(delta: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+        nonlocal rotations
+        off, own = residuals(delta)
+        system, count = splu(_laplacian(first, second, weight, prior)), len(given)
+        right = np.zeros((count, 3))
+        np.add.at(right, second, -weight[:, None] * off)
+        np.add.at(right, first, weight[:, None] * off)
+        right -= prior[:, None] * own
+        rotations = quaternion.multiply(rotations, quaternion.exp(system.solve(right)))
+        return np.zeros_like(delta), np.diag(system.solve(np.eye(count)))
+
+    found = _reweighted(np.zeros((len(given), 3)), residuals, solved, motions.rotation_sigma)
+    return Averaged(rotations, *found[1:])
+
+
+def average_centers(given: FloatArray, rotations: FloatArray, motions: Motions, held: BoolArray) -> Averaged:
+    """Return centres (N, 3) that agree with motions and with given ones; those not ``held`` are known to be wrong."""
+    first, second = motions.first, motions.second
+    direction = quaternion.rotate(quaternion.conjugate(rotations[second]), motions.direction)
+    start = _crossed(given, direction, motions, held)
+    least = 1e-3 * float(np.median(np.linalg.norm(given[first] - given[second], axis=1))) + 1e-12
+
+    def residuals(centers: FloatArray) -> tuple[FloatArray, FloatArray]:
+        between = centers[first] - centers[second]
+        length = np.maximum(np.linalg.norm(between, axis=1, keepdims=True), least)
+        along = np.einsum("ij,ij->i", between, direction)[:, None]
+        return (between - np.maximum(along, 0.0) * direction) / length, centers - given
+
+    def solved(centers: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+        between = centers[first] - centers[second]
+        length = np.maximum(np.linalg.norm(between, axis=1), least)
+        ahead = np.einsum("ij,ij->i", between, direction) > 0.0
+        blocks = np.eye(3) - np.where(ahead, 1.0, 0.0)[:, None, None] * direction[:, :, None] * direction[:, None, :]
+        system = splu(_block_laplacian(first, second, (weight / length**2)[:, None, None] * blocks, prior))
+        diagonal = np.diag(system.solve(np.eye(3 * len(given)))).reshape(-1, 3).mean(axis=1)
+        return _as_large(system.solve((prior[:, None] * given).ravel()).reshape(-1, 3), given, prior), diagonal
+
+    return Averaged(*_reweighted(start, residuals, solved, motions.direction_sigma, held))
+
+
+def _reweighted(
+    start: FloatArray,
+    residuals: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    solved: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]],
+    sigma: FloatArray,
+    held: BoolArray | None = None,
+) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:
+    """Solve by reweighting; return values, residuals and noise of the given ones, redundancy, and what was kept."""
+    counts = np.ones(len(start), bool) if held is None else held
+    values, redundancy = start, np.ones(len(start))
+    _, own = residuals(values)
+    noise = max(float(np.median(np.linalg.norm(own[counts], axis=1))), 1e-9) if counts.any() else 1.0
+    noise = noise if noise > 1e-6 else 1.0
+    for step in range(GATES.huber_steps + GATES.last_steps):
+        off, own = residuals(values)
+        spread = max(1.0, float(np.sqrt(np.median((np.linalg.norm(off, axis=1) / sigma) ** 2) / _MEDIAN)))
+        ratio = np.linalg.norm(off, axis=1) / (spread * sigma)
+        of_prior = np.linalg.norm(own, axis=1) / noise
+        last = step >= GATES.huber_steps
+        kept = _geman_mcclure(ratio) if last else 1.0 / np.maximum(ratio, 1.0)
+        trust = np.where(counts, _geman_mcclure(of_prior) if last else 1.0 / np.maximum(of_prior, 1.0), 1e-6)
+        values, diagonal = solved(values, kept / (spread * sigma) ** 2, trust / noise**2)
+        redundancy = np.clip(1.0 - trust / noise**2 * diagonal, 0.0, 1.0)
+        _, own = residuals(values)
+        counted = counts & (redundancy > GATES.least_redundancy)
+        if 2 * counted.sum() > counts.sum():  # else the given ones are too good for motions to tell their noise
+            squares = np.sum(own[counted] ** 2, axis=1) / redundancy[counted]
+            noise = max(float(np.sqrt(np.median(squares) / _MEDIAN)), 1e-9)
+    return values, own, noise, redundancy, kept
+
+
+def _as_large(centers: FloatArray, given: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return centres in the size of the given ones: motions tell none, and wrong ones make everything smaller."""
+    share = (weight / weight.sum())[:, None]
+    middle, of_given = np.sum(share * centers, axis=0), np.sum(share * given, axis=0)
+    around = centers - middle
+    size = np.sum(share * around * around)
+    scale = np.sum(share * around * (given - of_given)) / size if size > 0.0 else 1.0
+    return of_given + (scale if scale > 0.0 else 1.0) * around
+
+
+def _geman_mcclure(ratio: FloatArray) -> FloatArray:
+    return 1.0 / (1.0 + (ratio / GATES.scale) ** 2) ** 2
+
+
+def _laplacian(first: FloatArray, second: FloatArray, weight: FloatArray, prior: FloatArray) -> csc_array:
+    rows = np.concatenate([first, second, first, second, np.arange(len(prior))])
+    columns = np.concatenate([first, second, second, first, np.arange(len(prior))])
+    values = np.concatenate([weight, weight, -weight, -weight, prior])
+    return csc_array(coo_array((values, (rows, columns)), (len(prior), len(prior))))
+
+
+def _block_laplacian(first: FloatArray, second: FloatArray, blocks: FloatArray, prior: FloatArray) -> csc_array:
+    own = prior[:, None, None] * np.eye(3)
+    every = np.arange(len(prior))
+    row = np.concatenate([first, second, first, second, every])
+    column = np.concatenate([first, second, second, first, every])
+    values = np.concatenate([blocks, blocks, -blocks, -blocks, own])
+    rows = (3 * row[:, None, None] + np.arange(3)[:, None]) + np.zeros((1, 1, 3), int)
+    columns = (3 * column[:, None, None] + np.arange(3)[None, :]) + np.zeros((1, 3, 1), int)
+    size = 3 * len(prior)
+    return csc_array(coo_array((values.ravel(), (rows.ravel(), columns.ravel())), (size, size)))
+
+
+def _voted(given: FloatArray, motions: Motions) -> FloatArray:
+    """Return for each image the rotation nearest to all that its neighbours and its own pose propose."""
+    rotations = given
+    for _ in range(2):
+        proposed = [[rotation] for rotation in rotations]
+        onto = quaternion.multiply(motions.rotation, rotations[motions.first])
+        back = quaternion.multiply(quaternion.conjugate(motions.rotation), rotations[motions.second])
+        for row, one in zip([*motions.second, *motions.first], [*onto, *back], strict=True):
+            proposed[row].append(one)
+        rotations = np.array([_median_rotation(np.array(some)) for some in proposed])
+    return rotations
+
+
+def _median_rotation(proposed: FloatArray) -> FloatArray:
+    apart = 2.0 * np.arccos(np.clip(np.abs(proposed @ proposed.T), 0.0, 1.0))
+    return proposed[int(apart.sum(axis=1).argmin())]
+
+
+def _crossed(given: FloatArray, direction: FloatArray, motions: Motions, held: BoolArray) -> FloatArray:
+    """Return centres, those that contradict their neighbours moved to where the directions from these cross."""
+    centers = given.copy()
+    ends = ((motions.first, motions.second, direction), (motions.second, motions.first, -direction))
+    for row in range(len(given)):
+        others = np.concatenate([other[own == row] for own, other, _ in ends])
+        ways = np.concatenate([way[own == row] for own, _, way in ends])
+        usable = held[others]
+        if usable.sum() < 2:
+            continue
+        at, way = given[others[usable]], ways[usable]
+        crossing = _intersection(at, way)
+        if not held[row] or _disagreement(crossing, at, way) < 0.5 * _disagreement(given[row], at, way):
+            centers[row] = crossing
+    return centers
+
+
+def _intersection(at: FloatArray, way: FloatArray) -> FloatArray:
+    """Return the point nearest to half-lines, by reweighting."""
+    blocks = np.eye(3) - way[:, :, None] * way[:, None, :]
+    weight = np.ones(len(at))
+    for _ in range(10):
+        normal = np.einsum("i,ijk->jk", weight, blocks)
+        normal += 1e-9 * np.trace(normal) * np.eye(3)
+        point = np.linalg.solve(normal, np.einsum("i,ijk,ik->j", weight, blocks, at))
+        weight = 1.0 / np.maximum(np.linalg.norm(np.einsum("ijk,ik->ij", blocks, point - at), axis=1), 1e-9)
+        weight /= weight.max()
+    return point
+
+
+def _disagreement(point: FloatArray, at: FloatArray, way: FloatArray) -> float:
+    """Return the median angle between directions and those to a point."""
+    between = point - at
+    size = np.maximum(np.linalg.norm(between, axis=1), 1e-12)
+    return float(np.median(np.arccos(np.clip(np.einsum("ij,ij->i", between, way) / size, -1.0, 1.0))))
+
+
+__all__ = ["Averaged", "AveragingGates", "average_centers", "average_rotations"]
