@@ -29,6 +29,7 @@ from groma.geometry import quaternion, se3
 from groma.io.colmap.at_poses import MIN_MATCHES, PosedPhotographs
 from groma.io.colmap.sfm import PointModelOptions
 from groma.mapping.noise.observations import noise_px
+from groma.mapping.posed.axes import check_axes
 from groma.mapping.posed.averaging import average_centers, average_rotations
 from groma.mapping.posed.motions import Motions, motions_of
 from groma.mapping.posed.noise import GivenNoise, noise_of_given
@@ -126,6 +127,7 @@ def place_photographs(
     photographs.match(say)
     motions = motions_of(photographs.pairs())
     _check_motions(motions, scene)
+    check_axes(scene, motions)
     found, known = averaged(scene, motions)
     rounds = len(GATES.tolerances_px)
     for number, tolerance in enumerate(GATES.tolerances_px):
