@@ -36,8 +36,8 @@ from groma.gates import gate
 from groma.geometry import quaternion
 from groma.mapping.posed.motions import Motions
 
-#: Median of a squared normalised residual of three coordinates.
-_MEDIAN = 2.366
+#: Median and lower quartile of a squared normalised residual of three coordinates.
+_MEDIAN, _QUARTILE = 2.366, 1.213
 
 
 @dataclass(frozen=True)
@@ -75,16 +75,16 @@ def average_rotations(given: FloatArray, motions: Motions) -> Averaged:
     rotations = _voted(given, motions)
     first, second = motions.first, motions.second
 
-    def residuals(delta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def residuals(delta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         now = quaternion.multiply(rotations, quaternion.exp(delta))
         between = quaternion.multiply(now[second], quaternion.conjugate(now[first]))
         off = quaternion.log(quaternion.multiply(between, quaternion.conjugate(motions.rotation)))
         in_world = quaternion.rotate(quaternion.conjugate(now[second]), off)
-        return in_world, quaternion.log(quaternion.multiply(quaternion.conjugate(given), now))
+        return in_world, quaternion.log(quaternion.multiply(quaternion.conjugate(given), now)), np.ones(len(first))
 
     def solved(delta: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
         nonlocal rotations
-        off, own = residuals(delta)
+        off, own, _ = residuals(delta)
         system, count = splu(_laplacian(first, second, weight, prior)), len(given)
         right = np.zeros((count, 3))
         np.add.at(right, second, -weight[:, None] * off)
@@ -104,11 +104,11 @@ def average_centers(given: FloatArray, rotations: FloatArray, motions: Motions, 
     start = _crossed(given, direction, motions, held)
     least = 1e-3 * float(np.median(np.linalg.norm(given[first] - given[second], axis=1))) + 1e-12
 
-    def residuals(centers: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def residuals(centers: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         between = centers[first] - centers[second]
         length = np.maximum(np.linalg.norm(between, axis=1, keepdims=True), least)
         along = np.einsum("ij,ij->i", between, direction)[:, None]
-        return (between - np.maximum(along, 0.0) * direction) / length, centers - given
+        return (between - np.maximum(along, 0.0) * direction) / length, centers - given, length[:, 0]
 
     def solved(centers: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
         between = centers[first] - centers[second]
@@ -124,7 +124,7 @@ def average_centers(given: FloatArray, rotations: FloatArray, motions: Motions, 
 
 def _reweighted(
     start: FloatArray,
-    residuals: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    residuals: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]],
     solved: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]],
     sigma: FloatArray,
     held: BoolArray | None = None,
@@ -132,20 +132,21 @@ def _reweighted(
     """Solve by reweighting; return values, residuals and noise of the given ones, redundancy, and what was kept."""
     counts = np.ones(len(start), bool) if held is None else held
     values, redundancy = start, np.ones(len(start))
-    _, own = residuals(values)
+    off, own, size = residuals(values)
     noise = max(float(np.median(np.linalg.norm(own[counts], axis=1))), 1e-9) if counts.any() else 1.0
-    noise = noise if noise > 1e-6 else 1.0
     for step in range(GATES.huber_steps + GATES.last_steps):
-        off, own = residuals(values)
-        spread = max(1.0, float(np.sqrt(np.median((np.linalg.norm(off, axis=1) / sigma) ** 2) / _MEDIAN)))
-        ratio = np.linalg.norm(off, axis=1) / (spread * sigma)
-        of_prior = np.linalg.norm(own, axis=1) / noise
+        ratio = np.linalg.norm(off, axis=1) / sigma
+        # Of repeated structure most motions are wrong: the quartile, not the median.
+        spread = max(1.0, float(np.sqrt(np.quantile(ratio**2, 0.25) / _QUARTILE)))
+        # A pose that claims to be far better than the motions would outvote any number of them.
+        used = max(noise, spread * float(np.median(sigma * size)))
+        ratio, of_prior = ratio / spread, np.linalg.norm(own, axis=1) / used
         last = step >= GATES.huber_steps
         kept = _geman_mcclure(ratio) if last else 1.0 / np.maximum(ratio, 1.0)
         trust = np.where(counts, _geman_mcclure(of_prior) if last else 1.0 / np.maximum(of_prior, 1.0), 1e-6)
-        values, diagonal = solved(values, kept / (spread * sigma) ** 2, trust / noise**2)
-        redundancy = np.clip(1.0 - trust / noise**2 * diagonal, 0.0, 1.0)
-        _, own = residuals(values)
+        values, diagonal = solved(values, kept / (spread * sigma) ** 2, trust / used**2)
+        redundancy = np.clip(1.0 - trust / used**2 * diagonal, 0.0, 1.0)
+        off, own, size = residuals(values)
         counted = counts & (redundancy > GATES.least_redundancy)
         if 2 * counted.sum() > counts.sum():  # else the given ones are too good for motions to tell their noise
             squares = np.sum(own[counted] ** 2, axis=1) / redundancy[counted]
