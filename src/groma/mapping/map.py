@@ -3,7 +3,8 @@
 
 Stages, each saved when it is finished, so that an interrupted run goes on where it was:
 
-1. ``model``      points and poses: read, or reconstructed from the images; adjusted with robust losses (``points``);
+1. ``model``      points and poses: read, reconstructed from the images, or found at poses without points
+                  (``placed``); adjusted with robust losses (``points``);
                   the points' observations placed anew by their grey levels, and adjusted again (``measured``);
 2. ``segments``   line segments in every image, one image at a time;
 3. ``lines``      3D lines from the segments;
@@ -35,7 +36,7 @@ from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
 from groma.gates import gate
 from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
-from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, SCENE, SEGMENTS
+from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, PLACED, SCENE, SEGMENTS
 from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
@@ -53,6 +54,7 @@ from groma.mapping.photographs import (
     image_reader,
     images_left_out,
 )
+from groma.mapping.posed.place import PlacedPhotographs, place_photographs
 from groma.mapping.refine_points import PointRefinementOptions, refine_points
 from groma.mapping.result import MapResult
 from groma.mapping.structure.find import StructureOptions, find_structure
@@ -152,7 +154,8 @@ def map_images(
     work : path
         Folder for finished stages. A second call with the same images, model and options goes on from them.
     model : Scene, optional
-        Poses, cameras and points of the images; reconstructed from the images if not given.
+        Poses, cameras and points of the images; reconstructed from the images if not given. Where it has no points,
+        they are found, and the poses are measurements whose noise is estimated.
     options : MapOptions, optional
         Lengths, gates and what is estimated.
     progress : callable, optional
@@ -189,7 +192,11 @@ def map_images(
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
     with work_with(options.threads), Stages(Path(work), key, options, say) as stages:
-        start = stages.run(find_start, folder, names, model, stages.place)
+        if model is not None and not model.num_point_observations:
+            placed = stages.run(place_at_poses, folder, model, stages.place)
+        else:
+            placed = PlacedPhotographs(stages.run(find_start, folder, names, model, stages.place))
+        start = placed.scene
         points = stages.run(adjust_points, start)
         if options.refine_points:
             points = stages.run(measure_points, folder, points)
@@ -197,8 +204,13 @@ def map_images(
         matches = matches_for(options, folder, points, segments, line_matches)
         result = map_segments(points, segments, matches, stages, neighbors_for(options, folder))
     say("done", 1, 1)
-    left_out = images_left_out(names, start.images.names, model is not None)
-    result = dataclasses.replace(result, start=start, warnings=(*left_out, *result.warnings))
+    left_out = images_left_out(names, (model or start).images.names, model is not None)
+    result = dataclasses.replace(
+        result,
+        start=start,
+        explanation=" ".join([*placed.notes, result.explanation]),
+        warnings=(*left_out, *placed.warnings, *result.warnings),
+    )
     if near is None:
         return result
     scene, start, before = (part.transformed(near.inverse()) for part in (result.scene, result.start, result.before))
@@ -257,6 +269,15 @@ def find_start(
 ) -> Scene:
     """Poses and points: the given ones, or reconstructed from the images."""
     return reconstruct_points(folder, place("sfm"), names, options.point_model(), say) if model is None else model
+
+
+@stage("placed", PLACED, lambda o: (o.point_model(threads=False), o.refine_poses, o.refine_intrinsics))
+def place_at_poses(
+    folder: Path, given: Scene, place: Callable[[str], Path], options: MapOptions, say: StageProgress
+) -> PlacedPhotographs:
+    """Points at given poses, and what these are worth."""
+    refine = (options.refine_poses, bool(options.refine_intrinsics))
+    return place_photographs(folder, place("sfm"), given, options.point_model(), *refine, say)
 
 
 @stage("points", SCENE, lambda options: (options.refine_poses, options.refine_intrinsics, options.max_iterations))

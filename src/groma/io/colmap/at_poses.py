@@ -7,17 +7,16 @@ database as :mod:`groma.io.colmap.sfm` does it, and what is finished there is no
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from groma import cameras as camera_models
-from groma._typing import FloatArray, IntArray
+from groma._typing import FloatArray
 from groma.geometry import quaternion
 from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.model import from_pycolmap, to_pycolmap
@@ -106,10 +105,11 @@ class PosedPhotographs:
                 matches = geometry.inlier_matches
                 if len(matches) < MIN_MATCHES or first not in row_of or second not in row_of:
                     continue
-                of = [cameras[int(self.scene.cameras.ids[self.scene.images.camera_idx[row_of[k]]])] for k in (first, second)]
-                if not pycolmap.estimate_two_view_geometry_pose(
-                    of[0], places[first], of[1], places[second], geometry
-                ):
+                of = [
+                    cameras[int(self.scene.cameras.ids[self.scene.images.camera_idx[row_of[k]]])]
+                    for k in (first, second)
+                ]
+                if not pycolmap.estimate_two_view_geometry_pose(of[0], places[first], of[1], places[second], geometry):
                     continue
                 motion = geometry.cam2_from_cam1
                 shift = np.asarray(motion.translation, float)
@@ -123,6 +123,9 @@ class PosedPhotographs:
                     np.concatenate([motion.rotation.quat, shift / np.linalg.norm(shift)]),
                     float(np.sqrt(of[0].mean_focal_length() * of[1].mean_focal_length())),
                 )
+
+    def _camera_id(self, row: int) -> int:
+        return int(self.scene.cameras.ids[self.scene.images.camera_idx[row]])
 
     def _rays(self, row: int, pixels: FloatArray) -> FloatArray:
         camera = int(self.scene.images.camera_idx[row])
@@ -182,7 +185,7 @@ class PosedPhotographs:
             estimation = pycolmap.AbsolutePoseEstimationOptions()
             estimation.ransac.max_error = max_error_px
             estimation.ransac.random_seed = self.options.seed
-            camera = content.read_camera(int(model.cameras.ids[self.scene.images.camera_idx[row]]))
+            camera = content.read_camera(self._camera_id(row))
             answer = pycolmap.estimate_and_refine_absolute_pose(
                 places[together[0]], model.points.xyz[together[1]], camera, estimation
             )
@@ -205,7 +208,8 @@ def _enter(pycolmap: Any, database: Path, scene: Scene) -> None:
         for rig in model.rigs.values():
             content.write_rig(rig, use_rig_id=True)
         for image in model.images.values():
-            content.write_image(image, use_image_id=True)
+            alone = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+            content.write_image(alone, use_image_id=True)
         for frame in model.frames.values():
             content.write_frame(frame, use_frame_id=True)
 
@@ -226,13 +230,15 @@ def _blocks(scene: Scene) -> list[list[tuple[int, int]]]:
         return blocks
     centers = scene.cam_centers_in_world
     axes = quaternion.rotate(quaternion.conjugate(scene.cam_from_world[:, :4]), np.array([0.0, 0.0, 1.0]))
-    _, near = cKDTree(centers).query(centers, min(count, 2 * _NEAREST))
-    first = np.repeat(np.arange(count), near.shape[1])
+    _, near = KDTree(centers).query(centers, min(count, 2 * _NEAREST))
+    first = np.repeat(np.arange(count), len(near[0]))
     second = near.ravel()
     same_way = np.einsum("ij,ij->i", axes[first], axes[second]) > 0.0
     by_name = {pair for block in blocks for pair in block}
     by_pose = {
-        (min(i, j), max(i, j)) for i, j in zip(first[same_way].tolist(), second[same_way].tolist(), strict=True) if i != j
+        (min(i, j), max(i, j))
+        for i, j in zip(first[same_way].tolist(), second[same_way].tolist(), strict=True)
+        if i != j
     }
     more = sorted(by_pose - by_name)
     return blocks + [more[start : start + _PAIRS_IN_A_CALL] for start in range(0, len(more), _PAIRS_IN_A_CALL)]

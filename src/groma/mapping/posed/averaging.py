@@ -31,7 +31,7 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
-from groma._typing import BoolArray, FloatArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
 from groma.geometry import quaternion
 from groma.mapping.posed.motions import Motions
@@ -131,7 +131,7 @@ def _reweighted(
 ) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:
     """Solve by reweighting; return values, residuals and noise of the given ones, redundancy, and what was kept."""
     counts = np.ones(len(start), bool) if held is None else held
-    values, redundancy = start, np.ones(len(start))
+    values, redundancy, kept = start, np.ones(len(start)), np.ones(len(sigma))
     off, own, size = residuals(values)
     noise = max(float(np.median(np.linalg.norm(own[counts], axis=1))), 1e-9) if counts.any() else 1.0
     for step in range(GATES.huber_steps + GATES.last_steps):
@@ -168,14 +168,14 @@ def _geman_mcclure(ratio: FloatArray) -> FloatArray:
     return 1.0 / (1.0 + (ratio / GATES.scale) ** 2) ** 2
 
 
-def _laplacian(first: FloatArray, second: FloatArray, weight: FloatArray, prior: FloatArray) -> csc_array:
+def _laplacian(first: IntArray, second: IntArray, weight: FloatArray, prior: FloatArray) -> csc_array:
     rows = np.concatenate([first, second, first, second, np.arange(len(prior))])
     columns = np.concatenate([first, second, second, first, np.arange(len(prior))])
     values = np.concatenate([weight, weight, -weight, -weight, prior])
     return csc_array(coo_array((values, (rows, columns)), (len(prior), len(prior))))
 
 
-def _block_laplacian(first: FloatArray, second: FloatArray, blocks: FloatArray, prior: FloatArray) -> csc_array:
+def _block_laplacian(first: IntArray, second: IntArray, blocks: FloatArray, prior: FloatArray) -> csc_array:
     own = prior[:, None, None] * np.eye(3)
     every = np.arange(len(prior))
     row = np.concatenate([first, second, first, second, every])
@@ -225,7 +225,7 @@ def _crossed(given: FloatArray, direction: FloatArray, motions: Motions, held: B
 def _intersection(at: FloatArray, way: FloatArray) -> FloatArray:
     """Return the point nearest to half-lines, by reweighting."""
     blocks = np.eye(3) - way[:, :, None] * way[:, None, :]
-    weight = np.ones(len(at))
+    weight, point = np.ones(len(at)), at.mean(axis=0)
     for _ in range(10):
         normal = np.einsum("i,ijk->jk", weight, blocks)
         normal += 1e-9 * np.trace(normal) * np.eye(3)

@@ -32,15 +32,27 @@ from groma.scene import Scene
 class AxesGates:
     """When the axes of a file are refused."""
 
-    cut: float = gate(np.radians(40.0), "rad", "at which a disagreement counts no more", "convention: half a right angle")
+    cut: float = gate(
+        np.radians(40.0), "rad", "at which a disagreement counts no more", "convention: half a right angle"
+    )
     better: float = gate(
-        0.5, "share", "of the score of the file's own reading: another that is lower is the right one", "chosen on fountain-P11"
+        0.5,
+        "share",
+        "of the score of the file's own reading: another that is lower is the right one",
+        "chosen on fountain-P11",
     )
     trusted: float = gate(
-        np.radians(10.0), "rad", "standard deviation up to which a direction is compared", "convention: a quarter of the cut"
+        np.radians(10.0),
+        "rad",
+        "standard deviation up to which a direction is compared",
+        "convention: a quarter of the cut",
     )
-    kept: float = gate(0.8, "share", "of the pairs that agree best: the others may have gross errors", "convention: 10 %, twice")
-    shuffles: int = gate(99, "orders", "in which the poses are given to the images at random", "cost: tells one in a hundred")
+    kept: float = gate(
+        0.8, "share", "of the pairs that agree best: the others may have gross errors", "convention: 10 %, twice"
+    )
+    shuffles: int = gate(
+        99, "orders", "in which the poses are given to the images at random", "cost: tells one in a hundred"
+    )
     chance: float = gate(0.05, "share", "of these that may fit as well as the file's", "convention: one in twenty")
     fewest: int = gate(5, "images", "for which such a comparison tells something", "derived from 120 orders of five")
 
@@ -84,8 +96,8 @@ def check_axes(scene: Scene, motions: Motions) -> None:
     if fitting > GATES.chance * GATES.shuffles:
         raise InputError(
             f"The poses contradict the photographs: motions between images are {np.degrees(own):.2g} degrees off on "
-            f"average, and no more so in {fitting} of {GATES.shuffles} random orders of the poses. Check that names and "
-            "poses belong together."
+            f"average, and no more so in {fitting} of {GATES.shuffles} random orders of the poses. Check that names "
+            "and poses belong together."
         )
 
 
@@ -111,7 +123,10 @@ def _best(values: FloatArray) -> FloatArray:
 def readings(rotation: FloatArray, centers: FloatArray) -> Iterator[Reading]:
     """Yield the other ways to read poses: inverse, cameras with other axes, mirrored, places with other axes."""
     inverse, moved = np.swapaxes(rotation, 1, 2), -np.einsum("nij,nj->ni", rotation, centers)
-    ways = ((rotation, centers, ""), (inverse, moved, "they go the other way (world to camera for camera to world) and "))
+    ways = (
+        (rotation, centers, ""),
+        (inverse, moved, "they are inverted (world to camera for camera to world) and "),
+    )
     for turned, places, words in ways:
         if words:
             yield Reading(words.removesuffix(" and "), turned, places)
@@ -123,7 +138,9 @@ def readings(rotation: FloatArray, centers: FloatArray) -> Iterator[Reading]:
         for axes in _signed_permutations():
             if np.linalg.det(axes) < 0.0:
                 yield Reading(
-                    "their axes are left-handed, as in Unity and Unreal", axes @ rotation @ reflection, centers @ reflection
+                    "their axes are left-handed, as in Unity and Unreal",
+                    axes @ rotation @ reflection,
+                    centers @ reflection,
                 )
     for axes in _signed_permutations():
         if not np.array_equal(axes, np.eye(3)):
@@ -138,7 +155,7 @@ def _signed_permutations() -> Iterator[FloatArray]:
 
 def _camera_words(axes: FloatArray) -> str:
     if np.array_equal(axes, np.diag([1.0, -1.0, -1.0])):
-        return "the cameras look along the other z axis with y the other way (OpenGL's axes for OpenCV's, or vice versa)"
+        return "the cameras have y up and look along -z where y down and z are expected, or vice versa (OpenGL, OpenCV)"
     return f"the axes of the cameras, x right, y down, z forward, are {_listed(axes)} of the file"
 
 

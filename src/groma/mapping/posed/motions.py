@@ -13,7 +13,7 @@ matrix at the noise that the residuals show.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,13 +28,21 @@ from groma.io.colmap.at_poses import MatchedPair
 class MotionGates:
     """How motions between two images are refined and trusted."""
 
-    noise_px: float = gate(1.0, "px", "least noise of a match: SIFT's, and what calibrations slip", "convention: COLMAP")
+    noise_px: float = gate(
+        1.0, "px", "least noise of a match: SIFT's, and what calibrations slip", "convention: COLMAP"
+    )
     steps: int = gate(5, "steps", "of refinement; two suffice near a solution", "cost: the joint adjustment follows")
     floor: float = gate(
-        np.radians(0.1), "rad", "least error of a motion: errors that neighbouring matches share", "chosen on fountain-P11"
+        np.radians(0.1),
+        "rad",
+        "least error of a motion: errors that neighbouring matches share",
+        "chosen on fountain-P11",
     )
     weakest: float = gate(
-        np.radians(20.0), "rad", "standard deviation from which a motion tells nothing", "convention: a third of a radian"
+        np.radians(20.0),
+        "rad",
+        "standard deviation from which a motion tells nothing",
+        "convention: a third of a radian",
     )
 
 
@@ -81,6 +89,7 @@ def motions_of(pairs: Iterable[MatchedPair]) -> Motions:
 def _refined(pair: MatchedPair) -> tuple[FloatArray, float, float]:
     """Return the refined motion and the standard deviations of its rotation and of its direction."""
     pose, least = pair.second_from_first, GATES.noise_px / pair.focal
+    noise, normal = least, np.eye(5)
     for _ in range(GATES.steps):
         residual, jacobian, basis = _linearised(pose, pair.first_rays, pair.second_rays)
         noise = max(least, 1.4826 * float(np.median(np.abs(residual))))
@@ -114,9 +123,4 @@ def _linearised(pose: FloatArray, first: FloatArray, second: FloatArray) -> tupl
     return value / size, np.hstack([wrt_turn, wrt_shift]) / size[:, None], basis
 
 
-def connected(motions: Motions, count: int) -> Sequence[int]:
-    """Return the number of motions of each of the images."""
-    return np.bincount(np.concatenate([motions.first, motions.second]), minlength=count).tolist()
-
-
-__all__ = ["MotionGates", "Motions", "connected", "motions_of"]
+__all__ = ["MotionGates", "Motions", "motions_of"]

@@ -64,7 +64,8 @@ def noise_of_given(squared: FloatArray, redundancy: FloatArray) -> GivenNoise:
     ratio = squared[order] / redundancy[order]
     total, freedom = np.cumsum(squared[order]), 3.0 * np.cumsum(redundancy[order])
     count = len(order)
-    for k in range((count + 2) // 2, count + 1):
+    half, k, variance = (count + 2) // 2, count, 0.0
+    for k in range(half, count + 1):
         variance = total[k - 1] / freedom[k - 1] / _truncated(k / count)
         if k == count or ratio[k] > 3.0 * variance * f.isf(GATES.false_alarm / count, 3, 3 * k):
             break

@@ -15,13 +15,13 @@ is to say. Images that see too few points are not in it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from groma._typing import BoolArray, FloatArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.errors import InputError
 from groma.gates import gate
@@ -29,12 +29,13 @@ from groma.geometry import quaternion, se3
 from groma.io.colmap.at_poses import MIN_MATCHES, PosedPhotographs
 from groma.io.colmap.sfm import PointModelOptions
 from groma.mapping.noise.observations import noise_px
-from groma.mapping.posed.axes import check_axes
 from groma.mapping.posed.averaging import average_centers, average_rotations
+from groma.mapping.posed.axes import check_axes
 from groma.mapping.posed.motions import Motions, motions_of
 from groma.mapping.posed.noise import GivenNoise, noise_of_given
+from groma.mapping.posed.placed import PlacedPhotographs
 from groma.mapping.posed.sentences import about_gross_errors, about_left_out, about_noise
-from groma.scene import PosePriors, Scene
+from groma.scene import PosePriors, Scene, Similarity
 from groma.scene.local_frame import usual_frame
 from groma.solver.covariance.marginals import Covariances
 
@@ -46,12 +47,12 @@ class PlacingGates:
     """How points are found at poses that are not exact yet."""
 
     tolerances_px: tuple[float, ...] = gate(
-        (24.0, 4.0), "px", "largest reprojection error of a point, round by round", "convention: COLMAP's, before it 6 x"
+        (24.0, 4.0),
+        "px",
+        "largest reprojection error of a point, round by round",
+        "convention: COLMAP's, before it 6 x",
     )
     absolute_px: float = gate(12.0, "px", "tolerance of an image placed by points", "convention: COLMAP")
-    exact: float = gate(
-        1e-3, "share", "noise of given poses that show none, of the distance between neighbours", "convention: a thousandth"
-    )
 
 
 GATES = PlacingGates()
@@ -80,21 +81,12 @@ class GivenPoses:
         return PosePriors(rows, self.poses[rows], np.tile(np.repeat(self.sigma, 3), (len(rows), 1)))
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedPhotographs:
-    """A scene of photographs whose poses came from elsewhere."""
-
-    #: Poses, points, and the given poses as measurements.
-    scene: Scene
-    #: What there is to say.
-    sentences: tuple[str, ...]
-
-
 def place_photographs(
     images: Path,
     work: Path,
     given: Scene,
     options: PointModelOptions,
+    refine_poses: bool = True,
     refine_intrinsics: bool = False,
     say: Say = lambda doing, done, total: None,
 ) -> PlacedPhotographs:
@@ -110,6 +102,8 @@ def place_photographs(
         Cameras, names and poses. Every image is taken for itself, also where frames of rigs hold several.
     options : PointModelOptions
         Seed and threads.
+    refine_poses : bool
+        Better the poses; else points are placed at them as they are.
     refine_intrinsics : bool
         Estimate the calibration too.
     say : callable
@@ -128,26 +122,36 @@ def place_photographs(
     motions = motions_of(photographs.pairs())
     _check_motions(motions, scene)
     check_axes(scene, motions)
+    if not refine_poses:
+        say("placing points at the poses", 0, 1)
+        return _told(photographs.triangulate(scene, GATES.tolerances_px[-1]), None, near)
     found, known = averaged(scene, motions)
     rounds = len(GATES.tolerances_px)
     for number, tolerance in enumerate(GATES.tolerances_px):
         say("placing points at the poses", number, rounds)
-        found = _with_missing_placed(photographs, photographs.triangulate(found, tolerance), say)
+        found = _with_missing_placed(photographs, photographs.triangulate(found, tolerance))
         found, known = _adjusted(found, known, refine_intrinsics, number > 0)
-    seen = _num_points_seen(found) >= MIN_MATCHES
+    return _told(found, known, near)
+
+
+def _told(found: Scene, known: GivenPoses | None, near: Similarity | None) -> PlacedPhotographs:
+    """Return the images that see points, in the frame of the given poses, with what there is to say."""
+    names, seen = found.images.names, _num_points_seen(found) >= MIN_MATCHES
     if seen.sum() < 2:
         raise InputError(
             "No points could be placed: the photographs match each other, and their matches meet nowhere at the given "
             "poses or near them. Check that names and poses belong together, and the calibration."
         )
-    unit = 1.0 if near is None else 1.0 / near.scale
-    sentences = (
-        *about_noise(known.place.sigma, known.turn.sigma, unit, int((seen & ~known.gross).sum())),
-        *about_gross_errors(scene.images.names, known.place.gross & seen, known.turn.gross & seen, found, known.poses, unit),
-        *about_left_out(scene.images.names, seen),
+    notes, warnings = [], about_left_out(names, seen)
+    if known is not None:
+        unit = 1.0 if near is None else 1.0 / near.scale
+        notes = about_noise(known.place.sigma, known.turn.sigma, unit, int((seen & ~known.gross).sum()))
+        warnings = about_gross_errors(names, known.gross & seen, found, known.poses, unit) + warnings
+        found = found.replace(pose_priors=known.priors())
+    found = found.subset(np.flatnonzero(seen), min_observations=2)
+    return PlacedPhotographs(
+        found if near is None else found.transformed(near.inverse()), tuple(notes), tuple(warnings)
     )
-    found = found.replace(pose_priors=known.priors()).subset(np.flatnonzero(seen), min_observations=2)
-    return PlacedPhotographs(found if near is None else found.transformed(near.inverse()), sentences)
 
 
 def averaged(scene: Scene, motions: Motions) -> tuple[Scene, GivenPoses]:
@@ -190,7 +194,7 @@ def _compared(poses: FloatArray, covariance: FloatArray, known: GivenPoses) -> G
     return GivenPoses(known.poses, told[0], told[1], (sigma[0], sigma[1]))
 
 
-def _with_missing_placed(photographs: PosedPhotographs, scene: Scene, say: Say) -> Scene:
+def _with_missing_placed(photographs: PosedPhotographs, scene: Scene) -> Scene:
     """Return the scene with images that see too few points placed by the points of the others."""
     poses = scene.cam_from_world
     for row in np.flatnonzero(_num_points_seen(scene) < MIN_MATCHES).tolist():
@@ -200,7 +204,7 @@ def _with_missing_placed(photographs: PosedPhotographs, scene: Scene, say: Say) 
     return scene.with_poses(poses)
 
 
-def _num_points_seen(scene: Scene) -> FloatArray:
+def _num_points_seen(scene: Scene) -> IntArray:
     return np.bincount(scene.point_observations.image_idx, minlength=scene.num_images)
 
 
@@ -221,4 +225,4 @@ def _check_motions(motions: Motions, scene: Scene) -> None:
         )
 
 
-__all__ = ["GivenPoses", "PlacedPhotographs", "PlacingGates", "averaged", "place_photographs"]
+__all__ = ["GivenPoses", "PlacingGates", "averaged", "place_photographs"]

@@ -26,10 +26,10 @@ def about_noise(place: float | None, turn: float | None, unit: float, count: int
 
 
 def about_gross_errors(
-    names: Sequence[str], place: BoolArray, turn: BoolArray, scene: Scene, given: FloatArray, unit: float
+    names: Sequence[str], gross: BoolArray, scene: Scene, given: FloatArray, unit: float
 ) -> list[str]:
     """Say which given poses were wrong, by how much, and that they were placed anew."""
-    rows = np.flatnonzero(place | turn)
+    rows = np.flatnonzero(gross)
     if not len(rows):
         return []
     poses = scene.cam_from_world[rows]
@@ -54,7 +54,7 @@ def about_left_out(names: Sequence[str], seen: BoolArray) -> list[str]:
     rows = np.flatnonzero(~seen)
     if not len(rows):
         return []
-    listed = ", ".join(names[row] for row in rows[:_NAMES].tolist())
+    listed = ", ".join([names[int(row)] for row in rows[:_NAMES]])
     more = f" and {len(rows) - _NAMES} more" if len(rows) > _NAMES else ""
     return [
         f"{len(rows)} of {len(seen)} images see too few points of the others for their poses to be checked, and were "
