@@ -35,8 +35,8 @@ from groma.features.matches import LineMatches
 from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
 from groma.gates import gate
-from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
-from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, PLACED, SCENE, SEGMENTS
+from groma.io.colmap.sfm import PointModelOptions
+from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, SCENE, SEGMENTS
 from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
@@ -54,9 +54,9 @@ from groma.mapping.photographs import (
     image_reader,
     images_left_out,
 )
-from groma.mapping.posed.place import PlacedPhotographs, place_photographs
 from groma.mapping.refine_points import PointRefinementOptions, refine_points
 from groma.mapping.result import MapResult
+from groma.mapping.start import start_of
 from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.unused import without_unused
@@ -128,12 +128,15 @@ class MapOptions:
     camera_model: str | None = None
     #: Where points are reconstructed: the parameters of the cameras if they are known, seed.
     camera_params: tuple[float, ...] | None = None
+    #: Where poses are reconstructed: ``incremental`` or ``global``, pycolmap's mappers.
+    mapper: str = "incremental"
     seed: int = 0
 
     def point_model(self, threads: bool = True) -> PointModelOptions:
         """How points are reconstructed, with or without the number of threads, on which no result depends."""
+        count = self.threads if threads else None
         return PointModelOptions(
-            self.camera_model or "SIMPLE_RADIAL", self.camera_params, self.seed, self.threads if threads else None
+            self.camera_model or "SIMPLE_RADIAL", self.camera_params, self.seed, count, self.mapper
         )
 
 
@@ -192,10 +195,7 @@ def map_images(
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
     with work_with(options.threads), Stages(Path(work), key, options, say) as stages:
-        if model is not None and not model.num_point_observations:
-            placed = stages.run(place_at_poses, folder, model, stages.place)
-        else:
-            placed = PlacedPhotographs(stages.run(find_start, folder, names, model, stages.place))
+        placed = start_of(folder, names, model, stages)
         start = placed.scene
         points = stages.run(adjust_points, start)
         if options.refine_points:
@@ -208,6 +208,7 @@ def map_images(
     result = dataclasses.replace(
         result,
         start=start,
+        num_photographs=len(names) if model is None else model.num_images,
         explanation=" ".join([*placed.notes, result.explanation]),
         warnings=(*left_out, *placed.warnings, *result.warnings),
     )
@@ -258,28 +259,6 @@ def map_segments(
 
 
 # --------------------------------------------------------------------------------------------------------------- stages
-@stage("model", SCENE, lambda options: options.point_model(threads=False))
-def find_start(
-    folder: Path,
-    names: list[str],
-    model: Scene | None,
-    place: Callable[[str], Path],
-    options: MapOptions,
-    say: StageProgress,
-) -> Scene:
-    """Poses and points: the given ones, or reconstructed from the images."""
-    return reconstruct_points(folder, place("sfm"), names, options.point_model(), say) if model is None else model
-
-
-@stage("placed", PLACED, lambda o: (o.point_model(threads=False), o.refine_poses, o.refine_intrinsics))
-def place_at_poses(
-    folder: Path, given: Scene, place: Callable[[str], Path], options: MapOptions, say: StageProgress
-) -> PlacedPhotographs:
-    """Points at given poses, and what these are worth."""
-    refine = (options.refine_poses, bool(options.refine_intrinsics))
-    return place_photographs(folder, place("sfm"), given, options.point_model(), *refine, say)
-
-
 @stage("points", SCENE, lambda options: (options.refine_poses, options.refine_intrinsics, options.max_iterations))
 def adjust_points(start: Scene, options: MapOptions, say: StageProgress) -> Scene:
     """A model whose poses and points are adjusted with robust losses."""

@@ -54,6 +54,10 @@ def map_(
         str | None,
         typer.Option(metavar="F,CX,CY,...", help="Without --model: the calibration, if it is known; it is then kept."),
     ] = None,
+    mapper: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="Without --model and --poses: place cameras incremental(ly) or global(ly)."),
+    ] = "incremental",
     line_matches: Annotated[
         Path | None,
         typer.Option(
@@ -148,6 +152,7 @@ def map_(
         max_iterations=max_iterations,
         camera_model=camera_model,
         camera_params=_parameters(camera_params),
+        mapper=mapper,
         threads=threads,
         seed=seed,
     )

@@ -13,16 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from groma import cameras as camera_models
 from groma._typing import FloatArray
 from groma.geometry import quaternion
 from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.model import from_pycolmap, to_pycolmap
+from groma.io.colmap.pairs import blocks_of_pairs
 from groma.io.colmap.quiet import quiet
 from groma.io.colmap.sfm import (
-    EXHAUSTIVE_LIMIT,
     PointModelOptions,
     Progress,
     _check_room,
@@ -30,13 +29,9 @@ from groma.io.colmap.sfm import (
     _find_features,
     _match,
     _opened,
-    pair_blocks,
 )
 from groma.scene import PosePriors, Scene
 
-#: Of more images than are matched with all others: with so many of the nearest that look the same way.
-_NEAREST = 24
-_PAIRS_IN_A_CALL = 200
 #: Matches that a pair of images, or an image and a map, must agree on: COLMAP's numbers.
 MIN_MATCHES = 15
 
@@ -223,25 +218,9 @@ def _pixels_per_radian(scene: Scene) -> float:
 
 
 def _blocks(scene: Scene) -> list[list[tuple[int, int]]]:
-    """Return the pairs to match in blocks: all of few images; else neighbours by name and by their given poses."""
-    count = scene.num_images
-    blocks = list(pair_blocks(count))
-    if count <= EXHAUSTIVE_LIMIT:
-        return blocks
-    centers = scene.cam_centers_in_world
+    """Return the pairs to match, in blocks."""
     axes = quaternion.rotate(quaternion.conjugate(scene.cam_from_world[:, :4]), np.array([0.0, 0.0, 1.0]))
-    _, near = KDTree(centers).query(centers, min(count, 2 * _NEAREST))
-    first = np.repeat(np.arange(count), len(near[0]))
-    second = near.ravel()
-    same_way = np.einsum("ij,ij->i", axes[first], axes[second]) > 0.0
-    by_name = {pair for block in blocks for pair in block}
-    by_pose = {
-        (min(i, j), max(i, j))
-        for i, j in zip(first[same_way].tolist(), second[same_way].tolist(), strict=True)
-        if i != j
-    }
-    more = sorted(by_pose - by_name)
-    return blocks + [more[start : start + _PAIRS_IN_A_CALL] for start in range(0, len(more), _PAIRS_IN_A_CALL)]
+    return blocks_of_pairs(scene.num_images, scene.cam_centers_in_world, axes)
 
 
 __all__ = ["MatchedPair", "PosedPhotographs"]

@@ -88,10 +88,13 @@ def line_end_correlation(scene: Scene) -> float:
 
     Segments of lines that few images see follow their line and are left out; where no others are, it is zero.
     """
-    problem = assemble(scene, AssemblyOptions(points=False, planes=False)).problem
+    assembly = assemble(scene, AssemblyOptions(points=False, planes=False))
+    problem = assembly.problem
     images = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
     ends = [np.zeros((0, 2))]
-    for factor in problem.factors:
+    for factor, group in zip(problem.factors, assembly.groups, strict=True):
+        if group.observes != "lines":
+            continue
         told = images[factor.line.index] >= GATES.min_views  # type: ignore[attr-defined]
         residual, unit = residuals_of(factor, problem.variables), np.asarray(factor.sqrt_information)
         # Where a camera sees behind itself, each end has a weight of its own.
