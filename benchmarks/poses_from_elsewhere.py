@@ -4,14 +4,15 @@
     python benchmarks/poses_from_elsewhere.py SCENE ...
     python benchmarks/poses_from_elsewhere.py SCENE ... --draws 10 --cases phone "drone, 10 % wrong" --no-lines
 
-SCENE is a folder with ``images/`` and the survey ``sparse_gt/``, a COLMAP model. The surveyed poses are disturbed, written
-to a ``transforms.json`` and read back, and the photographs are mapped at them; no points are given. Cases: *phone*, 5 cm
-and 0.5 degrees in each coordinate; *drone*, 0.5 m and 3 degrees; and both with a tenth of the poses grossly wrong: turned by
-about a radian about each axis, at random places as spread as the cameras.
+SCENE is a folder with ``images/`` and the survey ``sparse_gt/``, a COLMAP model. The surveyed poses are disturbed,
+written to a ``transforms.json`` and read back, and the photographs are mapped at them; no points are given. Cases:
+*phone*, 5 cm and 0.5 degrees in each coordinate; *drone*, 0.5 m and 3 degrees; and both with a tenth of the poses
+grossly wrong: turned by about a radian about each axis, at random places as spread as the cameras.
 
 A row says, over the draws: root mean square and largest distance of the centres from the survey after alignment
-(thousandths of a unit), of the points' adjustment and of the whole map; the noise that was found; and how many of the
-wrong poses were named, and how many right ones. Features and matches are the same for all draws and made once.
+(thousandths of a unit), of the points' adjustment and of the whole map; the noise that was found; how many of the wrong
+poses were named, how many right ones were, and how many images were left out. Features and matches are the same for all
+draws and made once.
 """
 
 import argparse
@@ -130,7 +131,7 @@ def main() -> None:
     parser.add_argument("--no-lines", action="store_true", help="End with the adjustment of points.")
     parser.add_argument("--work", type=Path, help="Keep features and matches here, a folder for each scene.")
     told = parser.parse_args()
-    head = "scene | case | draws | points: rms mean / max | map | noise found, units / degrees | named | accused | left out"
+    head = "scene | case | draws | points: rms mean / max | map | noise, units / degrees | named | accused | left out"
     print(f"| {head} |\n|" + "---|" * 9, flush=True)
     with tempfile.TemporaryDirectory() as own:
         for folder in told.scenes:

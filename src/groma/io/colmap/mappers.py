@@ -76,8 +76,10 @@ def map_incrementally(task: Task, say: Say) -> list[Any]:
     others = _incremental(task, options, say)
     if _most(others) <= _most(models):
         return models
+    adjusting = task.pycolmap.BundleAdjustmentOptions()
+    adjusting.print_summary = False
     for model in others if not task.calibrated else []:
-        task.pycolmap.bundle_adjustment(model)
+        task.pycolmap.bundle_adjustment(model, adjusting)
     return others
 
 

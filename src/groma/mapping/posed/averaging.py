@@ -44,9 +44,14 @@ _MEDIAN, _QUARTILE = 2.366, 1.213
 class AveragingGates:
     """How motions and given poses are weighed against each other."""
 
-    huber_steps: int = gate(15, "steps", "under Huber's loss", "cost: converged before")
-    last_steps: int = gate(15, "steps", "under Geman and McClure's loss", "cost: converged before")
+    steps: int = gate(15, "steps", "under each of the two losses", "cost: converged before")
     scale: float = gate(4.0, "sigma", "of the last loss: where a motion or a pose is doubted", "convention: four sigma")
+    odd: float = gate(
+        3.0,
+        "ratio",
+        "to the median disagreement of a place with its neighbours: it starts elsewhere",
+        "convention: three",
+    )
     least_redundancy: float = gate(
         0.05, "share", "below which a pose's residual tells nothing about its error", "convention: of geodesy"
     )
@@ -70,88 +75,99 @@ class Averaged:
     kept: FloatArray
 
 
+#: Differences of motions, of given values, and the lengths by which the former are divided.
+_Residuals = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+#: From values and weights of motions and of given ones: new values and the diagonal of the inverse normal matrix.
+_Solved = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+_Loss = Callable[[FloatArray], FloatArray]
+
+
 def average_rotations(given: FloatArray, motions: Motions) -> Averaged:
     """Return rotations (N, 4) that agree with motions and with given ones."""
-    rotations = _voted(given, motions)
-    first, second = motions.first, motions.second
+    first, second, counts = motions.first, motions.second, np.ones(len(given), bool)
 
-    def residuals(delta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        now = quaternion.multiply(rotations, quaternion.exp(delta))
+    def residuals(now: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         between = quaternion.multiply(now[second], quaternion.conjugate(now[first]))
         off = quaternion.log(quaternion.multiply(between, quaternion.conjugate(motions.rotation)))
         in_world = quaternion.rotate(quaternion.conjugate(now[second]), off)
         return in_world, quaternion.log(quaternion.multiply(quaternion.conjugate(given), now)), np.ones(len(first))
 
-    def solved(delta: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
-        nonlocal rotations
-        off, own, _ = residuals(delta)
-        system, count = splu(_laplacian(first, second, weight, prior)), len(given)
-        right = np.zeros((count, 3))
+    def solved(now: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+        off, own, _ = residuals(now)
+        system, right = splu(_laplacian(first, second, weight, prior)), -prior[:, None] * own
         np.add.at(right, second, -weight[:, None] * off)
         np.add.at(right, first, weight[:, None] * off)
-        right -= prior[:, None] * own
-        rotations = quaternion.multiply(rotations, quaternion.exp(system.solve(right)))
-        return np.zeros_like(delta), np.diag(system.solve(np.eye(count)))
+        new = quaternion.multiply(now, quaternion.exp(system.solve(right)))
+        return new, np.diag(system.solve(np.eye(len(given))))
 
-    found = _reweighted(np.zeros((len(given), 3)), residuals, solved, motions.rotation_sigma)
-    return Averaged(rotations, *found[1:])
+    found = _reweighted(_voted(given, motions), residuals, solved, motions.rotation_sigma, counts, _huber)
+    return _reweighted(found.values, residuals, solved, motions.rotation_sigma, counts, _geman_mcclure, found.sigma)
 
 
 def average_centers(given: FloatArray, rotations: FloatArray, motions: Motions, held: BoolArray) -> Averaged:
     """Return centres (N, 3) that agree with motions and with given ones; those not ``held`` are known to be wrong."""
     first, second = motions.first, motions.second
     direction = quaternion.rotate(quaternion.conjugate(rotations[second]), motions.direction)
-    start = _crossed(given, direction, motions, held)
     least = 1e-3 * float(np.median(np.linalg.norm(given[first] - given[second], axis=1))) + 1e-12
 
-    def residuals(centers: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        between = centers[first] - centers[second]
-        length = np.maximum(np.linalg.norm(between, axis=1, keepdims=True), least)
-        along = np.einsum("ij,ij->i", between, direction)[:, None]
-        return (between - np.maximum(along, 0.0) * direction) / length, centers - given, length[:, 0]
+    def averaged(start: FloatArray, loss: _Loss, sigma: float | None) -> Averaged:
+        # Lengths stay during a stage: else places far away, where every angle is small, would look right.
+        length = np.maximum(np.linalg.norm(start[first] - start[second], axis=1), least)
 
-    def solved(centers: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
-        between = centers[first] - centers[second]
-        length = np.maximum(np.linalg.norm(between, axis=1), least)
-        ahead = np.einsum("ij,ij->i", between, direction) > 0.0
-        blocks = np.eye(3) - np.where(ahead, 1.0, 0.0)[:, None, None] * direction[:, :, None] * direction[:, None, :]
-        system = splu(_block_laplacian(first, second, (weight / length**2)[:, None, None] * blocks, prior))
-        diagonal = np.diag(system.solve(np.eye(3 * len(given)))).reshape(-1, 3).mean(axis=1)
-        return _as_large(system.solve((prior[:, None] * given).ravel()).reshape(-1, 3), given, prior), diagonal
+        def residuals(centers: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+            between = centers[first] - centers[second]
+            along = np.einsum("ij,ij->i", between, direction)[:, None]
+            return (between - np.maximum(along, 0.0) * direction) / length[:, None], centers - given, length
 
-    return Averaged(*_reweighted(start, residuals, solved, motions.direction_sigma, held))
+        def solved(centers: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+            ahead = np.einsum("ij,ij->i", centers[first] - centers[second], direction) > 0.0
+            along = np.where(ahead, 1.0, 0.0)[:, None, None] * direction[:, :, None] * direction[:, None, :]
+            blocks = (weight / length**2)[:, None, None] * (np.eye(3) - along)
+            system = splu(_block_laplacian(first, second, blocks, prior))
+            diagonal = np.diag(system.solve(np.eye(3 * len(given)))).reshape(-1, 3).mean(axis=1)
+            new = system.solve((prior[:, None] * given).ravel()).reshape(-1, 3)
+            return _as_large(new, given, prior), diagonal
+
+        return _reweighted(start, residuals, solved, motions.direction_sigma, held, loss, sigma)
+
+    found = averaged(_crossed(given, direction, motions, held), _huber, None)
+    return averaged(found.values, _geman_mcclure, found.sigma)
 
 
 def _reweighted(
-    start: FloatArray,
-    residuals: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]],
-    solved: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]],
+    values: FloatArray,
+    residuals: _Residuals,
+    solved: _Solved,
     sigma: FloatArray,
-    held: BoolArray | None = None,
-) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:
-    """Solve by reweighting; return values, residuals and noise of the given ones, redundancy, and what was kept."""
-    counts = np.ones(len(start), bool) if held is None else held
-    values, redundancy, kept = start, np.ones(len(start)), np.ones(len(sigma))
-    off, own, size = residuals(values)
-    noise = max(float(np.median(np.linalg.norm(own[counts], axis=1))), 1e-9) if counts.any() else 1.0
-    for step in range(GATES.huber_steps + GATES.last_steps):
+    counts: BoolArray,
+    loss: _Loss,
+    noise: float | None = None,
+) -> Averaged:
+    """Solve by reweighting under a loss, from ``values`` on; ``noise`` is that of the given ones, if it is known."""
+    redundancy, kept = np.ones(len(values)), np.ones(len(sigma))
+    off, own, length = residuals(values)
+    if noise is None:
+        noise = max(float(np.median(np.linalg.norm(own[counts], axis=1))), 1e-9) if counts.any() else 1.0
+    for _ in range(GATES.steps):
         ratio = np.linalg.norm(off, axis=1) / sigma
         # Of repeated structure most motions are wrong: the quartile, not the median.
         spread = max(1.0, float(np.sqrt(np.quantile(ratio**2, 0.25) / _QUARTILE)))
         # A pose that claims to be far better than the motions would outvote any number of them.
-        used = max(noise, spread * float(np.median(sigma * size)))
-        ratio, of_prior = ratio / spread, np.linalg.norm(own, axis=1) / used
-        last = step >= GATES.huber_steps
-        kept = _geman_mcclure(ratio) if last else 1.0 / np.maximum(ratio, 1.0)
-        trust = np.where(counts, _geman_mcclure(of_prior) if last else 1.0 / np.maximum(of_prior, 1.0), 1e-6)
+        used = max(noise, spread * float(np.median(sigma * length)))
+        kept = loss(ratio / spread)
+        trust = np.where(counts, loss(np.linalg.norm(own, axis=1) / used), 1e-6)
         values, diagonal = solved(values, kept / (spread * sigma) ** 2, trust / used**2)
         redundancy = np.clip(1.0 - trust / used**2 * diagonal, 0.0, 1.0)
-        off, own, size = residuals(values)
+        off, own, length = residuals(values)
         counted = counts & (redundancy > GATES.least_redundancy)
         if 2 * counted.sum() > counts.sum():  # else the given ones are too good for motions to tell their noise
             squares = np.sum(own[counted] ** 2, axis=1) / redundancy[counted]
             noise = max(float(np.sqrt(np.median(squares) / _MEDIAN)), 1e-9)
-    return values, own, noise, redundancy, kept
+    return Averaged(values, own, noise, redundancy, kept)
+
+
+def _huber(ratio: FloatArray) -> FloatArray:
+    return 1.0 / np.maximum(ratio, 1.0)
 
 
 def _as_large(centers: FloatArray, given: FloatArray, weight: FloatArray) -> FloatArray:
@@ -207,17 +223,19 @@ def _median_rotation(proposed: FloatArray) -> FloatArray:
 
 def _crossed(given: FloatArray, direction: FloatArray, motions: Motions, held: BoolArray) -> FloatArray:
     """Return centres, those that contradict their neighbours moved to where the directions from these cross."""
-    centers = given.copy()
+    centers, rays, off = given.copy(), [], np.full(len(given), np.nan)
     ends = ((motions.first, motions.second, direction), (motions.second, motions.first, -direction))
     for row in range(len(given)):
         others = np.concatenate([other[own == row] for own, other, _ in ends])
         ways = np.concatenate([way[own == row] for own, _, way in ends])
-        usable = held[others]
-        if usable.sum() < 2:
-            continue
-        at, way = given[others[usable]], ways[usable]
-        crossing = _intersection(at, way)
-        if not held[row] or _disagreement(crossing, at, way) < 0.5 * _disagreement(given[row], at, way):
+        rays.append((given[others[held[others]]], ways[held[others]]))
+        if len(rays[row][0]) >= 2:
+            off[row] = _disagreement(given[row], *rays[row])
+    # Few rays always cross somewhere: only what disagrees more than others is moved.
+    usual = np.nanmedian(off) if np.isfinite(off).any() else 0.0
+    for row in np.flatnonzero(np.isfinite(off) & (~held | (off > GATES.odd * usual))).tolist():
+        crossing = _intersection(*rays[row])
+        if _disagreement(crossing, *rays[row]) < 0.5 * off[row]:
             centers[row] = crossing
     return centers
 

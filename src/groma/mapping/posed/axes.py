@@ -27,6 +27,9 @@ from groma.geometry import quaternion
 from groma.mapping.posed.motions import Motions
 from groma.scene import Scene
 
+#: Metres of a degree of latitude.
+_DEGREE = 111_195.0
+
 
 @dataclass(frozen=True)
 class AxesGates:
@@ -145,6 +148,15 @@ def readings(rotation: FloatArray, centers: FloatArray) -> Iterator[Reading]:
     for axes in _signed_permutations():
         if not np.array_equal(axes, np.eye(3)):
             yield Reading(_place_words(axes), rotation, centers @ axes.T)
+    for order, words in (((0, 1), "latitudes and longitudes"), ((1, 0), "longitudes and latitudes")):
+        latitude, longitude = centers[:, order[0]], centers[:, order[1]]
+        if np.abs(latitude).max() <= 90.0 and np.abs(longitude).max() <= 180.0:
+            east = np.cos(np.radians(np.median(latitude))) * longitude
+            yield Reading(
+                f"the places are {words} in degrees with heights in metres; pass metres to the east, north and up",
+                rotation,
+                np.stack([_DEGREE * east, _DEGREE * latitude, centers[:, 2]], axis=1),
+            )
 
 
 def _signed_permutations() -> Iterator[FloatArray]:

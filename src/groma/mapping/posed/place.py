@@ -121,7 +121,7 @@ def place_photographs(
     photographs.match(say)
     motions = motions_of(photographs.pairs())
     _check_motions(motions, scene)
-    check_axes(scene, motions)
+    check_axes(alone, motions)
     if not refine_poses:
         say("placing points at the poses", 0, 1)
         return _told(photographs.triangulate(scene, GATES.tolerances_px[-1]), None, near)
