@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The directive ``drawn``: a figure of the mathematics, drawn when the pages are built, by groma's own functions.
 
-``drawn NAME`` draws the function NAME of this module; its docstring is the caption. Nothing is drawn by hand: charts are
-moved by ``retract``, pixels come from the camera models, weights from the losses.
+``drawn NAME`` draws the function NAME of this module; its docstring is the caption. Nothing is drawn by hand: charts
+are moved by ``retract``, pixels come from the camera models, weights from the losses.
 """
 
 from collections.abc import Callable
