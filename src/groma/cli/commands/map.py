@@ -181,8 +181,8 @@ def _start(
     given = scene_at_poses(images, poses, options.point_model())
     for sentence in given.sentences:
         console.say(sentence)
-    if given.calibrated:
-        return given.scene, options
+    if given.calibrated:  # a model that came with parameters is the one of the scene
+        return given.scene, options if options.camera_params is None else replace(options, camera_model=None)
     return given.scene, replace(options, camera_model=None, refine_intrinsics=options.refine_intrinsics is not False)
 
 

@@ -76,10 +76,8 @@ def map_incrementally(task: Task, say: Say) -> list[Any]:
     others = _incremental(task, options, say)
     if _most(others) <= _most(models):
         return models
-    adjusting = task.pycolmap.BundleAdjustmentOptions()
-    adjusting.print_summary = False
     for model in others if not task.calibrated else []:
-        task.pycolmap.bundle_adjustment(model, adjusting)
+        _free_calibration(task.pycolmap, model)
     return others
 
 
@@ -97,6 +95,18 @@ def map_globally(task: Task, say: Say) -> list[Any]:
 
 #: By the name that a user says.
 MAPPERS: dict[str, Callable[[Task, Say], list[Any]]] = {"incremental": map_incrementally, "global": map_globally}
+
+
+def _free_calibration(pycolmap: Any, model: Any) -> None:
+    """Adjust a model with its focal lengths and distortion; pycolmap's function for that writes to the terminal."""
+    options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = 1
+    for number, image in model.images.items():
+        if image.has_pose:
+            config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
 def _most(models: list[Any]) -> int:

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array, csc_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
@@ -38,6 +38,8 @@ from groma.mapping.posed.motions import Motions
 
 #: Median and lower quartile of a squared normalised residual of three coordinates.
 _MEDIAN, _QUARTILE = 2.366, 1.213
+#: Columns of an inverse that are computed at a time.
+_COLUMNS = 256
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class AveragingGates:
     """How motions and given poses are weighed against each other."""
 
     steps: int = gate(15, "steps", "under each of the two losses", "cost: converged before")
+    noise_steps: int = gate(3, "steps", "after which the noise is estimated again", "cost: it needs an inverse")
     scale: float = gate(4.0, "sigma", "of the last loss: where a motion or a pose is doubted", "convention: four sigma")
     odd: float = gate(
         3.0,
@@ -77,8 +80,8 @@ class Averaged:
 
 #: Differences of motions, of given values, and the lengths by which the former are divided.
 _Residuals = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
-#: From values and weights of motions and of given ones: new values and the diagonal of the inverse normal matrix.
-_Solved = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+#: From values and weights of motions and of given ones: new values and the factors of the normal matrix.
+_Solved = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, SuperLU]]
 _Loss = Callable[[FloatArray], FloatArray]
 
 
@@ -92,13 +95,12 @@ def average_rotations(given: FloatArray, motions: Motions) -> Averaged:
         in_world = quaternion.rotate(quaternion.conjugate(now[second]), off)
         return in_world, quaternion.log(quaternion.multiply(quaternion.conjugate(given), now)), np.ones(len(first))
 
-    def solved(now: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def solved(now: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, SuperLU]:
         off, own, _ = residuals(now)
         system, right = splu(_laplacian(first, second, weight, prior)), -prior[:, None] * own
         np.add.at(right, second, -weight[:, None] * off)
         np.add.at(right, first, weight[:, None] * off)
-        new = quaternion.multiply(now, quaternion.exp(system.solve(right)))
-        return new, np.diag(system.solve(np.eye(len(given))))
+        return quaternion.multiply(now, quaternion.exp(system.solve(right))), system
 
     found = _reweighted(_voted(given, motions), residuals, solved, motions.rotation_sigma, counts, _huber)
     return _reweighted(found.values, residuals, solved, motions.rotation_sigma, counts, _geman_mcclure, found.sigma)
@@ -119,14 +121,13 @@ def average_centers(given: FloatArray, rotations: FloatArray, motions: Motions, 
             along = np.einsum("ij,ij->i", between, direction)[:, None]
             return (between - np.maximum(along, 0.0) * direction) / length[:, None], centers - given, length
 
-        def solved(centers: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+        def solved(centers: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, SuperLU]:
             ahead = np.einsum("ij,ij->i", centers[first] - centers[second], direction) > 0.0
             along = np.where(ahead, 1.0, 0.0)[:, None, None] * direction[:, :, None] * direction[:, None, :]
             blocks = (weight / length**2)[:, None, None] * (np.eye(3) - along)
             system = splu(_block_laplacian(first, second, blocks, prior))
-            diagonal = np.diag(system.solve(np.eye(3 * len(given)))).reshape(-1, 3).mean(axis=1)
             new = system.solve((prior[:, None] * given).ravel()).reshape(-1, 3)
-            return _as_large(new, given, prior), diagonal
+            return _as_large(new, given, prior), system
 
         return _reweighted(start, residuals, solved, motions.direction_sigma, held, loss, sigma)
 
@@ -148,7 +149,7 @@ def _reweighted(
     off, own, length = residuals(values)
     if noise is None:
         noise = max(float(np.median(np.linalg.norm(own[counts], axis=1))), 1e-9) if counts.any() else 1.0
-    for _ in range(GATES.steps):
+    for step in range(1, GATES.steps + 1):
         ratio = np.linalg.norm(off, axis=1) / sigma
         # Of repeated structure most motions are wrong: the quartile, not the median.
         spread = max(1.0, float(np.sqrt(np.quantile(ratio**2, 0.25) / _QUARTILE)))
@@ -156,14 +157,28 @@ def _reweighted(
         used = max(noise, spread * float(np.median(sigma * length)))
         kept = loss(ratio / spread)
         trust = np.where(counts, loss(np.linalg.norm(own, axis=1) / used), 1e-6)
-        values, diagonal = solved(values, kept / (spread * sigma) ** 2, trust / used**2)
-        redundancy = np.clip(1.0 - trust / used**2 * diagonal, 0.0, 1.0)
+        values, system = solved(values, kept / (spread * sigma) ** 2, trust / used**2)
         off, own, length = residuals(values)
+        if step % GATES.noise_steps:
+            continue
+        redundancy = np.clip(1.0 - trust / used**2 * _inverse_diagonal(system, len(values)), 0.0, 1.0)
         counted = counts & (redundancy > GATES.least_redundancy)
         if 2 * counted.sum() > counts.sum():  # else the given ones are too good for motions to tell their noise
             squares = np.sum(own[counted] ** 2, axis=1) / redundancy[counted]
             noise = max(float(np.sqrt(np.median(squares) / _MEDIAN)), 1e-9)
     return Averaged(values, own, noise, redundancy, kept)
+
+
+def _inverse_diagonal(system: SuperLU, count: int) -> FloatArray:
+    """Return the mean of the diagonal of the inverse over the coordinates of each of so many quantities."""
+    size = system.shape[0]
+    parts = []
+    for start in range(0, size, _COLUMNS):
+        rows = np.arange(start, min(start + _COLUMNS, size))
+        unit = np.zeros((size, len(rows)))
+        unit[rows, rows - start] = 1.0
+        parts.append(system.solve(unit)[rows, rows - start])
+    return np.concatenate(parts).reshape(count, -1).mean(axis=1)
 
 
 def _huber(ratio: FloatArray) -> FloatArray:
