@@ -73,7 +73,7 @@ def test_other_files_are_refused(tmp_path, scene, found):
     with pytest.raises(InputError, match=r"\.npz"):
         read_covariances(tmp_path / "c.json", scene)
     np.savez(tmp_path / "other.npz", points=np.zeros((2, 3)))
-    with pytest.raises(FileFormatError, match="missing|shape"):
+    with pytest.raises(FileFormatError, match=r"missing|shape"):
         read_covariances(tmp_path / "other.npz", scene)
     strange = exact_scene(("x.jpg", "y.jpg"))
     strange = strange.keep(planes=[]).replace(

@@ -276,6 +276,11 @@ def test_the_summary_of_a_map_stands_in_the_page(tmp_path):
     for words in ("It went well.", "Mind the gap.", "Three of three.", "Convergence"):
         assert words in text
     assert [bool(entry["photo"]) for entry in _data(text)["images"]] == [True, False]
+    assert _floats(_data(text)["lines"]["confidence"]).tolist() == [-1] * 4  # a COLMAP model does not know it
+    sure = exact_scene()
+    write_scene(sure.replace(lines=sure.lines.replace(confidence=np.full(4, 0.5))), tmp_path / "map" / "scene.npz")
+    assert run(["report", str(tmp_path / "map"), "-o", str(page), "-f"]) == 0
+    assert _floats(_data(page.read_text(encoding="utf-8"))["lines"]["confidence"]).tolist() == [0.5] * 4
     assert run(["report", str(tmp_path / "map"), "-o", str(page), "-f", "--images", str(tmp_path / "none")]) != 0
     for content in ("no json", "[]"):
         (tmp_path / "map" / "summary.json").write_text(content)

@@ -42,7 +42,7 @@ def folder_of_images(model: str | os.PathLike[str], names: Iterable[str]) -> Pat
     ----------
     model : path
         A folder or file of a model. Folders that are tried: the one that ``summary.json`` in it names, as ``groma map``
-        writes it; then ``images`` in the model, beside it, and one and two folders higher, as COLMAP's projects have it.
+        writes it; then ``images`` in the model, beside it, and one and two folders higher, as in COLMAP's projects.
     names : iterable of str
         Names of the images; the folder holds one of the first hundred at least.
     """

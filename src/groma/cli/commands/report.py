@@ -42,7 +42,7 @@ def report(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.input import check_inputs, whole_scene
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target, file=True)
@@ -58,7 +58,7 @@ def report(
 
     if images is not None and not images.is_dir():
         raise InputError(f"{images} is not a folder of images. Check --images.")
-    scene = read_scene(source)
+    scene = read_scene(whole_scene(source))
     earlier = read_scene(before) if before is not None else None
     if images is not None and scene.num_images and not any(image_file(images, name) for name in scene.images.names):
         console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[0]!r}.")

@@ -19,7 +19,7 @@ def view(
         typer.Option(
             "--images",
             metavar="DIR",
-            help="Folder of the photographs. Default: what the summary of INPUT names, or a folder images near it.",
+            help="Folder of the photographs. Default: the one that groma map noted, or a folder images near INPUT.",
         ),
     ] = None,
     port: Annotated[
@@ -42,7 +42,7 @@ def view(
 
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.input import check_inputs, whole_scene
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
@@ -57,7 +57,7 @@ def view(
     from groma.viz.pictures import folder_of_images
     from groma.viz.viewer.scene import serving, wait_for_interrupt
 
-    scene = read_scene(source)
+    scene = read_scene(whole_scene(source))
     console.say(sentence_of(scene))
     if images is None and (images := folder_of_images(source, scene.images.names)) is not None:
         console.say(f"Photographs: {images}")
