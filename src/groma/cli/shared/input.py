@@ -7,7 +7,7 @@ from groma.errors import InputError
 
 
 def whole_scene(source: Path) -> Path:
-    """Return the archive in the folder of a map or track, which knows more than the COLMAP model there; or the source."""
+    """Return the archive in the folder of a map or track (it holds more than the COLMAP model there), or the source."""
     archive = source / "scene.npz"
     return archive if archive.is_file() and (source / "summary.json").is_file() else source
 
