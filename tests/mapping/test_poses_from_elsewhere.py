@@ -200,7 +200,8 @@ def test_photographs_are_mapped_at_the_poses_of_a_file(photographed, tmp_path, m
     assert np.linalg.norm(found.cam_centers_in_world - scene.cam_centers_in_world, axis=1).max() < 0.15
     words = json.loads((tmp_path / "out" / "summary.json").read_text())["warnings"]
     assert any("0002.png" in sentence for sentence in words)
-    assert run([*command, "--model", "out"]) == 1 or "exclude each other" in capsys.readouterr().err
+    assert run([*command, "--model", "out", "--force"]) == 1
+    assert "--model and --poses exclude each other" in capsys.readouterr().err
 
 
 def test_poses_that_are_held_stay(photographed, tmp_path, monkeypatch):
