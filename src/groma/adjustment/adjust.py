@@ -11,11 +11,12 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import FloatArray
-from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, at_places_of, disassemble
+from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, disassemble
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.fit import inliers, noise_of
 from groma.adjustment.lens import unmodelled_distortion
 from groma.adjustment.pixel_residuals import redundancy_of, squared_residuals_px
+from groma.adjustment.places import at_places_of
 from groma.adjustment.relation_outcome import drop_failed_relations
 from groma.adjustment.report import AdjustReport, AdjustResult, Progress, not_converged
 from groma.adjustment.rescue.clusters import settle_clusters

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.assemble import AssemblyOptions, assemble, at_places_of, first_camera_gauge
+from groma.adjustment.assemble import AssemblyOptions, assemble, first_camera_gauge
+from groma.adjustment.places import at_places_of
 from groma.errors import InputError, ProblemError
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables

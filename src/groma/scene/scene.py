@@ -14,6 +14,8 @@ all references are checked when it is made. Every change gives a new scene.
     point_depths       -> images, points          right_columns -> point_observations
     plane_observations -> images, planes          line_depths   -> line_observations
     pose_priors        -> frames                  line_intervals -> lines
+    camera_positions   -> images                  marks -> images, control_points
+    camera_distances   -> images                  point_distances -> control_points
 
 Each column declares in its table what it refers to and how it changes when the world moves (see
 :func:`groma.scene.table.column`); checks, selections and transforms here go by that.
@@ -21,7 +23,7 @@ Each column declares in its table what it refers to and how it changes when the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
@@ -38,6 +40,7 @@ from groma.scene.line_intervals import LineIntervals
 from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
+from groma.scene.survey import CameraDistances, CameraPositions, ControlPoints, Marks, PointDistances
 from groma.scene.table import check_index, check_quaternions, moved_column, new_index_of, references, rows_of
 
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
@@ -85,6 +88,13 @@ class Scene:
     plane_observations: PlaneObservations = field(default_factory=PlaneObservations)
     #: Poses known beforehand.
     pose_priors: PosePriors = field(default_factory=PosePriors)
+    #: Measured places of cameras, and distances between them.
+    camera_positions: CameraPositions = field(default_factory=CameraPositions)
+    camera_distances: CameraDistances = field(default_factory=CameraDistances)
+    #: Control and check points, where they are in the images, and distances between them.
+    control_points: ControlPoints = field(default_factory=ControlPoints)
+    marks: Marks = field(default_factory=Marks)
+    point_distances: PointDistances = field(default_factory=PointDistances)
 
     def __post_init__(self) -> None:
         for name, column, side, target in references(Scene):
@@ -208,15 +218,27 @@ class Scene:
     @property
     def num_measurements(self) -> dict[str, int]:
         """Numbers of measurements besides those of points and lines in images, by kind; only kinds that there are."""
-        kinds = {"point depths": self.point_depths, "right columns": self.right_columns}
+        kinds: dict[str, Sized] = {"point depths": self.point_depths, "right columns": self.right_columns}
         kinds |= {"line depths": self.line_depths, "plane observations": self.plane_observations}
-        kinds |= {"pose priors": self.pose_priors}
+        kinds |= {"pose priors": self.pose_priors, "camera positions": self.camera_positions}
+        kinds |= {"control points": self.control_points, "marks": self.marks}
+        kinds |= {"distances": (*self.camera_distances.distance, *self.point_distances.distance)}
         return {name: len(table) for name, table in kinds.items() if len(table)}
 
     @property
     def is_metric(self) -> bool:
         """Whether anything measured in the cameras tells the scale: depths, stereo pairs, planes."""
         return any(map(len, (self.point_depths, self.right_columns, self.line_depths, self.plane_observations)))
+
+    @property
+    def is_surveyed(self) -> bool:
+        """Whether positions of cameras or control points tell where the scene is, and its scale."""
+        return len(self.camera_positions) + int(self.control_points.is_control.sum()) > 1
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether anything measured tells the scale."""
+        return self.is_metric or self.is_surveyed or len(self.camera_distances) + len(self.point_distances) > 0
 
     # Poses
 
