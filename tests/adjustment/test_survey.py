@@ -14,12 +14,15 @@ from _survey import ELSEWHERE, MARK_PX, SIGMA, control, distances, made, on_rigs
 import groma
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.parts import adjust_parts, join_parts, write_parts
 from groma.adjustment.places import at_places_of
 from groma.adjustment.survey.attach import Survey, with_survey
 from groma.adjustment.survey.names import rows_by_name
 from groma.adjustment.survey.reliability import noncentrality, reliability
 from groma.adjustment.survey.similarity import robust_similarity
 from groma.errors import InputError
+from groma.factors.losses import Trivial
+from groma.io.archive import read_archive
 from groma.io.survey import ControlFile, CoordinateSystem, DistancesFile, Places
 from groma.problem.residuals import jacobians_of, residuals_of
 from groma.scene import CameraPositions, Similarity
@@ -57,7 +60,7 @@ def control_file(truth, rng, normalized=False):
 
 
 def test_positions_bring_a_scene_into_their_frame(truth_and_start):
-    truth, start = truth_and_start
+    truth, _ = truth_and_start
     given = measured_positions(truth, np.random.default_rng(5))
     found = with_survey(truth.transformed(ELSEWHERE), Survey(positions=given))
     off = found.scene.cam_centers_in_world - truth.cam_centers_in_world
@@ -371,6 +374,21 @@ def test_positions_are_of_cameras_not_of_their_rigs(truth_and_start):
     for factor in problem.factors:
         np.testing.assert_allclose(residuals_of(factor, problem.variables), 0.0, atol=1e-12)
     assert len(problem.factors) == 1
+
+
+def test_parts_are_the_whole(truth_and_start, tmp_path):
+    """What other instruments measured is in the first part and counts once."""
+    scene = with_everything(truth_and_start[0], np.random.default_rng(0))
+    scene = scene.replace(point_distances=type(scene.point_distances)())
+    whole = adjust(scene, LEAST_SQUARES)
+    paths = write_parts(scene, tmp_path / "parts", observations=150)
+    assert len(paths) > 2
+    assert sum(len(read_archive(path).marks) for path in paths) == len(read_archive(paths[0]).marks) == len(scene.marks)
+    result = adjust_parts(paths, tmp_path / "adjusted", Trivial(), point_sigma_px=0.5)
+    assert result.report.final_cost == pytest.approx(whole.report.solve.final_cost, rel=1e-6)
+    joined = join_parts([tmp_path / "adjusted" / path.name for path in paths])
+    np.testing.assert_allclose(joined.cam_centers_in_world, whole.scene.cam_centers_in_world, atol=1e-4)
+    np.testing.assert_allclose(joined.control_points.xyz, whole.scene.control_points.xyz, atol=1e-4)
 
 
 def test_measurements_hold_the_gauge(truth_and_start):
