@@ -31,6 +31,7 @@ from groma.adjustment.stages import (
     with_costs_at,
     with_loss,
 )
+from groma.adjustment.survey.place import settled
 from groma.adjustment.terms.contract import Term
 from groma.errors import InputError
 from groma.factors.losses import GemanMcClure, Loss, Trivial
@@ -161,10 +162,21 @@ def adjust(
         scene, options = _in_model(scene, options, options.camera_model, progress)
     near = local_frame(scene)
     if near is None:
-        return _adjusted(scene, options, progress)
-    result = _adjusted(scene.transformed(near), options, progress)
+        return _settled(scene, options, progress)
+    result = _settled(scene.transformed(near), options, progress)
     back = result.scene.transformed(near.inverse())
     return replace(result, scene=back, problem=result.problem and at_places_of(result.problem, back))
+
+
+def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
+    """Adjust a scene that begins and ends where measurements of other instruments fit best."""
+    if not (scene.is_surveyed and options.refine_poses):
+        return _adjusted(scene, options, progress)
+    result = _adjusted(settled(scene), options, progress)
+    after = settled(result.scene)
+    problem = result.problem and at_places_of(result.problem, after, shifted=False)
+    solve = with_costs_at(result.report.solve, problem) if problem else result.report.solve
+    return AdjustResult(after, replace(result.report, solve=solve), problem)
 
 
 def _in_model(

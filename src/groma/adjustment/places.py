@@ -19,10 +19,11 @@ from groma.problem.problem import Problem
 from groma.scene import Scene
 
 
-def at_places_of(problem: Problem, scene: Scene) -> Problem:
-    """Return the problem with frames and landmarks where a scene has them: the same one, its world shifted.
+def at_places_of(problem: Problem, scene: Scene, shifted: bool = True) -> Problem:
+    """Return the problem with frames and landmarks where a scene has them.
 
-    What factors measure in the world is shifted with it.
+    Where that is the same scene, its world shifted, what factors measure in the world is shifted with it; not if only
+    the scene moved.
     """
     variables = dict(problem.variables)
     for name in variables.keys() & {"frames", "points", "lines", "planes", "control_points"}:
@@ -36,7 +37,7 @@ def at_places_of(problem: Problem, scene: Scene) -> Problem:
         else:
             state = group.manifold.from_ambient(scene.lines.plucker if name == "lines" else scene.planes.hesse)
         variables[name] = group.with_state(state)
-    if "frames" not in variables or not any(isinstance(factor, _IN_WORLD) for factor in problem.factors):
+    if not shifted or "frames" not in variables or not any(isinstance(factor, _IN_WORLD) for factor in problem.factors):
         return Problem(variables, problem.factors)
     before, after = (se3.inverse(group["frames"].state)[:, 4:] for group in (problem.variables, variables))
     shift = np.median(after - before, axis=0)

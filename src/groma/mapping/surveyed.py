@@ -18,9 +18,12 @@ from groma.adjustment.survey.reliability import Reliability, reliability
 from groma.errors import ProblemError
 from groma.gates import gate
 from groma.io.survey import WorldFrame
+from groma.mapping.checkpoint_files import SCENE
+from groma.mapping.checkpoints import stage
 from groma.mapping.noise.observations import noise_px
 from groma.problem.problem import Problem
 from groma.scene import Scene, Similarity
+from groma.scene.local_frame import usual_frame
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,44 @@ def adjust_surveyed(
     return SurveyedResult(result, surveyed, reliability_of(result.scene, result.problem))
 
 
+@dataclass(frozen=True, eq=False)
+class Tied:
+    """A map on its way, in the frame of measurements."""
+
+    surveyed: Surveyed
+    #: The scene that went in, and the points with the measurements, both near the origin and in a usual unit.
+    start: Scene
+    points: Scene
+    #: What brought them there from the frame of the measurements; None where nothing did.
+    near: Similarity | None
+
+
+def tied(start: Scene, points: Scene, survey: Survey) -> Tied:
+    """Bring the points of a map into the frame of measurements, and add these."""
+    surveyed = with_survey(points, survey)
+    near = usual_frame(surveyed.scene)
+    start, points = start.transformed(surveyed.similarity), surveyed.scene
+    if near is not None:
+        start, points = start.transformed(near), points.transformed(near)
+    return Tied(surveyed, start, points, near)
+
+
+@stage("surveyed", SCENE)
+def adjust_with_survey(points: Scene, options: Any, say: Callable[[str, int, int], None]) -> Scene:
+    """Points and poses adjusted with measurements of other instruments, weighted by their noise."""
+    told = AdjustOptions(
+        refine_poses=options.refine_poses,
+        refine_intrinsics=bool(options.refine_intrinsics),
+        max_iterations=options.max_iterations,
+        threads=options.threads,
+    )
+
+    def tell(event: Progress) -> None:
+        say("adjusting with measurements", event.iteration, event.max_iterations)
+
+    return adjust(points, weighted(points, told), tell).scene
+
+
 def reliability_of(scene: Scene, problem: Problem | None) -> Reliability | None:
     """Return :func:`~groma.adjustment.survey.reliability.reliability`; None where the poses are not determined."""
     try:
@@ -122,4 +163,7 @@ def weighted(scene: Scene, options: AdjustOptions) -> AdjustOptions:
     return replace(options, **sigma)
 
 
-__all__ = ["SurveyedResult", "adjust_surveyed", "has_survey", "reliability_of", "survey_numbers", "weighted"]
+__all__ = [
+    "SurveyedResult", "Tied", "adjust_surveyed", "adjust_with_survey", "has_survey", "reliability_of",
+    "survey_numbers", "tied", "weighted",
+]  # fmt: skip

@@ -36,6 +36,7 @@ from scipy.stats import norm
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.places import at_places_of
+from groma.errors import ProblemError
 from groma.factors.contract import Factor
 from groma.gates import gate
 from groma.problem.problem import Problem
@@ -179,7 +180,7 @@ def reliability(
         problem = assemble(moved, AssemblyOptions()).problem
     elif near is not None:
         problem = at_places_of(problem, moved)
-    covariances = Covariances(problem, gauge="inner")
+    covariances = _covariances(problem)
     tests = [_tested(covariances, *entry) for entry in _entries(moved, problem)]
     measurements = [row for test in tests for row in _rows(test, level, power)]
     wrong = {(one.kind, one.name) for one in measurements if one.is_suspect}
@@ -189,6 +190,14 @@ def reliability(
         squares, redundancy[kind] = (float(sum(part)) for part in zip(*parts, strict=True))
         components[kind] = float(np.sqrt(squares / redundancy[kind])) if redundancy[kind] > _UNCHECKED else None
     return Reliability(tuple(measurements), _checked(covariances, moved), components, redundancy, level, power)
+
+
+def _covariances(problem: Problem) -> Covariances:
+    """Return the covariances in the frame of the measurements; where these leave it open, in an inner one."""
+    try:
+        return Covariances(problem)
+    except ProblemError:
+        return Covariances(problem, gauge="inner")
 
 
 @dataclass(frozen=True, eq=False)

@@ -166,23 +166,26 @@ def _turn_between(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def upright(found: RobustSimilarity, scene: Scene, target: FloatArray) -> RobustSimilarity:
-    """Return a similarity of points on a line, turned about it so that the cameras stand upright on average: z is up.
+    """Return a similarity of points on a line, turned about it so that the cameras stand upright: z is up.
+
+    Of cameras that do not roll the rows of the images are level. The direction that is most nearly perpendicular to all
+    of them is up, on the side where the images have their tops, or which the cameras look away from.
 
     Parameters
     ----------
     found : RobustSimilarity
         Of which the turn about the line is open.
     scene : Scene
-        The source; its cameras count as upright where y of their images is down.
+        The source.
     target : (N, 3) float
         The measured places.
     """
     places = target[found.inliers]
     axis = np.linalg.svd(places - places.mean(0))[2][0]
-    up = quaternion.rotate(
-        quaternion.conjugate(scene.cam_from_world[:, :4]), np.tile([0.0, -1.0, 0.0], (scene.num_images, 1))
-    )
-    up = found.similarity.directions(up.mean(0))
+    right, down, ahead = quaternion.to_matrix(scene.cam_from_world[:, :4]).transpose(1, 0, 2)
+    up = np.linalg.eigh(right.T @ right + 1e-3 * down.T @ down)[1][:, 0]
+    away = -float((down @ up).mean() + (ahead @ up).mean())
+    up = found.similarity.directions(up if away >= 0.0 else -up)
     flat, wanted = up - (up @ axis) * axis, np.array([0.0, 0.0, 1.0]) - axis[2] * axis
     if min(np.linalg.norm(flat), np.linalg.norm(wanted)) < 0.1:
         return found

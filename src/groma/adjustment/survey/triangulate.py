@@ -2,8 +2,8 @@
 r"""Places of marked points at the poses of a scene, found robustly.
 
 The point nearest to the rays :math:`c_i + \lambda d_i` of some marks solves
-:math:`\sum_i (I - d_i d_i^\top)(X - c_i) = 0`. Of all pairs of marks the one is taken whose point lies nearest to the
-median of the others' rays, in angle; then all rays that agree with it.
+:math:`\sum_i (I - d_i d_i^\top)(X - c_i) = 0`. Of all pairs of marks the one is taken whose point is near
+most of the rays, in angle; then all rays near it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from groma.geometry import quaternion
 from groma.geometry.algebra import unit
 from groma.scene import Marks, Scene
 
-#: Rays farther from a point than this many times the median angle, or this angle (radians), do not agree with it.
-_TIMES, _ANGLE = 5.0, 0.01
+#: Rays farther from a point than this angle (radians) do not agree with it.
+_ANGLE = 0.01
 #: Pairs of marks that are tried at most.
 _PAIRS = 200
 
@@ -52,15 +52,16 @@ def rays_of(scene: Scene, marks: Marks) -> FloatArray:
 
 def _meet(centers: FloatArray, rays: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the point that most rays meet in, and which ones."""
-    best, least, agree = np.full(3, np.nan), np.inf, np.zeros(len(rays), bool)
+    best, most, agree = np.full(3, np.nan), (0, -np.inf), np.zeros(len(rays), bool)
     for pair in list(combinations(range(len(rays)), 2))[:_PAIRS]:
         point = _nearest(centers[list(pair)], rays[list(pair)])
         if point is None:
             continue
         angles = _angles(point, centers, rays)
-        median = float(np.median(np.sort(angles)[1:]))  # one angle more says nothing
-        if median < least:
-            best, least, agree = point, median, angles <= max(_TIMES * median, _ANGLE)
+        near = angles <= _ANGLE
+        score = int(near.sum()), -float(np.median(angles))
+        if score > most:
+            best, most, agree = point, score, near
     if agree.sum() >= 2 and (point := _nearest(centers[agree], rays[agree])) is not None:
         best = point
     return best, agree
