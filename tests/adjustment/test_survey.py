@@ -16,6 +16,7 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.parts import adjust_parts, join_parts, write_parts
 from groma.adjustment.places import at_places_of
+from groma.adjustment.survey.align import align
 from groma.adjustment.survey.attach import Survey, with_survey
 from groma.adjustment.survey.names import rows_by_name
 from groma.adjustment.survey.reliability import noncentrality, reliability
@@ -234,6 +235,36 @@ def test_a_scene_in_place_stays(truth_and_start):
     assert len(again.scene.camera_positions) == 8 and len(again.scene.control_points) == 6
 
 
+# --------------------------------------------------------------------------------------------------------------- align
+
+
+def test_a_scene_is_aligned_with_another_one(truth_and_start):
+    """Two images are somewhere else in the reference; they are left out and named."""
+    truth, _ = truth_and_start
+    reference = truth.subset([5, 2, 7, 0, 3, 4])
+    poses = reference.cam_from_world.copy()
+    poses[1, 4:] += [3.0, 0.0, 1.0]
+    found = align(truth.transformed(ELSEWHERE), reference.with_poses(poses))
+    np.testing.assert_allclose(found.scene.cam_centers_in_world, truth.cam_centers_in_world, atol=1e-9)
+    assert found.names == tuple(truth.images.names[k] for k in (0, 2, 3, 4, 5, 7)) and found.rmse < 1e-9
+    assert [name for name, used in zip(found.names, found.inliers, strict=True) if not used] == [truth.images.names[2]]
+    assert found.similarity.scale == pytest.approx(1 / ELSEWHERE.scale) and np.delete(found.angles, 1).max() < 1e-7
+    two = align(truth.transformed(ELSEWHERE), truth.subset([1, 6]))
+    np.testing.assert_allclose(two.scene.cam_centers_in_world, truth.cam_centers_in_world, atol=1e-9)
+    assert "orientations took part" in two.notes[0]
+
+
+def test_a_scene_is_aligned_with_measurements(truth_and_start):
+    truth, _ = truth_and_start
+    points, _ = control_file(truth, np.random.default_rng(2))
+    given = Survey(control=points, control_sigma=(1.0,), positions=measured_positions(truth, np.random.default_rng(1)))
+    found = align(truth.transformed(ELSEWHERE), given)
+    assert found.names == (*truth.images.names, "p0", "p1", "p2", "p3") and found.rmse < 4 * SIGMA
+    assert len(found.scene.camera_positions) == 0 and len(found.to_dict()["residuals"]) == 12
+    with pytest.raises(InputError, match="none of its 8 names"):
+        align(truth, truth.replace(images=truth.images.replace(names=tuple("abcdefgh"))))
+
+
 # --------------------------------------------------------------------------------------------------------- reliability
 
 
@@ -342,6 +373,38 @@ def test_predicted_errors_are_those_that_occur():
     # the errors of the cameras of a draw depend on each other: 12 x 6 to 36 independent draws of chi-square 3
     assert 2.2 < np.mean(squares) < 3.9
     assert len(checks) == 24 and 1.8 < np.mean(checks) < 4.4
+
+
+@pytest.mark.parametrize("sigma", [1.0, 1e5])
+def test_measurements_that_weigh_little_place_the_scene_all_the_same(sigma):
+    """Positions so weak that beside the pixels they are lost in rounding: the scene ends where they fit best."""
+    truth, _ = made(8)
+    rng = np.random.default_rng(0)
+    scene = truth.transformed(Similarity(1e-3)) if sigma > 1 else truth
+    table = positions(scene, rng, sigma * (1e-3 if sigma < 1e3 else 1e-6))
+    table = table.replace(covariance=table.covariance * 1e6)
+    twist = Similarity.from_array(np.array([0.05, 0.1, -0.02, np.sqrt(1 - 0.0129), 0.3, -0.2, 0.1, 1.1]))
+    start = scene.transformed(twist).replace(camera_positions=table)
+    result = adjust(start, LEAST_SQUARES)
+
+    def cost(moved):
+        off = moved.cam_centers_in_world - table.xyz
+        return np.einsum("ni,nij,nj->", off, np.linalg.inv(table.covariance), off)
+
+    best = cost(result.scene)
+    size = np.sqrt(table.covariance[0, 0, 0]) * 1e-2
+    for k in range(3):
+        for sign in (-1, 1):
+            assert cost(result.scene.transformed(Similarity(translation=sign * size * np.eye(3)[k]))) >= best
+            turn = np.zeros(8)
+            turn[[3, 7]], turn[k] = 1.0, sign * 1e-5
+            turn[:4] /= np.linalg.norm(turn[:4])
+            assert cost(result.scene.transformed(turn)) >= best - 1e-9
+    found = reliability(result.scene, result.problem)
+    if sigma > 1:
+        assert found.redundancy["camera position"] == pytest.approx(3 * 8 - 7, abs=0.01)
+    # the noise was a thousandth of what was stated; the photographs add theirs
+    assert 0.3 < found.components["camera position"] * 1e3 < 5.0
 
 
 def pixel_noise(truth):

@@ -15,6 +15,14 @@ SIGMA, MARK_PX, SIGMA_DISTANCE = 0.02, 0.5, 0.005
 ELSEWHERE = Similarity.from_array(np.array([0.5, -0.5, 0.5, 0.5, 40.0, -7.0, 3.0, 0.21]))
 
 
+class Exact:
+    """Noise of nothing."""
+
+    def normal(self, size=None):
+        """Return zeros."""
+        return np.zeros(() if size is None else size)
+
+
 def made(images=8, noise_px=0.5, seed=1):
     """Truth and start of points alone, in the frame and unit of the truth."""
     scene = holistic(images, noise_px=noise_px, seed=seed)

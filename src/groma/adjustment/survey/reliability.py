@@ -39,6 +39,7 @@ from groma.adjustment.places import at_places_of
 from groma.errors import ProblemError
 from groma.factors.contract import Factor
 from groma.gates import gate
+from groma.problem.gauge import world_motions
 from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of, residuals_of
 from groma.scene import Scene
@@ -180,8 +181,9 @@ def reliability(
         problem = assemble(moved, AssemblyOptions()).problem
     elif near is not None:
         problem = at_places_of(problem, moved)
-    covariances = _covariances(problem)
-    tests = [_tested(covariances, *entry) for entry in _entries(moved, problem)]
+    entries = list(_entries(moved, problem))
+    frame = _frame(problem, [factor for _, _, factor in entries])
+    tests = [_tested(frame, *entry) for entry in entries]
     measurements = [row for test in tests for row in _rows(test, level, power)]
     wrong = {(one.kind, one.name) for one in measurements if one.is_suspect}
     components, redundancy = {}, {}
@@ -189,15 +191,51 @@ def reliability(
         parts = [_squares_and_shares(test, wrong) for test in tests if test.kind == kind]
         squares, redundancy[kind] = (float(sum(part)) for part in zip(*parts, strict=True))
         components[kind] = float(np.sqrt(squares / redundancy[kind])) if redundancy[kind] > _UNCHECKED else None
-    return Reliability(tuple(measurements), _checked(covariances, moved), components, redundancy, level, power)
+    return Reliability(tuple(measurements), _checked(frame, moved), components, redundancy, level, power)
 
 
-def _covariances(problem: Problem) -> Covariances:
-    """Return the covariances in the frame of the measurements; where these leave it open, in an inner one."""
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """Covariances in the frame of the measurements: those of the scene in itself, and of its place in the world."""
+
+    covariances: Covariances
+    #: World motions (count, dof, k) by group, and their covariance (k, k); none where the first covariances have all.
+    motions: dict[str, FloatArray] = field(default_factory=dict)
+    place: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+def _frame(problem: Problem, factors: list[Factor]) -> _Frame:
+    """Return the covariances in the frame of the measurements.
+
+    These may weigh so little beside the images that their part is lost in rounding; it is then added apart. They are
+    then also so much less exact than the scene in itself that its part of their covariance can be taken one by one.
+    """
     try:
-        return Covariances(problem)
+        return _Frame(Covariances(problem))
     except ProblemError:
-        return Covariances(problem, gauge="inner")
+        covariances = Covariances(problem, gauge="inner")
+    free = covariances.motions
+    if free is None or free.count == 0:
+        return _Frame(covariances)
+    motions = {
+        name: np.einsum("gnd,gk->ndk", part, free.combinations)
+        for name, part in world_motions(problem, free.center, free.length).items()
+    }
+    total = np.zeros((free.count, free.count))
+    alone = _Frame(covariances)
+    for factor in factors:
+        _, information, weight = _weighted(factor, problem)
+        noise = np.linalg.inv(information) / np.maximum(weight, 1e-12)[:, None, None] + _spread(alone, factor)
+        J = _moved(motions, factor, problem)
+        total += np.einsum("nik,nij,njl->kl", J, np.linalg.inv(noise), J)
+    return _Frame(covariances, motions, np.linalg.pinv(total, rcond=1e-12, hermitian=True))
+
+
+def _moved(motions: dict[str, FloatArray], factor: Factor, problem: Problem) -> FloatArray:
+    """Return how residuals change with world motions, (N, m, k)."""
+    blocks = jacobians_of(factor, problem.variables)
+    parts = [blocks[slot.name] @ motions[ref.group][ref.index] for slot, ref in factor.references()]
+    return np.sum(parts, axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,15 +284,18 @@ def _rows_of_marks(scene: Scene) -> Iterator[IntArray]:
             yield rows
 
 
-def _tested(covariances: Covariances, kind: str, names: list[str], factor: Factor) -> _Test:
-    variables = covariances.problem.variables
-    residual = residuals_of(factor, variables)
-    count, size = residual.shape
-    information = _information(factor, count, size)
-    whitened = np.einsum("ni,nij,nj->n", residual, information, residual)
-    weight = factor.loss.evaluate(whitened)[1]
-    spread = _spread(covariances, factor)
-    eye = np.eye(size)
+def _weighted(factor: Factor, problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return residuals (N, m), information (N, m, m) and the weights (N,) that a robust loss left."""
+    residual = residuals_of(factor, problem.variables)
+    information = _information(factor, *residual.shape)
+    squares = np.einsum("ni,nij,nj->n", residual, information, residual)
+    return residual, information, factor.loss.evaluate(squares)[1]
+
+
+def _tested(frame: _Frame, kind: str, names: list[str], factor: Factor) -> _Test:
+    residual, information, weight = _weighted(factor, frame.covariances.problem)
+    spread = _spread(frame, factor)
+    eye = np.eye(residual.shape[1])
     without = np.linalg.pinv(eye - weight[:, None, None] * spread @ information, rcond=1e-12)
     alone, spread_alone = np.einsum("nij,nj->ni", without, residual), without @ spread
     full = np.linalg.inv(eye + spread_alone @ information)
@@ -270,8 +311,16 @@ def _information(factor: Factor, count: int, size: int) -> FloatArray:
     return np.swapaxes(root, 1, 2) @ root
 
 
-def _spread(covariances: Covariances, factor: Factor) -> FloatArray:
+def _spread(frame: _Frame, factor: Factor) -> FloatArray:
     """Return S = J Sigma J^T (N, m, m) of the free variables that factors refer to."""
+    spread = _spread_inside(frame.covariances, factor)
+    if frame.motions:
+        J = _moved(frame.motions, factor, frame.covariances.problem)
+        spread = spread + J @ frame.place @ np.swapaxes(J, 1, 2)
+    return spread
+
+
+def _spread_inside(covariances: Covariances, factor: Factor) -> FloatArray:
     variables = covariances.problem.variables
     free = [(slot, ref) for slot, ref in factor.references() if not variables[ref.group].is_constant]
     blocks = jacobians_of(factor, variables)
@@ -323,12 +372,15 @@ def _squares_and_shares(test: _Test, wrong: set[tuple[str, str]]) -> tuple[float
     return float(squares[good].sum()), float(test.shares[good].sum())
 
 
-def _checked(covariances: Covariances, scene: Scene) -> tuple[CheckPoint, ...]:
+def _checked(frame: _Frame, scene: Scene) -> tuple[CheckPoint, ...]:
     points, found = scene.control_points, []
     rows = np.flatnonzero(points.is_check)
-    if len(rows) == 0 or "control_points" not in covariances.problem.variables:
+    if len(rows) == 0 or "control_points" not in frame.covariances.problem.variables:
         return ()
-    spread = covariances.of("control_points", rows)
+    spread = frame.covariances.of("control_points", rows)
+    if frame.motions:
+        J = frame.motions["control_points"][rows]
+        spread = spread + J @ frame.place @ np.swapaxes(J, 1, 2)
     for row, sigma in zip(rows, spread, strict=True):
         difference = points.xyz[row] - points.measured[row]
         total = points.covariance[row] + sigma

@@ -169,7 +169,8 @@ def upright(found: RobustSimilarity, scene: Scene, target: FloatArray) -> Robust
     """Return a similarity of points on a line, turned about it so that the cameras stand upright: z is up.
 
     Of cameras that do not roll the rows of the images are level. The direction that is most nearly perpendicular to all
-    of them is up, on the side where the images have their tops, or which the cameras look away from.
+    of them is up, on the side where the images have their tops, or which the cameras look away from; of cameras that
+    all look the same way, the one that is nearest to their tops.
 
     Parameters
     ----------
@@ -183,7 +184,7 @@ def upright(found: RobustSimilarity, scene: Scene, target: FloatArray) -> Robust
     places = target[found.inliers]
     axis = np.linalg.svd(places - places.mean(0))[2][0]
     right, down, ahead = quaternion.to_matrix(scene.cam_from_world[:, :4]).transpose(1, 0, 2)
-    up = np.linalg.eigh(right.T @ right + 1e-3 * down.T @ down)[1][:, 0]
+    up = np.linalg.eigh(right.T @ right + 1e-3 * ahead.T @ ahead)[1][:, 0]
     away = -float((down @ up).mean() + (ahead @ up).mean())
     up = found.similarity.directions(up if away >= 0.0 else -up)
     flat, wanted = up - (up @ axis) * axis, np.array([0.0, 0.0, 1.0]) - axis[2] * axis
