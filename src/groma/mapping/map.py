@@ -198,8 +198,8 @@ def map_images(
         points = stages.run(adjust_points, start)
         if options.refine_points:
             points = stages.run(measure_points, folder, points)
-        if survey:
-            in_place = tied(start, points, survey)
+        in_place = tied(start, points, survey) if survey else None
+        if in_place is not None:
             start, near = in_place.start, in_place.near
             points = stages.run(adjust_with_survey, in_place.points, given=in_place.points)
         segments = stages.run(find_segments, folder, points, line_matches, given=line_matches)
@@ -207,7 +207,7 @@ def map_images(
         result = map_segments(points, segments, matches, stages, neighbors_for(options, folder))
     say("done", 1, 1)
     left_out = images_left_out(names, start.images.names, model is not None)
-    surveyed = in_place.surveyed if survey else None
+    surveyed = None if in_place is None else in_place.surveyed
     result = dataclasses.replace(result, start=start, warnings=(*left_out, *result.warnings), surveyed=surveyed)
     if near is None:
         return result

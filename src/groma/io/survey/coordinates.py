@@ -63,7 +63,8 @@ class CoordinateSystem:
         if found := _UTM_WORDS.fullmatch(line):
             return cls(_utm(int(found[1]), found[2].upper() == "S"))
         if line.startswith("+proj="):
-            words = dict(word.lstrip("+").partition("=")[::2] for word in line.split())
+            parts = (word.lstrip("+").partition("=") for word in line.split())
+            words = {name: value for name, _, value in parts}
             wgs84 = words.get("datum", words.get("ellps", "WGS84")) == "WGS84" and words.get("units", "m") == "m"
             if words["proj"] == "utm" and wgs84 and words.get("zone", "").isdigit():
                 return cls(_utm(int(words["zone"]), "south" in words))
@@ -226,7 +227,7 @@ def _projected(group: Places, target: str) -> FloatArray:
     if group.system.name == target:
         return group.coordinates
     try:
-        import pyproj
+        import pyproj  # type: ignore[import-not-found]  # an extra
     except ImportError:
         raise InputError(
             f"{group.source} is in {group.system.name}; to bring it into {target} groma needs pyproj: pip install "
