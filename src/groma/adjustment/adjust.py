@@ -174,9 +174,7 @@ def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress]
         return _adjusted(scene, options, progress)
     result = _adjusted(settled(scene), options, progress)
     after = settled(result.scene)
-    problem = result.problem and at_places_of(result.problem, after, shifted=False)
-    solve = with_costs_at(result.report.solve, problem) if problem else result.report.solve
-    return AdjustResult(after, replace(result.report, solve=solve), problem)
+    return replace(result, scene=after, problem=result.problem and at_places_of(result.problem, after, shifted=False))
 
 
 def _in_model(

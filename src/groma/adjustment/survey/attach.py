@@ -125,7 +125,7 @@ def _positions(scene: Scene, survey: Survey, xyz: FloatArray, notes: list[str]) 
     rows = rows_by_name(given.names, scene.images.names)
     require_some(rows, given.names, scene.images.names, given.source, "an image")
     _tell_unknown(given, rows, scene.images.names, "images that are not in the scene", notes)
-    known = np.flatnonzero(rows >= 0)
+    known = np.flatnonzero(np.asarray(rows) >= 0)
     sigma = _sigma(given, survey.position_sigma, "--position-sigma")
     if (twice := len(known) - len(np.unique(rows[known]))) > 0:
         raise InputError(f"{given.source}: {counted(twice, 'images')} have two positions under different names.")
@@ -209,10 +209,12 @@ def _distances(scene: Scene, survey: Survey, given: DistancesFile, points: Contr
         )
         raise InputError(f"{given.source}: {reason}. Use the same names.")
     if of_points.any():
-        found["point_distances"] = PointDistances(*in_points[of_points].T, given.distance[of_points], sigma[of_points])
+        found["point_distances"] = PointDistances(
+            in_points[of_points, 0], in_points[of_points, 1], given.distance[of_points], sigma[of_points]
+        )
     if of_images.any():
         found["camera_distances"] = CameraDistances(
-            *in_images[of_images].T, given.distance[of_images], sigma[of_images]
+            in_images[of_images, 0], in_images[of_images, 1], given.distance[of_images], sigma[of_images]
         )
     return found
 

@@ -24,7 +24,7 @@ def rows_by_name(wanted: Sequence[str], known: Sequence[str]) -> IntArray:
         rows: dict[str, int] = {}
         for row, name in enumerate(known):
             rows[short(name)] = row if short(name) not in rows else -1
-        for place in np.flatnonzero(found < 0):
+        for place in np.flatnonzero(found < 0).tolist():
             found[place] = rows.get(short(wanted[place]), -1)
     return found
 

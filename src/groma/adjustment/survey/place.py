@@ -21,7 +21,7 @@ from groma.adjustment.terms.survey_loss import root_information, survey_loss
 from groma.geometry import so3
 from groma.scene import Scene, Similarity
 
-_STEPS, _TOLERANCE = 50, 1e-12
+_STEPS, _TOLERANCE = 50, 1e-6
 
 
 def settled(scene: Scene) -> Scene:
@@ -57,16 +57,18 @@ def _best(scene: Scene, with_scale: bool) -> Similarity:
         weight = survey_loss(3).evaluate(np.einsum("ni,ni->n", residual, residual))[1]
         bars = (scale * lengths - distances) * weights
         bar_weight = survey_loss(1).evaluate(bars**2)[1]
-        rows = np.concatenate([(np.sqrt(weight)[:, None, None] * J).reshape(-1, 7), np.zeros((len(bars), 7))])
-        rows[3 * len(seen) :, 6] = np.sqrt(bar_weight) * scale * lengths * weights
-        values = np.concatenate([(np.sqrt(weight)[:, None] * residual).reshape(-1), np.sqrt(bar_weight) * bars])
-        step = np.zeros(7)
-        free = 7 if with_scale else 6
-        size = np.maximum(np.linalg.norm(rows[:, :free], axis=0), 1e-300)
-        step[:free] = -np.linalg.lstsq(rows[:, :free] / size, values, rcond=1e-9)[0] / size
+        rows, of_bars = J.reshape(-1, 7), scale * lengths * weights
+        weighted = rows * np.repeat(weight, 3)[:, None]
+        normal, gradient = weighted.T @ rows, weighted.T @ residual.reshape(-1)
+        normal[6, 6] += of_bars @ (bar_weight * of_bars)
+        gradient[6] += of_bars @ (bar_weight * bars)
+        step, free = np.zeros(7), 7 if with_scale else 6
+        size = np.sqrt(np.maximum(np.diag(normal)[:free], 1e-300))
+        scaled = normal[:free, :free] / size / size[:, None]
+        step[:free] = -np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) @ (gradient[:free] / size) / size
         shift, rotation = shift + step[:3], so3.exp(step[None, 3:6])[0] @ rotation
         scale *= math.exp(min(max(step[6], -1.0), 1.0))
-        if np.abs(step[:free] * size).max() <= _TOLERANCE * max(1.0, float(np.linalg.norm(values))):
+        if np.abs(step[:free] * size).max() <= _TOLERANCE:  # in standard deviations
             break
     return Similarity(scale, rotation, middle + shift - scale * rotation @ middle)
 

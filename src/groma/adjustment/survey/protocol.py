@@ -78,7 +78,7 @@ def _tests(survey: Mapping[str, Any]) -> str:
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:
-    cells = [("name", "", "sigma", "residual", "r", "w", "MDE", "effect", "weight", "")]
+    cells: list[tuple[str, ...]] = [("name", "", "sigma", "residual", "r", "w", "MDE", "effect", "weight", "")]
     for one in rows:
         checked = one["normalized"] is not None
         tests = [f"{one['normalized']:.2f}", f"{one['detectable']:.4f}", f"{one['external']:.1f}"] if checked else "---"
@@ -90,7 +90,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _check_table(points: Sequence[Mapping[str, Any]]) -> str:
-    cells = [("name", "dx", "dy", "dz", "sigma x", "sigma y", "sigma z", "chi-square (3)")]
+    cells: list[tuple[str, ...]] = [("name", "dx", "dy", "dz", "sigma x", "sigma y", "sigma z", "chi-square (3)")]
     for one in points:
         numbers = [f"{value:.4f}" for value in (*one["difference"], *one["sigma"])]
         cells.append((one["name"], *numbers, f"{one['normalized_square']:.2f}"))

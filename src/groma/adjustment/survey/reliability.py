@@ -228,7 +228,7 @@ def _frame(problem: Problem, factors: list[Factor]) -> _Frame:
         noise = np.linalg.inv(information) / np.maximum(weight, 1e-12)[:, None, None] + _spread(alone, factor)
         J = _moved(motions, factor, problem)
         total += np.einsum("nik,nij,njl->kl", J, np.linalg.inv(noise), J)
-    return _Frame(covariances, motions, np.linalg.pinv(total, rcond=1e-12, hermitian=True))
+    return _Frame(covariances, motions, np.asarray(np.linalg.pinv(total, 1e-12, True), float))
 
 
 def _moved(motions: dict[str, FloatArray], factor: Factor, problem: Problem) -> FloatArray:

@@ -162,7 +162,8 @@ def _turn_between(first: FloatArray, second: FloatArray) -> FloatArray:
         axis = np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
     angle = np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)
     length = np.linalg.norm(axis)
-    return so3.exp((angle * axis / length if length > 0 else np.zeros(3))[None])[0]
+    turn: FloatArray = np.asarray(angle * axis / length if length > 0 else np.zeros(3), float)
+    return so3.exp(turn[None])[0]
 
 
 def upright(found: RobustSimilarity, scene: Scene, target: FloatArray) -> RobustSimilarity:
