@@ -31,6 +31,8 @@ def align(
     control: _measured.Control = None,
     crs: _measured.Crs = None,
     force: _options.Force = False,
+    threads: _options.Threads = None,
+    seed: _options.Seed = 0,
     json_target: _options.Json = None,
     quiet: _options.Quiet = False,
     verbose: _options.Verbose = False,
@@ -38,7 +40,8 @@ def align(
     """Bring a scene into the frame of a reference by a similarity, which ignores gross errors.
 
     The reference is another scene, measured camera positions or control points. Nothing is adjusted: for measurements
-    that take part in an adjustment, pass them to groma adjust or groma map.
+    that take part in an adjustment, pass them to groma adjust or groma map. --threads and --seed are accepted so that
+    scripts can pass them to every command.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
@@ -47,7 +50,7 @@ def align(
     measured = _measured.Measured(positions=positions, position_sigma="1", control=control, control_sigma="1", crs=crs)
     if (reference is None) == (not measured):
         raise InputError("Pass either a REFERENCE scene, or --positions or --control.")
-    console = Console(quiet, verbose, json_target, None)
+    console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
     check_inputs(source, reference, *measured.files)
 
