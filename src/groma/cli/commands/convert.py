@@ -21,8 +21,8 @@ def convert(
         typer.Argument(
             metavar="OUTPUT",
             help="Its name says the format: a folder for a COLMAP model, .npz for a groma archive, .txt, .bz2 or .gz "
-            "for BAL, .json for nerfstudio and instant-ngp: cameras, poses and points. To look at: .ply or .obj for points, "
-            "lines and pieces of planes, .glb, .gltf, .dxf or .rrd (rerun) for these and cameras.",
+            "for BAL, .json for nerfstudio and instant-ngp: cameras, poses and points. To look at: .ply, .obj: points, "
+            "lines and pieces of planes; .glb, .gltf, .dxf or .rrd (rerun): these and cameras.",
         ),
     ],
     parts: Annotated[
