@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from groma._json import json_text
@@ -23,7 +23,7 @@ from groma.io import atomic_output, write_geometry, write_scene
 from groma.mapping.surveyed import has_survey, reliability_of, survey_numbers
 from groma.problem.problem import Problem
 from groma.scene import Scene
-from groma.solver.observability.diagnosis import Diagnosis
+from groma.solver.observability.diagnosis import Diagnosis, Finding
 from groma.viz.pictures import ImageFiles
 from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.survey import survey_card
@@ -51,12 +51,24 @@ class MapResult:
     outcomes: dict[str, int]
     #: Sentences for the user.
     warnings: tuple[str, ...]
+    #: Photographs that were to be placed; 0 where that is not known.
+    num_photographs: int = 0
     #: How the map got into the frame of measurements, where there are any.
     surveyed: Surveyed | None = None
 
     def diagnose(self) -> Diagnosis:
         """Say in words what the observations determine, at the noise and with the loss of the last adjustment."""
-        return diagnose_scene(self.scene, problem=_problem_of(self.scene, self.adjusted_with))
+        found = diagnose_scene(self.scene, problem=_problem_of(self.scene, self.adjusted_with))
+        missing = self.num_photographs - self.scene.num_images
+        if 2 * missing <= self.num_photographs:
+            return found
+        sentence = (
+            f"{missing} of {self.num_photographs} photographs were not placed. All findings are about the other "
+            f"{self.scene.num_images}."
+        )
+        left = Finding("photographs_left_out", "problem", sentence, values={"count": float(missing)})
+        others = tuple(finding for finding in found.findings if finding.kind != "determined")
+        return replace(found, findings=(left, *others))
 
     def pose_uncertainty(self) -> dict[str, Any] | None:
         """Return how well the cameras are known, at the noise that the observations show."""
