@@ -27,10 +27,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Instructions of each baseline, as LLVM names them.
-BASELINES = {
-    "x86-64-v2": "+cx16,+sahf,+popcnt,+sse3,+ssse3,+sse4.1,+sse4.2",
-    "x86-64-v3": "+cx16,+sahf,+popcnt,+sse3,+ssse3,+sse4.1,+sse4.2,+avx,+avx2,+bmi,+bmi2,+f16c,+fma,+lzcnt,+movbe,+xsave",
-}
+_V2 = "+cx16,+sahf,+popcnt,+sse3,+ssse3,+sse4.1,+sse4.2"
+BASELINES = {"x86-64-v2": _V2, "x86-64-v3": f"{_V2},+avx,+avx2,+bmi,+bmi2,+f16c,+fma,+lzcnt,+movbe,+xsave"}
 
 #: Compiles everything, and prints the processor and where each function that Python calls was put.
 COMPILE = """
@@ -39,8 +37,8 @@ from numba.core.registry import cpu_target
 from groma import _numba_cache
 from groma.compilation import needed
 from groma.compilation.ahead import compile_ahead
-wanted = {(module, name) for work in needed.WORK for module, name, _ in needed.needed(work)}
-for work in needed.WORK:
+wanted = {(module, name) for work in needed.works() for module, name, _ in needed.needed(work)}
+for work in needed.works():
     compile_ahead(work)
 used = zip(_numba_cache.used_paths(), _numba_cache.used_functions())
 files = [(str(path), module) for path, (module, name, _) in used if (module, name) in wanted]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Every example runs to its end, in an empty folder and where it has run before, and the first one is the code of the README."""
+"""Every example runs to its end, in an empty folder and again; the first one is the code of the README."""
 
 import runpy
 from pathlib import Path

@@ -2,8 +2,8 @@
 """Who compiles what, when several processes need the same function at the same moment: one does, the others wait.
 
 In come the folder and the name of a compiled function; a turn is a lock on one byte of a file in that folder, the byte
-that the name stands for. The system takes it back when a process ends in any way, so nothing is left behind. Where locks
-are not possible every process compiles for itself, as if there were no others.
+that the name stands for. The system takes it back when a process ends in any way, so nothing is left behind. Where
+locks are not possible every process compiles for itself, as if there were no others.
 """
 
 from __future__ import annotations

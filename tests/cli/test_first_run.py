@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numba
 import pytest
@@ -15,12 +16,13 @@ from groma.cli.main import run
 from groma.compilation import ahead, needed
 from groma.scene import synthetic
 
+RECORDER = Path(__file__).resolve().parents[2] / "packaging" / "needed_functions.py"
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
 
 
-@pytest.mark.parametrize("work", list(needed.WORK))
+@pytest.mark.parametrize("work", needed.works())
 def test_what_is_listed_exists(work):
-    """After a function was renamed, or its arguments changed: python -m groma.compilation.needed."""
+    """After a function was renamed, or its arguments changed: python packaging/needed_functions.py."""
     entries = needed.needed(work)
     assert len(entries) > 30
     for module, name, kinds in entries:
@@ -29,11 +31,11 @@ def test_what_is_listed_exists(work):
         assert compiled.py_func.__code__.co_argcount == len(kinds), f"{module}.{name}"
 
 
-def test_the_list_is_what_an_adjustment_calls(tmp_path):
+def test_the_list_is_what_an_adjustment_calls():
     """Most of it: what is not listed is compiled when it is called."""
-    code = "import json\nfrom groma.compilation.needed import record\nfound = record('adjust')\n"
-    code += "print(json.dumps([[module, name, list(map(repr, kinds))] for module, name, kinds in found]))"
-    said = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    call = [sys.executable, "-W", "ignore", RECORDER, "adjust"]
+    subprocess.run(call, capture_output=True)  # compiles what is not there
+    said = subprocess.run(call, capture_output=True, text=True, check=True)
     called = {(module, name, tuple(kinds)) for module, name, kinds in json.loads(said.stdout.splitlines()[-1])}
     listed = {(module, name, tuple(map(repr, kinds))) for module, name, kinds in needed.needed("adjust")}
     assert len(called & listed) >= 0.9 * len(listed)

@@ -1,19 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Which compiled functions a command calls, so that they can be compiled before it gets there.
 
-``needed.json`` lists, for each kind of work, module, name and argument types of every function that Python calls, in the
-order of first use; types are written as Numba writes them, each once. ``python -m groma.compilation.needed`` makes the
-file anew, by doing the work and asking the cache (:mod:`groma._numba_cache`) what was called. An entry too many costs
-time on a second core, one too few is compiled when it is called.
+``needed.json`` lists, for each kind of work, module, name and argument types of every function that Python calls, in
+the order of first use; types are written as Numba writes them, each once. ``packaging/needed_functions.py`` makes the file
+anew, by doing the work and asking the cache what was called. An entry too many costs time on a second core, one too few
+is compiled when it is called.
 """
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-import tempfile
-from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -24,6 +20,11 @@ from numba.core import types
 PLACE = Path(__file__).with_name("needed.json")
 #: Module, name, argument types.
 Entry = tuple[str, str, tuple[Any, ...]]
+
+
+def works() -> tuple[str, ...]:
+    """Return the kinds of work that are listed."""
+    return tuple(json.loads(PLACE.read_text(encoding="utf-8"))["work"])
 
 
 def needed(work: str) -> list[Entry]:
@@ -48,97 +49,3 @@ def function(module: str, name: str) -> Any:
 def read_type(text: str) -> Any:
     """Return the Numba type that is written like this."""
     return eval(text, {"__builtins__": {}, **vars(types), "bool": types.boolean, "True": True, "False": False})
-
-
-def _is_readable(kind: Any) -> bool:
-    try:
-        return bool(read_type(repr(kind)) == kind)
-    except Exception:
-        return False
-
-
-# ---------------------------------------------------------------------------------------------------------- Recording
-
-
-def _adjust(folder: Path) -> None:
-    from groma.cli.main import run
-    from groma.io import write_scene
-    from groma.scene import synthetic
-
-    write_scene(synthetic.holistic(8, seed=1).start, folder / "start.npz")
-    run(["adjust", str(folder / "start.npz"), "-o", str(folder / "out"), "--quiet"])
-
-
-def _map(folder: Path) -> None:
-    from groma.cli.main import run
-
-    run(["demo", "-o", str(folder / "demo"), "--quiet"])
-
-
-def _track(folder: Path) -> None:
-    from groma.compilation.runs import RUNS
-
-    for _, step in RUNS["track"]():
-        step()
-
-
-def _selfcheck(folder: Path) -> None:
-    from groma.cli.main import run
-
-    run(["selfcheck", "--quiet"])
-
-
-#: Work that is known, and small instances of it.
-WORK: dict[str, Callable[[Path], None]] = {
-    "adjust": _adjust,
-    "map": _map,
-    "track": _track,
-    "selfcheck": _selfcheck,
-}
-
-
-def record(work: str) -> list[Entry]:
-    """Do some work and return what it called; in a process that compiles nothing and has done nothing before."""
-    from groma import _numba_cache
-
-    with tempfile.TemporaryDirectory() as folder:
-        WORK[work](Path(folder))
-    if _numba_cache.counts.compiled:
-        raise RuntimeError(f"Functions had to be compiled, which others than Python call; record {work!r} once more.")
-    used = _numba_cache.used_functions()
-    own = [entry for entry in used if entry[0].startswith("groma.") and function(*entry[:2]) is not None]
-    return [entry for entry in own if all(map(_is_readable, entry[2]))]
-
-
-def _listed(entries: dict[str, list[Entry]]) -> dict[str, Any]:
-    """Return what is written, with modules and types by number."""
-    modules = sorted({module for found in entries.values() for module, _, _ in found})
-    kinds = sorted({repr(kind) for found in entries.values() for _, _, chosen in found for kind in chosen})
-    rows = {
-        work: [[modules.index(module), name, [kinds.index(repr(kind)) for kind in chosen]]
-               for module, name, chosen in found]
-        for work, found in entries.items()
-    }  # fmt: skip
-    return {"modules": modules, "types": kinds, "work": rows}
-
-
-def _record_elsewhere(work: str) -> list[Entry]:
-    """Record some work in a process of its own, after another has compiled it."""
-    call = [sys.executable, "-W", "ignore", "-m", __spec__.name, work]
-    subprocess.run(call, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    said = json.loads(subprocess.run(call, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
-    return [(module, name, tuple(map(read_type, kinds))) for module, name, kinds in said]
-
-
-def main() -> None:
-    """Record everything, or only say what one kind of work calls."""
-    if len(sys.argv) > 1:
-        found = [(module, name, [repr(kind) for kind in kinds]) for module, name, kinds in record(sys.argv[1])]
-        print(json.dumps(found))
-        return
-    listed = _listed({work: _record_elsewhere(work) for work in WORK})
-    PLACE.write_text(json.dumps(listed, separators=(",", ":")).replace("]],", "]],\n") + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

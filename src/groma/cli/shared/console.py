@@ -69,8 +69,10 @@ class Console:
 
 
 class _Line:
-    """What goes on: on a terminal one line that rewrites itself and vanishes at the end; in a pipe or a file a line every
-    ten seconds, on standard error.
+    """What goes on, on standard error.
+
+    On a terminal it is one line that rewrites itself and vanishes at the end; in a pipe or a file, a line every ten
+    seconds.
     """
 
     def __init__(self, quiet: bool) -> None:
@@ -146,7 +148,7 @@ def stage_line(number: int, stage: str, done: int, total: int, seconds: float) -
 
 
 def say_seconds(seconds: float) -> str:
-    """Return a length of time in the largest unit that fits, and the one below: ``40 s``, ``2 min 5 s``, ``3 h 10 min``."""
+    """Return a length of time in two units at most: ``40 s``, ``2 min 5 s``, ``3 h 10 min``."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
