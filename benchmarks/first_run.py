@@ -86,8 +86,8 @@ def main() -> int:
         "|---|--:|--:|--:|--:|--:|",
     ]
     lines += [
-        f"| `groma {row['command']}` | {row['first_wall_s']:.1f} | {row['first_cpu_s']:.1f} | {row['second_wall_s']:.1f} "
-        f"| {row['second_cpu_s']:.1f} | {row['ratio']:.1f} |"
+        f"| `groma {row['command']}` | {row['first_wall_s']:.1f} | {row['first_cpu_s']:.1f} "
+        f"| {row['second_wall_s']:.1f} | {row['second_cpu_s']:.1f} | {row['ratio']:.1f} |"
         for row in rows
     ]
     (RESULTS / "first_run.md").write_text("\n".join(lines) + "\n")

@@ -4,8 +4,8 @@
     python packaging/needed_functions.py
 
 Each kind of work is done on a small instance, in a process of its own that compiles nothing (another has done so
-before), and the cache is asked what was called. Run it after a function that Python calls was added or renamed, or takes
-other arguments; tests/cli/test_first_run.py notices.
+before), and the cache is asked what was called. Run it after a function that Python calls was added or renamed, or
+takes other arguments; tests/cli/test_first_run.py notices.
 """
 
 from __future__ import annotations
