@@ -4,8 +4,8 @@
     python benchmarks/first_run.py [--command adjust|demo|selfcheck]... [--rounds N] [--python PYTHON]
 
 Each command runs twice from an empty cache of compiled functions, as a whole process: wall time, and the CPU time of it
-and of the processes that compile for it. ``--python`` takes the groma of another environment, for example one into which
-a wheel with compiled functions was installed. What the two runs write must be the same.
+and of the processes that compile for it. ``--python`` takes the groma of another environment, for example one into
+which a wheel with compiled functions was installed. What the two runs write must be the same.
 
 Medians; writes ``benchmarks/results/first_run.json`` and ``first_run.md``.
 """

@@ -3,8 +3,8 @@
 
 ``needed.json`` lists, for each kind of work, module, name and argument types of every function that Python calls, in
 the order of first use; types are written as Numba writes them, each once. ``packaging/needed_functions.py`` makes the
-file anew, by doing the work and asking the cache what was called. An entry too many costs time on a second core, one too few
-is compiled when it is called.
+file anew, by doing the work and asking the cache what was called. An entry too many costs time on a second core, one
+too few is compiled when it is called.
 """
 
 from __future__ import annotations

@@ -212,7 +212,7 @@ class Loops:
             signature = (numba.float64[::1], *real, *[numba.float64[:, ::1]] * len(real))
             names["jacobian"] = self._compile_function(self.jacobian, "jacobian", [signature])
         source = _write_loops(self.slots, self.sizes, self.residual_size, self.derivative)
-        plain = getattr(self.function, "py_func", self.function)
+        plain: Any = getattr(self.function, "py_func", self.function)
         exec(compile(source, plain.__code__.co_filename, "exec"), names)
         made = names["residuals_all"], names["linearize_all"]
         for function in made:
