@@ -14,6 +14,8 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
+from importlib import import_module
 
 from groma import _numba_cache
 
@@ -89,12 +91,15 @@ def compile_ahead(work: str) -> None:
     """Compile what some work calls, other than what is there or is being compiled."""
     from numba.core.registry import cpu_target
 
-    from groma.compilation.needed import function, needed
+    from groma.compilation.needed import IMPORTS, function, needed
 
+    if work in IMPORTS:
+        import_module(IMPORTS[work])
     for module, name, kinds in needed(work):
         compiled = function(module, name)
         if compiled is not None and not compiled._cache.is_there(kinds, cpu_target.target_context):
-            compiled.compile(kinds)
+            with suppress(Exception):  # what the list is wrong about is compiled when it is called, or not
+                compiled.compile(kinds)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,13 @@ from typing import Any
 from numba.core import types
 
 PLACE = Path(__file__).with_name("needed.json")
+#: What each kind of work imports: parts that compiled functions choose by number are registered there.
+IMPORTS = {
+    "adjust": "groma.adjustment.adjust",
+    "map": "groma.mapping.map",
+    "track": "groma.tracking",
+    "selfcheck": "groma.factors",
+}
 #: Module, name, argument types.
 Entry = tuple[str, str, tuple[Any, ...]]
 
