@@ -323,14 +323,16 @@ def find_planes(scene: Scene, options: MapOptions, say: StageProgress) -> Scene:
 @stage("adjusted", ADJUSTED)
 def adjust_everything(scene: Scene, weighted: AdjustOptions, options: MapOptions, say: StageProgress) -> AdjustResult:
     """Everything adjusted together."""
-    return _adjusted(scene, weighted, options, say, "adjusting everything")
+    return _adjusted(scene, dataclasses.replace(weighted, check_lens=True), options, say, "adjusting everything")
 
 
 # -------------------------------------------------------------------------------------------------------------- helpers
 def _robust(options: MapOptions) -> AdjustOptions:
+    """Options of an adjustment of which the scene alone is wanted: the last one asks what the lenses lack."""
     return AdjustOptions(
         refine_intrinsics=bool(options.refine_intrinsics),
         max_iterations=options.max_iterations,
+        check_lens=False,
         threads=options.threads,
     )
 

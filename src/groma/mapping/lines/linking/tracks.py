@@ -13,7 +13,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_ends import SegmentRays, trim
 from groma.gates import gate
-from groma.mapping.groups import grouped, num_distinct
+from groma.mapping.groups import num_distinct
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.linking.fit import fit_lines
 from groma.mapping.lines.outcomes import Outcome
@@ -111,10 +111,13 @@ class Tracks:
 
     def lines_near_images(self, neighbors: list[IntArray]) -> list[IntArray]:
         """Lines to look for in each image: those seen in it or in a neighbour."""
-        rows, line = self.members()
-        order, bounds = grouped(self.views.image_idx[rows], len(neighbors))
-        seen = [np.unique(line[order[bounds[i] : bounds[i + 1]]]) for i in range(len(neighbors))]
-        return [np.unique(np.concatenate([seen[i], *(seen[j] for j in row)])) for i, row in enumerate(neighbors)]
+        pointers, near, looked_for = self.views.pointers, [], np.zeros(self.num_lines + 1, bool)
+        for i, row in enumerate(neighbors):
+            looked_for[:] = False
+            for j in (i, *row):
+                looked_for[self.line_of[pointers[j] : pointers[j + 1]]] = True  # the last one stands for no line
+            near.append(np.flatnonzero(looked_for[:-1]))
+        return near
 
     def direction(self) -> FloatArray:
         """(L,) +1 or -1: whether most observations run from the first end point to the second in the image."""
