@@ -171,6 +171,26 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item])
         return map_work(function, items)
 
 
+@contextmanager
+def beside(function: Callable[[], object]) -> Iterator[None]:
+    """Call a function in a thread of this process while the block goes on; without workers, when it has ended.
+
+    What it raises is raised at the end of the block, unless the block itself has raised.
+    """
+    crew = _CREW.get()
+    executor = None if crew is None else crew.here.executor
+    if executor is None:
+        yield
+        function()
+        return
+    future = executor.submit(function)
+    try:
+        yield
+    finally:
+        wait([future])
+    future.result()
+
+
 def map_ranges(function: Callable[[slice], Any], count: int, size: int) -> None:
     """Call a function that writes into arrays with slices of ``size`` rows that cover ``count``, in threads.
 
@@ -215,6 +235,7 @@ def _num_workers(executor: Any) -> int:
 
 __all__ = [
     "available_cores",
+    "beside",
     "map_in_threads",
     "map_ranges",
     "map_work",
