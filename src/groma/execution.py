@@ -171,6 +171,11 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item])
         return map_work(function, items)
 
 
+def together(*functions: Callable[[], Any]) -> tuple[Any, ...]:
+    """Return what some functions return, which are called in threads of this process."""
+    return tuple(map_in_threads(_called, functions))
+
+
 @contextmanager
 def beside(function: Callable[[], object]) -> Iterator[None]:
     """Call a function in a thread of this process while the block goes on; without workers, when it has ended.
@@ -197,6 +202,10 @@ def map_ranges(function: Callable[[slice], Any], count: int, size: int) -> None:
     The rows of a slice must depend on no other row.
     """
     map_in_threads(function, [slice(first, min(first + size, count)) for first in range(0, count, size)])
+
+
+def _called(function: Callable[[], _Result]) -> _Result:
+    return function()
 
 
 def _each(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
@@ -241,5 +250,6 @@ __all__ = [
     "map_work",
     "num_threads",
     "num_workers",
+    "together",
     "work_with",
 ]

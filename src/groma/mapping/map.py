@@ -60,6 +60,7 @@ from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.unused import without_unused
 from groma.scene import Scene
 from groma.scene.local_frame import usual_frame
+from groma.solver.linear.blas import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ def map_images(
     check_cameras((options.point_model().camera_model,) if model is None else model.cameras.models)
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
-    with work_with(options.threads), Stages(Path(work), key, options, say) as stages:
+    with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
         start = stages.run(find_start, folder, names, model, stages.place)
         points = stages.run(adjust_points, start)
         if options.refine_points:
