@@ -124,7 +124,7 @@ class MapResult:
             for file in others.iterdir():
                 file.rename(draft / file.name)
 
-    def _write_others(self, folder: Path, images: ImageFiles | None, title: str, numbers: Mapping[str, Any]) -> None:
+    def _write_others(self, folder: Path, images: ImageFiles | None, title: str, numbers: dict[str, Any]) -> None:
         """Write what is not part of the COLMAP model."""
         write_scene(self.scene, folder / "scene.npz")
         write_geometry(self.scene, folder)

@@ -235,7 +235,7 @@ def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
         flat = options.surface_sigma_px * lengths_per_pixel(scene, "line")
         return line_noise(scene, options.line_sigma_px).widened(flat)
 
-    points, lines, spacing = together(
+    points, lines, (point_spacing, end_spacing) = together(
         noise_of_points, noise_of_lines, partial(spacings, scene.points.xyz, scene.lines.segments)
     )
     table = scene.point_observations
@@ -252,7 +252,8 @@ def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
         scene.lines.segments,
         lines,
         line_usable,
-        *spacing,
+        point_spacing,
+        end_spacing,
         scene.line_intervals,
     )
 

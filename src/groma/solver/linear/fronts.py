@@ -96,7 +96,7 @@ class Fronts:
         fronts, count = self._fronts, len(position)
         lengths = np.array([len(front.blocks) for front in fronts])
         blocks, owner = np.concatenate([front.blocks for front in fronts]), np.repeat(np.arange(len(fronts)), lengths)
-        ends, starts = np.cumsum(lengths), np.cumsum(lengths) - lengths
+        starts = np.cumsum(lengths) - lengths
         numbers = np.array([front.num_eliminated for front in fronts])
         eliminated = np.arange(len(blocks)) - starts[owner] < numbers[owner]
         home = np.empty(count, np.int64)
