@@ -6,6 +6,8 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from groma._json import json_text
@@ -18,6 +20,7 @@ from groma.adjustment.stages import with_loss
 from groma.adjustment.survey.attach import Surveyed
 from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
+from groma.execution import beside
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
 from groma.mapping.surveyed import has_survey, reliability_of, survey_numbers
@@ -135,27 +138,35 @@ class MapResult:
         if isinstance(images, str | os.PathLike):
             numbers["images"] = os.path.abspath(images)  # where groma localize looks for them
         with atomic_output(folder, force, work) as draft:
-            write_scene(self.scene, draft, format="colmap")
-            write_scene(self.scene, draft / "scene.npz")
-            write_geometry(self.scene, draft)
-            write_report(
-                draft / "report.html",
-                self.before,
-                self.scene,
-                self.report,
-                images,
-                title,
-                PageContents(
-                    self.outcomes,
-                    self.explanation,
-                    self.warnings,
-                    numbers.get("diagnosis"),
-                    contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
-                ),
-            )
-            if "survey" in numbers:
-                (draft / "adjustment.txt").write_text(protocol(numbers), encoding="utf-8")
-            (draft / "summary.json").write_text(json_text(numbers), encoding="utf-8")
+            others = draft.with_name("others")
+            others.mkdir()
+            with beside(partial(write_scene, self.scene, draft, format="colmap")):
+                self._write_others(others, images, title, numbers)
+            for file in others.iterdir():
+                file.rename(draft / file.name)
+
+    def _write_others(self, folder: Path, images: ImageFiles | None, title: str, numbers: dict[str, Any]) -> None:
+        """Write what is not part of the COLMAP model."""
+        write_scene(self.scene, folder / "scene.npz")
+        write_geometry(self.scene, folder)
+        write_report(
+            folder / "report.html",
+            self.before,
+            self.scene,
+            self.report,
+            images,
+            title,
+            PageContents(
+                self.outcomes,
+                self.explanation,
+                self.warnings,
+                numbers.get("diagnosis"),
+                contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
+            ),
+        )
+        if "survey" in numbers:
+            (folder / "adjustment.txt").write_text(protocol(numbers), encoding="utf-8")
+        (folder / "summary.json").write_text(json_text(numbers), encoding="utf-8")
 
 
 def _problem_of(scene: Scene, told: AdjustOptions) -> Problem:

@@ -150,6 +150,7 @@ def map_(
 
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.mapping import run_map, say_map, write_map
+    from groma.execution import work_with
     from groma.features.external import read_matches
     from groma.io import read_scene
     from groma.mapping.map import MapOptions
@@ -178,10 +179,11 @@ def map_(
     survey = None
     if measured:
         survey = measured.read(images, lambda: [path.relative_to(images).as_posix() for path in image_files(images)])
-    result = run_map(console, images, work, start, options, matches, survey)
-    found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
-    numbers = result.summary(found, result.contributions(true) if contributions else ())
-    write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
+    with work_with(threads):
+        result = run_map(console, images, work, start, options, matches, survey)
+        found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
+        numbers = result.summary(found, result.contributions(true) if contributions else ())
+        write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
