@@ -74,6 +74,8 @@ ROOMS: Rooms = (
             "groma.estimators.directions": None,
             "groma.estimators.plane_fit": None,
             "groma.estimators.plane_search": ("PlaneOptions", "PlaneSet", "find_planes"),
+            "groma.estimators.motion.matches": ("LandmarkMatches",),
+            "groma.estimators.motion.estimation": ("Motion", "MotionOptions", "estimate_motion"),
         },
     ),
     (

@@ -22,12 +22,13 @@ copyright = "2026, the groma developers"
 release = version = groma.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "_factor_table",
+    "_figures",
+    "_formulas",
     "_navigation",
     "_reference",
     "_segment_figures",
@@ -35,6 +36,13 @@ extensions = [
 ]
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
+
+# The notebooks are run when they or the machine are new.
+nb_execution_mode = "cache"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600
+nb_output_stderr = "remove"
+nb_merge_streams = True
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
@@ -51,6 +59,7 @@ napoleon_use_rtype = False
 napoleon_preprocess_types = False
 
 html_theme = "furo"
+html_math_renderer = "drawn"
 html_title = f"groma {release}"
 exclude_patterns = ["_build"]
 

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from groma.adjustment.uncertainty import uncertainty
     from groma.compilation.warmup import warm_up
     from groma.errors import FileFormatError, GromaError, InputError, OutputError, ProblemError, ShapeError
+    from groma.estimators.motion.estimation import Motion, MotionOptions, estimate_motion
+    from groma.estimators.motion.matches import LandmarkMatches
     from groma.evaluation.lines import evaluate_lines
     from groma.evaluation.planes import evaluate_planes
     from groma.evaluation.poses import evaluate_poses
@@ -85,6 +87,7 @@ _HOME = {
     "FileFormatError": "groma.errors",
     "GromaError": "groma.errors",
     "InputError": "groma.errors",
+    "LandmarkMatches": "groma.estimators.motion.matches",
     "LineBearing": "groma.factors.observations.line_bearing",
     "LineOnPlane": "groma.factors.relations.line_on_plane",
     "LineReprojection": "groma.factors.observations.line_reprojection",
@@ -93,6 +96,8 @@ _HOME = {
     "Localizer": "groma.localization.localizer",
     "MapOptions": "groma.mapping.map",
     "MapResult": "groma.mapping.result",
+    "Motion": "groma.estimators.motion.estimation",
+    "MotionOptions": "groma.estimators.motion.estimation",
     "OutputError": "groma.errors",
     "PlaneObservation": "groma.factors.observations.plane_observation",
     "PointOnPlane": "groma.factors.relations.point_on_plane",
@@ -123,6 +128,7 @@ _HOME = {
     "convert": "groma.io.convert",
     "diagnose": "groma.adjustment.diagnosis:diagnose_scene",
     "estimate_absolute_pose": "groma.localization.pose.absolute_pose",
+    "estimate_motion": "groma.estimators.motion.estimation",
     "evaluate_lines": "groma.evaluation.lines",
     "evaluate_planes": "groma.evaluation.planes",
     "evaluate_poses": "groma.evaluation.poses",
@@ -170,6 +176,7 @@ __all__ = [
     "FileFormatError",
     "GromaError",
     "InputError",
+    "LandmarkMatches",
     "LineBearing",
     "LineOnPlane",
     "LineReprojection",
@@ -178,6 +185,8 @@ __all__ = [
     "Localizer",
     "MapOptions",
     "MapResult",
+    "Motion",
+    "MotionOptions",
     "OutputError",
     "PlaneObservation",
     "PointOnPlane",
@@ -212,6 +221,7 @@ __all__ = [
     "diagnose",
     "errors",
     "estimate_absolute_pose",
+    "estimate_motion",
     "estimators",
     "evaluate_lines",
     "evaluate_planes",
