@@ -11,12 +11,10 @@ from groma.io.archive import read_archive, write_archive
 from groma.mapping.lines.confidence import (
     GATES,
     WEIGHTS,
-    confidence_after,
     left_out,
     line_accuracy,
     line_confidence,
     line_evidence,
-    weighted_by_confidence,
     with_confidence,
 )
 from groma.mapping.map import MapOptions
@@ -129,15 +127,6 @@ def test_good_lines_are_more_probable_than_lines_of_unrelated_segments(scene):
     assert (fewer < before).mean() > 0.9
     signs = {name: np.sign(WEIGHTS[name]) for name in ("spread", "support", "length", "residual")}
     assert signs == {"spread": 1, "support": 1, "length": 1, "residual": -1}
-
-
-def test_observations_weigh_as_much_as_their_line_is_probable(scene):
-    weighted, seen = weighted_by_confidence(scene), scene.line_observations
-    known = np.maximum(line_confidence(scene), GATES.least_weight)[seen.line_idx]
-    np.testing.assert_allclose((seen.sigma / weighted.line_observations.sigma) ** 2, known)
-    back = confidence_after(weighted, weighted)
-    np.testing.assert_allclose(back.line_observations.sigma, seen.sigma)
-    np.testing.assert_allclose(back.lines.confidence, line_confidence(scene))
 
 
 def test_kept_in_archives(scene, tmp_path):

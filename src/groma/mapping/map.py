@@ -7,8 +7,7 @@ Stages, each saved when it is finished, so that an interrupted run goes on where
                   the points' observations placed anew by their grey levels, and adjusted again (``measured``);
 2. ``segments``   line segments in every image, one image at a time;
 3. ``lines``      3D lines from the segments;
-4. ``joint``      poses, points and lines adjusted together, each point weighted by its own noise, the lines by theirs
-                  and by how probably they are right;
+4. ``joint``      poses, points and lines adjusted together, each point weighted by its own noise, the lines by theirs;
                   then the lines are mapped once more with the better poses, and all this again while that moves
                   the poses by more than the lines allow for;
 5. ``structure``  planes, common directions, and what lies on what, and how closely;
@@ -41,7 +40,7 @@ from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
 from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider, explain, map_lines
-from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE, confidence_after, left_out, weighted_by_confidence
+from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE, left_out, with_confidence
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
@@ -220,7 +219,7 @@ def map_segments(
     options = stages.options
     scene = with_point_noise(points)
     line_map = stages.run(find_lines, scene, segments, matches, neighbors, None)
-    scene = weighted_by_confidence(line_map.add_to(scene, segments))
+    scene = line_map.add_to(scene, segments)
     weighted = _weighted(scene, options)
     for turn in range(GATES.max_rounds if options.refine_poses and scene.num_lines else 0):
         before, tag = scene, f"-{turn + 1}" if turn else ""
@@ -232,7 +231,7 @@ def map_segments(
         weighted = _weighted(joint, options)
         earlier = EarlierMap(before, line_map)
         line_map = stages.run(find_lines_again, joint, segments, matches, neighbors, earlier, tag=tag)
-        scene = weighted_by_confidence(line_map.add_to(joint, segments))
+        scene = line_map.add_to(joint, segments)
         if scene.num_lines == 0 or moved_px(before, joint, GATES.moved_share) <= options.lines.noise:
             break
     if scene.num_lines:
@@ -364,7 +363,7 @@ def _result(
     line_map: LineMap,
     min_confidence: float,
 ) -> MapResult:
-    scene = confidence_after(with_supported_intervals(adjusted.scene), before)
+    scene = with_confidence(with_supported_intervals(adjusted.scene))
     before = before.replace(line_intervals=scene.line_intervals)
     kept = scene.lines.confidence >= min_confidence
     scene, before = without_unused(scene.keep(lines=kept), before.keep(lines=kept))

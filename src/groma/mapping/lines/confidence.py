@@ -52,9 +52,6 @@ class ConfidenceGates:
     tolerance: float = gate(
         0.0025, "1", "error of a right line over the usual distance", "convention: two pixels of a usual lens"
     )
-    least_weight: float = gate(
-        0.05, "1", "weight of the least probable line in an adjustment", "convention: four and a half times the sigma"
-    )
     edge_px: float = gate(1.0, "px", "residual of a segment of a right line", "derived from the width of an edge")
 
 
@@ -70,28 +67,6 @@ _MIN_MISFIT, _MIN_SPREAD = 0.3, 1e-4
 def with_confidence(scene: Scene) -> Scene:
     """Return the scene with the probability of each line to be right."""
     return scene.replace(lines=scene.lines.replace(confidence=line_confidence(scene)))
-
-
-def weighted_by_confidence(scene: Scene) -> Scene:
-    """Return the scene with the probability of each line, and its observations weighted by it.
-
-    What is known of a camera from a line that may be none is worth that much less.
-    """
-    scene = with_confidence(scene)
-    seen = scene.line_observations
-    return scene.replace(line_observations=seen.replace(sigma=seen.sigma * _widening(scene)[seen.line_idx]))
-
-
-def confidence_after(scene: Scene, before: Scene) -> Scene:
-    """Return an adjusted scene with the probability of each line, and its observations as before they were weighted."""
-    seen = scene.line_observations
-    as_measured = seen.replace(sigma=seen.sigma / _widening(before)[seen.line_idx])
-    return with_confidence(scene.replace(line_observations=as_measured))
-
-
-def _widening(scene: Scene) -> FloatArray:
-    """(L,) by how much the standard deviations of lines of so little confidence are widened."""
-    return 1.0 / np.sqrt(np.maximum(scene.lines.confidence, GATES.least_weight))
 
 
 def left_out(kept: BoolArray, min_confidence: float) -> str:
@@ -211,12 +186,10 @@ __all__ = [
     "GATES",
     "WEIGHTS",
     "ConfidenceGates",
-    "confidence_after",
     "left_out",
     "line_accuracy",
     "line_confidence",
     "line_evidence",
     "usual_distance",
-    "weighted_by_confidence",
     "with_confidence",
 ]
