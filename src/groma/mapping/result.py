@@ -10,7 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from groma._json import json_text
+from groma._typing import FloatArray
 from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.contributions import Contribution, contributions
@@ -88,6 +91,7 @@ class MapResult:
             "num_images": self.scene.num_images,
             "num_points": self.scene.num_points,
             "num_lines": self.scene.num_lines,
+            "line_confidence": _confidence_numbers(self.scene.lines.confidence),
             "num_planes": self.scene.num_planes,
             "num_directions": self.scene.num_directions,
             "sigma_px": self.sigma_px,
@@ -167,6 +171,12 @@ class MapResult:
         if "survey" in numbers:
             (folder / "adjustment.txt").write_text(protocol(numbers), encoding="utf-8")
         (folder / "summary.json").write_text(json_text(numbers), encoding="utf-8")
+
+
+def _confidence_numbers(confidence: FloatArray) -> dict[str, Any]:
+    """How many lines are expected to be right, and how many have a probability of 0 to 0.1, to 0.2 and so on."""
+    counts = np.histogram(confidence, np.linspace(0.0, 1.0, 11))[0]
+    return {"expected_right": float(confidence.sum()), "lines_by_tenth": counts.tolist()}
 
 
 def _problem_of(scene: Scene, told: AdjustOptions) -> Problem:

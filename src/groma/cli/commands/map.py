@@ -77,8 +77,8 @@ def map_(
     min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
     min_confidence: Annotated[
         float,
-        typer.Option(min=0.0, max=1.0, metavar="P", help="Leave out lines less probably right than this, such as 0.5."),
-    ] = 0.0,
+        typer.Option(min=0.0, max=1.0, metavar="P", help="Leave out lines less probably right than this; 0 keeps all."),
+    ] = 0.5,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
     refine_poses: Annotated[
         bool, typer.Option("--refine-poses/--fix-poses", help="Move the cameras too, or the landmarks alone.")
