@@ -27,6 +27,20 @@ def map_(
             "are reconstructed.",
         ),
     ] = None,
+    extend: Annotated[
+        Path | None,
+        typer.Option(
+            "--extend",
+            metavar="MAP",
+            help="Place the photographs in this map, OUT of groma map or a COLMAP model, and map all of both.",
+        ),
+    ] = None,
+    map_images: Annotated[
+        Path | None,
+        typer.Option(
+            "--map-images", metavar="FOLDER", help="With --extend: the photographs of MAP, where it does not tell."
+        ),
+    ] = None,
     camera_model: Annotated[
         str | None,
         typer.Option(
@@ -97,11 +111,13 @@ def map_(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
+    from groma.cli.shared.extending import check_extension
     from groma.cli.shared.input import check_inputs
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
-    check_inputs(images, model, line_matches, truth)
+    check_inputs(images, model, line_matches, truth, extend, map_images)
+    check_extension(extend, map_images, {"--model": model, "--camera-params": camera_params})
 
     if model is not None and camera_params is not None:
         raise InputError("--camera-params is for images without a model. Leave it out.")
@@ -113,9 +129,11 @@ def map_(
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
 
     from groma.cli.shared.diagnosis import try_diagnosis
+    from groma.cli.shared.extending import end_queries, extend_map
     from groma.cli.shared.mapping import run_map, say_map, write_map
     from groma.features.external import read_matches
     from groma.io import read_scene
+    from groma.localization.extension import in_world_of
     from groma.mapping.map import MapOptions
 
     options = MapOptions(
@@ -137,10 +155,18 @@ def map_(
     matches = read_matches(line_matches) if line_matches is not None else None
     true = read_scene(truth) if truth is not None else None
     work = output.with_name(output.name + ".work")
-    result = run_map(console, images, work, start, options, matches)
+    photographs, extended = images, None
+    if extend is not None:
+        extended = extend_map(console, extend, images, map_images, output, force)
+        photographs, start = extended.folder, extended.scene
+    result = run_map(console, photographs, work, start, options, matches)
+    if extended is not None:
+        result = in_world_of(result, extended.map)
     found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
     numbers = result.summary(found, result.contributions(true) if contributions else ())
-    write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
+    title = f"Map of {images.absolute().name}"
+    write_map(result, output, work, force, images=photographs, title=title, summary=numbers)
+    end_queries(output)
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
