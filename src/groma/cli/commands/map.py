@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
 from groma.cli.shared.ranks import led_by_first_rank
 from groma.errors import InputError
@@ -94,6 +95,15 @@ def map_(
             "--diagnosis/--no-diagnosis", help="Say what the data do not determine. Default: yes up to 300 images."
         ),
     ] = None,
+    positions: _measured.Positions = None,
+    position_sigma: _measured.PositionSigma = None,
+    control: _measured.Control = None,
+    control_sigma: _measured.ControlSigma = None,
+    mark_sigma: _measured.MarkSigma = 1.0,
+    check: _measured.Check = None,
+    distances: _measured.Distances = None,
+    distance_sigma: _measured.DistanceSigma = None,
+    crs: _measured.Crs = None,
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
@@ -106,8 +116,8 @@ def map_(
     """Map photographs: points, lines and planes, adjusted together.
 
     OUT then holds a COLMAP model with the lines and planes beside it (structures/), scene.npz, lines and planes as PLY
-    and OBJ, summary.json and report.html. Finished stages are kept in OUT.work until the end: after an interruption the
-    same command goes on from there.
+    and OBJ, summary.json and report.html; with measurements adjustment.txt. Finished stages are kept in OUT.work until
+    the end: after an interruption the same command goes on from there.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
@@ -116,7 +126,11 @@ def map_(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
-    check_inputs(images, model, line_matches, truth, extend, map_images)
+    measured = _measured.Measured(
+        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
+    )
+    _measured.check_measured(measured)
+    check_inputs(images, model, line_matches, truth, extend, map_images, *measured.files)
     check_extension(extend, map_images, {"--model": model, "--camera-params": camera_params})
 
     if model is not None and camera_params is not None:
@@ -135,6 +149,7 @@ def map_(
     from groma.io import read_scene
     from groma.localization.extension import in_world_of
     from groma.mapping.map import MapOptions
+    from groma.mapping.photographs import image_files
 
     options = MapOptions(
         min_segment_length=min_length,
@@ -159,8 +174,13 @@ def map_(
     if extend is not None:
         extended = extend_map(console, extend, images, map_images, output, force)
         photographs, start = extended.folder, extended.scene
-    result = run_map(console, photographs, work, start, options, matches)
-    if extended is not None:
+    survey = None
+    if measured:
+        survey = measured.read(
+            photographs, lambda: [path.relative_to(photographs).as_posix() for path in image_files(photographs)]
+        )
+    result = run_map(console, photographs, work, start, options, matches, survey)
+    if extended is not None and survey is None:
         result = in_world_of(result, extended.map)
     found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
     numbers = result.summary(found, result.contributions(true) if contributions else ())
