@@ -191,7 +191,8 @@ class LiveView:
                 visible=shown["points"],
             )]  # fmt: skip
             segments = scene.lines.segments.astype(np.float32)
-            nodes["lines"] = [self._segments("/lines", segments, _LINES, 2.0, shown["lines"])]
+            self.server.scene.remove_by_name("/lines")
+            nodes["lines"] = [self._segments("/lines", segments, _LINES, 2.0, shown["lines"])] if len(segments) else []
             self.server.scene.remove_by_name("/keyframes")
             nodes["keyframes"] = [
                 self._camera(f"/keyframes/{row}", world[row], _KEYFRAMES, 1.0, shown["keyframes"])
