@@ -26,7 +26,6 @@ from groma.localization.localizer import LocalizedImage, Localizer
 from groma.localization.map_index import Progress
 from groma.localization.placed import PlacedImage
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.verdict import moved as way_between
 from groma.localization.posed_model import gather_photographs, with_photographs
@@ -251,7 +250,8 @@ def _pose_of(moved: Scene, image: int, found: LocalizedImage) -> FloatArray:
     places = np.concatenate([matches.points3d[pose.point_inliers], lines])
     own = moved.cam_from_world[image]
     way = way_between(pose.camera, own, pose.cam_from_world, places)
-    return pose.cam_from_world if way > VERDICT.distinct * max_errors(matches)[0] else own
+    # Under its own pose half of what agrees with the first map would not.
+    return pose.cam_from_world if way > max_errors(matches)[0] else own
 
 
 def _as_placed(scene: Scene, image: int, pose: FloatArray | None) -> PlacedImage:
