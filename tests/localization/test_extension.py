@@ -3,6 +3,7 @@
 
 import shutil
 from collections import Counter
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -125,6 +126,15 @@ def test_photographs_of_both_maps_are_taken_once(place, maps, truth, tmp_path):
     gather_photographs(tmp_path / "b", {name: cabinet.folder() / "images" / name for name in both})
     made = merged_model(maps["a"], Localizer(scene, tmp_path / "b"), tmp_path / "images", "similarity", quiet)
     assert made.num_common == 1 and sorted(made.scene.images.names) == FRAMES
+
+
+def test_a_photograph_that_one_map_has_in_a_wrong_place_gets_that_of_the_other(maps, place, truth, tmp_path):
+    scene = read_scene(place / "b.npz")
+    poses = scene.frames.rig_from_world.copy()
+    poses[2, 4:] += 2.0
+    other = Localizer(scene.replace(frames=replace(scene.frames, rig_from_world=poses)), place / "b")
+    made = merged_model(maps["a"], other, tmp_path / "images", "similarity", quiet)
+    assert _off(made.scene, truth).max() < 0.2
 
 
 def test_maps_of_different_places_are_not_joined(place, maps, tmp_path):

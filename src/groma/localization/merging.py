@@ -26,6 +26,8 @@ from groma.localization.localizer import LocalizedImage, Localizer
 from groma.localization.map_index import Progress
 from groma.localization.placed import PlacedImage
 from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.hypotheses import max_errors
+from groma.localization.pose.verdict import moved as way_between
 from groma.localization.posed_model import gather_photographs, with_photographs
 from groma.scene import Scene, Similarity
 
@@ -96,12 +98,14 @@ def merged_model(
     InputError
         If the maps share no place that is recognised, or what they share does not determine the motion.
     """
-    matches = _matches(first, second, say, gates)
+    found = _found(first, second, say, gates)
+    matches = _matches(first, second, found, gates)
     motion = _motion(matches, kind, gates)
     moved = second.scene.transformed(Similarity.from_array(motion.similarity))
+    poses = {image: _pose_of(moved, image, one) for image, one in found.items()}
     known = {_digest(path) for path in first.files}
     fresh = [row for row, path in enumerate(second.files) if _digest(path) not in known]
-    placed = [_as_placed(moved, row) for row in fresh]
+    placed = [_as_placed(moved, row, poses.get(row)) for row in fresh]
     paths = [*first.files, *(second.files[row] for row in fresh)]
     scene = with_photographs(first.scene, first.index, placed, paths, say)
     gather_photographs(folder, dict(zip(scene.images.names, paths, strict=True)))
@@ -133,23 +137,32 @@ def _motion(matches: LandmarkMatches, kind: Kind, gates: MergeGates) -> Motion:
     return best[1]
 
 
-def _matches(first: Localizer, second: Localizer, say: Progress, gates: MergeGates) -> LandmarkMatches:
-    """Points and lines of the second map (a) and of the first (b) that are the same."""
+def _found(first: Localizer, second: Localizer, say: Progress, gates: MergeGates) -> dict[int, LocalizedImage]:
+    """Photographs of the second map that are found in the first, by their number."""
     count = second.scene.num_images
     chosen = np.unique(np.linspace(0, count - 1, min(count, gates.photographs)).astype(int))
-    points, lines = Counter[tuple[int, int]](), Counter[tuple[int, int]]()
-    sentence = ""
+    out, sentence = {}, ""
     for done, image in enumerate(chosen.tolist()):
         say("looking for photographs of the second map in the first", done, len(chosen))
         camera = QueryCamera.of(second.scene.cameras, int(second.scene.images.camera_idx[image]))
         found = first.localize(second.files[image], camera)
         sentence = found.pose.sentence
         if found.pose.status == "localized":
-            points.update(map(tuple, _same_points(second, image, found, gates).tolist()))
-            lines.update(map(tuple, _same_lines(second, image, found, gates).tolist()))
-    pairs, line_pairs = _one_to_one(points), _one_to_one(lines)
-    if not len(pairs) and not len(line_pairs):
+            out[image] = found
+    if not out:
         raise InputError(f"The maps cannot be joined: no photograph of the second is found in the first. {sentence}")
+    return out
+
+
+def _matches(
+    first: Localizer, second: Localizer, found: dict[int, LocalizedImage], gates: MergeGates
+) -> LandmarkMatches:
+    """Points and lines of the second map (a) and of the first (b) that are the same."""
+    points, lines = Counter[tuple[int, int]](), Counter[tuple[int, int]]()
+    for image, one in found.items():
+        points.update(map(tuple, _same_points(second, image, one, gates).tolist()))
+        lines.update(map(tuple, _same_lines(second, image, one, gates).tolist()))
+    pairs, line_pairs = _one_to_one(points), _one_to_one(lines)
     a, b = second.index, first.index
     of_points = np.column_stack(
         [_point_sigma(a.point_covariance[pairs[:, 0]]), _point_sigma(b.point_covariance[pairs[:, 1]])]
@@ -229,12 +242,25 @@ def _line_sigma(segments: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.where(length > 0, np.sqrt(total / 4.0), np.nan)
 
 
-def _as_placed(scene: Scene, image: int) -> PlacedImage:
-    """An image of a scene as a photograph with a pose."""
+def _pose_of(moved: Scene, image: int, found: LocalizedImage) -> FloatArray:
+    """The pose (7,) of a photograph that both maps tell: the first's where the second has it in another place."""
+    pose, matches = found.pose, found.pose.matches
+    assert pose.cam_from_world is not None
+    lines = matches.segments3d[pose.line_inliers].mean(axis=1)
+    places = np.concatenate([matches.points3d[pose.point_inliers], lines])
+    own = moved.cam_from_world[image]
+    way = way_between(pose.camera, own, pose.cam_from_world, places)
+    # Under its own pose half of what agrees with the first map would not.
+    return pose.cam_from_world if way > max_errors(matches)[0] else own
+
+
+def _as_placed(scene: Scene, image: int, pose: FloatArray | None) -> PlacedImage:
+    """An image of a scene as a photograph with a pose, its own unless another is given."""
     camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
     none = np.zeros(0, np.int64)
+    own = scene.cam_from_world[image] if pose is None else pose
     return PlacedImage(
-        scene.images.names[image], "localized", "", scene.cam_from_world[image], np.zeros((6, 6)), camera.model,
+        scene.images.names[image], "localized", "", own, np.zeros((6, 6)), camera.model,
         camera.params, np.array([camera.width, camera.height]), none, np.zeros((0, 2)), none, np.zeros((0, 4)), 0.0,
     )  # fmt: skip
 
