@@ -64,6 +64,7 @@ from groma.mapping.surveyed import adjust_with_survey, tied
 from groma.mapping.unused import without_unused
 from groma.scene import Scene
 from groma.scene.local_frame import usual_frame
+from groma.solver.linear.blas import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -199,7 +200,7 @@ def map_images(
     check_cameras((options.point_model().camera_model,) if model is None else model.cameras.models)
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
-    with work_with(options.threads), Stages(Path(work), key, options, say) as stages:
+    with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
         placed = start_of(folder, names, model, stages)
         start = placed.scene
         points = stages.run(adjust_points, start)
@@ -333,14 +334,16 @@ def find_planes(scene: Scene, options: MapOptions, say: StageProgress) -> Scene:
 @stage("adjusted", ADJUSTED)
 def adjust_everything(scene: Scene, weighted: AdjustOptions, options: MapOptions, say: StageProgress) -> AdjustResult:
     """Everything adjusted together."""
-    return _adjusted(scene, weighted, options, say, "adjusting everything")
+    return _adjusted(scene, dataclasses.replace(weighted, check_lens=True), options, say, "adjusting everything")
 
 
 # -------------------------------------------------------------------------------------------------------------- helpers
 def _robust(options: MapOptions) -> AdjustOptions:
+    """Options of an adjustment of which the scene alone is wanted: the last one asks what the lenses lack."""
     return AdjustOptions(
         refine_intrinsics=bool(options.refine_intrinsics),
         max_iterations=options.max_iterations,
+        check_lens=False,
         threads=options.threads,
     )
 
