@@ -26,7 +26,7 @@ estimation in linear models*, 1987; Foerstner and Wrobel, *Photogrammetric compu
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -58,6 +58,9 @@ class ReliabilityGates:
 
     level: float = gate(1e-3, "probability", "of calling a good measurement wrong", "convention: Baarda")
     power: float = gate(0.8, "probability", "of finding an error of the size told", "convention: Baarda")
+    outliers: float = gate(
+        0.25, "share", "of a kind that may be wrong; of more, the kind is worse than stated", "cost: a wrong sentence"
+    )
 
 
 GATES = ReliabilityGates()
@@ -109,8 +112,8 @@ class Reliability:
 
     measurements: tuple[Measurement, ...]
     check_points: tuple[CheckPoint, ...]
-    #: Standard deviations that the residuals show over those stated, by kind, of what is not suspect; None where
-    #: nothing is redundant.
+    #: Standard deviations that the residuals show over those stated, by kind, without suspects if these are few; None
+    #: where nothing is redundant.
     components: dict[str, float | None] = field(default_factory=dict)
     #: Sums of redundancy numbers by kind.
     redundancy: dict[str, float] = field(default_factory=dict)
@@ -185,7 +188,7 @@ def reliability(
     frame = _frame(problem, [factor for _, _, factor in entries])
     tests = [_tested(frame, *entry) for entry in entries]
     measurements = [row for test in tests for row in _rows(test, level, power)]
-    wrong = {(one.kind, one.name) for one in measurements if one.is_suspect}
+    wrong = _outliers(measurements)
     components, redundancy = {}, {}
     for kind in dict.fromkeys(test.kind for test in tests):
         parts = [_squares_and_shares(test, wrong) for test in tests if test.kind == kind]
@@ -363,6 +366,17 @@ def _rows(test: _Test, level: float, power: float) -> Iterator[Measurement]:
                 is_suspect=normalized is not None and bool(abs(normalized) > limit),
                 weight=float(test.weight[row]),
             )
+
+
+def _outliers(measurements: Sequence[Measurement]) -> set[tuple[str, str]]:
+    """Return kind and name of suspect measurements, of kinds of which few are: where many are, all are worse."""
+    found = set()
+    for kind in {one.kind for one in measurements}:
+        names = {one.name for one in measurements if one.kind == kind}
+        suspect = {one.name for one in measurements if one.kind == kind and one.is_suspect}
+        if len(suspect) <= GATES.outliers * len(names):
+            found |= {(kind, name) for name in suspect}
+    return found
 
 
 def _squares_and_shares(test: _Test, wrong: set[tuple[str, str]]) -> tuple[float, float]:
