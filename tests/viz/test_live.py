@@ -135,7 +135,9 @@ def test_a_track_writes_what_the_page_shows(tmp_path):
         timestamp=0.5, pose=np.array([0, 0, 0, 1.0, 0, 0, 0]), status="tracked", counts={"points": 3}, keyframe=True,
         submap=0,
     )  # fmt: skip
-    tracker = SimpleNamespace(followed=(np.array([[640.0, 50.0]]), np.array([[100.0, 10.0, 200.0, 20.0]])))
+    points = SimpleNamespace(pixel=np.array([[640.0, 50.0]]))
+    lines = SimpleNamespace(ends=np.array([[100.0, 10.0, 200.0, 20.0]]))
+    tracker = SimpleNamespace(_present=SimpleNamespace(followed=SimpleNamespace(points=points, lines=lines)))
     journal = Journal(tmp_path / "out.work")
     journal.frame(tracked, frame, tracker)  # type: ignore[arg-type]
     found = glance.read_statuses(tmp_path / "out.work" / "statuses.txt")

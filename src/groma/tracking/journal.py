@@ -14,6 +14,7 @@ import numpy as np
 from groma.geometry import se3
 from groma.io import write_scene
 from groma.io.trajectories import write_tum
+from groma.tracking.map.keyframes import Followed
 
 if TYPE_CHECKING:
     from groma.io.sequences.frame import Frame
@@ -60,7 +61,8 @@ class Journal:
 
         scale = min(1.0, COLUMNS / frame.gray.shape[1])
         picture = cv2.resize(frame.gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        points, segments = tracker.followed if tracked.pose is not None else (np.zeros((0, 2)), np.zeros((0, 4)))
+        followed = tracker._present.followed if tracked.pose is not None else Followed.nothing()
+        points, segments = followed.points.pixel, followed.lines.ends
         draft = self._folder / "now.draft"
         with draft.open("wb") as file:
             np.savez(file, picture=picture, points=scale * points, segments=scale * segments)

@@ -105,12 +105,6 @@ class Tracker:
         """The map so far."""
         return self._mapper.map
 
-    @property
-    def followed(self) -> tuple[FloatArray, FloatArray]:
-        """Points (n, 2) and segments (m, 4) that are followed in the last frame with a pose, pixels."""
-        followed = self._present.followed
-        return followed.points.pixel, followed.lines.ends
-
     def begun_anew(self) -> Tracker | None:
         """End this track and return one for the same frames, if the right camera is turned far from what was taken."""
         if self._mapper.better_turn is None:
