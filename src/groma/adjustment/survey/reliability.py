@@ -31,7 +31,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
@@ -121,7 +121,7 @@ class Reliability:
     @property
     def limit(self) -> float:
         """Normalised residuals beyond are called wrong."""
-        return float(norm.isf(self.level / 2.0))
+        return float(-ndtri(self.level / 2.0))
 
     @property
     def suspects(self) -> tuple[Measurement, ...]:
@@ -145,7 +145,7 @@ class Reliability:
 
 def noncentrality(level: float = GATES.level, power: float = GATES.power) -> float:
     """Return by how many standard deviations a mean must be off for a two-sided test to find it with a power."""
-    return float(norm.isf(level / 2.0) + norm.ppf(power))
+    return float(ndtri(power) - ndtri(level / 2.0))
 
 
 def reliability(
@@ -344,7 +344,7 @@ def _rows(test: _Test, level: float, power: float) -> Iterator[Measurement]:
     deviation = np.sqrt(np.einsum("nii->ni", np.linalg.inv(test.information)))
     scores = np.einsum("nij,nj->ni", test.information, test.full)
     of_scores = np.einsum("nij,njk,nki->ni", test.information, test.cofactor, test.information)
-    limit, shift = norm.isf(level / 2.0), noncentrality(level, power)
+    limit, shift = -ndtri(level / 2.0), noncentrality(level, power)
     for row, name in enumerate(test.names):
         for k, coordinate in enumerate(_COORDINATES[test.kind]):
             share, variance = float(test.shares[row, k]), float(of_scores[row, k])
