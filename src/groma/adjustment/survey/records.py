@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from groma.gates import gate
 
@@ -86,7 +86,7 @@ class Reliability:
     @property
     def limit(self) -> float:
         """Normalised residuals beyond are called wrong."""
-        return float(norm.isf(self.level / 2.0))
+        return float(-ndtri(self.level / 2.0))
 
     @property
     def suspects(self) -> tuple[Measurement, ...]:
@@ -110,7 +110,7 @@ class Reliability:
 
 def noncentrality(level: float = GATES.level, power: float = GATES.power) -> float:
     """Return by how many standard deviations a mean must be off for a two-sided test to find it with a power."""
-    return float(norm.isf(level / 2.0) + norm.ppf(power))
+    return float(ndtri(power) - ndtri(level / 2.0))
 
 
 __all__ = ["GATES", "CheckPoint", "Measurement", "Reliability", "ReliabilityGates", "noncentrality"]
