@@ -2,13 +2,17 @@
 """``groma map``: points, lines and planes from photographs."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from groma.cli.shared import options as _options
 from groma.cli.shared.ranks import led_by_first_rank
 from groma.errors import InputError
+
+if TYPE_CHECKING:
+    from groma.cli.shared.console import Console
+    from groma.io.colmap.rigs import RigDescription
 
 
 @led_by_first_rank
@@ -39,6 +43,18 @@ def map_(
         str | None,
         typer.Option(metavar="F,CX,CY,...", help="Without --model: the calibration, if it is known; it is then kept."),
     ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            "--rig",
+            metavar="FILE",
+            help="Images taken at the same moment by cameras fixed to each other: COLMAP's rig_config.json. Found by "
+            "itself in IMAGES.",
+        ),
+    ] = None,
+    refine_rig: Annotated[
+        bool, typer.Option("--refine-rig/--fix-rig", help="Estimate where the cameras sit on their rig.")
+    ] = False,
     line_matches: Annotated[
         Path | None,
         typer.Option(
@@ -101,10 +117,13 @@ def map_(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
-    check_inputs(images, model, line_matches, truth)
+    check_inputs(images, model, rig, line_matches, truth)
 
     if model is not None and camera_params is not None:
         raise InputError("--camera-params is for images without a model. Leave it out.")
+
+    if model is not None and rig is not None:
+        raise InputError("--rig is for images without a model: a model has its own rigs. Leave it out.")
 
     if line_matches is not None and line_matcher is not None:
         raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
@@ -130,6 +149,8 @@ def map_(
         max_iterations=max_iterations,
         camera_model=camera_model,
         camera_params=_parameters(camera_params),
+        rigs=() if model is not None else _rigs(console, images, rig),
+        refine_rigs=refine_rig,
         threads=threads,
         seed=seed,
     )
@@ -144,6 +165,23 @@ def map_(
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
+
+
+def _rigs(console: "Console", images: Path, path: Path | None) -> "tuple[RigDescription, ...]":
+    """Return the rigs of a file, or of the one in the folder of photographs, and say what they hold."""
+    from groma.io.colmap.rigs import RIG_FILE, check_rigs, read_rigs
+    from groma.mapping.photographs import image_files
+
+    if path is None and not (images / RIG_FILE).is_file():
+        return ()
+    file = path or images / RIG_FILE
+    found = read_rigs(file)
+    names = [image.relative_to(images).as_posix() for image in image_files(images)]
+    console.say(
+        f"{'Cameras' if path is not None else 'Found in the folder: cameras'} on rigs by {file}. "
+        + check_rigs(found, names)
+    )
+    return found
 
 
 def _parameters(text: str | None) -> tuple[float, ...] | None:

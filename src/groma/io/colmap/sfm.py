@@ -27,6 +27,7 @@ from groma.errors import GromaError, InputError, OutputError
 from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.model import from_pycolmap
 from groma.io.colmap.quiet import quiet
+from groma.io.colmap.rigs import RigDescription, by_frames, camera_of, check_rigs, map_frames
 from groma.scene import Scene
 
 #: Up to this many images every pair is matched; beyond it each image is matched with its followers by name.
@@ -60,6 +61,10 @@ class PointModelOptions:
     seed: int = 0
     #: Most threads of pycolmap; None: as many as there are processors.
     threads: int | None = None
+    #: Which images were taken at the same moment by cameras fixed to each other; none: every image stands alone.
+    rigs: tuple[RigDescription, ...] = ()
+    #: Estimate where the cameras sit on their rig; otherwise they stay where the description says.
+    refine_rigs: bool = False
 
     def __post_init__(self) -> None:
         known = {model.name: model for model in camera_models.models() if model.colmap_name is not None}
@@ -77,6 +82,14 @@ class PointModelOptions:
                 f"The camera parameters ({', '.join(model.parameter_names)}) must be numbers, the focal length "
                 f"positive; got {', '.join(f'{value:g}' for value in given)}."
             )
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the calibration of all cameras is known, and kept."""
+        cameras = [camera for rig in self.rigs for camera in rig.cameras]
+        return self.camera_params is not None or (
+            bool(cameras) and all(camera.camera_params is not None for camera in cameras)
+        )
 
 
 def reconstruct_points(
@@ -120,6 +133,7 @@ def reconstruct_points(
     options = options or PointModelOptions()
     say = progress or (lambda stage, done, total: None)
     folder, names = Path(work), sorted(names)
+    check_rigs(options.rigs, names)
     database = folder / "database.db"
     pycolmap.set_random_seed(options.seed)
     with quiet(pycolmap), _explained(folder):
@@ -127,10 +141,17 @@ def reconstruct_points(
         _check_room(folder)
         _enter_images(pycolmap, database, Path(images), names, options)
         _find_features(pycolmap, database, Path(images), names, options, say)
-        _match(pycolmap, database, names, options, say)
-        models = []
-        for angle in FIRST_PAIR_ANGLES:
-            models = models or _reconstruct(pycolmap, database, Path(images), folder, len(names), options, angle, say)
+        _match(pycolmap, database, by_frames(options.rigs, names), options, say)
+
+        def attempt(content: Path) -> list[Any]:
+            models: list[Any] = []
+            for angle in FIRST_PAIR_ANGLES:
+                models = models or _reconstruct(
+                    pycolmap, content, Path(images), folder, len(names), options, angle, say
+                )
+            return models
+
+        models = map_frames(pycolmap, database, options.rigs, attempt)
     if not models:
         with _opened(pycolmap, database) as content:
             features, matches = content.num_keypoints(), content.num_inlier_matches()
@@ -169,25 +190,28 @@ def _enter_images(pycolmap: Any, database: Path, images: Path, names: list[str],
             path.unlink()
         with _opened(pycolmap, database):
             pass
-    groups: dict[tuple[object, ...], list[str]] = {}
+    groups: dict[tuple[Any, ...], list[str]] = {}
     for name in names:
         bitmap = pycolmap.Bitmap.read(str(images / name), False)
         if bitmap is None:
             raise InputError(
                 f"{images / name} cannot be read by pycolmap, which finds the points. Convert it to JPEG or PNG."
             )
-        groups.setdefault((bitmap.width, bitmap.height, bitmap.exif_camera_model()), []).append(name)
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = camera_models.model(options.camera_model).colmap_name
-    if options.camera_params is not None:
-        if len(groups) > 1:
-            sizes = ", ".join(sorted({f"{key[0]}x{key[1]}" for key in groups}))
-            raise InputError(
-                f"One set of camera parameters was given, but the images come from {len(groups)} cameras ({sizes}). "
-                "Leave the parameters out, or map the images of one camera."
-            )
-        reader.camera_params = ",".join(repr(float(value)) for value in options.camera_params)
-    for members in groups.values():
+        key = (bitmap.width, bitmap.height, bitmap.exif_camera_model(), camera_of(options.rigs, name))
+        groups.setdefault(key, []).append(name)
+    if options.camera_params is not None and len({key[:3] for key in groups}) > 1:
+        sizes = ", ".join(sorted({f"{key[0]}x{key[1]}" for key in groups}))
+        raise InputError(
+            f"One set of camera parameters was given, but the images come from {len(groups)} cameras ({sizes}). "
+            "Leave the parameters out, or map the images of one camera."
+        )
+    for (*_, mounted), members in groups.items():
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = camera_models.model(options.camera_model).colmap_name
+        params = options.camera_params
+        if mounted is not None and mounted.camera_params is not None:
+            reader.camera_model, params = mounted.camera_model, mounted.camera_params
+        reader.camera_params = "" if params is None else ",".join(repr(float(value)) for value in params)
         pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, members, reader)
 
 
@@ -274,7 +298,8 @@ def _reconstruct(
     for part in (pipeline, pipeline.mapper, pipeline.triangulation):
         part.random_seed = options.seed
     pipeline.mapper.init_min_tri_angle = angle
-    if options.camera_params is not None:
+    pipeline.ba_refine_sensor_from_rig = options.refine_rigs
+    if options.is_calibrated:
         pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False
         pipeline.mapper.abs_pose_refine_focal_length = pipeline.mapper.abs_pose_refine_extra_params = False
     placed = [0]
