@@ -27,6 +27,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "_factor_table",
+    "_figures",
     "_formulas",
     "_navigation",
     "_reference",

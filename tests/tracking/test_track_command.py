@@ -20,6 +20,7 @@ from groma.io import read_scene
 from groma.io.trajectories import read_tum
 from groma.tracking import Tracker, TrackOptions
 from groma.tracking.journal import Journal
+from groma.tracking.saved import FrameSource
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +130,8 @@ def _same_files(first, second):
 def test_the_command_is_one_call(sequence, tmp_path):
     opened = groma.open_sequence(sequence, camera=CAMERA)
     events = []
-    result = groma.track(opened, progress=events.append, work=tmp_path / "work", name=str(sequence))
+    source = FrameSource.of(sequence, CAMERA)
+    result = groma.track(opened, progress=events.append, work=tmp_path / "work", name=str(sequence), source=source)
     result.write(tmp_path / "called")
     assert _run(sequence, "-o", tmp_path / "commanded", "--camera", CAMERA).exit_code == 0
     assert "trajectory.txt" in _same_files(tmp_path / "called", tmp_path / "commanded")

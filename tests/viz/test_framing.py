@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 from _scene import exact_scene
 
+from groma.geometry import se3
 from groma.scene import Lines, Points, Scene
 from groma.scene.synthetic.scenes import holistic
 from groma.viz.drawable import drawable
-from groma.viz.framing import OPENING, StartingView, horizontal, starting_view, upward
+from groma.viz.framing import FOR_CAMERAS, OPENING, StartingView, horizontal, starting_view, upward
 
 
 def _seen(view: StartingView, places: np.ndarray) -> np.ndarray:
@@ -27,17 +28,30 @@ def _view(scene: Scene) -> StartingView:
     return starting_view(drawable(scene), np.zeros(3))
 
 
-def _places(scene: Scene) -> np.ndarray:
-    return np.concatenate([scene.points.xyz, scene.lines.segments.reshape(-1, 3), drawable(scene).centers])
+def _landmarks(scene: Scene) -> np.ndarray:
+    return np.concatenate([scene.points.xyz, scene.lines.segments.reshape(-1, 3)])
 
 
 @pytest.mark.parametrize("scene", [holistic(10, seed=1).truth, exact_scene()], ids=["room", "box"])
-def test_the_scene_fills_the_picture(scene):
-    at = np.abs(_seen(_view(scene), _places(scene)))
+def test_the_landmarks_fill_the_picture(scene):
+    at = np.abs(_seen(_view(scene), _landmarks(scene)))
     assert (at <= 1).all(axis=1).mean() > 0.9
-    assert at.max() > 0.9
-    cameras = np.abs(_seen(_view(scene), drawable(scene).centers))
-    assert (cameras <= 1).all()
+    assert at.max() > 0.9 / FOR_CAMERAS
+
+
+def test_cameras_are_in_the_picture_where_that_makes_nothing_small():
+    scene = holistic(10, seed=1).truth
+    centers = drawable(scene).centers
+    near = scene.frames.rig_from_world.copy()  # the same rotations, in the middle of the room
+    near[:, 4:] = 0.1 * near[:, 4:] - 0.9 * se3.to_matrix(near)[:, :3, :3] @ np.median(_landmarks(scene), axis=0)
+    among = scene.replace(frames=scene.frames.replace(rig_from_world=near))
+    assert (np.abs(_seen(_view(among), drawable(among).centers)) <= 1).all()
+    far = scene.frames.rig_from_world.copy()
+    far[:, 4:] *= 30.0
+    gone = _view(scene.replace(frames=scene.frames.replace(rig_from_world=far)))
+    assert gone.distance < 2.0 * _view(scene).distance < 0.2 * 30.0 * np.linalg.norm(centers, axis=1).max()
+    at = np.abs(_seen(gone, _landmarks(scene)))
+    assert (at <= 1).all(axis=1).mean() > 0.9 and at.max() > 0.5
 
 
 def test_outliers_do_not_count():

@@ -20,8 +20,8 @@ from groma.io import write_scene
 from groma.scene import Directions, Relations, Scene
 from groma.scene.synthetic.scenes import holistic
 from groma.viz.pictures import jpeg_address
-from groma.viz.report import data as _page_data
 from groma.viz.report import images as _page_images
+from groma.viz.report import kept as _page_kept
 from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.saved import saved_report
 
@@ -84,6 +84,10 @@ def _floats(text: str) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), "<f4")
 
 
+def _whole(text: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), "<i4")
+
+
 def _noisy(scene: Scene) -> Scene:
     return scene.with_points(scene.points.xyz + np.random.default_rng(2).normal(size=scene.points.xyz.shape) * 0.02)
 
@@ -106,10 +110,12 @@ def test_data_of_both_states(tmp_path):
     np.testing.assert_allclose(steps - steps[0], 0, atol=1e-6)  # one offset for all
     assert not np.allclose(_floats(before["points"]), _floats(after["points"]))
     assert len(_floats(after["lines"])) == 4 * 6
-    assert len(_floats(after["planes"])) == 3 * sum(data["corners"]) >= 9
+    assert len(_floats(after["planes"])) == 3 * sum(data["planes"]["corners"]) >= 9
     assert len(_floats(after["cameras"])) == 2 * 12
-    assert len(_floats(after["line_errors"])) == len(_floats(data["line_views"])) == 4
-    assert _floats(data["line_views"]).tolist() == [2] * 4
+    assert len(_floats(after["line_errors"])) == len(data["lines"]["colours"]) * 3 // 4 // 3 == 4
+    assert _whole(data["lines"]["images"]).tolist() == [2] * 4
+    assert _whole(data["points"]["images"]).tolist() == [2] * 12
+    assert _whole(data["relations"]["point_on_plane"]).reshape(-1, 2).tolist() == [[k, 0] for k in range(5)]
     assert len(_floats(data["rows"])) == 24 * 6
     assert [entry["points_seen"] for entry in data["images"]] == [12, 12]
 
@@ -152,10 +158,14 @@ def test_an_empty_scene(tmp_path):
 
 
 def test_large_scenes_are_thinned(tmp_path, monkeypatch):
-    monkeypatch.setattr(_page_data, "MAX_POINTS", 5)
+    monkeypatch.setattr(_page_kept, "MAX_POINTS", 5)
     data = _data(_write(tmp_path, None, exact_scene()))
     assert len(_floats(data["states"][0]["points"])) == 5 * 3
     assert len(_floats(data["states"][0]["errors"])) == 5
+    assert sorted(_whole(data["row_points"])) == sorted([*range(5)] * 2)  # of those that are left, all observations
+    kept = _whole(data["points"]["ids"]).tolist()
+    on_plane = _whole(data["relations"]["point_on_plane"]).reshape(-1, 2)[:, 0]
+    assert [kept[row] for row in on_plane] == [number for number in exact_scene().points.ids[:5] if number in kept]
 
 
 def test_different_scenes_are_refused(tmp_path):
@@ -185,16 +195,20 @@ def test_segments_in_the_images(tmp_path):
     projected = _floats(data["projected"]).reshape(len(rows), data["samples"], 2)
     assert data["samples"] > 2  # one of the cameras bends lines
     np.testing.assert_allclose(projected[:, [0, -1]].reshape(-1, 4), seen.segment, rtol=1e-5)
-    assert data["owners"] == scene.lines.ids[seen.line_idx].tolist()
+    assert (
+        _whole(data["lines"]["ids"])[_whole(data["segment_lines"])].tolist() == scene.lines.ids[seen.line_idx].tolist()
+    )
     first, second = data["images"]
     assert (first["segments"], second["segments"]) == ([0, 4], [4, 8])
     assert first["lines_seen"] == second["lines_seen"] == 4
 
 
-def test_bent_ends_of_polylines_are_kept_when_thinned(tmp_path, monkeypatch):
-    monkeypatch.setattr(_page_images, "MAX_SEGMENT_ROWS", 4)
+def test_lines_keep_all_their_segments_when_there_are_too_many(tmp_path, monkeypatch):
+    monkeypatch.setattr(_page_kept, "MAX_SEGMENT_ROWS", 5)
     data = _data(_write(tmp_path, None, exact_scene()))
-    assert len(data["owners"]) == 8  # forty per image are always kept
+    owners = _whole(data["segment_lines"])
+    assert len(owners) == 4 and sorted(np.bincount(owners).tolist())[-2:] == [2, 2]  # two lines with both segments
+    assert len(_floats(data["projected"])) == 4 * 2 * data["samples"]
     assert [entry["lines_seen"] for entry in data["images"]] == [4, 4]
 
 
@@ -262,6 +276,11 @@ def test_the_summary_of_a_map_stands_in_the_page(tmp_path):
     for words in ("It went well.", "Mind the gap.", "Three of three.", "Convergence"):
         assert words in text
     assert [bool(entry["photo"]) for entry in _data(text)["images"]] == [True, False]
+    assert _floats(_data(text)["lines"]["confidence"]).tolist() == [-1] * 4  # a COLMAP model does not know it
+    sure = exact_scene()
+    write_scene(sure.replace(lines=sure.lines.replace(confidence=np.full(4, 0.5))), tmp_path / "map" / "scene.npz")
+    assert run(["report", str(tmp_path / "map"), "-o", str(page), "-f"]) == 0
+    assert _floats(_data(page.read_text(encoding="utf-8"))["lines"]["confidence"]).tolist() == [0.5] * 4
     assert run(["report", str(tmp_path / "map"), "-o", str(page), "-f", "--images", str(tmp_path / "none")]) != 0
     for content in ("no json", "[]"):
         (tmp_path / "map" / "summary.json").write_text(content)
@@ -352,7 +371,8 @@ def test_the_page_draws_in_a_browser_without_complaints(tmp_path):
     _pictures(tmp_path, "photos/first.jpg")
     write_report(tmp_path / "page.html", None, exact_scene(("first.jpg", "second.jpg")), images=tmp_path / "photos")
     finished = subprocess.run(
-        ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
+        ["chromium", "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+         "--enable-logging=stderr", "--v=0",
          f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=3000", "--dump-dom",
          f"file://{tmp_path / 'page.html'}"],
         capture_output=True, text=True, timeout=120,

@@ -21,8 +21,9 @@ from groma.cli.main import run
 from groma.errors import InputError
 from groma.geometry import se3
 from groma.io import write_scene
-from groma.scene import Directions, Points, Relations, Scene, Similarity, synthetic
+from groma.scene import Directions, Lines, Points, Relations, Scene, Similarity, synthetic
 from groma.scene.patches import plane_patches
+from groma.viz.pictures import folder_of_images
 from groma.viz.viewer import nodes as _scene_view
 from groma.viz.viewer import scene as viewer
 from groma.viz.viewer.content import LINE_MODES, REACH, ray_to_segments, view_content
@@ -84,11 +85,13 @@ def test_openings_are_those_of_the_camera(scene):
 @pytest.mark.parametrize("mode", LINE_MODES)
 def test_line_colours(scene, mode):
     lines = scene.lines.replace(confidence=np.linspace(0.0, 1.0, scene.num_lines))
-    content = view_content(scene.replace(lines=lines))
+    shared = {"directions": Directions(np.array([1]), np.eye(3)[:1])}
+    shared["relations"] = Relations(line_along_direction=np.array([[0, 0], [1, 0]]))
+    content = view_content(scene.replace(lines=lines, **shared))
     found = content.line_colours(mode)
     assert found.colours.shape == (scene.num_lines, 3) and found.colours.dtype == np.uint8
     assert len(np.unique(found.colours, axis=0)) > 1
-    assert (found.low is None) == (mode == "direction")
+    assert (found.low is None) == (mode in ("direction", "shared direction"))
 
 
 def test_long_lines_are_red_and_short_ones_blue(scene):
@@ -104,9 +107,27 @@ def test_lines_of_one_direction_have_one_colour(scene):
         directions=Directions(np.array([1, 2]), np.eye(3)[:2]),
         relations=Relations(line_along_direction=along),
     )
-    colours = view_content(shared).line_colours("direction").colours
+    colours = view_content(shared).line_colours("shared direction").colours
     assert (colours[0] == colours[3]).all() and (colours[1] == colours[4]).all()
     assert len(np.unique(colours[[0, 1, 2]], axis=0)) == 3  # the third follows none
+
+
+def test_lines_at_right_angles_have_three_colours_in_any_frame():
+    """Lines along the axes of a turned building, and as many in no direction of their own: three colours, and grey."""
+    rng = np.random.default_rng(4)
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    along = np.repeat(axes, [40, 20, 10], axis=0) + 0.01 * rng.normal(size=(70, 3))
+    start = rng.normal(size=(100, 3))
+    odd = rng.normal(size=(30, 3))
+    odd *= 0.8 / np.linalg.norm(odd, axis=1, keepdims=True)
+    scene = Scene(lines=Lines.through(np.stack([start, start + np.concatenate([along, odd])], axis=1)))
+    colours = view_content(scene).line_colours("direction").colours
+    kinds = [np.unique(part, axis=0) for part in (colours[:40], colours[40:60], colours[60:70])]
+    assert [len(kind) for kind in kinds] == [1, 1, 1]
+    red, blue, green = (kind[0].tolist() for kind in kinds)
+    assert np.argmax(red) == 0 and np.argmax(blue) == 2 and np.argmax(green) == 1  # the most length first
+    far = np.abs(odd @ axes.T / 0.8).max(axis=1) < np.cos(np.deg2rad(27.0))
+    assert far.any() and (colours[70:][far] == [150, 152, 156]).all()
 
 
 def test_first_points_are_an_even_sample():
@@ -246,7 +267,7 @@ def test_fewer_points_and_lines(view):
 
 def test_colours_of_lines_change(view):
     before = np.array(view.lines.colors)
-    view.line_mode.value = "direction"
+    view.line_mode.value = "length"
     assert view.lines.colors.shape == before.shape and (view.lines.colors != before).any()
 
 
@@ -359,3 +380,28 @@ def test_ctrl_c_ends_it(tmp_path):
         process.kill()
     assert process.returncode == 0
     assert errors == "" and "Closed" in rest
+
+
+# ------------------------------------------------------------------------------------------------------ Photographs
+
+
+def test_photographs_are_found_by_what_lies_beside_a_model(tmp_path):
+    names = ("first.jpg", "deep/second.jpg")
+    model = tmp_path / "project" / "sparse" / "0"
+    model.mkdir(parents=True)
+    assert folder_of_images(model, names) is None
+    beside = tmp_path / "project" / "images"
+    (beside / "deep").mkdir(parents=True)
+    assert folder_of_images(model, names) is None  # it holds none of them
+    (beside / "deep" / "second.jpg").write_bytes(b"")
+    assert folder_of_images(model, names) == beside
+    named = tmp_path / "photographs"
+    named.mkdir()
+    (named / "first.jpg").write_bytes(b"")
+    (model / "summary.json").write_text(json.dumps({"images": str(named)}))
+    assert folder_of_images(model, names) == named
+    for damage in ("[", "[]", '{"images": 5}', '{"images": "nowhere"}'):
+        (model / "summary.json").write_text(damage)
+        assert folder_of_images(model, names) == beside
+    assert folder_of_images(model, ["../secret.jpg"]) is None
+    assert folder_of_images(tmp_path / "project" / "scene.npz", names) == beside

@@ -11,6 +11,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from groma._counted import counted
 from groma._json import json_text
 from groma.errors import GromaError, InputError
@@ -19,9 +21,12 @@ from groma.io import atomic_output, write_scene
 from groma.io.sequences import Sequence, open_sequence
 from groma.io.sequences.frame import Frame
 from groma.io.trajectories import write_tum
+from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.journal import Journal
+from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.outcome import LOST, SKIPPED, TrackedFrame, TrackResult
+from groma.tracking.saved import FrameSource, SavedMap, read_saved_map, sources_of
 from groma.tracking.tracker import Tracker
 from groma.viz.report.trajectory import write_track_report
 
@@ -59,11 +64,21 @@ class SequenceResult(TrackResult):
     #: Comparison with the reference of the sequence, if it has one; else why there is none.
     scores: TrajectoryScores | None = None
     not_compared: str = ""
+    #: The map that was tracked in, if there was one: where it is, its keyframes, when the first frame was found in it.
+    saved: dict[str, Any] | None = None
+    #: Where the frames of the keyframes are, so that the result can be tracked in.
+    sources: tuple[dict[str, Any], ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """Return all numbers as plain values: the content of ``summary.json``."""
         numbers = {"kind": self.kind, "interrupted": self.interrupted, **self.statistics, "sequence": self.name}
         numbers["warnings"] = list(self.warnings)
+        if self.saved is not None:
+            numbers["map"] = self.saved
+        if self.sources:
+            numbers["sources"] = list(self.sources)
+        if len(self.sources) == 1:
+            numbers["images"] = self.sources[0]["path"]  # where groma localize looks for them
         numbers["frames_without_pose"] = [frame.name for frame in self.frames if frame.pose is None]
         if self.scores is not None:
             numbers["reference"] = self.scores.to_dict()
@@ -117,6 +132,8 @@ def track(
     *,
     work: str | os.PathLike[str] | None = None,
     name: str = "",
+    map_: str | os.PathLike[str] | None = None,
+    source: FrameSource | None = None,
 ) -> SequenceResult:
     """Track a camera through a sequence, and map points, lines and planes on the way.
 
@@ -132,6 +149,10 @@ def track(
         Folder for the keyframes that are finished, while it runs (``groma view --live``); made anew.
     name : str
         What the sequence is called in the summary; by default the path.
+    map_ : path, optional
+        OUT of an earlier track: this one begins lost in it, goes on in its world once it finds itself, and adds to it.
+    source : FrameSource, optional
+        Where the frames are, so that the result can be tracked in; by default the path.
 
     Returns
     -------
@@ -145,8 +166,10 @@ def track(
     """
     if isinstance(sequence, (str, os.PathLike)):
         name = name or os.fspath(sequence)
+        source = source or FrameSource.of(sequence)
         sequence = open_sequence(sequence)
-    tracker = Tracker(sequence.camera, options)
+    earlier = None if map_ is None else read_saved_map(map_)
+    tracker = Tracker(sequence.camera, options, saved=_loaded(earlier, sequence, options, progress))
     frames: list[TrackedFrame] = []
     journal = None if work is None else Journal(Path(work))
     tracker, completed = _follow(tracker, sequence, frames, progress, journal)
@@ -155,13 +178,19 @@ def track(
     result = tracker.finish()
     warnings = [*sequence.warnings, *result.warnings, *_without_pose(frames)]
     if not len(result.trajectory):
+        what = "could be tracked" if earlier is None else f"was found in the map {earlier.path}"
         raise InputError(
-            f"No frame of {name or 'the sequence'} could be tracked: {' '.join(warnings)} Check the camera and the "
-            "depth scale."
+            f"No frame of {name or 'the sequence'} {what}: {' '.join(warnings)} Check the camera and the depth scale."
         )
     if result.submaps:
         folders = ", ".join(f"submap_{number}" for number in range(2, len(result.submaps) + 2))
         warnings.append(f"Only the longest submap is in trajectory.txt and the report; see also {folders}.")
+    found = next((frame.timestamp for frame in frames if frame.pose is not None and frame.submap == 0), None)
+    in_map = earlier is not None and bool(np.isnan(result.keyframes).any())
+    if earlier is not None and not in_map:
+        warnings.append(
+            f"The sequence was not found in the map {earlier.path}: its trajectory is in a world of its own."
+        )
     scores, not_compared = _compared(result, sequence)
     tracked: dict[str, Any] = {item.name: getattr(result, item.name) for item in fields(result)}
     tracked["warnings"] = tuple(warnings)
@@ -173,7 +202,29 @@ def track(
         interrupted=not completed,
         scores=scores,
         not_compared=not_compared,
-    )
+        saved=None if earlier is None else {
+            "path": earlier.path, "keyframes": earlier.scene.num_images, "joined": in_map, "found_at": found,
+        },
+        sources=tuple(sources_of(result.scene, earlier, source, {frame.name for frame in frames})),
+    )  # fmt: skip
+
+
+def _loaded(
+    earlier: SavedMap | None,
+    sequence: Sequence,
+    options: TrackOptions | None,
+    progress: Callable[[TrackProgress], bool | None] | None,
+) -> TrackMap | None:
+    """Return the map of an earlier track, ready to be tracked in."""
+    if earlier is None:
+        return None
+
+    def say(done: int, total: int) -> None:
+        if progress is not None:
+            progress(TrackProgress("reading the map", done, total))
+
+    camera = TrackCamera.of(sequence.camera)
+    return earlier.track_map(camera, sequence.kind != "mono", options or TrackOptions(), say)
 
 
 def _follow(

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from functools import partial
@@ -64,17 +65,18 @@ class Tracker:
 
     Parameters
     ----------
-    camera
-        The camera of all frames; free of distortion.
-    options
-        See :class:`TrackOptions`.
+    camera, options
+        The camera of all frames, free of distortion; see :class:`TrackOptions`.
     right_turn
         How the right camera of a stereo pair is turned, if that is known from a track before.
+    saved
+        The map of an earlier track (:func:`groma.tracking.map.saved_map.map_of_scene`): the track begins lost in it.
     """
 
     def __init__(
-        self, camera: SequenceCamera, options: TrackOptions | None = None, right_turn: RightTurn | None = None
-    ) -> None:
+        self, camera: SequenceCamera, options: TrackOptions | None = None, right_turn: RightTurn | None = None,
+        saved: TrackMap | None = None,
+    ) -> None:  # fmt: skip
         self.options = options or TrackOptions()
         self._given, self.camera = camera, TrackCamera.of(camera)
         self.status = STARTING
@@ -82,12 +84,14 @@ class Tracker:
         self._checks = FrameChecks(self.camera, self.options.gates.checks)
         self._motion = MotionModel(self.options.gates.motion)
         self._initialiser: Initialiser | None = None
-        self._mapper = Mapper(self.camera, self.options, right_turn)
+        self._saved = saved
+        self._mapper = Mapper(self.camera, self.options, right_turn, None if saved is None else saved.copy())
         self._ahead = LookAhead(self.camera, self.options, self._mapper.right)
         self._present = Present()
         self._history = History()
         self._verification = PoseVerification(self.camera, self.options)
-        self._lost_for, self._lost_since = 0, 0.0
+        # In a map of before the camera can be anywhere, as after a loss.
+        self._lost_for, self._lost_since = 0 if saved is None else self._gates.lost_frames + 1, math.nan
         #: The frame before, if it was lost, and where it may have been taken.
         self._guess = np.zeros((0, 0), np.uint8), self._present.pose
         #: What happened to the track between its maps, for the reader.
@@ -108,7 +112,7 @@ class Tracker:
         self._finished = True
         self._mapper.abandon()
         self._mapper.close()
-        return Tracker(self._given, self.options, self._mapper.better_turn)
+        return Tracker(self._given, self.options, self._mapper.better_turn, self._saved)
 
     # ------------------------------------------------------------------------------------------------- each frame
 
@@ -117,10 +121,8 @@ class Tracker:
 
         Parameters
         ----------
-        frame
-            The frame.
-        following
-            The frame after it, if it is there already: its planes are found meanwhile. The result is the same.
+        frame, following
+            The frame, and the one after it if it is there already: its planes are found meanwhile, to the same result.
 
         Returns
         -------
@@ -314,11 +316,14 @@ class Tracker:
 
     def _lose(self, data: FrameFeatures, guess: FloatArray, began: float, watch: Stopwatch) -> TrackedFrame:
         now = data.frame.timestamp
-        if self._lost_for == 0:
+        if self._lost_for == 0 or math.isnan(self._lost_since):
             self._lost_since = now
         self._lost_for += 1
         self._guess = data.gray, guess
-        if self._lost_for > self._gates.lost_frames and now - self._lost_since > self._gates.restart_seconds:
+        # A map that one camera begins has a scale of its own, in which no other map can be joined.
+        stays = self._saved is not None and data.frame.depth is None and data.frame.right is None
+        long = self._lost_for > self._gates.lost_frames and now - self._lost_since > self._gates.restart_seconds
+        if long and not stays:
             self._mapper.begin_anew(self._present)
             self._present, self._motion = Present(), MotionModel(self.options.gates.motion)
             return self._start(data, began, watch)
@@ -360,11 +365,12 @@ class Tracker:
         roots = sorted({root for root, _ in where if mapper.maps[root].keyframes}) or [0]
         count = {root: sum(entry.submap == root for entry in history.entries) for root in roots}
         main = max(roots, key=lambda root: count[root])
-        others = [root for root in roots if root != main]
+        if self._saved is not None and count[0]:  # a world that is known before comes first
+            main = 0
+        others = [root for root in roots if root != main and (count[root] or self._saved is None)]
         for root in others:
             ending.adjust(root)
-        adjusted = ending.adjust(main).numbers(self.camera)
-        statistics = self.statistics() | adjusted
+        statistics = self.statistics() | ending.adjust(main).numbers(self.camera)
         whole, *submaps = [ending.submap(root) for root in (main, *others)]
         warnings = [*self._checks.warnings, *ending.warnings]
         if not history.entries:

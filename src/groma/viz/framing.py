@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Where the 3D view of the page starts: behind the cameras and a little above, as near as the scene allows.
+r"""Where the 3D view of the page starts: behind the cameras and a little above, as near as the landmarks allow.
+
+Cameras that stand around the scene are in the picture, too, as long as the landmarks do not become small for them.
 
 What is far from all the rest (matches gone wrong, the horizon, a stray camera) does not count. What counts fills the
 picture: with :math:`r` and :math:`u` the coordinates of a place to the right and upwards, :math:`b` that towards the
@@ -26,11 +28,13 @@ LANDMARK_SHARE, CAMERA_SHARE = 0.95, 0.98
 FAR = 4.0
 #: Share of the landmarks that count on each side of the picture.
 EDGE = 0.997
-#: Tangents of half the opening of the viewer, across and upwards. Its focal length is 1.1 times its height (at most 0.6
-#: of its width), and it is about twice as wide as high.
-OPENING = np.array([0.83, 0.45])
+#: Tangents of half the opening of the viewer, across and upwards. Its focal length is 0.6 times its width (at most 1.1
+#: of its height), and it is about four thirds as wide as high.
+OPENING = np.array([0.83, 0.6])
 #: Room around what counts.
 MARGIN = 1.06
+#: How much farther away than the landmarks need the view may start for the cameras to be in it.
+FOR_CAMERAS = 1.15
 #: Angle aside and above, radians.
 ASIDE, ABOVE = 0.45, 0.38
 
@@ -79,7 +83,7 @@ def starting_view(scene: Drawable, middle: FloatArray) -> StartingView:
     frame = np.stack([right, np.cross(back, right), back])
     if not len(places):
         return StartingView(center, up, azimuth, elevation, 1.0, 0.018)
-    pivot, distance = _fitted((np.concatenate(kept[:2]) - center) @ frame.T, (kept[2] - center) @ frame.T)
+    pivot, distance = _compromise((np.concatenate(kept[:2]) - center) @ frame.T, (kept[2] - center) @ frame.T)
     return StartingView(center + pivot @ frame, up, azimuth, elevation, distance, _camera_size(scene, distance))
 
 
@@ -109,6 +113,25 @@ def _near(distances: FloatArray, share: float, far: float) -> BoolArray:
         return np.zeros(0, dtype=bool)
     usual = float(np.median(distances))
     return distances <= min(float(np.quantile(distances, share, method="higher")), far * usual if usual else np.inf)
+
+
+def _compromise(landmarks: FloatArray, cameras: FloatArray) -> tuple[FloatArray, float]:
+    """Return pivot and distance for the landmarks, moved towards those for cameras and landmarks as far as may be.
+
+    Places seen from two viewpoints are seen from any between them, because the conditions are linear.
+    """
+    pivot, distance = _fitted(landmarks, cameras)
+    if not (len(landmarks) and len(cameras)):
+        return pivot, distance
+    near_pivot, near = _fitted(landmarks, cameras[:0])
+    # The viewers stand at pivot + distance * back: compare them along that axis.
+    share = min(1.0, (FOR_CAMERAS - 1.0) * near / max(distance + pivot[2] - near - near_pivot[2], 1e-300))
+    if share < 0.0 or share >= 1.0:
+        return pivot, distance
+    viewer, near_viewer = (at + np.array([0.0, 0.0, far]) for at, far in ((pivot, distance), (near_pivot, near)))
+    viewer = near_viewer + share * (viewer - near_viewer)
+    pivot = np.array([viewer[0], viewer[1], near_pivot[2]])
+    return pivot, float(viewer[2] - pivot[2])
 
 
 def _fitted(landmarks: FloatArray, cameras: FloatArray) -> tuple[FloatArray, float]:

@@ -19,6 +19,11 @@ def pack(values: FloatArray) -> str:
     return base64.b64encode(np.ascontiguousarray(finite, dtype="<f4").tobytes()).decode()
 
 
+def pack_whole(values: IntArray) -> str:
+    """Return whole numbers as base64 of four bytes each."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype="<i4").tobytes()).decode()
+
+
 def pack_bytes(values: npt.NDArray[np.uint8]) -> str:
     """Return small whole numbers as base64."""
     return base64.b64encode(np.ascontiguousarray(values, dtype=np.uint8).tobytes()).decode()

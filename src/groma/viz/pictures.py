@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import os
 import warnings
 from collections.abc import Iterable, Mapping
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from groma._counted import counted
 from groma.bounded.images import decoded
 from groma.bounded.names import outside, stays_inside
+from groma.bounded.text import read_text
 from groma.errors import FileFormatError
 
 Picture = npt.NDArray[np.uint8]
@@ -31,6 +33,28 @@ def image_file(images: ImageFiles | None, name: str) -> Path | None:
     else:
         path = Path(images) / name if stays_inside(name) else None
     return path if path is not None and path.is_file() else None
+
+
+def folder_of_images(model: str | os.PathLike[str], names: Iterable[str]) -> Path | None:
+    """Return the folder that holds photographs of a model, found by what lies beside it; None where none does.
+
+    Parameters
+    ----------
+    model : path
+        A folder or file of a model. Folders that are tried: the one that ``summary.json`` in it names, as ``groma map``
+        writes it; then ``images`` in the model, beside it, and one and two folders higher, as in COLMAP's projects.
+    names : iterable of str
+        Names of the images; the folder holds one of the first hundred at least.
+    """
+    place, wanted = Path(model).absolute(), [name for name, _ in zip(names, range(100), strict=False)]
+    tried = [parent / "images" for parent in (place, *place.parents[:3])]
+    try:
+        numbers = json.loads(read_text(place / "summary.json"))
+        if isinstance(numbers, dict) and isinstance(numbers.get("images"), str):
+            tried = [Path(numbers["images"]), place / numbers["images"], *tried]
+    except (OSError, ValueError, RecursionError, FileFormatError):
+        pass
+    return next((one for one in tried if any(image_file(one, name) for name in wanted)), None)
 
 
 def warn_of_names_outside(images: ImageFiles | None, names: Iterable[str]) -> None:

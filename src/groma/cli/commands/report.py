@@ -21,6 +21,15 @@ def report(
     before: Annotated[
         Path | None, typer.Option(metavar="SCENE", help="The same scene before adjustment, to compare with.")
     ] = None,
+    covariance: Annotated[
+        Path | None,
+        typer.Option(
+            "--covariance",
+            metavar="FILE",
+            help="Arrays of groma adjust --covariance FILE.npz: lengths and angles measured on the page get standard "
+            "deviations.",
+        ),
+    ] = None,
     force: _options.Force = False,
     threads: _options.Threads = None,
     json_target: _options.Json = None,
@@ -33,28 +42,31 @@ def report(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.input import check_inputs, whole_scene
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target, file=True)
-    check_inputs(source, images, before)
+    check_inputs(source, images, before, covariance)
 
     from groma.errors import InputError
     from groma.io import read_scene
     from groma.scene.counts import counts_of
     from groma.viz.pictures import image_file
+    from groma.viz.report.covariances import read_covariances
     from groma.viz.report.page import PageContents, write_report
     from groma.viz.report.saved import saved_report
 
     if images is not None and not images.is_dir():
         raise InputError(f"{images} is not a folder of images. Check --images.")
-    scene = read_scene(source)
+    scene = read_scene(whole_scene(source))
     earlier = read_scene(before) if before is not None else None
     if images is not None and scene.num_images and not any(image_file(images, name) for name in scene.images.names):
         console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[0]!r}.")
     saved = saved_report(source) if source.is_dir() else None
+    found = None if covariance is None else read_covariances(covariance, scene)
     with _output.atomic_output(output, force) as draft:
-        contents = None if saved is None else PageContents(saved.outcomes, saved.explanation)
+        told = {} if saved is None else {"outcomes": saved.outcomes, "explanation": saved.explanation}
+        contents = PageContents(**told, covariances=found)
         write_report(draft, earlier, scene, saved, images, source.absolute().name, contents)
     console.say(f"Wrote {output}")
     _output.write_json(json_target, {"output": str(output), **counts_of(scene)}, force)

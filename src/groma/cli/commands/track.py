@@ -21,6 +21,12 @@ def track(
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")],
+    map_: Annotated[
+        Path | None,
+        typer.Option(
+            "--map", metavar="MAP", help="OUT of an earlier track: begin lost in it, go on in its world, and add to it."
+        ),
+    ] = None,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -80,17 +86,15 @@ def track(
 
     from groma.io.sequences import open_sequence
     from groma.tracking.options import TrackOptions
+    from groma.tracking.saved import FrameSource
     from groma.tracking.sequence import TrackProgress
     from groma.tracking.sequence import track as track_sequence
 
+    known = cast("Literal['rgbd', 'stereo', 'mono'] | None", kind)
     frames = open_sequence(
-        sequence,
-        camera=camera,
-        depth_scale=depth_scale,
-        stride=stride,
-        max_frames=max_frames,
-        kind=cast("Literal['rgbd', 'stereo', 'mono'] | None", kind),
+        sequence, camera=camera, depth_scale=depth_scale, stride=stride, max_frames=max_frames, kind=known
     )
+    source = FrameSource.of(sequence, camera, depth_scale=depth_scale, kind=known)
     options = TrackOptions(
         points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth, detector=line_detector
     )
@@ -106,7 +110,7 @@ def track(
                 why = frame.reason or ("held by the prior: " + ", ".join(frame.weak) if frame.weak else "")
                 console.detail(f"frame {event.name or event.done}: {frame.status} {why}".rstrip())
 
-        result = track_sequence(frames, options, show, work=work, name=str(sequence))
+        result = track_sequence(frames, options, show, work=work, name=str(sequence), map_=map_, source=source)
     if result.interrupted:
         console.warn("interrupted; what was tracked so far is written.")
     _output.check_output(output, force)

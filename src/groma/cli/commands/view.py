@@ -16,7 +16,11 @@ def view(
     source: Annotated[Path, typer.Argument(metavar="INPUT", help="Model to look at; with --live the OUT of a track.")],
     images: Annotated[
         Path | None,
-        typer.Option("--images", metavar="DIR", help="Folder of the photographs, shown in the cameras."),
+        typer.Option(
+            "--images",
+            metavar="DIR",
+            help="Folder of the photographs. Default: the one that groma map noted, or a folder images near INPUT.",
+        ),
     ] = None,
     port: Annotated[
         int, typer.Option("--port", "-p", min=0, max=65535, metavar="N", help="Port, or the next free one; 0: any.")
@@ -38,7 +42,7 @@ def view(
 
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.input import check_inputs, whole_scene
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
@@ -50,10 +54,13 @@ def view(
 
     from groma.io import read_scene
     from groma.scene.counts import counts_of, sentence_of
+    from groma.viz.pictures import folder_of_images
     from groma.viz.viewer.scene import serving, wait_for_interrupt
 
-    scene = read_scene(source)
+    scene = read_scene(whole_scene(source))
     console.say(sentence_of(scene))
+    if images is None and (images := folder_of_images(source, scene.images.names)) is not None:
+        console.say(f"Photographs: {images}")
     # Once the page is there, Ctrl-C is the way to end and no accident.
     with serving(scene, images, port, say=console.warn) as shown, contextlib.suppress(KeyboardInterrupt):
         address = f"http://localhost:{shown.server.get_port()}"

@@ -6,6 +6,12 @@ from pathlib import Path
 from groma.errors import InputError
 
 
+def whole_scene(source: Path) -> Path:
+    """Return the archive in the folder of a map or track (it holds more than the COLMAP model there), or the source."""
+    archive = source / "scene.npz"
+    return archive if archive.is_file() and (source / "summary.json").is_file() else source
+
+
 def check_inputs(*paths: Path | None) -> None:
     """Refuse places where there is nothing; None stands for an input that was not given."""
     for path in paths:

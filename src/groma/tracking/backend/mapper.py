@@ -80,9 +80,15 @@ class _Pending:
 class Mapper:
     """Makes keyframes of chosen frames and keeps the map adjusted."""
 
-    def __init__(self, camera: TrackCamera, options: TrackOptions, right_turn: RightTurn | None = None) -> None:
-        #: Maps begun so far; more than one after the track was lost for long.
-        self.maps, self.current = [TrackMap()], 0
+    def __init__(
+        self,
+        camera: TrackCamera,
+        options: TrackOptions,
+        right_turn: RightTurn | None = None,
+        first: TrackMap | None = None,
+    ) -> None:
+        #: Maps begun so far; more than one after the track was lost for long. The first may be of an earlier track.
+        self.maps, self.current = [first or TrackMap()], 0
         #: How maps join older ones, by the number of the newer.
         self.joints: dict[int, Joint] = {}
         self.camera, self.options = camera, options
@@ -93,7 +99,7 @@ class Mapper:
         self._began_with, self._may_begin_anew = right_turn, right_turn is None
         #: How the right camera is turned, if so far from what was taken that the track should start over.
         self.better_turn: RightTurn | None = None
-        self.metric = True
+        self.metric = first is None or first.is_metric
         self.loops = 0
         #: A frame that is to become a keyframe; its features are being found meanwhile.
         self.due: _Chosen | None = None

@@ -74,6 +74,16 @@ class TrackMap:
         """The keyframe whose patches are followed."""
         return self.keyframes[self.reference]
 
+    @property
+    def is_metric(self) -> bool:
+        """Whether depths or right images give it its scale."""
+        return any(
+            np.isfinite(k.measured.points.depth).any()
+            or np.isfinite(k.measured.points.right[:, 0]).any()
+            or len(k.measured.planes)
+            for k in self.keyframes
+        )
+
     def copy(self) -> TrackMap:
         """Return a map that can be changed without changing this one; images and other values are shared."""
         tables = {kind: getattr(self, kind).copy() for kind in ("points", "lines", "planes")}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the 3D view of the page draws, as text: arrays in single precision less a common offset, and where to start."""
+"""What the 3D view of the page draws and says, as text: arrays less a common offset, and where to start."""
 
 from __future__ import annotations
 
@@ -8,38 +8,37 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.scene.line_intervals import line_pieces
-from groma.scene.patches import PALETTE, patch_groups
+from groma.scene.patches import PALETTE, patch_area, patch_groups
 from groma.viz import colours as _colours
 from groma.viz.framing import starting_view
-from groma.viz.pack import pack, pack_bytes, thin
-from groma.viz.statistics import line_statistics
+from groma.viz.pack import pack, pack_bytes, pack_whole
+from groma.viz.report.kept import Kept, places_of
+from groma.viz.statistics import LineStatistics, images_of, line_statistics
 
 if TYPE_CHECKING:
     from groma.scene import Scene
     from groma.viz.drawable import Drawable
-
-#: More points, and more lines, than this are thinned out evenly: a page should open in a second.
-MAX_POINTS = 200_000
-MAX_LINES = 40_000
+    from groma.viz.report.covariances import LandmarkCovariances
 
 
-def scene_data(scenes: Sequence[Scene], states: Sequence[Drawable]) -> dict[str, Any]:
+def scene_data(
+    scenes: Sequence[Scene], states: Sequence[Drawable], kept: Kept, covariances: LandmarkCovariances | None = None
+) -> dict[str, Any]:
     """Return the states of a scene for the 3D view, the last one being the one that counts."""
     scene, after = scenes[-1], states[-1]
     offset = _middle(after)
     owner = line_pieces(scene)[1]
-    keep, drawn = thin(len(after.points), MAX_POINTS), thin(len(owner), MAX_LINES)
-    lines = owner[drawn]
-    view = starting_view(after, offset)
+    drawn = np.flatnonzero(places_of(kept.lines, scene.num_lines)[owner] >= 0)
     numbers = [line_statistics(one, shown) for one, shown in zip(scenes, states, strict=True)]
-    point_errors = [shown.point_errors[keep] for shown in states]
-    line_errors = [found.residual_px[lines] for found in numbers]
+    point_errors = [shown.point_errors[kept.points] for shown in states]
+    line_errors = [found.residual_px[kept.lines] for found in numbers]
+    view = starting_view(after, offset)
     return {
         "states": [
             {
-                "points": pack(shown.points[keep] - offset),
+                "points": pack(shown.points[kept.points] - offset),
                 "errors": pack(errors) if np.isfinite(errors).any() else "",
                 "lines": pack(line_pieces(scene, shown.segments)[0][drawn] - offset),
                 "line_errors": pack(far),
@@ -48,12 +47,15 @@ def scene_data(scenes: Sequence[Scene], states: Sequence[Drawable]) -> dict[str,
             }
             for one, shown, errors, far in zip(scenes, states, point_errors, line_errors, strict=True)
         ],
-        "colours": pack_bytes(after.colours[keep]) if after.colours is not None else "",
-        "line_colours": pack_bytes(_colours.of_lines(scene)[lines]),
-        "shared_directions": bool(len(scene.relations.line_along_direction)),
-        "line_views": pack(numbers[-1].num_images[lines].astype(float)),
-        "corners": [len(patch) for patch in after.patches],
-        "plane_colours": [_colours.css(PALETTE[group]) for group in patch_groups(after.patch_members)],
+        "offset": offset.tolist(),
+        "pieces": pack_whole(places_of(kept.lines, scene.num_lines)[owner[drawn]]),
+        "points": _points(scene, after, kept),
+        "lines": _lines(scene, numbers[-1], kept),
+        "planes": _planes(scene, after),
+        "directions": {"ids": pack_whole(scene.directions.ids)},
+        "cameras": _cameras(scene),
+        "relations": _relations(scene, kept),
+        "covariances": None if covariances is None else _covariances(covariances, kept, offset),
         "view": {
             "pivot": (view.pivot - offset).tolist(),
             "up": view.up.tolist(),
@@ -65,6 +67,90 @@ def scene_data(scenes: Sequence[Scene], states: Sequence[Drawable]) -> dict[str,
             "line_error_top": _top(line_errors[-1]),
         },
     }
+
+
+# --------------------------------------------------------------------------------------------------- Kinds of things
+
+
+def _points(scene: Scene, after: Drawable, kept: Kept) -> dict[str, Any]:
+    seen = scene.point_observations
+    return {
+        "ids": pack_whole(scene.points.ids[kept.points]),
+        "images": pack_whole(images_of(seen.point_idx, seen.image_idx, scene.num_points)[kept.points]),
+        "colours": pack_bytes(after.colours[kept.points]) if after.colours is not None else "",
+    }
+
+
+def _lines(scene: Scene, numbers: LineStatistics, kept: Kept) -> dict[str, Any]:
+    direction = np.full(scene.num_lines, -1, np.int64)
+    along = scene.relations.line_along_direction
+    direction[along[:, 0]] = along[:, 1]
+    shared = pack_bytes(_colours.of_shared_directions(scene)[kept.lines]) if len(along) else ""
+    return {
+        "ids": pack_whole(scene.lines.ids[kept.lines]),
+        "images": pack_whole(numbers.num_images[kept.lines]),
+        "lengths": pack(numbers.length[kept.lines]),
+        "confidence": pack(scene.lines.confidence[kept.lines]),
+        "direction": pack_whole(direction[kept.lines]),
+        "colours": pack_bytes(_colours.of_lines(scene)[kept.lines]),
+        "shared_colours": shared,
+    }
+
+
+def _planes(scene: Scene, after: Drawable) -> dict[str, Any]:
+    return {
+        "ids": pack_whole(scene.planes.ids),
+        "corners": [len(patch) for patch in after.patches],
+        "colours": [_colours.css(PALETTE[group]) for group in patch_groups(after.patch_members)],
+        "areas": [patch_area(patch) for patch in after.patches],
+    }
+
+
+def _cameras(scene: Scene) -> dict[str, Any]:
+    """Return the names of all images, and what opens of each: half the width and half the height at distance one."""
+    camera = scene.images.camera_idx
+    width, height = (np.asarray(side, float)[camera] for side in (scene.cameras.width, scene.cameras.height))
+    aspect = np.divide(width, height, out=np.full(len(camera), 4.0 / 3.0), where=height > 0)
+    return {"names": list(scene.images.names), "aspects": pack(aspect)}
+
+
+def _relations(scene: Scene, kept: Kept) -> dict[str, str]:
+    """Return pairs of things that belong together, as places among what is kept."""
+    point, line = places_of(kept.points, scene.num_points), places_of(kept.lines, scene.num_lines)
+    plane = np.arange(scene.num_planes)
+    ends = {
+        "line_on_plane": (line, plane),
+        "point_on_plane": (point, plane),
+        "point_on_line": (point, line),
+    }
+
+    def packed(pairs: IntArray, first: IntArray, second: IntArray) -> str:
+        found = np.column_stack([first[pairs[:, 0]], second[pairs[:, 1]]])
+        return pack_whole(found[(found >= 0).all(axis=1)])
+
+    return {name: packed(getattr(scene.relations, name), *sides) for name, sides in ends.items()}
+
+
+def _covariances(found: LandmarkCovariances, kept: Kept, offset: FloatArray) -> dict[str, Any]:
+    """Return upper triangles of covariances, of coordinates less the offset."""
+    local = found.moved(offset)
+    return {
+        "gauge": found.gauge,
+        "points": _triangles(local.points[kept.points]),
+        "lines": _triangles(local.lines[kept.lines]),
+        "planes": _triangles(local.planes),
+        "centers": _triangles(local.centers),
+    }
+
+
+def _triangles(matrices: FloatArray) -> str:
+    """Return the upper triangles of symmetric matrices; rows of -1 for those that are not known."""
+    size = matrices.shape[-1]
+    rows = matrices[:, *np.triu_indices(size)]
+    return pack(np.where(np.isfinite(rows).all(axis=1, keepdims=True), rows, -1.0))
+
+
+# ------------------------------------------------------------------------------------------------------------- Parts
 
 
 def _top(errors: FloatArray) -> float:

@@ -11,17 +11,15 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.scene.line_intervals import one_line_per_interval
-from groma.viz.pack import pack, thin
+from groma.viz.pack import pack, pack_whole, thin
 from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture, warn_of_names_outside
+from groma.viz.report.kept import Kept, places_of
 from groma.viz.report.overlays import is_straight, projected_segments
 
 if TYPE_CHECKING:
     from groma.scene import Scene
     from groma.viz.drawable import Drawable
 
-#: More residuals of points, and more segments, than this are thinned out evenly.
-MAX_POINT_ROWS = 60_000
-MAX_SEGMENT_ROWS = 40_000
 #: Photographs in the page, the longer side of each, pixels, and what all of them may weigh, characters.
 MAX_PHOTOS = 60
 PHOTO_SIZE = 1100
@@ -30,36 +28,35 @@ PHOTO_BUDGET = 9_000_000
 _SAMPLES = 6
 
 
-def image_data(scene: Scene, states: Sequence[Drawable], images: ImageFiles | None) -> dict[str, Any]:
+def image_data(scene: Scene, kept: Kept, states: Sequence[Drawable], images: ImageFiles | None) -> dict[str, Any]:
     """Return, for the page, an entry per image that observes something, and the rows that the entries point to.
 
     ``first`` is the entry to begin with. ``rows`` are points: measured place, then the residual in each state.
     ``segments`` are 2D segments: measured ends, then the ways from them to the image of their line in each state;
-    ``owners`` their lines as numbers of the table; ``projected`` the images of the 3D segments in the last state,
-    ``samples`` places each, zero where there is none.
+    ``row_points`` and ``segment_lines`` say whose they are, as places among what is kept; ``projected`` are the images
+    of the 3D segments in the last state, ``samples`` places each, zero where there is none.
     """
     after = states[-1]
     num_points = len(scene.point_observations)
     seen, pieces = scene.line_observations, one_line_per_interval(scene)
-    point_rows = _by_image(scene.point_observations.image_idx, scene.num_images, MAX_POINT_ROWS)
-    segment_rows = _by_image(seen.image_idx, scene.num_images, MAX_SEGMENT_ROWS)
+    point_rows = _by_image(kept.point_observations, scene.point_observations.image_idx, scene.num_images)
+    segment_rows = _by_image(kept.line_observations, seen.image_idx, scene.num_images)
     samples = 2 if all(is_straight(name) for name in scene.cameras.models) else _SAMPLES
     points_seen = np.bincount(scene.point_observations.image_idx, minlength=scene.num_images)
     lines_seen = np.bincount(seen.image_idx, minlength=scene.num_images)
     used = np.flatnonzero(points_seen + lines_seen)
     photos = _photographs([scene.images.names[image] for image in used], images)
-    entries, projected = [], [np.zeros((0, 2 * samples))]
-    begin = {"rows": 0, "segments": 0}
+    ends = np.cumsum([[len(point_rows[image]), len(segment_rows[image])] for image in [*used]] or [[0, 0]], axis=0)
+    begins = np.vstack([[0, 0], ends[:-1]])
+    entries = []
     for place, image in enumerate(used.tolist()):
-        mine = segment_rows[image]
-        projected.append(_projected(pieces, image, pieces.line_observations.line_idx[mine], samples))
         left, top, width, height = _frame(after, image)
-        end = {"rows": begin["rows"] + len(point_rows[image]), "segments": begin["segments"] + len(mine)}
         entries.append(
             {
                 "name": scene.images.names[image],
-                "rows": [begin["rows"], end["rows"]],
-                "segments": [begin["segments"], end["segments"]],
+                "camera": image,
+                "rows": [int(begins[place, 0]), int(ends[place, 0])],
+                "segments": [int(begins[place, 1]), int(ends[place, 1])],
                 "points_seen": int(points_seen[image]),
                 "lines_seen": int(lines_seen[image]),
                 "frame": [left, top, width, height],
@@ -67,22 +64,24 @@ def image_data(scene: Scene, states: Sequence[Drawable], images: ImageFiles | No
                 "photo": photos[place] if left == top == 0.0 else "",
             }
         )
-        begin = end
-    rows = np.concatenate([*(point_rows[image] for image in used), np.zeros(0, np.int64)]).astype(np.int64)
-    segments = np.concatenate([*(segment_rows[image] for image in used), np.zeros(0, np.int64)]).astype(np.int64)
+    rows, segments = (
+        np.concatenate([*(groups[image] for image in used), np.zeros(0, np.int64)]).astype(np.int64)
+        for groups in (point_rows, segment_rows)
+    )
+    projected = [
+        _projected(pieces, image, pieces.line_observations.line_idx[segment_rows[image]], samples)
+        for image in used.tolist()
+    ]
     ways = [state.residuals[num_points:].reshape(-1, 4)[segments] for state in states]
+    point_ways = [state.residuals[:num_points][rows] for state in states]
     return {
         "images": entries,
         "first": _first(entries),
-        "rows": pack(
-            np.concatenate(
-                [after.residual_place[:num_points][rows], *(s.residuals[:num_points][rows] for s in states)], 1
-            )
-        ),
+        "rows": pack(np.concatenate([after.residual_place[:num_points][rows], *point_ways], axis=1)),
+        "row_points": pack_whole(places_of(kept.points, scene.num_points)[scene.point_observations.point_idx[rows]]),
         "segments": pack(np.concatenate([seen.segment[segments], *ways], axis=1)),
-        "owners": scene.lines.ids[seen.line_idx[segments]].tolist(),
-        "views": pack(np.bincount(seen.line_idx, minlength=scene.num_lines)[seen.line_idx[segments]].astype(float)),
-        "projected": pack(np.concatenate(projected)),
+        "segment_lines": pack_whole(places_of(kept.lines, scene.num_lines)[seen.line_idx[segments]]),
+        "projected": pack(np.concatenate([*projected, np.zeros((0, 2 * samples))])),
         "samples": samples,
     }
 
@@ -93,15 +92,11 @@ def _first(entries: Sequence[dict[str, Any]]) -> int:
     return keys.index(max(keys)) if keys else 0
 
 
-def _by_image(image_idx: IntArray, num_images: int, limit: int) -> list[IntArray]:
-    """Return the rows of each image, thinned out where there are more than its share of the limit."""
-    order = np.argsort(image_idx, kind="stable")
+def _by_image(rows: IntArray, image_idx: IntArray, num_images: int) -> list[IntArray]:
+    """Return, of these observations, those of each image."""
+    order = rows[np.argsort(image_idx[rows], kind="stable")]
     bounds = np.searchsorted(image_idx[order], np.arange(num_images + 1))
-    share = max(40, limit // max(num_images, 1))
-    groups: list[IntArray] = [order[first:last].astype(np.int64) for first, last in pairwise(bounds)]
-    if len(image_idx) > limit:
-        groups = [group[thin(len(group), share)] for group in groups]
-    return groups
+    return [order[first:last].astype(np.int64) for first, last in pairwise(bounds)]
 
 
 def _projected(scene: Scene, image: int, lines: IntArray, samples: int) -> FloatArray:

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A scene, or a scene before and after adjustment, as one self-contained HTML file.
 
-The file needs no network and no server: styles, viewer, data and photographs lie inside. The scene is drawn in 3D on a
-canvas, and so are the photographs with what was measured in them; charts are inline SVG; numbers stand in tables.
-Arrays travel as base64 float32, less a common offset, so that far away coordinates keep their digits.
+The file needs no network and no server: styles, viewer, data and photographs lie inside. The scene is drawn by WebGL,
+or on a canvas where there is none, with the photographs and what was measured in them beside it; charts are inline
+SVG; numbers stand in tables. Arrays travel as base64 float32, less a common offset, so that far away coordinates keep
+their digits. The parts of the page are the files in ``web``; the scripts there are one program, joined in the order of
+``SCRIPTS``.
 """
 
 from __future__ import annotations
@@ -27,11 +29,20 @@ from groma.viz.drawable import Drawable, drawable
 from groma.viz.pack import script_json
 from groma.viz.pictures import ImageFiles
 from groma.viz.report import tables as _page_tables
+from groma.viz.report.covariances import LandmarkCovariances
 from groma.viz.report.data import scene_data
 from groma.viz.report.images import image_data
+from groma.viz.report.kept import kept
 
 if TYPE_CHECKING:
     from groma.scene import Scene
+
+
+#: The program of the page, in order: data, drawing, what is chosen, what hands do.
+SCRIPTS = (
+    *("data", "vectors", "colours", "orbit", "things", "webgl", "flat"),
+    *("scene", "measure", "about", "photo", "strip", "main"),
+)
 
 
 class Report(Protocol):
@@ -73,6 +84,8 @@ class PageContents:
     cards: str = ""
     #: HTML of the large numbers instead of the usual ones.
     tiles: str | None = None
+    #: Covariances of ``scene_after``: what is measured on the page then has standard deviations.
+    covariances: LandmarkCovariances | None = None
 
 
 def write_report(
@@ -125,9 +138,11 @@ def write_report(
     diagnosis = said.diagnosis
     if diagnosis is None and numbers is not None:
         diagnosis = numbers.get("diagnosis")
-    page = files("groma.viz.report").joinpath("_page.html").read_text(encoding="utf-8")
+    script = '"use strict";\n' + "".join(_part(f"{name}.js") for name in SCRIPTS)
+    held = kept(scene_after)
     parts = {
-        "POLICY": _policy(page),
+        "POLICY": _policy(script),
+        "STYLE": _part("page.css"),
         "TITLE": html.escape(title),
         "LEAD": _lead(scene_after, after, report),
         "TILES": _page_tables.tiles(scene_after, before, after, numbers) if said.tiles is None else said.tiles,
@@ -139,19 +154,25 @@ def write_report(
         ),
         "TABLES": _page_tables.number_tables(scene_after, before, after, numbers),
         "FOOTER": _footer(),
-        "DATA": script_json({**scene_data(scenes, states), **image_data(scene_after, states, images)}),
+        "DATA": script_json(
+            scene_data(scenes, states, held, said.covariances) | image_data(scene_after, held, states, images)
+        ),
+        "SCRIPT": script,
     }
-    page = re.sub(r"\{\{([A-Z]+)\}\}", lambda match: parts[match[1]], page)
+    page = re.sub(r"\{\{([A-Z]+)\}\}", lambda match: parts[match[1]], _part("page.html"))
     try:
         Path(path).write_text(page, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}. Choose another place.") from error
 
 
-def _policy(page: str) -> str:
+def _part(name: str) -> str:
+    return files("groma.viz.report").joinpath("web", name).read_text(encoding="utf-8")
+
+
+def _policy(script: str) -> str:
     """Return what a browser lets the page do: run the script that groma wrote, show what lies in the page, no more."""
-    script = page.rpartition("<script>")[2].partition("</script>")[0]
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    digest = base64.b64encode(hashlib.sha256(f"\n{script}\n".encode()).digest()).decode()
     return (
         f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data:; "
         "base-uri 'none'; form-action 'none'"

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 #: Half the size of the scene in the frame of the viewer.
 REACH = 5.0
 #: What lines can be coloured by.
-LINE_MODES = ("length", "reprojection error", "direction", "number of images", "confidence")
+LINE_MODES = ("direction", "shared direction", "length", "reprojection error", "number of images", "confidence")
 #: Half the largest opening of a drawn camera, radians; wider ones are drawn with this one.
 _WIDEST = 1.2
 
@@ -90,10 +90,10 @@ class ViewContent:
         if mode == "confidence":
             known = np.where(self.scene.lines.confidence >= 0.0, self.scene.lines.confidence, np.nan)
             return LineColours(_colours.ramp(known), "0 ", "1 ", "Probability to be right; grey: not known.")
-        shared = len(self.scene.relations.line_along_direction) > 0
-        meaning = (
-            "One colour per shared direction; others grey." if shared else "Red along x, green along y, blue along z."
-        )
+        if mode == "shared direction":
+            meaning = "One colour per shared direction; others grey."
+            return LineColours(_colours.of_shared_directions(self.scene), meaning=meaning)
+        meaning = "Red, blue and green along the three directions at right angles that most lines follow; others grey."
         return LineColours(_colours.of_lines(self.scene), meaning=meaning)
 
     def pick(self, origin: FloatArray, direction: FloatArray, tolerance: float, shown: BoolArray) -> int | None:

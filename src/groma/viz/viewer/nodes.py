@@ -99,7 +99,7 @@ class SceneView:
                 for name, number in kinds.items()
             }
         with gui.add_folder("Lines", visible=scene.num_lines > 0):
-            self.line_mode = gui.add_dropdown("Colour", LINE_MODES, initial_value="length")
+            self.line_mode = gui.add_dropdown("Colour", LINE_MODES, initial_value="direction")
             self.legend = gui.add_html("")
             self.line_width = gui.add_slider("Width", min=1.0, max=8.0, step=0.5, initial_value=2.0)
             most = int(content.statistics.num_images.max(initial=1))

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""How fast the page of a report draws a large scene: milliseconds a frame, and for finding what a click hits.
+
+    python benchmarks/report_frames.py [--points 100000] [--lines 20000] [--canvas] [--json FILE]
+
+Needs Playwright and Chromium. Without a graphics card, Chromium draws by the processor (SwiftShader), which this says:
+times of one machine cannot be compared with those of another.
+"""
+
+import argparse
+import json
+import statistics
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from groma.scene import Cameras, Lines, Points, Scene
+from groma.viz.report.page import write_report
+
+#: Turns the scene and waits each time until all is drawn.
+FRAMES = """count => {
+  const times = [];
+  for (let i = 0; i < count; i++) {
+    const begin = performance.now();
+    turnEye(0.02, 0); paint(); renderer.finish();
+    times.push(performance.now() - begin);
+  }
+  return times;
+}"""
+#: Turns the scene as a hand does: how many milliseconds lie between frames, and which share of the scene they show.
+MOTION = """async count => {
+  const times = [], shares = [];
+  for (let i = 0, before = 0; i < count; i++) {
+    turnEye(0.02, 0); draw();
+    const now = await new Promise(requestAnimationFrame);
+    if (i) times.push(now - before);
+    shares.push(share); before = now;
+  }
+  return [times, shares];
+}"""
+HITS = """count => {
+  const times = [];
+  for (let i = 0; i < count; i++) {
+    const begin = performance.now();
+    hit(canvas.width * (i % 7) / 7, canvas.height * (i % 5) / 5, 8);
+    times.push(performance.now() - begin);
+  }
+  return times;
+}"""
+CARD = """() => {
+  const gl = canvas.getContext("webgl2"), more = gl && gl.getExtension("WEBGL_debug_renderer_info");
+  return more ? gl.getParameter(more.UNMASKED_RENDERER_WEBGL) : "none";
+}"""
+
+
+def city(num_points: int, num_lines: int) -> Scene:
+    """Points on the walls of a hundred boxes, and lines along their three directions."""
+    rng = np.random.default_rng(0)
+    corner = rng.uniform(-50, 50, (100, 3)) * [1, 1, 0]
+    xyz = corner[rng.integers(0, 100, num_points)] + rng.uniform(0, 8, (num_points, 3))
+    start = corner[rng.integers(0, 100, num_lines)] + rng.uniform(0, 8, (num_lines, 3))
+    way = np.eye(3)[rng.integers(0, 3, num_lines)] * rng.uniform(0.3, 4, (num_lines, 1))
+    poses = np.tile([0, 0, 0, 1, 0, 0, 0.0], (200, 1))
+    poses[:, 4:] = rng.uniform(-60, 60, (200, 3)) * [1, 1, 0.1]
+    cameras = Cameras(np.array([1]), ("PINHOLE",), np.array([[500.0, 500, 320, 240]]), np.array([640]), np.array([480]))
+    return Scene.from_images(
+        cameras, [f"{k}.jpg" for k in range(200)], np.zeros(200, int), poses,
+        points=Points.at(xyz), lines=Lines.through(np.stack([start, start + way], axis=1)),
+    )  # fmt: skip
+
+
+def measure(page: Path, canvas: bool, size: tuple[int, int]) -> dict[str, object]:
+    """Return medians, milliseconds, and who drew."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as program:
+        browser = program.chromium.launch(
+            executable_path="/usr/bin/chromium",
+            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"],
+        )
+        view = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        view.goto(page.as_uri() + ("#canvas" if canvas else ""))
+        view.wait_for_function("blend === target")
+        times, shares = view.evaluate(MOTION, 90)
+        frames, hits = view.evaluate(FRAMES, 20), view.evaluate(HITS, 30)
+        pixels = view.evaluate("[canvas.width, canvas.height]")
+        found = {"drawn_by": view.evaluate("renderer.name"), "graphics": view.evaluate(CARD) if not canvas else "none"}
+        browser.close()
+    moving = {"moving_ms": statistics.median(times[30:]), "moving_share": statistics.median(shares[30:])}
+    return {
+        **found,
+        "pixels": pixels,
+        **moving,
+        "whole_frame_ms": statistics.median(frames),
+        "hit_ms": statistics.median(hits),
+    }
+
+
+def main() -> None:
+    """Write the page, measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--points", type=int, default=100_000)
+    parser.add_argument("--lines", type=int, default=20_000)
+    parser.add_argument("--canvas", action="store_true", help="without WebGL")
+    parser.add_argument("--json", type=Path)
+    wanted = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        page = Path(folder) / "page.html"
+        write_report(page, None, city(wanted.points, wanted.lines), title="A synthetic city")
+        found = {"bytes": page.stat().st_size, **measure(page, wanted.canvas, (1400, 1000))}
+    text = json.dumps(found, indent=1)
+    sys.stdout.write(text + "\n")
+    if wanted.json is not None:
+        wanted.json.write_text(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The page of a report in a real browser: what is clicked lights up everywhere, search, measuring, a phone, no WebGL.
+
+Needs Chromium and Playwright (its Python package; the browser is that of the system).
+"""
+
+import shutil
+
+import numpy as np
+import pytest
+from _scene import exact_scene
+
+from groma.viz.report.covariances import LandmarkCovariances
+from groma.viz.report.page import PageContents, write_report
+
+CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), None)
+playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install playwright")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+
+ORANGE = """name => {
+  const one = document.getElementById(name), flat = document.createElement("canvas");
+  flat.width = one.width; flat.height = one.height;
+  const c = flat.getContext("2d"); c.drawImage(one, 0, 0);
+  const d = c.getImageData(0, 0, flat.width, flat.height).data;
+  let count = 0;
+  for (let i = 0; i < d.length; i += 4)
+    if (Math.abs(d[i] - 240) < 15 && Math.abs(d[i + 1] - 138) < 15 && d[i + 2] < 25 && d[i + 3] > 128) count++;
+  return count;
+}"""
+#: The pixel of the window where a place of the scene is drawn.
+WHERE = """([x, y, z]) => {
+  paint(); const p = view.project(x, y, z), box = canvas.getBoundingClientRect();
+  return [box.left + p[0] / ratio, box.top + p[1] / ratio];
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as program:
+        found = program.chromium.launch(
+            executable_path=CHROMIUM,
+            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"],
+        )
+        yield found
+        found.close()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return exact_scene()
+
+
+@pytest.fixture(scope="module")
+def covariances(scene):
+    """Different in every direction, so that a wrong axis shows."""
+    rng = np.random.default_rng(5)
+
+    def random(count: int, size: int) -> np.ndarray:
+        root = 0.01 * rng.normal(size=(count, size, size))
+        return root @ root.transpose(0, 2, 1)
+
+    return LandmarkCovariances("inner", random(12, 3), random(4, 6), random(1, 4), random(2, 3))
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory, scene, covariances):
+    import cv2
+
+    folder = tmp_path_factory.mktemp("report")
+    for name in scene.images.names:
+        cv2.imwrite(str(folder / name), np.full((480, 640, 3), 120, np.uint8))
+    write_report(folder / "page.html", None, scene, images=folder, contents=PageContents(covariances=covariances))
+    return (folder / "page.html").as_uri()
+
+
+@pytest.fixture
+def opened(browser, report):
+    """Open the page; its complaints fail the test."""
+    complaints, contexts = [], []
+
+    def open_page(fragment: str = "", **options):
+        contexts.append(browser.new_context(**({"viewport": {"width": 1300, "height": 1000}} | options)))
+        page = contexts[-1].new_page()
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+        page.goto(report + fragment)
+        page.wait_for_function("blend === target")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+def _middle(scene, line: int) -> np.ndarray:
+    return scene.lines.segments[line].mean(axis=0)
+
+
+def _in_page(page, place) -> list[float]:
+    """A place of the world in the coordinates of the page."""
+    return (np.asarray(place) - page.evaluate("data.offset")).tolist()
+
+
+def _only(page, kind: str) -> None:
+    page.evaluate("kind => { for (const name in shown) shown[name] = name === kind; draw(); }", kind)
+
+
+def _click(page, place) -> None:
+    page.mouse.click(*page.evaluate(WHERE, _in_page(page, place)))
+
+
+def test_a_line_clicked_in_the_scene_lights_up_in_every_photograph(opened, scene):
+    page = opened()
+    assert page.evaluate(ORANGE, "photo") == page.evaluate(ORANGE, "scene") == 0
+    _only(page, "lines")
+    _click(page, _middle(scene, 2))
+    assert page.inner_text("#about h3").startswith(f"Line {scene.lines.ids[2]}")
+    said = page.inner_text("#about")
+    length = np.linalg.norm(scene.lines.segments[2, 1] - scene.lines.segments[2, 0])
+    for words in (f"{length:.4g}", "first.jpg", "second.jpg", "Images\n2"):
+        assert words in said, words
+    page.wait_for_function("document.querySelectorAll('#strip .lit').length === 2")
+    page.wait_for_function("thumbs.every(t => t.bitmap)")
+    assert page.evaluate(ORANGE, "photo") > 50 and page.evaluate(ORANGE, "scene") > 50
+    for number in (0, 1):
+        page.evaluate("i => { thumbs[i].one.firstChild.id = 'thumb' + i; }", number)
+        assert page.evaluate(ORANGE, f"thumb{number}") > 20
+    page.mouse.move(5, 5)  # what the mouse points at is marked, too
+    page.keyboard.press("Escape")
+    assert page.evaluate("chosen") is None
+    page.evaluate("() => { paint(); drawImage(); }")
+    assert page.evaluate(ORANGE, "photo") == page.evaluate(ORANGE, "scene") == 0
+
+
+def test_a_segment_clicked_in_a_photograph_lights_up_in_the_scene(opened, scene):
+    page = opened()
+    line = int(scene.line_observations.line_idx[1])
+    page.select_option("#image", "0")
+    ends = scene.line_observations.segment[1].reshape(2, 2)
+    box, (x, y) = page.locator("#photo").bounding_box(), ends.mean(axis=0) / [640, 480]
+    page.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"])
+    assert page.inner_text("#tip").startswith(f"line {scene.lines.ids[line]}: 0.00 px")
+    page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+    assert page.evaluate("[chosen.kind, chosen.index]") == ["line", line]
+    page.evaluate("() => { paint(); drawImage(); }")
+    assert page.evaluate(ORANGE, "scene") > 50
+    assert page.evaluate("pieceEnds(piecesOf(chosen.index)[0])") == [
+        pytest.approx(_in_page(page, end), abs=1e-5) for end in scene.lines.segments[line]
+    ]
+
+
+def test_points_planes_and_cameras_can_be_clicked(opened, scene):
+    page = opened()
+    _only(page, "points")
+    _click(page, scene.points.xyz[7])
+    assert page.evaluate("[chosen.kind, chosen.index]") == ["point", 7]
+    _only(page, "planes")
+    inside = page.evaluate("planeOf(0).at") + np.array(page.evaluate("data.offset"))
+    _click(page, inside)
+    assert page.inner_text("#about h3").startswith("Plane 1")
+    assert page.evaluate("[lit.lines, lit.points]") == [[0], [0, 1, 2, 3, 4]]
+    _only(page, "cameras")
+    page.evaluate("eye.pivot = cameraCenter(1), draw()")
+    _click(page, scene.cam_centers_in_world[1])
+    assert page.inner_text("#about h3").startswith("Second.jpg") and page.input_value("#image") == "1"
+    page.click("#about h3 button")
+    assert page.evaluate("chosen") is None
+
+
+def test_links_lead_from_a_line_to_its_plane_and_back(opened, scene):
+    page = opened(f"#line {scene.lines.ids[0]}")
+    page.click("#about dl >> text=plane 1")
+    assert page.evaluate("chosen.kind") == "plane"
+    page.click(f"#about dl >> text=line {scene.lines.ids[0]}")
+    assert page.evaluate("[chosen.kind, chosen.index]") == ["line", 0]
+
+
+def test_search_by_name(opened, scene):
+    page = opened()
+    page.fill("#search", f"line {scene.lines.ids[3]}")
+    page.press("#search", "Enter")
+    assert page.evaluate("[chosen.kind, chosen.index]") == ["line", 3]
+    page.fill("#search", "second")
+    page.click("#found button")
+    assert page.evaluate("[chosen.kind, chosen.index, current]") == ["camera", 1, 1]
+    page.fill("#search", "line 99999")
+    assert page.inner_text("#found") == "Nothing has this name."
+    page.fill("#search", str(scene.points.ids[5]))
+    kinds = page.evaluate("search($('search').value).map(found => found.kind)")
+    assert "point" in kinds
+
+
+def _measured(page) -> dict[str, str]:
+    return dict(
+        zip(page.locator("#about dt").all_inner_texts(), page.locator("#about dd").all_inner_texts(), strict=True)
+    )
+
+
+def test_distance_of_two_points_with_its_standard_deviation(opened, scene, covariances):
+    page = opened()
+    page.click("#measure")
+    _only(page, "points")
+    for point in (3, 9):
+        _click(page, scene.points.xyz[point])
+    way = scene.points.xyz[9] - scene.points.xyz[3]
+    along = way / np.linalg.norm(way)
+    sigma = np.sqrt(along @ (covariances.points[3] + covariances.points[9]) @ along)
+    value, spread = map(float, _measured(page)["Distance of the picks"].split(" ± "))
+    assert value == pytest.approx(np.linalg.norm(way), rel=2e-4)
+    assert spread == pytest.approx(sigma, rel=0.06)  # two digits
+    page.evaluate("() => { paint(); drawImage(); }")
+    assert page.evaluate(ORANGE, "marks") > 50
+
+
+def test_angle_of_two_lines_with_its_standard_deviation(opened, scene, covariances):
+    """Against the derivative of the angle by the directions, taken numerically."""
+    page = opened()
+    page.click("#measure")
+    _only(page, "lines")
+    for line in (1, 3):
+        _click(page, _middle(scene, line))
+    first, second = (scene.lines.segments[line, 1] - scene.lines.segments[line, 0] for line in (1, 3))
+    first, second = first / np.linalg.norm(first), second / np.linalg.norm(second)
+
+    def angle(change: np.ndarray) -> float:
+        a, b = first + change[:3], second + change[3:]
+        return np.rad2deg(np.arccos(abs(a @ b) / np.linalg.norm(a) / np.linalg.norm(b)))
+
+    slope = np.array([(angle(1e-5 * axis) - angle(-1e-5 * axis)) / 2e-5 for axis in np.eye(6)])
+    variance = sum(
+        slope[k : k + 3] @ covariances.lines[line, 3:, 3:] @ slope[k : k + 3] for k, line in ((0, 1), (3, 3))
+    )
+    value, spread = (float(text.removesuffix("°")) for text in _measured(page)["Angle"].split(" ± "))
+    assert value == pytest.approx(angle(np.zeros(6)), abs=0.02)
+    assert spread == pytest.approx(np.sqrt(variance), rel=0.06)
+
+
+def test_distance_of_a_line_from_a_point_uses_moments_about_the_offset(opened, scene, covariances):
+    """The page works in coordinates less an offset; the spread across a line comes out as from the world's moments."""
+    page = opened()
+    page.click("#measure")
+    line, point = 2, 6
+    at = _middle(scene, line)
+    page.evaluate(
+        """([line, point, at]) => {
+          pick({ kind: "line", index: line }, at);
+          pick({ kind: "point", index: point }, place("points", point));
+        }""",
+        [line, point, _in_page(page, at)],
+    )
+    d = scene.lines.segments[line, 1] - scene.lines.segments[line, 0]
+    d /= np.linalg.norm(d)
+    m = np.cross(at, d)
+    off = scene.points.xyz[point] - at
+    off -= (off @ d) * d
+    unit, foot = off / np.linalg.norm(off), scene.points.xyz[point] - off
+
+    def place(change: np.ndarray) -> np.ndarray:
+        moment, along = m + change[:3], d + change[3:]
+        return np.cross(along, moment) / (along @ along) + (foot @ d) * along
+
+    slope = np.array([unit @ (place(1e-6 * axis) - place(-1e-6 * axis)) / 2e-6 for axis in np.eye(6)])
+    variance = slope @ covariances.lines[line] @ slope + unit @ covariances.points[point] @ unit
+    told = next(text for name, text in _measured(page).items() if "perpendicular" in name)
+    value, spread = map(float, told.split(" ± "))
+    assert value == pytest.approx(np.linalg.norm(off), rel=2e-4)
+    # |d| = 1 is kept by the page and not by the differences; that part runs along the line.
+    assert spread == pytest.approx(np.sqrt(variance), rel=0.15)
+
+
+def test_a_phone(opened, scene):
+    """Nothing wider than the screen, the scene without scrolling past numbers, taps that choose."""
+    page = opened(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True, device_scale_factor=2)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    box = page.locator("#scene").bounding_box()
+    assert box["width"] > 300 and box["height"] >= 300 and box["y"] + box["height"] < 844
+    _only(page, "lines")
+    page.touchscreen.tap(*page.evaluate(WHERE, _in_page(page, _middle(scene, 1))))
+    assert page.evaluate("[chosen.kind, chosen.index]") == ["line", 1]
+    photo = page.locator("#photo").bounding_box()
+    assert photo["y"] > box["y"] + box["height"] and photo["width"] > 300
+
+
+def test_without_webgl_the_scene_is_drawn_on_a_canvas(opened, scene):
+    page = opened("#canvas")
+    assert page.evaluate("renderer.name") == "canvas"
+    _only(page, "lines")
+    _click(page, _middle(scene, 2))
+    assert page.evaluate("[chosen.kind, chosen.index]") == ["line", 2]
+    page.evaluate("() => { paint(); drawImage(); }")
+    assert page.evaluate(ORANGE, "scene") > 50
+    assert opened().evaluate("renderer.name") == "webgl"
+
+
+def test_hands_turn_move_and_bring_the_view_back(opened):
+    page = opened()
+    box = page.locator("#scene").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    before = page.evaluate("({ ...eye, pivot: [...eye.pivot] })")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 80, y + 30, steps=4)
+    page.mouse.up()
+    turned = page.evaluate("eye")
+    assert turned["azimuth"] == pytest.approx(before["azimuth"] - 0.56) and turned["pivot"] == before["pivot"]
+    assert page.evaluate("chosen") is None  # a drag is no click
+    page.mouse.wheel(0, 300)
+    page.wait_for_function("eye.distance > data.view.distance")
+    page.click("#home")
+    assert page.evaluate("eye") == before
