@@ -189,7 +189,7 @@ class WideDetection:
         places = found.ends[:, None, :2] * (1.0 - along) + found.ends[:, None, 2:] * along
         rays = self.views.from_view(view, places.reshape(-1, 2))
         own = self.views.is_own(view, rays).reshape(len(found), _SAMPLES)
-        first, last = own.argmax(axis=1), _SAMPLES - 1 - own[:, ::-1].argmax(axis=1)
+        first, last = own.argmax(axis=1), _SAMPLES - 1 - np.fliplr(own).argmax(axis=1)
         rows = np.arange(len(found))
         ends = np.hstack([places[rows, first], places[rows, last]])
         keep = own.any(axis=1) & (segment2.length(ends) >= shortest)

@@ -148,7 +148,7 @@ def _split(scene: Scene, segments: Sequence[Segments], wide: Sequence[WideViews 
     """Return the images as views; those that a plane holds stay as they are."""
     cameras, first_camera = _cameras(scene.cameras, wide)
     parts, image, camera, poses, rows = [], [], [], [], []
-    observed: list[tuple[FloatArray, ...]] = []
+    observed: list[tuple[Any, ...]] = []
     seen, of_image = scene.point_observations, scene.images.camera_idx
     order = np.argsort(seen.image_idx, kind="stable")
     bounds = np.searchsorted(seen.image_idx[order], np.arange(scene.num_images + 1))
@@ -163,8 +163,8 @@ def _split(scene: Scene, segments: Sequence[Segments], wide: Sequence[WideViews 
             image.append(i)
             camera.append(first_camera[which] + view)
             poses.append(_turned(scene.cam_from_world[i], None if views is None else views.view_from_cam[view]))
-    columns = [np.concatenate(column) for column in zip(*observed, strict=True)]
-    table = PointObservations(*columns, np.arange(len(columns[0])))
+    in_view, point, pixel = (np.concatenate(column) for column in zip(*observed, strict=True))
+    table = PointObservations(in_view, point, pixel, np.arange(len(point)))
     names = [str(view) for view in range(len(image))]
     made = Scene.from_images(cameras, names, camera, np.array(poses), points=scene.points, point_observations=table)
     return _Split(made, parts, np.array(image, np.int64), rows)
