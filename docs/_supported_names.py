@@ -64,7 +64,13 @@ ROOMS: Rooms = (
     ),
     (
         "Files",
-        {"groma.io": None, "groma.io.sequences": None, "groma.io.reference": None, "groma.io.geometry": None},
+        {
+            "groma.io": None,
+            "groma.io.sequences": None,
+            "groma.io.reference": None,
+            "groma.io.geometry": None,
+            "groma.io.survey": None,
+        },
     ),
     ("Features", {"groma.features": None, "groma.features.contract": None}),
     (

@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from groma.adjustment.parts import adjust_parts, write_parts
     from groma.adjustment.pose_graph import PoseGraphOptions, PoseGraphResult, adjust_pose_graph
     from groma.adjustment.report import AdjustResult
+    from groma.adjustment.survey.align import Alignment, align
+    from groma.adjustment.survey.attach import Survey
+    from groma.adjustment.survey.reliability import Reliability, reliability
     from groma.adjustment.uncertainty import uncertainty
     from groma.compilation.warmup import warm_up
     from groma.errors import FileFormatError, GromaError, InputError, OutputError, ProblemError, ShapeError
@@ -68,6 +71,7 @@ if TYPE_CHECKING:
     from groma.localization.pose.camera import QueryCamera
     from groma.mapping.map import MapOptions, map_images
     from groma.mapping.result import MapResult
+    from groma.mapping.surveyed import SurveyedResult, adjust_surveyed
     from groma.problem.problem import Problem
     from groma.problem.variables import Variables
     from groma.scene import Scene, Similarity
@@ -84,6 +88,7 @@ _HOME = {
     "AbsolutePose": "groma.localization.pose.absolute_pose",
     "AdjustOptions": "groma.adjustment.adjust",
     "AdjustResult": "groma.adjustment.report",
+    "Alignment": "groma.adjustment.survey.align",
     "FileFormatError": "groma.errors",
     "GromaError": "groma.errors",
     "InputError": "groma.errors",
@@ -110,12 +115,15 @@ _HOME = {
     "ProblemError": "groma.errors",
     "QueryCamera": "groma.localization.pose.camera",
     "Ref": "groma.factors.contract",
+    "Reliability": "groma.adjustment.survey.reliability",
     "Scene": "groma.scene",
     "ShapeError": "groma.errors",
     "Similarity": "groma.scene",
     "Solution": "groma.solver.solve",
     "SolveReport": "groma.solver.report",
     "SolverOptions": "groma.solver.options",
+    "Survey": "groma.adjustment.survey.attach",
+    "SurveyedResult": "groma.mapping.surveyed",
     "Termination": "groma.solver.termination",
     "TrackOptions": "groma.tracking",
     "TrackResult": "groma.tracking",
@@ -124,6 +132,8 @@ _HOME = {
     "adjust": "groma.adjustment.adjust",
     "adjust_parts": "groma.adjustment.parts",
     "adjust_pose_graph": "groma.adjustment.pose_graph",
+    "adjust_surveyed": "groma.mapping.surveyed",
+    "align": "groma.adjustment.survey.align",
     "contributions": "groma.adjustment.contributions",
     "convert": "groma.io.convert",
     "diagnose": "groma.adjustment.diagnosis:diagnose_scene",
@@ -139,6 +149,7 @@ _HOME = {
     "open_sequence": "groma.io.sequences",
     "read_scene": "groma.io",
     "read_trajectory": "groma.io",
+    "reliability": "groma.adjustment.survey.reliability",
     "solve": "groma.solver.solve",
     "track": "groma.tracking",
     "uncertainty": "groma.adjustment.uncertainty",
@@ -173,6 +184,7 @@ __all__ = [
     "AbsolutePose",
     "AdjustOptions",
     "AdjustResult",
+    "Alignment",
     "FileFormatError",
     "GromaError",
     "InputError",
@@ -199,12 +211,15 @@ __all__ = [
     "ProblemError",
     "QueryCamera",
     "Ref",
+    "Reliability",
     "Scene",
     "ShapeError",
     "Similarity",
     "Solution",
     "SolveReport",
     "SolverOptions",
+    "Survey",
+    "SurveyedResult",
     "Termination",
     "TrackOptions",
     "TrackResult",
@@ -213,7 +228,9 @@ __all__ = [
     "adjust",
     "adjust_parts",
     "adjust_pose_graph",
+    "adjust_surveyed",
     "adjustment",
+    "align",
     "cameras",
     "compilation",
     "contributions",
@@ -241,6 +258,7 @@ __all__ = [
     "problem",
     "read_scene",
     "read_trajectory",
+    "reliability",
     "scene",
     "solve",
     "solver",

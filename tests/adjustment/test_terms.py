@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _measured import with_measurements
+from _survey import Exact, with_everything
 
 import groma
 from groma.adjustment.assemble import TERMS, AssemblyOptions, assemble
@@ -50,7 +51,8 @@ def related(scene):
 
 @pytest.fixture(scope="module")
 def exact():
-    return related(with_measurements(holistic(20, noise_px=0.0, seed=3).truth, depth_sigma=0.0, pixel_sigma=0.0))
+    measured = with_measurements(holistic(20, noise_px=0.0, seed=3).truth, depth_sigma=0.0, pixel_sigma=0.0)
+    return related(with_everything(measured, Exact()))
 
 
 @pytest.fixture(scope="module")

@@ -76,7 +76,7 @@ def test_one_part_alone(scene, tmp_path, part, vertices):
     assert kinds == {"v", "o", {"points": "p", "lines": "l", "planes": "f"}[part]}
 
 
-def test_obj_holds_points_lines_and_polygons(scene, tmp_path):
+def test_obj_holds_points_lines_and_planes(scene, tmp_path):
     write_obj(scene, tmp_path / "all.obj")
     rows = [row.split() for row in (tmp_path / "all.obj").read_text().splitlines()]
     table = {kind: [row[1:] for row in rows if row[0] == kind] for kind in "vplfo"}
@@ -84,8 +84,12 @@ def test_obj_holds_points_lines_and_polygons(scene, tmp_path):
     assert places.shape[1] == 6 and (places[:, 3:] >= 0).all() and (places[:, 3:] <= 1).all()
     np.testing.assert_array_equal(places[np.array(table["p"], int)[:, 0] - 1, :3], scene.points.xyz)
     np.testing.assert_array_equal(places[np.array(table["l"], int) - 1, :3], scene.lines.segments)
-    for corners, patch in zip(table["f"], plane_patches(scene)[0], strict=True):
-        np.testing.assert_array_equal(places[np.array(corners, int) - 1, :3], patch)
+    faces = iter(table["f"])
+    for patch in plane_patches(scene)[0]:  # a fan of triangles around each
+        fan = np.array([next(faces) for _ in range(len(patch) - 2)], int) - 1
+        assert (fan[:, 0] == fan[0, 0]).all() and (fan[1:, 1] == fan[:-1, 2]).all()
+        np.testing.assert_array_equal(places[[*fan[0], *fan[1:, 2]], :3], patch)
+    assert next(faces, None) is None
     assert [name for (name,) in table["o"]] == ["points", "lines", *(f"plane_{number}" for number in scene.planes.ids)]
 
 

@@ -11,11 +11,12 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import FloatArray
-from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, at_places_of, disassemble
+from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, disassemble
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.fit import inliers, noise_of
 from groma.adjustment.lens import unmodelled_distortion
 from groma.adjustment.pixel_residuals import redundancy_of, squared_residuals_px
+from groma.adjustment.places import at_places_of
 from groma.adjustment.relation_outcome import drop_failed_relations
 from groma.adjustment.report import AdjustReport, AdjustResult, Progress, not_converged
 from groma.adjustment.rescue.clusters import settle_clusters
@@ -30,6 +31,7 @@ from groma.adjustment.stages import (
     with_costs_at,
     with_loss,
 )
+from groma.adjustment.survey.place import settled
 from groma.adjustment.terms.contract import Term
 from groma.errors import InputError
 from groma.factors.losses import GemanMcClure, Loss, Trivial
@@ -160,10 +162,19 @@ def adjust(
         scene, options = _in_model(scene, options, options.camera_model, progress)
     near = local_frame(scene)
     if near is None:
-        return _adjusted(scene, options, progress)
-    result = _adjusted(scene.transformed(near), options, progress)
+        return _settled(scene, options, progress)
+    result = _settled(scene.transformed(near), options, progress)
     back = result.scene.transformed(near.inverse())
     return replace(result, scene=back, problem=result.problem and at_places_of(result.problem, back))
+
+
+def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
+    """Adjust a scene that begins and ends where measurements of other instruments fit best."""
+    if not (scene.is_surveyed and options.refine_poses):
+        return _adjusted(scene, options, progress)
+    result = _adjusted(settled(scene), options, progress)
+    after = settled(result.scene)
+    return replace(result, scene=after, problem=result.problem and at_places_of(result.problem, after, shifted=False))
 
 
 def _in_model(

@@ -5,7 +5,7 @@ Every factor of an adjustment, of a map and of a track is made here, by the term
 measurement.
 
 Groups of variables: ``frames`` (rig_from_world), ``sensors`` (cam_from_rig, only in scenes with rigs), one
-``intrinsics/MODEL`` per camera model, ``points``, ``lines``, ``planes``, ``directions``.
+``intrinsics/MODEL`` per camera model, ``points``, ``lines``, ``planes``, ``directions``, ``control_points``.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.terms import (
+    camera_positions,
+    control_points,
+    distances,
     line_depths,
     lines,
     plane_observations,
@@ -52,6 +55,11 @@ TERMS: tuple[Term, ...] = (
     relations.TERM,
     relations_in_pixels.TERM,
     pose_priors.TERM,
+    camera_positions.TERM,
+    control_points.MARKS,
+    control_points.CONTROL,
+    distances.BETWEEN_CAMERAS,
+    distances.BETWEEN_POINTS,
 )
 #: Types of factors that are observations of points and of lines in images.
 POINT_FACTORS = ("point_reprojection", "stereo_point")
@@ -112,7 +120,7 @@ def assemble(scene: Scene, options: AssemblyOptions, more: Sequence[Term] = ()) 
 
 def gauge_of(scene: Scene, options: AssemblyOptions) -> str:
     """Whether the first frame must be held; see :attr:`AssemblyOptions.gauge`."""
-    if len(scene.pose_priors):
+    if len(scene.pose_priors) or scene.is_surveyed:
         return "free"
     wireframe = options.points and options.lines and len(scene.relations.point_on_line) > 0
     metric = (wireframe or (options.planes and len(scene.relations) > 0)) and options.structure_form == "metric"
@@ -135,6 +143,8 @@ def disassemble(scene: Scene, problem: Problem) -> Scene:
         tables["sensors"] = scene.sensors.replace(cam_from_rig=states["sensors"])
     if "points" in states:
         tables["points"] = scene.points.replace(xyz=problem.variables["points"].ambient())
+    if "control_points" in states:
+        tables["control_points"] = scene.control_points.replace(xyz=states["control_points"])
     if "directions" in states:
         tables["directions"] = scene.directions.replace(vectors=states["directions"])
     scene = scene.replace(**tables)
@@ -143,21 +153,6 @@ def disassemble(scene: Scene, problem: Problem) -> Scene:
     if "planes" in states:
         scene = scene.with_planes(problem.variables["planes"].ambient())
     return scene
-
-
-def at_places_of(problem: Problem, scene: Scene) -> Problem:
-    """Return the problem with frames and landmarks where a scene has them: the same one, its world moved."""
-    variables = dict(problem.variables)
-    for name in variables.keys() & {"frames", "points", "lines", "planes"}:
-        group = variables[name]
-        if name == "frames":
-            state = scene.frames.rig_from_world
-        elif name == "points":
-            state = _point_variables(scene, "euclidean" if isinstance(group.manifold, Euclidean) else "auto").state
-        else:
-            state = group.manifold.from_ambient(scene.lines.plucker if name == "lines" else scene.planes.hesse)
-        variables[name] = group.with_state(state)
-    return Problem(variables, problem.factors)
 
 
 # --------------------------------------------------------------------------------------------------------- cameras
@@ -232,7 +227,7 @@ def first_camera_gauge(
     centers = se3.inverse(poses)[:, 4:]
     away = centers - centers[first]
     far = int(fit[np.argmax(np.linalg.norm(away[fit], axis=1))])
-    if far != first and not (scene.is_metric if is_metric is None else is_metric):
+    if far != first and not (scene.has_scale if is_metric is None else is_metric):
         in_camera = quaternion.rotate(poses[far, :4], away[far])
         held[far, int(np.argmax(np.abs(in_camera)))] = True
     return held
@@ -245,7 +240,9 @@ def _landmark_variables(scene: Scene, options: AssemblyOptions) -> dict[str, Var
     """Return the groups of points and lines, if they take part; terms use what they need."""
     variables = {}
     if options.points and (scene.num_point_observations or len(scene.point_depths)):
-        variables["points"] = _point_variables(scene, options.point_chart)
+        variables["points"] = point_variables(scene, options.point_chart)
+    if len(scene.marks):
+        variables["control_points"] = Variables(Euclidean(3, "point"), scene.control_points.xyz)
     if options.lines and scene.num_line_observations:
         chart = LINE_CHARTS[options.line_chart]
         variables["lines"] = Variables(chart, chart.from_ambient(scene.lines.plucker))
@@ -268,7 +265,7 @@ def _held(variables: dict[str, Variables]) -> dict[str, Variables]:
     return {name: replace(group, constant=True) for name, group in variables.items()}
 
 
-def _point_variables(scene: Scene, chart_name: str = "auto") -> Variables:
+def point_variables(scene: Scene, chart_name: str = "auto") -> Variables:
     """Points; those far from their cameras move linearly in the inverse of their distance from the cameras' mean."""
     if chart_name == "euclidean":
         return Variables(Euclidean(3, "point"), scene.points.xyz)
@@ -295,11 +292,11 @@ __all__ = [
     "Assembly",
     "AssemblyOptions",
     "assemble",
-    "at_places_of",
     "camera_variables",
     "disassemble",
     "first_camera_gauge",
     "gauge_of",
     "observations_of_frames",
+    "point_variables",
     "structure_variables",
 ]

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from groma.adjustment.assemble import AssemblyOptions, assemble, at_places_of
+from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.places import at_places_of
 from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.scene.local_frame import local_frame

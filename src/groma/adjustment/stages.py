@@ -25,8 +25,12 @@ METRIC_LOSS, METRIC_RELATION_LOSS = Cauchy(2.0), Cauchy(1.0)
 METRIC_START_TOLERANCE = 1e-3
 
 
+#: Factors that keep the loss they were made with: what is measured by other instruments than the cameras.
+OWN_LOSS = ("pose_prior", "position_prior", "vector_prior", "point_distance", "camera_distance")
+
+
 def with_loss(problem: Problem, loss: Loss, relation_loss: Loss | None = None) -> Problem:
-    """Return a problem under a loss; priors stay without one.
+    """Return a problem under a loss; priors keep theirs.
 
     Relations between landmarks have a noise of their own, and a given loss or the plain scale.
     """
@@ -34,7 +38,7 @@ def with_loss(problem: Problem, loss: Loss, relation_loss: Loss | None = None) -
         relation_loss = make_loss(loss.name, RELATION_SCALES[loss.name]) if loss.name in RELATION_SCALES else loss
 
     def of(factor: Factor) -> Loss:
-        if factor.type_name == "pose_prior":
+        if factor.type_name in OWN_LOSS:
             return factor.loss
         return relation_loss if factor.type_name in RELATION_FACTORS else loss
 

@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.assemble import AssemblyOptions, assemble, at_places_of, first_camera_gauge
+from groma.adjustment.assemble import AssemblyOptions, assemble, first_camera_gauge
+from groma.adjustment.places import at_places_of
 from groma.errors import InputError, ProblemError
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
@@ -22,7 +24,7 @@ from groma.solver.covariance.marginals import Covariances
 class SceneUncertainty:
     """Covariances of a scene. NaN for what is unobservable, zero where it is held."""
 
-    #: Frame that the covariances refer to: ``inner`` or ``held``.
+    #: Frame that the covariances refer to: ``inner``, ``held`` or ``measured``.
     gauge: str
     #: Standard deviation of unit weight that they are scaled by.
     sigma0: float
@@ -85,7 +87,8 @@ def uncertainty(
         The noise and the losses it was adjusted with; ``gauge`` in it is overridden.
     gauge : str
         ``inner``: a free network; the camera centres vary least together. ``held``: the first camera and the scale are
-        certain. ``auto``: inner, or held where lengths in the cameras or between landmarks tie the scale.
+        certain. ``auto``: inner, or held where lengths in the cameras or between landmarks tie the scale; where
+        positions or control points hold the scene, ``measured``: nothing is held, and covariances are of their frame.
     sigma0 : float
         Covariances are multiplied by its square; pass the root of the report's ``reduced_chi_square`` where the stated
         noise is not to be believed.
@@ -189,12 +192,16 @@ def _covariances(
     """Return the gauge that was chosen, and the covariances in it."""
     if gauge == "auto":
         metric = options.planes and len(scene.relations) > 0 and options.structure_form == "metric"
-        gauge = "held" if metric or scene.is_metric else "inner"
+        gauge = "measured" if scene.is_surveyed else "held" if metric or scene.is_metric else "inner"
     if problem is None:
         held = "first_camera" if gauge == "held" else "free"
         problem = assemble(scene, replace(options, gauge=held)).problem
-    else:
+    elif gauge != "measured":
         problem = _in_gauge(problem, scene, gauge)
+    if gauge == "measured":
+        with suppress(ProblemError):
+            return gauge, Covariances(problem)
+        gauge = "inner"
     datum = {"frames": [1, 1, 1, 0, 0, 0]} if gauge == "inner" and _free_cameras(problem) > 2 else None
     return gauge, Covariances(problem, gauge=gauge, datum=datum)
 

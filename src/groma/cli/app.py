@@ -9,6 +9,7 @@ import typer
 import groma
 from groma.cli.commands import (
     adjust,
+    align,
     convert,
     demo,
     evaluate,
@@ -40,6 +41,7 @@ _COMMANDS: _Commands = (
     ("track", track.track, "Follow a camera through a sequence, and map on the way."),
     ("localize", localize.localize, "Where photographs were taken, in a map that is there already."),
     ("adjust", adjust.adjust, "Bundle adjustment of a COLMAP model, BAL file or archive."),
+    ("align", align.align, "Into the frame of another scene, measured positions or control points."),
     ("convert", convert.convert, "From one file format to another."),
     ("report", report.report, "A scene as one HTML page that needs no network."),
     ("view", view.view, "Look at a scene in the browser."),

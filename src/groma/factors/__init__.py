@@ -40,6 +40,8 @@ from groma.factors.observations.point_depth import PointDepth
 from groma.factors.observations.point_reprojection import PointReprojection
 from groma.factors.observations.stereo_line import StereoLine
 from groma.factors.observations.stereo_point import StereoPoint
+from groma.factors.priors.camera_distance import CameraDistance
+from groma.factors.priors.point_distance import PointDistance
 from groma.factors.priors.pose_between import PoseBetween
 from groma.factors.priors.pose_prior import PosePrior
 from groma.factors.priors.position_prior import PositionPrior
@@ -73,6 +75,7 @@ __all__ = [
     "LOSSES",
     "WORLD_FIXED",
     "Barron",
+    "CameraDistance",
     "Cauchy",
     "Example",
     "Factor",
@@ -101,6 +104,7 @@ __all__ = [
     "PlanePerpendicularToDirection",
     "PlaneQuaternion",
     "PointDepth",
+    "PointDistance",
     "PointOnLine",
     "PointOnPlane",
     "PointOnPlanePixels",

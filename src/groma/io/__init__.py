@@ -5,6 +5,9 @@ from groma.io.archive import read_archive, write_archive
 from groma.io.atomic import atomic_output
 from groma.io.bal import read_bal, write_bal
 from groma.io.colmap.model import from_pycolmap, read_colmap, to_pycolmap, write_colmap
+from groma.io.exports.dxf import write_dxf
+from groma.io.exports.gltf import write_gltf
+from groma.io.exports.recording import write_recording
 from groma.io.g2o import read_g2o, write_g2o
 from groma.io.interchange.bundler import read_bundler
 from groma.io.interchange.nvm import read_nvm
@@ -45,10 +48,13 @@ __all__ = [
     "write_archive",
     "write_bal",
     "write_colmap",
+    "write_dxf",
     "write_g2o",
     "write_geometry",
+    "write_gltf",
     "write_obj",
     "write_ply",
+    "write_recording",
     "write_scene",
     "write_trajectory",
     "write_transforms",

@@ -5,8 +5,8 @@ Both files hold vertices with colours first: points, then the ends of the segmen
 images support), then the corners of the planes. The
 pieces of planes are the convex hulls of what lies on them (:mod:`groma.scene.patches`). Programs differ in what they
 read: all of them read vertices and faces with the colours of vertices; edges of PLY are read by MeshLab and
-Blender, ``l`` of OBJ by Blender, MeshLab and CloudCompare. Faces are triangles in PLY, because CloudCompare reads no
-others, and whole polygons in OBJ, where a program can then move a plane as one object.
+Blender, ``l`` of OBJ by Blender, MeshLab and CloudCompare. Faces are triangles, because CloudCompare and Open3D read no
+others. In OBJ every plane is an object, which a program can move.
 """
 
 from __future__ import annotations
@@ -14,25 +14,18 @@ from __future__ import annotations
 import os
 from collections.abc import Collection
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
-from groma.errors import InputError
 from groma.io.atomic import atomic_output
+from groma.io.drawn import PARTS, Part, drawn
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
-from groma.scene.line_intervals import line_pieces
-from groma.scene.patches import PALETTE, patch_groups, plane_patches, triangle_fans
-
-Part = Literal["points", "lines", "planes"]
-PARTS: tuple[Part, ...] = ("points", "lines", "planes")
-#: Points whose colours are not known; lines that share their direction with no others.
-_POINT_GREY = 128
-_LINE_COLOUR = (220, 60, 40)
+from groma.scene.patches import triangle_fans
 
 
 @dataclass(frozen=True)
@@ -102,7 +95,8 @@ def write_obj(scene: Scene, path: str | os.PathLike[str], force: bool = False, p
     if len(geometry.edges):
         rows += ["o lines", *(f"l {first} {second}" for first, second in (geometry.edges + 1).tolist())]
     for number, corners in zip(geometry.plane_ids, geometry.polygons, strict=True):
-        rows += [f"o plane_{number}", "f " + " ".join(str(row + 1) for row in corners.tolist())]
+        first, *others = (corners + 1).tolist()
+        rows += [f"o plane_{number}", *(f"f {first} {second} {third}" for second, third in pairwise(others))]
     with atomic_output(path, force) as draft:
         draft.write_text("\n".join(rows) + "\n", encoding="ascii")
 
@@ -134,38 +128,18 @@ def write_geometry(scene: Scene, folder: str | os.PathLike[str]) -> tuple[str, .
 
 
 def _geometry(scene: Scene, parts: Collection[Part]) -> _Geometry:
-    unknown = set(parts) - set(PARTS)
-    if isinstance(parts, str) or unknown or not parts:
-        raise InputError(f"parts must be some of {', '.join(PARTS)}; got {parts!r}.")
-    num_points = scene.num_points if "points" in parts else 0
-    pieces, line = line_pieces(scene) if "lines" in parts else (np.zeros((0, 2, 3)), np.zeros(0, np.int64))
-    num_lines = len(line)
-    polygons, members = plane_patches(scene) if "planes" in parts else ([], np.zeros(0, np.int64))
-    begin = num_points + 2 * num_lines + np.cumsum([0, *(len(corners) for corners in polygons)])
-    points = scene.points.color[:num_points]
+    shown = drawn(scene, parts)
+    num_points, num_lines = len(shown.points), len(shown.pieces)
+    begin = num_points + 2 * num_lines + np.cumsum([0, *(len(corners) for corners in shown.polygons)])
     return _Geometry(
-        places=np.concatenate([scene.points.xyz[:num_points], pieces.reshape(-1, 3), *polygons]),
-        colours=np.concatenate(
-            [
-                points if points.any() else np.full_like(points, _POINT_GREY),
-                np.repeat(_line_colours(scene)[line], 2, axis=0),
-                np.repeat(PALETTE[patch_groups(members)], [len(corners) for corners in polygons], axis=0),
-            ]
-        ),
+        places=shown.places,
+        colours=shown.colours,
         num_points=num_points,
         edges=num_points + np.arange(2 * num_lines).reshape(-1, 2),
-        polygons=[first + np.arange(len(corners)) for first, corners in zip(begin, polygons, strict=False)],
-        triangles=begin[0] + triangle_fans(polygons)[1],
-        plane_ids=scene.planes.ids.tolist()[: len(polygons)],
+        polygons=[first + np.arange(len(corners)) for first, corners in zip(begin, shown.polygons, strict=False)],
+        triangles=begin[0] + triangle_fans(shown.polygons)[1],
+        plane_ids=shown.plane_ids,
     )
-
-
-def _line_colours(scene: Scene) -> npt.NDArray[np.uint8]:
-    """One colour per shared direction."""
-    colours = np.tile(np.array(_LINE_COLOUR, np.uint8), (scene.num_lines, 1))
-    line, direction = scene.relations.line_along_direction.T
-    colours[line] = PALETTE[direction % len(PALETTE)]
-    return colours
 
 
 register_format(SceneFormat("ply", target=".ply", endings=(".ply",), write=write_ply))

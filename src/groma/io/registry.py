@@ -132,10 +132,11 @@ def write_scene(
     path : path
         Where. With ``format="auto"`` the name says the format: ``.npz`` archive, ``.txt``, ``.bz2`` or ``.gz`` BAL,
         ``.json`` cameras, poses and points for nerfstudio, ``.ply`` and ``.obj`` geometry only (points, lines, pieces
-        of planes), no suffix a COLMAP model in a new folder.
+        of planes), ``.glb``, ``.gltf``, ``.dxf`` and ``.rrd`` geometry and cameras, no suffix a COLMAP model in a new
+        folder.
     format : str
-        ``colmap``, ``colmap_text``, ``archive``, ``bal``, ``transforms``, ``ply``, ``obj`` or a registered one, to
-        override the name.
+        ``colmap``, ``colmap_text``, ``archive``, ``bal``, ``transforms``, ``ply``, ``obj``, ``gltf``, ``dxf``,
+        ``rerun`` or a registered one, to override the name.
     force : bool
         Replace what is there.
     like : Structures, optional

@@ -27,6 +27,7 @@ from pathlib import Path
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
+from groma.adjustment.survey.attach import Survey
 from groma.execution import work_with
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches
@@ -58,6 +59,7 @@ from groma.mapping.refine_points import PointRefinementOptions, refine_points
 from groma.mapping.result import MapResult
 from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
+from groma.mapping.surveyed import adjust_with_survey, tied
 from groma.mapping.unused import without_unused
 from groma.scene import Scene
 from groma.scene.local_frame import usual_frame
@@ -152,6 +154,7 @@ def map_images(
     options: MapOptions | None = None,
     progress: StageProgress | None = None,
     line_matches: ExternalMatches | None = None,
+    survey: Survey | None = None,
 ) -> MapResult:
     """Map a folder of photographs: points, lines and planes, adjusted together.
 
@@ -169,6 +172,8 @@ def map_images(
         Called with the name of a stage, what is done and what there is to do.
     line_matches : ExternalMatches, optional
         Segments and their matches from elsewhere, by image name; nothing is detected then.
+    survey : Survey, optional
+        Positions, control points and distances; the map is in their frame and adjusted with them.
 
     Returns
     -------
@@ -202,12 +207,17 @@ def map_images(
         points = stages.run(adjust_points, start)
         if options.refine_points:
             points = stages.run(measure_points, folder, points)
+        in_place = tied(start, points, survey) if survey else None
+        if in_place is not None:
+            start, near = in_place.start, in_place.near
+            points = stages.run(adjust_with_survey, in_place.points, given=in_place.points)
         segments = stages.run(find_segments, folder, points, line_matches, given=line_matches)
         matches = matches_for(options, folder, points, segments, line_matches)
         result = map_segments(points, segments, matches, stages, neighbors_for(options, folder))
     say("done", 1, 1)
     left_out = images_left_out(names, start.images.names, model is not None)
-    result = dataclasses.replace(result, start=start, warnings=(*left_out, *result.warnings))
+    surveyed = None if in_place is None else in_place.surveyed
+    result = dataclasses.replace(result, start=start, warnings=(*left_out, *result.warnings), surveyed=surveyed)
     if near is None:
         return result
     scene, start, before = (part.transformed(near.inverse()) for part in (result.scene, result.start, result.before))

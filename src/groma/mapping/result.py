@@ -15,14 +15,18 @@ from groma.adjustment.contributions import Contribution, contributions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.report import AdjustReport
 from groma.adjustment.stages import with_loss
+from groma.adjustment.survey.attach import Surveyed
+from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
+from groma.mapping.surveyed import has_survey, reliability_of, survey_numbers
 from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.solver.observability.diagnosis import Diagnosis
 from groma.viz.pictures import ImageFiles
 from groma.viz.report.page import PageContents, write_report
+from groma.viz.report.survey import survey_card
 from groma.viz.report.tables import contributions_card
 
 
@@ -47,6 +51,8 @@ class MapResult:
     outcomes: dict[str, int]
     #: Sentences for the user.
     warnings: tuple[str, ...]
+    #: How the map got into the frame of measurements, where there are any.
+    surveyed: Surveyed | None = None
 
     def diagnose(self) -> Diagnosis:
         """Say in words what the observations determine, at the noise and with the loss of the last adjustment."""
@@ -78,6 +84,9 @@ class MapResult:
         }
         if contributions:
             numbers["contributions"] = [entry.to_dict() for entry in contributions]
+        if has_survey(self.scene):
+            found = reliability_of(self.scene, _problem_of(self.scene, self.adjusted_with))
+            numbers["survey"] = survey_numbers(self.surveyed, found)
         return numbers
 
     def write(
@@ -93,7 +102,7 @@ class MapResult:
         """Write everything that ``groma map`` writes to a folder, whole or not at all.
 
         A COLMAP model with the lines and planes beside it (``structures``), ``scene.npz``, lines and planes as PLY and
-        OBJ, ``summary.json`` and ``report.html``.
+        OBJ, ``summary.json`` and ``report.html``; with measurements of other instruments ``adjustment.txt``.
 
         Parameters
         ----------
@@ -129,9 +138,11 @@ class MapResult:
                     self.explanation,
                     self.warnings,
                     numbers.get("diagnosis"),
-                    contributions_card(numbers.get("contributions")),
+                    contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
                 ),
             )
+            if "survey" in numbers:
+                (draft / "adjustment.txt").write_text(protocol(numbers), encoding="utf-8")
             (draft / "summary.json").write_text(json_text(numbers), encoding="utf-8")
 
 

@@ -56,9 +56,10 @@ def choose_landmarks(problem: Problem, eliminate: str | tuple[str, ...], warning
                     f"system unasked. Pass eliminate=({(set(chosen) - {smaller}).pop()!r},) if that is intended."
                 )
             chosen.remove(smaller)
-            warnings.append(
-                f"Factor {name!r} couples {first!r} and {second!r}; {smaller!r} stays in the reduced system."
-            )
+            if first != second:
+                warnings.append(
+                    f"Factor {name!r} couples {first!r} and {second!r}; {smaller!r} stays in the reduced system."
+                )
         return tuple(chosen)
     groups = (eliminate,) if isinstance(eliminate, str) else tuple(eliminate)
     for name in groups:

@@ -9,9 +9,13 @@ from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths,
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.scene import Scene
 from groma.scene.similarity import Similarity
+from groma.scene.survey import CameraDistances, CameraPositions, ControlPoints, Marks, PointDistances
 
 __all__ = [
+    "CameraDistances",
+    "CameraPositions",
     "Cameras",
+    "ControlPoints",
     "Directions",
     "Frames",
     "Images",
@@ -20,9 +24,11 @@ __all__ = [
     "LineIntervals",
     "LineObservations",
     "Lines",
+    "Marks",
     "PlaneObservations",
     "Planes",
     "PointDepths",
+    "PointDistances",
     "PointObservations",
     "Points",
     "PosePriors",

@@ -29,4 +29,20 @@ def sentence_of(scene: "Scene", geometry: bool = False) -> str:
     return ", ".join(said) or "nothing"
 
 
-__all__ = ["counts_of", "sentence_of"]
+def measurements_of(scene: "Scene") -> dict[str, int]:
+    """Number of measurements besides those of points and lines in images, by kind; only kinds that there are."""
+    counts = {
+        "point depths": len(scene.point_depths),
+        "right columns": len(scene.right_columns),
+        "line depths": len(scene.line_depths),
+        "plane observations": len(scene.plane_observations),
+        "pose priors": len(scene.pose_priors),
+        "camera positions": len(scene.camera_positions),
+        "control points": len(scene.control_points),
+        "marks": len(scene.marks),
+        "distances": len(scene.camera_distances) + len(scene.point_distances),
+    }
+    return {name: count for name, count in counts.items() if count}
+
+
+__all__ = ["counts_of", "measurements_of", "sentence_of"]

@@ -14,6 +14,8 @@ all references are checked when it is made. Every change gives a new scene.
     point_depths       -> images, points          right_columns -> point_observations
     plane_observations -> images, planes          line_depths   -> line_observations
     pose_priors        -> frames                  line_intervals -> lines
+    camera_positions   -> images                  marks -> images, control_points
+    camera_distances   -> images                  point_distances -> control_points
 
 Each column declares in its table what it refers to and how it changes when the world moves (see
 :func:`groma.scene.table.column`); checks, selections and transforms here go by that.
@@ -31,14 +33,18 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3
-from groma.scene.camera import CAMERA, Cameras, Rigs, Sensors
+from groma.scene.camera import Cameras, Rigs, Sensors
+from groma.scene.checks import check_scene
+from groma.scene.counts import measurements_of
 from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
 from groma.scene.line_intervals import LineIntervals
 from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
-from groma.scene.table import check_index, check_quaternions, moved_column, new_index_of, references, rows_of
+from groma.scene.standing_alone import standing_alone
+from groma.scene.survey import CameraDistances, CameraPositions, ControlPoints, Marks, PointDistances
+from groma.scene.table import moved_column, new_index_of, references, rows_of
 
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
@@ -85,23 +91,16 @@ class Scene:
     plane_observations: PlaneObservations = field(default_factory=PlaneObservations)
     #: Poses known beforehand.
     pose_priors: PosePriors = field(default_factory=PosePriors)
+    #: Measured places of cameras, and distances between them.
+    camera_positions: CameraPositions = field(default_factory=CameraPositions)
+    camera_distances: CameraDistances = field(default_factory=CameraDistances)
+    #: Control and check points, where they are in the images, and distances between them.
+    control_points: ControlPoints = field(default_factory=ControlPoints)
+    marks: Marks = field(default_factory=Marks)
+    point_distances: PointDistances = field(default_factory=PointDistances)
 
     def __post_init__(self) -> None:
-        for name, column, side, target in references(Scene):
-            if len(index := getattr(getattr(self, name), column)):
-                where, index = (column, index) if side is None else (f"{column}[:, {side}]", index[:, side])
-                check_index(f"{name}.{where}", index, len(getattr(self, target)), target.replace("_", " "))
-        is_camera = self.sensors.kind == CAMERA
-        check_index("sensors.camera_idx", self.sensors.camera_idx[is_camera], len(self.cameras), "cameras")
-        check_quaternions("frames.rig_from_world", self.frames.rig_from_world)
-        check_quaternions("sensors.cam_from_rig", self.sensors.cam_from_rig)
-        check_quaternions("pose_priors.rig_from_world", self.pose_priors.rig_from_world)
-        if len(self.images):
-            sensor = self.images.sensor_idx
-            if (self.sensors.camera_idx[sensor] != self.images.camera_idx).any() or (~is_camera[sensor]).any():
-                raise InputError("images.camera_idx must be the camera of the image's sensor. Correct one of the two.")
-            if (self.sensors.rig_idx[sensor] != self.frames.rig_idx[self.images.frame_idx]).any():
-                raise InputError("images.sensor_idx must be a sensor of the rig of the image's frame. Correct one.")
+        check_scene(self)
 
     def __repr__(self) -> str:
         counts = [(name, getattr(self, f"num_{name}")) for name in ("images", "cameras", "points", "lines", "planes")]
@@ -133,25 +132,7 @@ class Scene:
         **tables
             Further tables of the scene, by field name.
         """
-        index = np.asarray(camera_idx, np.int64)
-        every, count = np.arange(len(cameras)), len(names)
-        sensors = Sensors(
-            rig_idx=every,
-            kind=np.full(len(cameras), CAMERA),
-            sensor_ids=cameras.ids,
-            camera_idx=every,
-            cam_from_rig=np.tile(_IDENTITY, (len(cameras), 1)),
-            is_reference=np.ones(len(cameras), int),
-            has_pose=np.ones(len(cameras), int),
-        )
-        return cls(
-            cameras=cameras,
-            rigs=Rigs(cameras.ids),
-            sensors=sensors,
-            frames=Frames(np.arange(count) + 1, index, np.asarray(cam_from_world, float)),
-            images=Images(np.arange(count) + 1, tuple(names), index, np.arange(count), index),
-            **tables,
-        )
+        return cls(**standing_alone(cameras, names, camera_idx, cam_from_world), **tables)
 
     # Counts
 
@@ -208,15 +189,22 @@ class Scene:
     @property
     def num_measurements(self) -> dict[str, int]:
         """Numbers of measurements besides those of points and lines in images, by kind; only kinds that there are."""
-        kinds = {"point depths": self.point_depths, "right columns": self.right_columns}
-        kinds |= {"line depths": self.line_depths, "plane observations": self.plane_observations}
-        kinds |= {"pose priors": self.pose_priors}
-        return {name: len(table) for name, table in kinds.items() if len(table)}
+        return measurements_of(self)
 
     @property
     def is_metric(self) -> bool:
         """Whether anything measured in the cameras tells the scale: depths, stereo pairs, planes."""
         return any(map(len, (self.point_depths, self.right_columns, self.line_depths, self.plane_observations)))
+
+    @property
+    def is_surveyed(self) -> bool:
+        """Whether positions of cameras or control points tell where the scene is, and its scale."""
+        return len(self.camera_positions) + int(self.control_points.is_control.sum()) > 1
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether anything measured tells the scale."""
+        return self.is_metric or self.is_surveyed or len(self.camera_distances) + len(self.point_distances) > 0
 
     # Poses
 

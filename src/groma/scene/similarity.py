@@ -62,6 +62,10 @@ class Similarity:
         """Turn directions, (..., 3)."""
         return np.asarray(vectors, float) @ self.rotation.T
 
+    def covariances(self, matrices: npt.ArrayLike) -> FloatArray:
+        r"""Return covariances of points, (..., 3, 3), in the new world: :math:`s^2 R \Sigma R^\top`."""
+        return self.scale**2 * (self.rotation @ np.asarray(matrices, float) @ self.rotation.T)
+
     def lines(self, plucker: npt.ArrayLike) -> FloatArray:
         r"""Move Plücker lines, (..., 6); unit directions stay unit.
 

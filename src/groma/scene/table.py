@@ -51,7 +51,7 @@ def column(
         The table of the scene that the indices refer to; of pairs of indices the two tables.
     world : str
         What the rows are in the world, for the column to move with it: ``points``, ``directions``, ``lines``,
-        ``planes`` or ``poses``, the methods of :class:`~groma.scene.similarity.Similarity`.
+        ``planes``, ``poses`` or ``covariances`` (of points), methods of :class:`~groma.scene.similarity.Similarity`.
     length : int or tuple of int
         The power of the scene's unit of length in numbers that do not belong to the world, or one for each of a row:
         1 for depths and their standard deviations, -1 for inverse depths.

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
+from groma.scene.upright import upward
 
 if TYPE_CHECKING:
     from groma.viz.drawable import Drawable
@@ -85,14 +86,6 @@ def starting_view(scene: Drawable, middle: FloatArray) -> StartingView:
         return StartingView(center, up, azimuth, elevation, 1.0, 0.018)
     pivot, distance = _compromise((np.concatenate(kept[:2]) - center) @ frame.T, (kept[2] - center) @ frame.T)
     return StartingView(center + pivot @ frame, up, azimuth, elevation, distance, _camera_size(scene, distance))
-
-
-def upward(down: FloatArray) -> FloatArray:
-    """Return the direction (3,) that is up for cameras whose y axes (N, 3) point down; z if that is not clear."""
-    up = -down.sum(axis=0)
-    if np.linalg.norm(up) < 0.3 * max(len(down), 1):
-        return np.array([0.0, 0.0, 1.0])
-    return up / np.linalg.norm(up)
 
 
 def horizontal(up: FloatArray) -> tuple[FloatArray, FloatArray]:

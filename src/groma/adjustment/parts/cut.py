@@ -15,7 +15,7 @@ from groma._typing import IntArray
 from groma.adjustment.parts.same import check_same_scene
 from groma.errors import InputError, OutputError
 from groma.io.archive import read_archive, write_archive
-from groma.scene import Keypoints, PlaneObservations, PosePriors, Scene
+from groma.scene import Scene
 
 #: Observations of a part, where a scene is cut: about 400 MB while it is worked on.
 PART_SIZE = 1_000_000
@@ -23,6 +23,11 @@ PART_SIZE = 1_000_000
 PART_NAMES = "part-*.npz"
 #: Tables that are the same in all parts.
 SHARED = ("cameras", "rigs", "sensors", "frames", "images", "planes", "directions")
+#: Tables that are in the first part alone.
+ONCE = (
+    "keypoints", "plane_observations", "pose_priors", "camera_positions", "camera_distances", "control_points", "marks",
+    "point_distances",
+)  # fmt: skip
 
 
 def parts_of(folder: str | os.PathLike[str]) -> tuple[Path, ...]:
@@ -43,7 +48,7 @@ def write_parts(
     Landmarks are taken in the order of the first image that sees them, so that a part concerns few images; points that
     lie on lines are in the part of the first of these. Cameras, planes and directions are in all parts; a relation is
     in the part of its point or line. What concerns none is in the first part: relations between planes, planes
-    measured in the cameras, poses known beforehand.
+    measured in the cameras, poses known beforehand, measurements of other instruments.
 
     Parameters
     ----------
@@ -113,8 +118,7 @@ def num_ties_cut(scene: Scene, observations: int = PART_SIZE) -> int:
 def _without_what_counts_once(scene: Scene) -> Scene:
     """Return a scene without what is in the first part alone: it would count once per part."""
     relations = scene.relations.take(parallel_planes=[], perpendicular_planes=[])
-    alone: dict[str, Any] = {"keypoints": Keypoints(), "plane_observations": PlaneObservations()}
-    return scene.replace(relations=relations, pose_priors=PosePriors(), **alone)
+    return scene.replace(relations=relations, **{name: type(getattr(scene, name))() for name in ONCE})
 
 
 def join_parts(paths: Sequence[str | os.PathLike[str]]) -> Scene:

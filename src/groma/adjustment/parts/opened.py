@@ -44,7 +44,7 @@ from groma.solver.reduce.shard import Shard
 from groma.solver.steps import States
 
 #: Groups of landmarks.
-LANDMARKS = ("points", "lines")
+LANDMARKS = ("points", "lines", "control_points")
 #: Groups that all parts share, by the first part of their names.
 SHARED = ("frames", "sensors", "intrinsics", "planes", "directions")
 
@@ -214,8 +214,8 @@ def _facts(scene: Scene, options: AssemblyOptions, made: Assembly) -> dict[str, 
         "observations": sum(len(group.factor) for group in made.groups if group.observes),
         "measurements": made.num_measurements,
         "kept": sorted(made.problem.variables.keys() - set(LANDMARKS) - _held_besides(made)),
-        "priors": len(scene.pose_priors) > 0,
-        "metric": scene.is_metric,
+        "priors": len(scene.pose_priors) > 0 or scene.is_surveyed,
+        "metric": scene.has_scale,
         "gauge": gauge_of(scene, options) if options.gauge == "auto" else options.gauge,
         "squares": {kind: [float(values.sum()), len(values)] for kind, values in squares.items()},
         "notes": list(made.notes),

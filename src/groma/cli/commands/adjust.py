@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
 from groma.errors import InputError
 
@@ -153,6 +154,24 @@ def adjust(
             help="With a folder of parts: keep them in memory from one step to the next; auto: where they fit.",
         ),
     ] = "auto",
+    positions: _measured.Positions = None,
+    position_sigma: _measured.PositionSigma = None,
+    control: _measured.Control = None,
+    control_sigma: _measured.ControlSigma = None,
+    mark_sigma: _measured.MarkSigma = 1.0,
+    check: _measured.Check = None,
+    distances: _measured.Distances = None,
+    distance_sigma: _measured.DistanceSigma = None,
+    crs: _measured.Crs = None,
+    protocol: Annotated[
+        Path | None,
+        typer.Option(
+            "--protocol",
+            metavar="FILE",
+            help="Also write the measurements with residuals, redundancy and tests, as text (adjustment.txt).",
+            rich_help_panel=_measured.PANEL,
+        ),
+    ] = None,
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
@@ -180,9 +199,13 @@ def adjust(
     if linear_solver != "auto":
         _check_linear_solver(linear_solver)
     console = Console(quiet, verbose, json_target, threads)
+    measured = _measured.Measured(
+        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
+    )
+    _measured.check_measured(measured)
     in_parts = has_company() or is_parts(source)
     if not in_parts:
-        _output.check_outputs(force, output, page, covariance, json_target=json_target)
+        _output.check_outputs(force, output, page, covariance, protocol, json_target=json_target)
     if covariance is not None and covariance.suffix not in (".npz", ".json"):
         raise InputError(f"--covariance must end in .npz or .json; got {covariance}.")
     if not 0.0 < sigma0 < float("inf"):
@@ -190,12 +213,12 @@ def adjust(
     if truth is not None and not contributions:
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
     if not in_parts:
-        check_inputs(source, truth)
+        check_inputs(source, truth, *measured.files)
     if is_pose_graph(source) and not in_parts:
         refused = {
             "--report": page, "--covariance": covariance, "--contributions": contributions, "--gauge": gauge,
             "--line-chart": line_chart, "--refine-intrinsics": refine_intrinsics, "--refine-rigs": refine_rigs,
-            "--camera-model": camera_model,
+            "--camera-model": camera_model, **measured.given,
         }  # fmt: skip
         graph_options = _chosen(
             loss="none" if loss == "auto" else loss, loss_scale=loss_scale, linear_solver=linear_solver,
@@ -216,12 +239,23 @@ def adjust(
     if in_parts:
         refused = {
             "--report": page, "--covariance": covariance, "--contributions": contributions, "--diagnosis": diagnosis,
-            "--camera-model": camera_model,
+            "--camera-model": camera_model, **measured.given,
         }  # fmt: skip
         adjust_parts_and_write(source, console, options, PartsWanted(output, json_target, force, keep), refused)
         return
     wanted = Wanted(
-        output, page, covariance, covariance_gauge, sigma0, diagnosis, contributions, truth, json_target, force
+        output,
+        page,
+        covariance,
+        covariance_gauge,
+        sigma0,
+        diagnosis,
+        contributions,
+        truth,
+        json_target,
+        force,
+        measured,
+        protocol,
     )
     adjust_and_write(console, source, options, wanted)
 

@@ -21,8 +21,8 @@ def convert(
         typer.Argument(
             metavar="OUTPUT",
             help="Its name says the format: a folder for a COLMAP model, .npz for a groma archive, .txt, .bz2 or .gz "
-            "for BAL, .json for nerfstudio and instant-ngp: cameras, poses and points, .ply or .obj for geometry only: "
-            "points, lines and pieces of planes.",
+            "for BAL, .json for nerfstudio and instant-ngp: cameras, poses and points. To look at: .ply, .obj: points, "
+            "lines and pieces of planes; .glb, .gltf, .dxf or .rrd (rerun): these and cameras.",
         ),
     ],
     parts: Annotated[
@@ -68,7 +68,7 @@ def _convert(source: Path, target: Path, console: Console, force: bool) -> dict[
         scene = convert_scene(source, target, force)
     if target.suffix.lower() == ".json":  # cameras, poses and points
         scene = scene.points_only().keep(point_observations=[])
-    console.say(f"Wrote {target}: {sentence_of(scene, geometry=target.suffix.lower() in ('.ply', '.obj'))}")
+    console.say(f"Wrote {target}: {sentence_of(scene, geometry=target.suffix.lower() in ('.ply', '.obj', '.dxf'))}")
     return counts_of(scene)
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
 from groma.cli.shared.ranks import led_by_first_rank
 from groma.errors import InputError
@@ -96,6 +97,15 @@ def map_(
             "--diagnosis/--no-diagnosis", help="Say what the data do not determine. Default: yes up to 300 images."
         ),
     ] = None,
+    positions: _measured.Positions = None,
+    position_sigma: _measured.PositionSigma = None,
+    control: _measured.Control = None,
+    control_sigma: _measured.ControlSigma = None,
+    mark_sigma: _measured.MarkSigma = 1.0,
+    check: _measured.Check = None,
+    distances: _measured.Distances = None,
+    distance_sigma: _measured.DistanceSigma = None,
+    crs: _measured.Crs = None,
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
@@ -108,8 +118,8 @@ def map_(
     """Map photographs: points, lines and planes, adjusted together.
 
     OUT then holds a COLMAP model with the lines and planes beside it (structures/), scene.npz, lines and planes as PLY
-    and OBJ, summary.json and report.html. Finished stages are kept in OUT.work until the end: after an interruption the
-    same command goes on from there.
+    and OBJ, summary.json and report.html; with measurements adjustment.txt. Finished stages are kept in OUT.work until
+    the end: after an interruption the same command goes on from there.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
@@ -117,7 +127,11 @@ def map_(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
-    check_inputs(images, model, rig, line_matches, truth)
+    measured = _measured.Measured(
+        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
+    )
+    _measured.check_measured(measured)
+    check_inputs(images, model, rig, line_matches, truth, *measured.files)
 
     if model is not None and camera_params is not None:
         raise InputError("--camera-params is for images without a model. Leave it out.")
@@ -136,6 +150,7 @@ def map_(
     from groma.features.external import read_matches
     from groma.io import read_scene
     from groma.mapping.map import MapOptions
+    from groma.mapping.photographs import image_files
 
     options = MapOptions(
         min_segment_length=min_length,
@@ -158,7 +173,10 @@ def map_(
     matches = read_matches(line_matches) if line_matches is not None else None
     true = read_scene(truth) if truth is not None else None
     work = output.with_name(output.name + ".work")
-    result = run_map(console, images, work, start, options, matches)
+    survey = None
+    if measured:
+        survey = measured.read(images, lambda: [path.relative_to(images).as_posix() for path in image_files(images)])
+    result = run_map(console, images, work, start, options, matches, survey)
     found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
     numbers = result.summary(found, result.contributions(true) if contributions else ())
     write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)

@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from groma._counted import counted
 from groma.cli.shared import output as _output
-from groma.errors import ProblemError
+from groma.cli.shared.measurements import Measured, say_survey
+from groma.errors import InputError, ProblemError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from groma.adjustment.adjust import AdjustOptions
+    from groma.adjustment.report import AdjustResult, Progress
     from groma.cli.shared.console import Console
     from groma.scene import Scene
 
@@ -36,6 +40,9 @@ class Wanted:
     #: Value of --json, and whether files may be replaced.
     json_target: str | None = None
     force: bool = False
+    #: Measurements of other instruments, and where their protocol goes.
+    measured: Measured = field(default_factory=Measured)
+    protocol: Path | None = None
 
 
 def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wanted: Wanted) -> None:
@@ -47,7 +54,6 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
         If covariances are wanted that do not exist, after everything else was written and said. Where the images fall
         into groups a warning says so instead.
     """
-    from groma.adjustment.adjust import adjust
     from groma.adjustment.covariance_files import write_covariances
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.compilation.time import compilation_time
@@ -59,7 +65,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     true = None if wanted.truth is None else read_scene(wanted.truth)
     console.announce_compilation()
     with compilation_time() as compilation, console.progress() as progress:
-        result = adjust(before, options, progress)
+        before, result, survey = _adjusted(before, options, wanted, progress)
     entries = ()
     if wanted.contributions:
         from groma.adjustment.contributions import contributions  # with evaluation, half a second to import
@@ -68,11 +74,18 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     diagnosis = try_diagnosis(result.diagnose, before.num_images, console, wanted.diagnosis)
     numbers = result.summary(diagnosis, entries)
     numbers["seconds"]["compilation"] = compilation.seconds
+    numbers |= {} if survey is None else {"survey": survey}
 
     if wanted.output is not None:
         write_scene(result.scene, wanted.output, force=wanted.force, like=structures_of(source))
+    if wanted.protocol is not None:
+        from groma.adjustment.survey.protocol import protocol
+
+        with _output.atomic_output(wanted.protocol, wanted.force) as draft:
+            draft.write_text(protocol(numbers), encoding="utf-8")
     if wanted.page is not None:
         from groma.viz.report.page import PageContents, write_report
+        from groma.viz.report.survey import survey_card
         from groma.viz.report.tables import contributions_card
 
         with _output.atomic_output(wanted.page, wanted.force) as draft:
@@ -85,7 +98,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
                 contents=PageContents(
                     warnings=numbers["warnings"],
                     diagnosis=numbers["diagnosis"],
-                    cards=contributions_card(numbers.get("contributions")),
+                    cards=contributions_card(numbers.get("contributions")) + survey_card(survey),
                 ),
             )
     failure = None
@@ -100,7 +113,8 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
             numbers["warnings"] += reasons
             failure = None if reasons else error  # raised at the end, when all else is written and said
     _say(console, numbers, compilation.compiled)
-    for path in (wanted.output, wanted.page, wanted.covariance if "uncertainty" in numbers else None):
+    say_survey(console, survey or {})
+    for path in (wanted.output, wanted.page, wanted.protocol, wanted.covariance if "uncertainty" in numbers else None):
         if path is not None:
             console.say(f"Wrote {path}")
     if all(place is None for place in (wanted.output, wanted.page, wanted.covariance, wanted.json_target)):
@@ -108,6 +122,24 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     _output.write_json(wanted.json_target, numbers, wanted.force)
     if failure is not None:
         raise failure
+
+
+def _adjusted(
+    before: Scene, options: AdjustOptions, wanted: Wanted, progress: Callable[[Progress], bool | None]
+) -> tuple[Scene, AdjustResult, dict[str, Any] | None]:
+    """Return the scene as it went into the adjustment, the result, and what is told of measurements if there are."""
+    from groma.adjustment.adjust import adjust
+    from groma.mapping.surveyed import adjust_surveyed, has_survey
+
+    if not wanted.measured and not has_survey(before):
+        if wanted.protocol is not None:
+            raise InputError(
+                "--protocol is of measurements; there are none. Add --positions, --control or --distances."
+            )
+        return before, adjust(before, options, progress), None
+    survey = wanted.measured.read(None, lambda: before.images.names) if wanted.measured else None
+    found = adjust_surveyed(before, survey, options, progress)
+    return found.surveyed.scene, found.result, found.to_dict()
 
 
 def why_no_covariances(scene: Scene, path: Path) -> list[str]:

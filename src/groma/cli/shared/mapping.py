@@ -11,9 +11,11 @@ import typer
 from groma._counted import counted
 from groma.cli.shared import output as _output
 from groma.cli.shared.interrupt import PROCESS
+from groma.cli.shared.measurements import say_survey
 from groma.errors import OutputError
 
 if TYPE_CHECKING:
+    from groma.adjustment.survey.attach import Survey
     from groma.cli.shared.console import Console
     from groma.features.external import ExternalMatches
     from groma.mapping.map import MapOptions
@@ -28,6 +30,7 @@ def run_map(
     model: Scene | None,
     options: MapOptions,
     line_matches: ExternalMatches | None = None,
+    survey: Survey | None = None,
 ) -> MapResult:
     """Map a folder of photographs; Ctrl-C ends the command and keeps the finished stages in ``work``."""
     from groma.cli.shared.interrupt import interruptible
@@ -40,7 +43,7 @@ def run_map(
         console.say(f"Going on from the finished stages in {work}, as far as they fit.")
     try:
         with interruptible() as interruption, console.stages() as stages:
-            return map_images(images, work, model, options, interruption.checking(stages), line_matches)
+            return map_images(images, work, model, options, interruption.checking(stages), line_matches, survey)
     except KeyboardInterrupt:
         words = f"finished stages are kept in {work}: the same command goes on from there."
         raise typer.Exit(PROCESS.tell(words)) from None
@@ -85,5 +88,6 @@ def say_map(console: Console, result: MapResult, numbers: dict[str, Any], explai
     if explain or console.verbose:
         say_diagnosis(numbers["diagnosis"], console)
     (console.say if explain else console.detail)(result.explanation)
+    say_survey(console, numbers.get("survey") or {})
     for sentence in result.warnings:
         console.warn(sentence)

@@ -13,7 +13,7 @@ from groma.errors import OutputError
 #: What the commands write into folders. A folder that holds anything else is not replaced by ``--force``.
 _RESULTS = re.compile(
     r"(cameras|images|points3D|rigs|frames)\.(bin|txt)|structures|(scene|start|truth)\.npz|(lines|planes)\.(ply|obj)|"
-    r"summary\.json|report\.html|trajectory\.txt|poses\.txt|localized\.json|(submap|part)_\d+"
+    r"summary\.json|adjustment\.txt|report\.html|trajectory\.txt|poses\.txt|localized\.json|(submap|part)_\d+"
 )
 
 

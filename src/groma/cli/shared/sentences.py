@@ -14,7 +14,11 @@ _SIGMAS = (
     ("line directions", "line_direction_deg", "°"),
     ("plane normals", "plane_normal_deg", "°"),
 )
-_GAUGES = {"inner": "all camera centres together", "held": "the first camera and the scale"}
+_GAUGES = {
+    "inner": "all camera centres together",
+    "held": "the first camera and the scale",
+    "measured": "the measurements",
+}
 #: Times in reports that are not of one stage.
 _NO_STAGES = ("total", "compilation")
 

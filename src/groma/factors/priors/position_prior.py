@@ -5,6 +5,7 @@ r"""A camera centre is known: GNSS, a surveyed station.
           \frac{\partial r}{\partial (\rho, \omega)} = \left[ -R^\top,\; 0 \right]
 
 for the pose ``cam_from_world`` = (R, t) and its left increment. The residual is in the world frame, in scene units.
+On a rig the centre is that of the camera, not of the body (:mod:`groma.factors._rig`).
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ import numpy as np
 from groma._numba import loop
 from groma._typing import FloatArray
 from groma.factors._examples import indices, make_example
-from groma.factors._record import set_rows
-from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
+from groma.factors._rig import EXTRINSICS, POSE, CameraFactor
+from groma.factors.contract import WORLD_FIXED, Example, Invariance, Ref, Slot, register
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @loop
-def _linearize_all(poses, positions, index, begin, end, column, record):
+def _linearize_all(poses, index, positions, begin, end, column, record):
     last = record.shape[2] - 1
     for i in range(begin, end):
         T, row = poses[index[i]], record[i - begin]
@@ -39,30 +40,21 @@ def _linearize_all(poses, positions, index, begin, end, column, record):
 # ------------------------------------------------------------------------------------------------------------- Public
 @register("position_prior")
 @dataclass(frozen=True, kw_only=True)
-class PositionPrior(Factor):
+class PositionPrior(CameraFactor):
     """Known camera centres; residual in scene units, world frame."""
 
-    #: The poses, cam_from_world.
-    pose: Ref
     #: (N, 3) measured camera centres in the world.
     cam_center_in_world: FloatArray
 
-    slots: ClassVar[tuple[Slot, ...]] = (Slot("pose", "pose"),)
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, EXTRINSICS)
+    measured: ClassVar[tuple[tuple[str, int], ...]] = (("cam_center_in_world", 3),)
     invariance: ClassVar[Invariance] = WORLD_FIXED
-
-    def __post_init__(self) -> None:
-        set_rows(self, "cam_center_in_world", 3)
-
     rows: ClassVar[int] = 3
 
-    def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
-        return ambients[0], self.cam_center_in_world
-
-    def linearize(  # noqa: D102
+    def evaluate(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
-        poses, positions = inputs
-        return _linearize_all(poses, positions, self.pose.index, begin, end, columns[0], record)
+        return _linearize_all(*inputs, self.cam_center_in_world, begin, end, *columns, record)
 
     @classmethod
     def example(cls, rng: np.random.Generator) -> Example:  # noqa: D102

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.special import polygamma
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.assemble import LINE_FACTORS, AssemblyOptions, assemble
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.gates import gate
 from groma.mapping.noise.landmarks import GATES as LANDMARK_GATES
@@ -92,6 +92,8 @@ def line_end_correlation(scene: Scene) -> float:
     images = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
     ends = [np.zeros((0, 2))]
     for factor in problem.factors:
+        if factor.type_name not in LINE_FACTORS:
+            continue  # measurements of other instruments
         told = images[factor.line.index] >= GATES.min_views  # type: ignore[attr-defined]
         residual, unit = residuals_of(factor, problem.variables), np.asarray(factor.sqrt_information)
         # Where a camera sees behind itself, each end has a weight of its own.

@@ -34,7 +34,7 @@ from groma.problem.lay_out import lay_out
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import Workers
 from groma.problem.problem import Problem
-from groma.solver.covariance.datum import constrained, free_motions, held_coordinates
+from groma.solver.covariance.datum import FreeMotions, constrained, free_motions, held_coordinates
 from groma.solver.covariance.landmarks import Landmarks
 from groma.solver.covariance.rank_deficient import (
     LOOSE,
@@ -65,9 +65,8 @@ Variable = tuple[str, int]
 class Derived:
     """A quantity computed from variables, with its covariance to first order."""
 
-    #: (n,) value.
+    #: (n,) value and (n, n) covariance.
     value: FloatArray
-    #: (n, n) covariance.
     covariance: FloatArray
 
     @property
@@ -126,6 +125,7 @@ class Covariances:
         self._held, self._held_landmarks = held_coordinates(layout)
         self._undetermined = [self._landmarks.undetermined(e, held) for e, held in enumerate(self._held_landmarks)]
         self._datum: Transformation | None = None
+        self.motions: FreeMotions | None = None  #: of an inner gauge: the world motions that the data leave free
         self._sigma: Blocks = {}
         if layout.kept:
             self._system.assemble(0.0)
@@ -143,7 +143,7 @@ class Covariances:
         S, self._size = scaled(layout, self._system.S)
         motions, G = None, np.zeros((layout.num_kept_unknowns, 0))
         if gauge == "inner":
-            motions = free_motions(layout, self._equations, self._system)
+            motions = self.motions = free_motions(layout, self._equations, self._system)
             G = np.concatenate(motions.kept)
             G[np.concatenate(self._held) | np.concatenate(self._unseen)] = 0.0
             S = constrained(layout, S, G * self._size[:, None])

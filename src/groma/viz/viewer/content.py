@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from groma import cameras
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.geometry import quaternion
+from groma.io.drawn import openings
 from groma.scene.line_intervals import line_pieces
 from groma.scene.similarity import Similarity
+from groma.scene.upright import upward
 from groma.viz import colours as _colours
 from groma.viz.colours import Colours
 from groma.viz.drawable import drawable
-from groma.viz.framing import upward
 from groma.viz.statistics import LineStatistics, line_statistics
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 REACH = 5.0
 #: What lines can be coloured by.
 LINE_MODES = ("direction", "shared direction", "length", "reprojection error", "number of images", "confidence")
-#: Half the largest opening of a drawn camera, radians; wider ones are drawn with this one.
-_WIDEST = 1.2
 
 
 @dataclass(frozen=True)
@@ -134,7 +132,7 @@ def view_content(scene: Scene) -> ViewContent:
     point_colours["plain"] = np.tile(np.array([[96, 104, 116]], np.uint8), (len(order), 1))
     pose = frame.poses(scene.cam_from_world)
     world_from_cam = quaternion.conjugate(pose[:, :4])
-    opening, aspect = _openings(scene)
+    opening, aspect = openings(scene)
     return ViewContent(
         scene=scene,
         statistics=line_statistics(scene, shown),
@@ -202,25 +200,6 @@ def _by_number(values: FloatArray, unit: str, logarithmic: bool = False, from_ze
     else:
         share = (values - low) / max(high - low, 1e-12)
     return LineColours(_colours.ramp(share), f"{low:.3g}{unit}", f"{high:.3g}{unit}")
-
-
-def _openings(scene: Scene) -> tuple[FloatArray, FloatArray]:
-    """Return the vertical opening of each image in radians, and width over height."""
-    count = scene.num_cameras
-    opening, aspect = np.full(count, 0.8), np.full(count, 4 / 3)
-    for index in range(count):
-        width, height = float(scene.cameras.width[index]), float(scene.cameras.height[index])
-        if not (width > 0 and height > 0):
-            continue
-        model = cameras.model(scene.cameras.models[index])
-        params = np.ascontiguousarray(scene.cameras.params[index, : model.num_parameters])
-        edges = np.array([[0.5 * width, 0.0], [0.5 * width, height], [0.0, 0.5 * height], [width, 0.5 * height]])
-        bearings = model.unproject(params, edges)
-        if np.isfinite(bearings).all():
-            up, down, left, right = np.minimum(np.arccos(np.clip(bearings[:, 2], -1.0, 1.0)), _WIDEST)
-            opening[index] = up + down
-            aspect[index] = np.tan(0.5 * (left + right)) / np.tan(0.5 * (up + down))
-    return opening[scene.images.camera_idx], aspect[scene.images.camera_idx]
 
 
 def _frame(scene: Scene) -> tuple[Similarity, FloatArray, FloatArray]:

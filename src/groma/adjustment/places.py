@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A solved problem in another frame of its world: scenes far from the origin are solved near it, and moved back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.adjustment.assemble import point_variables
+from groma.factors.contract import Factor
+from groma.factors.priors.pose_prior import PosePrior
+from groma.factors.priors.position_prior import PositionPrior
+from groma.factors.priors.vector_prior import VectorPrior
+from groma.geometry import quaternion, se3
+from groma.geometry.manifold import Euclidean
+from groma.problem.problem import Problem
+from groma.scene import Scene
+
+
+def at_places_of(problem: Problem, scene: Scene, shifted: bool = True) -> Problem:
+    """Return the problem with frames and landmarks where a scene has them.
+
+    Where that is the same scene, its world shifted, what factors measure in the world is shifted with it; not if only
+    the scene moved.
+    """
+    variables = dict(problem.variables)
+    for name in variables.keys() & {"frames", "points", "lines", "planes", "control_points"}:
+        group = variables[name]
+        if name == "frames":
+            state = scene.frames.rig_from_world
+        elif name == "control_points":
+            state = scene.control_points.xyz
+        elif name == "points":
+            state = point_variables(scene, "euclidean" if isinstance(group.manifold, Euclidean) else "auto").state
+        else:
+            state = group.manifold.from_ambient(scene.lines.plucker if name == "lines" else scene.planes.hesse)
+        variables[name] = group.with_state(state)
+    if not shifted or "frames" not in variables or not any(isinstance(factor, _IN_WORLD) for factor in problem.factors):
+        return Problem(variables, problem.factors)
+    before, after = (se3.inverse(group["frames"].state)[:, 4:] for group in (problem.variables, variables))
+    shift = np.median(after - before, axis=0)
+    return Problem(variables, [_shifted(factor, shift) for factor in problem.factors])
+
+
+_IN_WORLD = (PositionPrior, PosePrior, VectorPrior)
+
+
+def _shifted(factor: Factor, shift: FloatArray) -> Factor:
+    """Return factors that measure in the world after it was shifted."""
+    if isinstance(factor, PositionPrior):
+        return replace(factor, cam_center_in_world=factor.cam_center_in_world + shift)
+    if isinstance(factor, VectorPrior) and factor.variable.group in ("points", "control_points"):
+        return replace(factor, measured=factor.measured + shift)
+    if isinstance(factor, PosePrior) and factor.pose.group == "frames":
+        poses = factor.cam_from_world.copy()
+        poses[:, 4:] -= quaternion.rotate(poses[:, :4], np.tile(shift, (len(poses), 1)))
+        return replace(factor, cam_from_world=poses)
+    return factor
+
+
+__all__ = ["at_places_of"]

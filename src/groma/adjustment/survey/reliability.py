@@ -1,0 +1,396 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""How well each measurement is checked by all others, and which of them are wrong.
+
+Let a measurement of m coordinates have the covariance C, its residual v (computed less measured) and
+:math:`S = J \Sigma_x J^\top` the covariance that the adjusted scene has there. A robust loss gave it the weight
+:math:`\omega C^{-1}`. Had it not taken part, residual and covariance would be
+
+.. math:: v_- = (I - \omega S C^{-1})^{-1} v, \qquad S_- = (I - \omega S C^{-1})^{-1} S ,
+
+and at full weight :math:`v_+ = (I + S_- C^{-1})^{-1} v_-` and :math:`Q_v = C - (I + S_- C^{-1})^{-1} S_-`. From the
+last two follow, for each coordinate i, with :math:`P = C^{-1}`,
+
+.. math:: r_i = (Q_v P)_{ii}, \qquad w_i = \frac{(P v_+)_i}{\sqrt{(P Q_v P)_{ii}}}, \qquad
+          \nabla_i = \frac{\delta_0}{\sqrt{(P Q_v P)_{ii}}},
+
+the redundancy number (1: checked fully, 0: not at all), the normalised residual (standard normal without gross
+errors), and the error that a test at the level :math:`\alpha` finds with the power :math:`1 - \beta`. For C diagonal
+these are :math:`w_i = v_i / (\sigma_i \sqrt{r_i})` and :math:`\nabla_i = \delta_0 \sigma_i / \sqrt{r_i}`. The sum of
+:math:`v_+^\top P v_+` over that of r is the variance component of a kind: 1 where standard deviations are right.
+
+References
+----------
+Baarda, *A testing procedure for use in geodetic networks*, 1968; Foerstner, *Reliability analysis of parameter
+estimation in linear models*, 1987; Foerstner and Wrobel, *Photogrammetric computer vision*, 2016, section 4.6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm
+
+from groma._typing import FloatArray, IntArray
+from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.places import at_places_of
+from groma.errors import ProblemError
+from groma.factors.contract import Factor
+from groma.gates import gate
+from groma.problem.gauge import world_motions
+from groma.problem.problem import Problem
+from groma.problem.residuals import jacobians_of, residuals_of
+from groma.scene import Scene
+from groma.scene.local_frame import local_frame
+from groma.solver.covariance.marginals import Covariances
+
+#: Names of coordinates by kind of measurement.
+_COORDINATES = {"camera position": "xyz", "control point": "xyz", "mark": "uv", "distance": ("",)}
+#: A redundancy number below this says that nothing checks a measurement.
+_UNCHECKED = 1e-6
+
+
+@dataclass(frozen=True)
+class ReliabilityGates:
+    """The test for gross errors."""
+
+    level: float = gate(1e-3, "probability", "of calling a good measurement wrong", "convention: Baarda")
+    power: float = gate(0.8, "probability", "of finding an error of the size told", "convention: Baarda")
+
+
+GATES = ReliabilityGates()
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One measured coordinate after the adjustment; lengths in scene units, of marks in pixels."""
+
+    #: ``camera position``, ``control point``, ``mark`` or ``distance``.
+    kind: str
+    #: Image, point, point and image, or both ends.
+    name: str
+    #: ``x``, ``y``, ``z``, ``u``, ``v``, or nothing.
+    coordinate: str
+    #: Standard deviation as stated.
+    sigma: float
+    #: Measured less computed.
+    residual: float
+    #: How far the others check it, from 0 to 1.
+    redundancy: float
+    #: Normalised residual; None where nothing checks the measurement.
+    normalized: float | None
+    #: Smallest error that the test finds with the stated power, and how far a smaller one moves the result, in
+    #: standard deviations of that; None where nothing checks the measurement.
+    detectable: float | None
+    external: float | None
+    #: Whether the test calls it wrong.
+    is_suspect: bool
+    #: Weight that the robust loss left it.
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class CheckPoint:
+    """A point whose coordinates took no part."""
+
+    name: str
+    #: (3,) computed less measured, and standard deviations of that: of the scene and of the measurement together.
+    difference: tuple[float, float, float]
+    sigma: tuple[float, float, float]
+    #: Squared difference in units of its covariance; 3 on average.
+    normalized_square: float
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """What an adjustment says of the measurements of other instruments than the cameras."""
+
+    measurements: tuple[Measurement, ...]
+    check_points: tuple[CheckPoint, ...]
+    #: Standard deviations that the residuals show over those stated, by kind, of what is not suspect; None where
+    #: nothing is redundant.
+    components: dict[str, float | None] = field(default_factory=dict)
+    #: Sums of redundancy numbers by kind.
+    redundancy: dict[str, float] = field(default_factory=dict)
+    #: Level and power of the test, and the limit of normalised residuals.
+    level: float = GATES.level
+    power: float = GATES.power
+
+    @property
+    def limit(self) -> float:
+        """Normalised residuals beyond are called wrong."""
+        return float(norm.isf(self.level / 2.0))
+
+    @property
+    def suspects(self) -> tuple[Measurement, ...]:
+        """Measurements that the test calls wrong, the worst first."""
+        found = [one for one in self.measurements if one.is_suspect]
+        return tuple(sorted(found, key=lambda one: -abs(one.normalized or 0.0)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        return {
+            "level": self.level,
+            "power": self.power,
+            "limit": self.limit,
+            "variance_components": dict(self.components),
+            "redundancy": dict(self.redundancy),
+            "measurements": [asdict(one) for one in self.measurements],
+            "check_points": [asdict(one) for one in self.check_points],
+            "suspects": [f"{one.kind} {one.name} {one.coordinate}".rstrip() for one in self.suspects],
+        }
+
+
+def noncentrality(level: float = GATES.level, power: float = GATES.power) -> float:
+    """Return by how many standard deviations a mean must be off for a two-sided test to find it with a power."""
+    return float(norm.isf(level / 2.0) + norm.ppf(power))
+
+
+def reliability(
+    scene: Scene, problem: Problem | None = None, level: float = GATES.level, power: float = GATES.power
+) -> Reliability | None:
+    """Say of each measurement of other instruments how well it is checked, and whether it is wrong.
+
+    Parameters
+    ----------
+    scene : Scene
+        An adjusted scene.
+    problem : Problem, optional
+        The problem at its solution; made anew by default, at the noise stated in the scene.
+    level, power : float
+        Of the test for gross errors: its level, and the power with which it finds an error of the size told.
+
+    Returns
+    -------
+    Reliability or None
+        None if the scene holds no such measurement.
+
+    Raises
+    ------
+    ProblemError
+        If the poses are not determined.
+    """
+    tables = (scene.camera_positions, scene.control_points, scene.camera_distances, scene.point_distances)
+    if not any(map(len, tables)):
+        return None
+    near = local_frame(scene)
+    moved = scene if near is None else scene.transformed(near)
+    if problem is None:
+        problem = assemble(moved, AssemblyOptions()).problem
+    elif near is not None:
+        problem = at_places_of(problem, moved)
+    entries = list(_entries(moved, problem))
+    frame = _frame(problem, [factor for _, _, factor in entries])
+    tests = [_tested(frame, *entry) for entry in entries]
+    measurements = [row for test in tests for row in _rows(test, level, power)]
+    wrong = {(one.kind, one.name) for one in measurements if one.is_suspect}
+    components, redundancy = {}, {}
+    for kind in dict.fromkeys(test.kind for test in tests):
+        parts = [_squares_and_shares(test, wrong) for test in tests if test.kind == kind]
+        squares, redundancy[kind] = (float(sum(part)) for part in zip(*parts, strict=True))
+        components[kind] = float(np.sqrt(squares / redundancy[kind])) if redundancy[kind] > _UNCHECKED else None
+    return Reliability(tuple(measurements), _checked(frame, moved), components, redundancy, level, power)
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """Covariances in the frame of the measurements: those of the scene in itself, and of its place in the world."""
+
+    covariances: Covariances
+    #: World motions (count, dof, k) by group, and their covariance (k, k); none where the first covariances have all.
+    motions: dict[str, FloatArray] = field(default_factory=dict)
+    place: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+def _frame(problem: Problem, factors: list[Factor]) -> _Frame:
+    """Return the covariances in the frame of the measurements.
+
+    These may weigh so little beside the images that their part is lost in rounding; it is then added apart. They are
+    then also so much less exact than the scene in itself that its part of their covariance can be taken one by one.
+    """
+    try:
+        return _Frame(Covariances(problem))
+    except ProblemError:
+        covariances = Covariances(problem, gauge="inner")
+    free = covariances.motions
+    if free is None or free.count == 0:
+        return _Frame(covariances)
+    motions = {
+        name: np.einsum("gnd,gk->ndk", part, free.combinations)
+        for name, part in world_motions(problem, free.center, free.length).items()
+    }
+    total = np.zeros((free.count, free.count))
+    alone = _Frame(covariances)
+    for factor in factors:
+        _, information, weight = _weighted(factor, problem)
+        noise = np.linalg.inv(information) / np.maximum(weight, 1e-12)[:, None, None] + _spread(alone, factor)
+        J = _moved(motions, factor, problem)
+        total += np.einsum("nik,nij,njl->kl", J, np.linalg.inv(noise), J)
+    return _Frame(covariances, motions, np.asarray(np.linalg.pinv(total, 1e-12, True), float))
+
+
+def _moved(motions: dict[str, FloatArray], factor: Factor, problem: Problem) -> FloatArray:
+    """Return how residuals change with world motions, (N, m, k)."""
+    blocks = jacobians_of(factor, problem.variables)
+    parts = [blocks[slot.name] @ motions[ref.group][ref.index] for slot, ref in factor.references()]
+    return np.sum(parts, axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Test:
+    """One group of measurements: arrays by measurement and coordinate."""
+
+    kind: str
+    names: list[str]
+    residual: FloatArray
+    #: (N, m) residuals at full weight, (N, m, m) information and covariances of the residuals, (N, m) r_i, (N,) weights
+    full: FloatArray
+    information: FloatArray
+    cofactor: FloatArray
+    shares: FloatArray
+    weight: FloatArray
+
+
+def _entries(scene: Scene, problem: Problem) -> Iterator[tuple[str, list[str], Factor]]:
+    """Yield kind, names and factors of the measurements, as the terms made them."""
+    images, points = scene.images.names, scene.control_points.names
+    held = np.flatnonzero(scene.control_points.is_control)
+    of_marks = _rows_of_marks(scene)
+    for factor in problem.factors:
+        refs = {slot.name: ref for slot, ref in factor.references()}
+        groups = {ref.group for ref in refs.values()}
+        if factor.type_name == "position_prior" and len(factor) == len(scene.camera_positions):
+            yield "camera position", [images[row] for row in scene.camera_positions.image_idx], factor
+        elif factor.type_name == "vector_prior" and groups == {"control_points"}:
+            yield "control point", [points[row] for row in held], factor
+        elif factor.type_name == "point_reprojection" and "control_points" in groups:
+            rows = next(of_marks)
+            pairs = zip(scene.marks.point_idx[rows], scene.marks.image_idx[rows], strict=True)
+            yield "mark", [f"{points[point]} in {images[image]}" for point, image in pairs], factor
+        elif factor.type_name in ("point_distance", "camera_distance"):
+            in_points = factor.type_name == "point_distance"
+            names, table = (points, scene.point_distances) if in_points else (images, scene.camera_distances)
+            pairs = zip(table.first_idx, table.second_idx, strict=True)
+            yield "distance", [f"{names[first]} to {names[second]}" for first, second in pairs], factor
+
+
+def _rows_of_marks(scene: Scene) -> Iterator[IntArray]:
+    """Yield the rows of marks by camera model, in the order in which their factors are made."""
+    camera = scene.images.camera_idx[scene.marks.image_idx]
+    for members in scene.cameras.by_model().values():
+        if len(rows := np.flatnonzero(np.isin(camera, members))):
+            yield rows
+
+
+def _weighted(factor: Factor, problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return residuals (N, m), information (N, m, m) and the weights (N,) that a robust loss left."""
+    residual = residuals_of(factor, problem.variables)
+    information = _information(factor, *residual.shape)
+    squares = np.einsum("ni,nij,nj->n", residual, information, residual)
+    return residual, information, factor.loss.evaluate(squares)[1]
+
+
+def _tested(frame: _Frame, kind: str, names: list[str], factor: Factor) -> _Test:
+    residual, information, weight = _weighted(factor, frame.covariances.problem)
+    spread = _spread(frame, factor)
+    eye = np.eye(residual.shape[1])
+    without = np.linalg.pinv(eye - weight[:, None, None] * spread @ information, rcond=1e-12)
+    alone, spread_alone = np.einsum("nij,nj->ni", without, residual), without @ spread
+    full = np.linalg.inv(eye + spread_alone @ information)
+    cofactor = np.linalg.inv(information) - full @ spread_alone
+    shares = np.clip(np.einsum("nij,nji->ni", cofactor, information), 0.0, 1.0)
+    return _Test(kind, names, residual, np.einsum("nij,nj->ni", full, alone), information, cofactor, shares, weight)
+
+
+def _information(factor: Factor, count: int, size: int) -> FloatArray:
+    root = np.asarray(factor.sqrt_information, float)
+    if root.ndim < 3:
+        return np.broadcast_to(root**2, count)[:, None, None] * np.eye(size)
+    return np.swapaxes(root, 1, 2) @ root
+
+
+def _spread(frame: _Frame, factor: Factor) -> FloatArray:
+    """Return S = J Sigma J^T (N, m, m) of the free variables that factors refer to."""
+    spread = _spread_inside(frame.covariances, factor)
+    if frame.motions:
+        J = _moved(frame.motions, factor, frame.covariances.problem)
+        spread = spread + J @ frame.place @ np.swapaxes(J, 1, 2)
+    return spread
+
+
+def _spread_inside(covariances: Covariances, factor: Factor) -> FloatArray:
+    variables = covariances.problem.variables
+    free = [(slot, ref) for slot, ref in factor.references() if not variables[ref.group].is_constant]
+    blocks = jacobians_of(factor, variables)
+    count, size = len(factor), factor.residual_size
+    if not free:
+        return np.zeros((count, size, size))
+    if len(free) == 1:
+        slot, ref = free[0]
+        sigma = np.nan_to_num(covariances.of(ref.group, ref.index), nan=0.0)
+        return blocks[slot.name] @ sigma @ np.swapaxes(blocks[slot.name], 1, 2)
+    out = np.empty((count, size, size))
+    for row in range(count):
+        J = np.concatenate([blocks[slot.name][row] for slot, _ in free], axis=1)
+        sigma = covariances.joint([(ref.group, int(ref.index[row])) for _, ref in free])
+        out[row] = J @ np.nan_to_num(sigma, nan=0.0) @ J.T
+    return out
+
+
+def _rows(test: _Test, level: float, power: float) -> Iterator[Measurement]:
+    """Yield the measured coordinates of a group."""
+    deviation = np.sqrt(np.einsum("nii->ni", np.linalg.inv(test.information)))
+    scores = np.einsum("nij,nj->ni", test.information, test.full)
+    of_scores = np.einsum("nij,njk,nki->ni", test.information, test.cofactor, test.information)
+    limit, shift = norm.isf(level / 2.0), noncentrality(level, power)
+    for row, name in enumerate(test.names):
+        for k, coordinate in enumerate(_COORDINATES[test.kind]):
+            share, variance = float(test.shares[row, k]), float(of_scores[row, k])
+            checked = share > _UNCHECKED and variance > 0.0
+            normalized = float(-scores[row, k] / np.sqrt(variance)) if checked else None
+            yield Measurement(
+                kind=test.kind,
+                name=name,
+                coordinate=coordinate,
+                sigma=float(deviation[row, k]),
+                residual=float(-test.residual[row, k]),
+                redundancy=share,
+                normalized=normalized,
+                detectable=float(shift / np.sqrt(variance)) if checked else None,
+                external=float(shift * np.sqrt((1.0 - share) / share)) if checked else None,
+                is_suspect=normalized is not None and bool(abs(normalized) > limit),
+                weight=float(test.weight[row]),
+            )
+
+
+def _squares_and_shares(test: _Test, wrong: set[tuple[str, str]]) -> tuple[float, float]:
+    """Return the weighted squares and the redundancy of the measurements of a group that are not wrong."""
+    good = np.array([(test.kind, name) not in wrong for name in test.names], bool)
+    squares = np.einsum("ni,nij,nj->n", test.full, test.information, test.full)
+    return float(squares[good].sum()), float(test.shares[good].sum())
+
+
+def _checked(frame: _Frame, scene: Scene) -> tuple[CheckPoint, ...]:
+    points, found = scene.control_points, []
+    rows = np.flatnonzero(points.is_check)
+    if len(rows) == 0 or "control_points" not in frame.covariances.problem.variables:
+        return ()
+    spread = frame.covariances.of("control_points", rows)
+    if frame.motions:
+        J = frame.motions["control_points"][rows]
+        spread = spread + J @ frame.place @ np.swapaxes(J, 1, 2)
+    for row, sigma in zip(rows, spread, strict=True):
+        difference = points.xyz[row] - points.measured[row]
+        total = points.covariance[row] + sigma
+        square = float(difference @ np.linalg.solve(total, difference)) if np.isfinite(total).all() else float("nan")
+        east, north, up = difference.tolist()
+        x, y, z = np.sqrt(np.diag(total)).tolist()
+        found.append(CheckPoint(points.names[row], (east, north, up), (x, y, z), square))
+    return tuple(found)
+
+
+__all__ = [
+    "GATES", "CheckPoint", "Measurement", "Reliability", "ReliabilityGates", "noncentrality", "reliability",
+]  # fmt: skip

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma align``: a scene into the frame of another one, or of measurements."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from groma.cli.shared import measurements as _measured
+from groma.cli.shared import options as _options
+from groma.errors import InputError
+
+if TYPE_CHECKING:
+    from groma.adjustment.survey.align import Alignment
+    from groma.cli.shared.console import Console
+
+#: Places with the largest residuals that are told.
+_TOLD = 5
+
+
+def align(
+    source: _options.Input,
+    reference: Annotated[
+        Path | None,
+        typer.Argument(metavar="[REFERENCE]", help="A scene with images of the same names, of any format."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="OUT", help="Folder or file for the moved scene.")
+    ] = None,
+    positions: _measured.Positions = None,
+    control: _measured.Control = None,
+    crs: _measured.Crs = None,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    seed: _options.Seed = 0,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Bring a scene into the frame of a reference by a similarity, which ignores gross errors.
+
+    The reference is another scene, measured camera positions or control points. Nothing is adjusted: for measurements
+    that take part in an adjustment, pass them to groma adjust or groma map. --threads and --seed are accepted so that
+    scripts can pass them to every command.
+    """
+    from groma.cli.shared import output as _output
+    from groma.cli.shared.console import Console
+    from groma.cli.shared.input import check_inputs
+
+    measured = _measured.Measured(positions=positions, position_sigma="1", control=control, control_sigma="1", crs=crs)
+    if (reference is None) == (not measured):
+        raise InputError("Pass either a REFERENCE scene, or --positions or --control.")
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_outputs(force, output, json_target=json_target)
+    check_inputs(source, reference, *measured.files)
+
+    from groma.adjustment.survey.align import align as aligned
+    from groma.io import check_target, read_scene, structures_of, write_scene
+
+    scene = read_scene(source)
+    if output is not None:
+        check_target(scene, output)
+    target = measured.read(None, lambda: scene.images.names) if reference is None else read_scene(reference)
+    found = aligned(scene, target)
+    if output is not None:
+        write_scene(found.scene, output, force=force, like=structures_of(source))
+    _say(console, found)
+    console.say(f"Wrote {output}" if output is not None else "No -o given: the moved scene was not written.")
+    _output.write_json(json_target, found.to_dict(), force)
+
+
+def _say(console: "Console", found: "Alignment") -> None:
+    import numpy as np
+
+    distance = np.linalg.norm(found.residuals, axis=1)
+    console.say(
+        f"Scale {found.similarity.scale:.8g}; {int(found.inliers.sum())} of {len(found.names)} places used, rmse "
+        f"{found.rmse:.4g}, largest {distance[found.inliers].max():.4g}."
+    )
+    if found.angles is not None:
+        console.say(f"Orientations differ by {np.degrees(np.median(found.angles)):.3g} degrees (median).")
+    for row in np.argsort(-distance)[:_TOLD]:
+        x, y, z = found.residuals[row]
+        left = "" if found.inliers[row] else ", left out"
+        console.say(f"  {found.names[row]}: off by {distance[row]:.4g} ({x:.4g}, {y:.4g}, {z:.4g}){left}")
+    for sentence in found.notes:
+        console.say(sentence)

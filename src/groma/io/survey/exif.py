@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Positions that cameras wrote into their photographs: the GPS part of EXIF, of JPEG and TIFF files.
+
+Only the first bytes of a file are read, and only the numbers asked for; what is damaged counts as missing.
+
+Reference: CIPA DC-008, *Exchangeable image file format*, sections 4.5 and 4.6.6.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from groma._counted import counted
+from groma.errors import InputError
+from groma.io.survey.coordinates import CoordinateSystem, Places
+
+#: Bytes of a file that are read: EXIF stands in one of the first segments, of 64 kB at most.
+_HEAD = 1 << 18
+_GPS, _RATIONAL = 0x8825, 5
+#: Standard deviations of receivers in cameras and phones, metres: east, north, height.
+EXIF_SIGMA = (5.0, 5.0, 10.0)
+
+
+def read_exif_positions(folder: str | os.PathLike[str], names: Sequence[str]) -> Places:
+    """Read the positions in the EXIF of photographs, with the accuracy usual for receivers in cameras.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of the photographs.
+    names : sequence of str
+        Their names in it.
+
+    Raises
+    ------
+    InputError
+        If none has a position.
+    """
+    found = {name: place for name in names if (place := position_of(Path(folder) / name)) is not None}
+    if not found:
+        raise InputError(
+            f"None of the {len(names)} photographs in {folder} has a position in its EXIF. Give a file: --positions "
+            "FILE."
+        )
+    table = np.array(list(found.values()), float)
+    sigma = np.tile(np.array(EXIF_SIGMA), (len(table), 1))
+    notes = []
+    if missing := len(names) - len(found):
+        notes.append(f"{counted(missing, 'photographs')} without a position in the EXIF.")
+    flat = np.isnan(table[:, 2])
+    if flat.any():
+        table[flat, 2] = np.median(table[~flat, 2]) if not flat.all() else 0.0
+        sigma[flat, 2] = 1e4
+        notes.append(f"{counted(int(flat.sum()), 'photographs')} without a height in the EXIF.")
+    return Places(tuple(found), table, sigma, CoordinateSystem("EPSG:4326"), "EXIF", tuple(notes))
+
+
+def position_of(path: Path) -> tuple[float, float, float] | None:
+    """Return longitude, latitude (degrees) and height of a photograph; None without, NaN for a missing height."""
+    try:
+        with path.open("rb") as file:
+            block = _tiff_of(file.read(_HEAD))
+        return None if block is None else _position(block)
+    except (OSError, struct.error, ValueError, ZeroDivisionError):
+        return None
+
+
+def _tiff_of(head: bytes) -> bytes | None:
+    """Return the TIFF structure with the EXIF of a file."""
+    if head[:4] in (b"II*\0", b"MM\0*"):
+        return head
+    if head[:2] != b"\xff\xd8":
+        return None
+    at = 2
+    while at + 4 <= len(head) and head[at] == 0xFF and head[at + 1] != 0xDA:
+        size = struct.unpack_from(">H", head, at + 2)[0]
+        if head[at + 1] == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0":
+            return head[at + 10 : at + 2 + size]
+        at += 2 + max(size, 2)
+    return None
+
+
+def _position(block: bytes) -> tuple[float, float, float] | None:
+    order = "<" if block[:2] == b"II" else ">"
+    main = _entries(block, order, struct.unpack_from(order + "I", block, 4)[0])
+    if _GPS not in main:
+        return None
+    gps = _entries(block, order, struct.unpack_from(order + "I", block, main[_GPS][2])[0])
+    if not {2, 4} <= gps.keys():
+        return None
+    degrees = []
+    for tag, negative in ((4, b"W"), (2, b"S")):
+        whole, minutes, seconds = _rationals(block, order, gps[tag], 3)
+        value = whole + minutes / 60.0 + seconds / 3600.0
+        reference = block[gps[tag - 1][2] : gps[tag - 1][2] + 1] if tag - 1 in gps else b""
+        degrees.append(-value if reference.upper() == negative else value)
+    if not (abs(degrees[0]) <= 180.0 and abs(degrees[1]) <= 90.0) or degrees == [0.0, 0.0]:
+        return None
+    height = float("nan")
+    if 6 in gps:
+        below = 5 in gps and block[gps[5][2]] == 1
+        height = _rationals(block, order, gps[6], 1)[0] * (-1.0 if below else 1.0)
+    return degrees[0], degrees[1], height
+
+
+def _entries(block: bytes, order: str, offset: int) -> dict[int, tuple[int, int, int]]:
+    """Return type, count and place of the value of the entries of a directory, by tag."""
+    count = min(struct.unpack_from(order + "H", block, offset)[0], 512)
+    found = {}
+    for k in range(count):
+        tag, kind, number = struct.unpack_from(order + "HHI", block, offset + 2 + 12 * k)
+        found[tag] = kind, number, offset + 10 + 12 * k
+    return found
+
+
+def _rationals(block: bytes, order: str, entry: tuple[int, int, int], count: int) -> list[float]:
+    kind, number, place = entry
+    if kind != _RATIONAL or number < count:
+        raise ValueError(f"expected {count} rationals")
+    start = struct.unpack_from(order + "I", block, place)[0]
+    parts = struct.unpack_from(f"{order}{2 * count}I", block, start)
+    return [above / below if below or above else 0.0 for above, below in zip(parts[::2], parts[1::2], strict=True)]
+
+
+__all__ = ["EXIF_SIGMA", "position_of", "read_exif_positions"]

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Positions of cameras from a text file: one image a line, separated by commas, semicolons or white space.
+
+===================  ================================================================================================
+no header            ``name x y z``, and one or three standard deviations
+header               the columns by name: ``name`` (``image``, ``filename``, ``label``); ``x y z`` (``easting``,
+                     ``northing``, ``height``), or ``longitude latitude altitude``; ``sigma`` (``accuracy``),
+                     or ``sx sy sz``, or ``horizontal vertical``
+first line a system  ``EPSG:32611``, ``WGS84 UTM 11N`` or ``+proj=...``: what follows is in that system. This is
+                     ``geo.txt`` of OpenDroneMap: ``name x y z omega phi kappa horizontal vertical``; all after z
+                     may be missing
+===================  ================================================================================================
+
+Of longitude and latitude, x is the longitude.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from groma._counted import counted
+from groma.bounded.text import finite, read_lines, shown
+from groma.errors import FileFormatError
+from groma.io.reading import existing, reading
+from groma.io.survey.coordinates import CoordinateSystem, Places
+
+_KIND = "file of positions"
+#: Names of columns, in lower case and without what stands in brackets or after an underscore and a unit.
+_COLUMNS = {
+    "name": ("name", "image", "imagename", "filename", "file", "label", "photo"),
+    "x": ("x", "easting", "east", "e", "geox"),
+    "y": ("y", "northing", "north", "n", "geoy"),
+    "z": ("z", "height", "altitude", "alt", "elevation", "up", "h", "geoz", "altitudem"),
+    "longitude": ("longitude", "lon", "long", "lng"),
+    "latitude": ("latitude", "lat"),
+    "sigma": ("sigma", "accuracy", "std", "stddev", "sd"),
+    "sx": ("sx", "sigmax", "stdx", "se", "xaccuracy", "sdx"),
+    "sy": ("sy", "sigmay", "stdy", "sn", "yaccuracy", "sdy"),
+    "sz": ("sz", "sigmaz", "stdz", "su", "zaccuracy", "sdz"),
+    "horizontal": ("horizontal", "horizontalaccuracy", "horzaccuracy", "sh", "hacc"),
+    "vertical": ("vertical", "verticalaccuracy", "vertaccuracy", "sv", "vacc"),
+}
+_MEANING = {word: meaning for meaning, words in _COLUMNS.items() for word in words}
+
+
+def read_positions(path: str | os.PathLike[str]) -> Places:
+    """Read positions of cameras; see the module for the layouts.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged, or its columns cannot be told.
+    """
+    place = existing(path)
+    with reading(place, _KIND):
+        rows = [(number, split(line)) for number, line in read_lines(place)]
+        if not rows:
+            raise FileFormatError(f"{place} holds no position. Expected lines of name, x, y and z.")
+        system = CoordinateSystem.parse(next(line for _, line in read_lines(place)))
+        if system is not None:
+            return _places(place, rows[1:], ["name", "x", "y", "z"], system, _after_z)
+        columns = _header(rows[0][1])
+        if columns is None:
+            return _places(place, rows, ["name", "x", "y", "z"], CoordinateSystem(), _plain)
+        return _with_header(place, rows, columns)
+
+
+def split(line: str) -> list[str]:
+    """Return the words of a line: between commas or semicolons where there are any, else between white space."""
+    mark = next((mark for mark in ",;\t" if mark in line), None)
+    words = [word.strip().strip('"') for word in line.split(mark)]
+    while words and not words[-1]:
+        words.pop()
+    return words
+
+
+def _header(words: Sequence[str]) -> dict[str, int] | None:
+    """Return the column of each meaning; None if the line holds no names of columns."""
+    found: dict[str, int] = {}
+    for column, word in enumerate(words):
+        bare = re.sub(r"[^a-z]", "", re.sub(r"[(\[].*", "", word.lower()))
+        if bare in _MEANING and not re.search(r"\.(jpe?g|png|tiff?|dng)$", word.lower()):
+            found.setdefault(_MEANING[bare], column)
+    return found if len(found) >= 3 else None
+
+
+def _with_header(place: Path, rows: Sequence[tuple[int, list[str]]], columns: dict[str, int]) -> Places:
+    geographic = {"longitude", "latitude"} <= columns.keys()
+    needed = ("name", *(("longitude", "latitude") if geographic else ("x", "y")), "z")
+    if missing := [name for name in needed if name not in columns]:
+        raise FileFormatError(
+            f"{place}: the header {shown(' '.join(rows[0][1]))} names no column for {', '.join(missing)}. Expected "
+            "name, x, y, z or name, longitude, latitude, altitude."
+        )
+    order = [columns[name] for name in needed]
+    if {"sx", "sy", "sz"} <= columns.keys():
+        sigma = [columns[name] for name in ("sx", "sy", "sz")]
+    elif {"horizontal", "vertical"} <= columns.keys():
+        sigma = [columns["horizontal"], columns["horizontal"], columns["vertical"]]
+    else:
+        sigma = [columns["sigma"]] * 3 if "sigma" in columns else []
+    last = max((*order, *sigma))
+    ordered = []
+    for number, words in rows[1:]:
+        if len(words) <= last:
+            raise FileFormatError(f"{place}, line {number}: expected {last + 1} columns; got {len(words)}.")
+        ordered.append((number, [words[column] for column in (*order, *sigma)]))
+    system = CoordinateSystem("EPSG:4326" if geographic else "")
+    return _places(place, ordered, list(needed), system, _plain)
+
+
+def _places(
+    place: Path, rows: Sequence[tuple[int, list[str]]], names: list[str], system: CoordinateSystem, tail
+) -> Places:
+    """Return places of rows of a name, three coordinates, and what ``tail`` turns into three standard deviations."""
+    found: dict[str, list[float]] = {}
+    without_height = 0
+    for number, words in rows:
+        where = f"{place}, line {number}"
+        if len(words) < 3 or (len(words) < 4 and tail is not _after_z):
+            raise FileFormatError(f"{where}: expected {', '.join(names)}; got {shown(' '.join(words))}.")
+        if words[0] in found:
+            raise FileFormatError(f"{where}: {shown(words[0])} has a position already. Leave one of the two out.")
+        without_height += len(words) < 4
+        numbers = finite(words[1:] if len(words) > 3 else [*words[1:], "0"], where, "numbers after the name")
+        found[words[0]] = [*numbers[:3], *tail(numbers[3:], where)]
+    table = np.array(list(found.values())).reshape(-1, 6)
+    notes = (
+        [f"{place.name}: {counted(without_height, 'positions')} without a height; 0 is taken."]
+        if without_height
+        else []
+    )
+    sigma = np.where(table[:, 3:] > 0.0, table[:, 3:], np.nan)
+    return Places(tuple(found), table[:, :3], sigma, system, str(place), tuple(notes))
+
+
+def _plain(rest: list[float], where: str) -> list[float]:
+    """Standard deviations after three coordinates: none, one, or three."""
+    if len(rest) not in (0, 1, 3):
+        raise FileFormatError(f"{where}: expected one or three standard deviations after x, y and z; got {len(rest)}.")
+    return (rest * 3)[:3] if rest else [0.0] * 3
+
+
+def _after_z(rest: list[float], where: str) -> list[float]:
+    """What follows z in ``geo.txt``: three angles, which are not used, then horizontal and vertical accuracy."""
+    if len(rest) >= 5:
+        return [rest[3], rest[3], rest[4]]
+    if len(rest) in (0, 3):
+        return [0.0] * 3
+    return [rest[0]] * 3 if len(rest) == 1 else [rest[0], rest[0], rest[1]] if len(rest) == 2 else [rest[3]] * 3
+
+
+__all__ = ["read_positions", "split"]

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Adjusting a scene with measurements of other instruments: pixels have to be weighed against them.
+
+Standard deviations of positions and distances are stated, those of observations in images are estimated from their
+residuals, which the frame of the scene does not change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.report import AdjustResult, Progress
+from groma.adjustment.survey.attach import Survey, Surveyed, with_survey
+from groma.adjustment.survey.reliability import Reliability, reliability
+from groma.errors import ProblemError
+from groma.gates import gate
+from groma.io.survey import WorldFrame
+from groma.mapping.checkpoint_files import SCENE
+from groma.mapping.checkpoints import stage
+from groma.mapping.noise.observations import noise_px
+from groma.problem.problem import Problem
+from groma.scene import Scene, Similarity
+from groma.scene.local_frame import usual_frame
+
+
+@dataclass(frozen=True)
+class SurveyedGates:
+    """When a scene is adjusted again with better weights."""
+
+    wrong: float = gate(
+        1.15,
+        "times",
+        "that the noise of the images is off, for the adjustment to be repeated",
+        "cost: 15 % of a weight",
+    )
+    max_rounds: int = gate(3, "adjustments", "of a scene", "cost: most need one")
+
+
+GATES = SurveyedGates()
+
+
+def has_survey(scene: Scene) -> bool:
+    """Tell whether a scene holds measurements of other instruments than the cameras."""
+    tables = (scene.camera_positions, scene.control_points, scene.camera_distances, scene.point_distances)
+    return any(map(len, tables))
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyedResult:
+    """An adjustment with measurements of other instruments."""
+
+    result: AdjustResult
+    #: How the scene got into its frame, with the scene as it went in.
+    surveyed: Surveyed
+    #: What the adjustment says of the measurements; None where the poses are not determined.
+    reliability: Reliability | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values: the entry ``survey`` of ``summary.json``."""
+        return survey_numbers(self.surveyed, self.reliability)
+
+
+def survey_numbers(surveyed: Surveyed | None, found: Reliability | None) -> dict[str, Any]:
+    """Return what a summary says of measurements, as plain values."""
+    return (surveyed.to_dict() if surveyed else {}) | (found.to_dict() if found else {})
+
+
+def adjust_surveyed(
+    scene: Scene,
+    survey: Survey | None = None,
+    options: AdjustOptions | None = None,
+    progress: Callable[[Progress], bool | None] | None = None,
+) -> SurveyedResult:
+    """Bring a scene into the frame of measurements and adjust it with them.
+
+    Parameters
+    ----------
+    scene : Scene
+        Adjusted already, in any frame.
+    survey : Survey, optional
+        Measurements to add; without, those that the scene holds are used.
+    options : AdjustOptions, optional
+        As for :func:`groma.adjust`; ``point_sigma_px`` and ``line_sigma_px`` are estimated.
+    progress : callable, optional
+        As for :func:`groma.adjust`.
+
+    Raises
+    ------
+    InputError
+        If measurements and scene do not fit together.
+    """
+    surveyed = (
+        with_survey(scene, survey) if survey else Surveyed(scene, Similarity(), WorldFrame("the frame of the scene"))
+    )
+    chosen = weighted(surveyed.scene, options or AdjustOptions())
+    result = adjust(surveyed.scene, chosen, progress)
+    for _ in range(GATES.max_rounds - 1):
+        better = weighted(result.scene, chosen)
+        ratio = better.point_sigma_px / chosen.point_sigma_px
+        if 1.0 / GATES.wrong <= ratio <= GATES.wrong:
+            break
+        chosen = better
+        result = adjust(surveyed.scene, chosen, progress)
+    return SurveyedResult(result, surveyed, reliability_of(result.scene, result.problem))
+
+
+@dataclass(frozen=True, eq=False)
+class Tied:
+    """A map on its way, in the frame of measurements."""
+
+    surveyed: Surveyed
+    #: The scene that went in, and the points with the measurements, both near the origin and in a usual unit.
+    start: Scene
+    points: Scene
+    #: What brought them there from the frame of the measurements; None where nothing did.
+    near: Similarity | None
+
+
+def tied(start: Scene, points: Scene, survey: Survey) -> Tied:
+    """Bring the points of a map into the frame of measurements, and add these."""
+    surveyed = with_survey(points, survey)
+    near = usual_frame(surveyed.scene)
+    start, points = start.transformed(surveyed.similarity), surveyed.scene
+    if near is not None:
+        start, points = start.transformed(near), points.transformed(near)
+    return Tied(surveyed, start, points, near)
+
+
+@stage("surveyed", SCENE)
+def adjust_with_survey(points: Scene, options: Any, say: Callable[[str, int, int], None]) -> Scene:
+    """Points and poses adjusted with measurements of other instruments, weighted by their noise."""
+    told = AdjustOptions(
+        refine_poses=options.refine_poses,
+        refine_intrinsics=bool(options.refine_intrinsics),
+        max_iterations=options.max_iterations,
+        threads=options.threads,
+    )
+
+    def tell(event: Progress) -> None:
+        say("adjusting with measurements", event.iteration, event.max_iterations)
+
+    return adjust(points, weighted(points, told), tell).scene
+
+
+def reliability_of(scene: Scene, problem: Problem | None) -> Reliability | None:
+    """Return :func:`~groma.adjustment.survey.reliability.reliability`; None where the poses are not determined."""
+    try:
+        return reliability(scene, problem)
+    except ProblemError:
+        return None
+
+
+def weighted(scene: Scene, options: AdjustOptions) -> AdjustOptions:
+    """Return the options with the noise that the observations of a scene show."""
+    sigma = {}
+    if options.points and scene.num_point_observations:
+        sigma["point_sigma_px"] = noise_px(scene, "points")
+    if options.lines and scene.num_line_observations:
+        sigma["line_sigma_px"] = noise_px(scene, "lines")
+    return replace(options, **sigma)
+
+
+__all__ = [
+    "SurveyedResult", "Tied", "adjust_surveyed", "adjust_with_survey", "has_survey", "reliability_of",
+    "survey_numbers", "tied", "weighted",
+]  # fmt: skip

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What makes a scene valid: all references point somewhere, quaternions are of unit length, cameras are consistent."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from groma.errors import InputError
+from groma.scene.camera import CAMERA
+from groma.scene.table import check_index, check_quaternions, references
+
+if TYPE_CHECKING:
+    from groma.scene.scene import Scene
+
+
+def check_scene(scene: Scene) -> None:
+    """Raise InputError or ShapeError where a scene is not valid."""
+    for name, column, side, target in references(type(scene)):
+        if len(index := getattr(getattr(scene, name), column)):
+            where, index = (column, index) if side is None else (f"{column}[:, {side}]", index[:, side])
+            check_index(f"{name}.{where}", index, len(getattr(scene, target)), target.replace("_", " "))
+    is_camera = scene.sensors.kind == CAMERA
+    check_index("sensors.camera_idx", scene.sensors.camera_idx[is_camera], len(scene.cameras), "cameras")
+    check_quaternions("frames.rig_from_world", scene.frames.rig_from_world)
+    check_quaternions("sensors.cam_from_rig", scene.sensors.cam_from_rig)
+    check_quaternions("pose_priors.rig_from_world", scene.pose_priors.rig_from_world)
+    if len(scene.images):
+        sensor = scene.images.sensor_idx
+        if (scene.sensors.camera_idx[sensor] != scene.images.camera_idx).any() or (~is_camera[sensor]).any():
+            raise InputError("images.camera_idx must be the camera of the image's sensor. Correct one of the two.")
+        if (scene.sensors.rig_idx[sensor] != scene.frames.rig_idx[scene.images.frame_idx]).any():
+            raise InputError("images.sensor_idx must be a sensor of the rig of the image's frame. Correct one.")
+
+
+__all__ = ["check_scene"]
