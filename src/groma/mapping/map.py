@@ -137,14 +137,8 @@ class MapOptions:
 
     def point_model(self, threads: bool = True) -> PointModelOptions:
         """How points are reconstructed, with or without the number of threads, on which no result depends."""
-        return PointModelOptions(
-            self.camera_model or "SIMPLE_RADIAL",
-            self.camera_params,
-            self.seed,
-            self.threads if threads else None,
-            rigs=self.rigs,
-            refine_rigs=self.refine_rigs,
-        )
+        lens, count = (self.camera_model or "SIMPLE_RADIAL", self.camera_params), self.threads if threads else None
+        return PointModelOptions(*lens, self.seed, count, rigs=self.rigs, refine_rigs=self.refine_rigs)
 
 
 def map_images(

@@ -199,7 +199,7 @@ class WideDetection:
 def _rays(model: camera_models.CameraModel, params: FloatArray, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Rays of pixels, and whether the model has one that comes back to the pixel."""
     rays = model.unproject(params, pixels)
-    seen: BoolArray = np.isfinite(rays).all(axis=1)
+    seen: BoolArray = np.asarray(np.isfinite(rays).all(axis=1), np.bool_)
     back = model.project(params, np.where(seen[:, None], rays, [0.0, 0.0, 1.0]))
     seen &= np.linalg.norm(model.pixel_difference(params, back, pixels), axis=1) < GATES.max_fold
     return rays, seen
