@@ -44,6 +44,20 @@ def map_(
             "(TUM, KITTI), a g2o graph. Points are found, poses improved, wrong ones named.",
         ),
     ] = None,
+    extend: Annotated[
+        Path | None,
+        typer.Option(
+            "--extend",
+            metavar="MAP",
+            help="Place the photographs in this map, OUT of groma map or a COLMAP model, and map all of both.",
+        ),
+    ] = None,
+    map_images: Annotated[
+        Path | None,
+        typer.Option(
+            "--map-images", metavar="FOLDER", help="With --extend: the photographs of MAP, where it does not tell."
+        ),
+    ] = None,
     camera_model: Annotated[
         str | None,
         typer.Option(
@@ -139,6 +153,7 @@ def map_(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
+    from groma.cli.shared.extending import check_extension
     from groma.cli.shared.input import check_inputs
 
     console = Console(quiet, verbose, json_target, threads)
@@ -147,7 +162,10 @@ def map_(
         positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
     )
     _measured.check_measured(measured)
-    check_inputs(images, model, poses, rig, line_matches, truth, *measured.files)
+    check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, *measured.files)
+    check_extension(
+        extend, map_images, {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params}
+    )
 
     if model is not None and camera_params is not None:
         raise InputError("--camera-params is for images without a model. Leave it out.")
@@ -165,10 +183,12 @@ def map_(
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
 
     from groma.cli.shared.diagnosis import try_diagnosis
+    from groma.cli.shared.extending import end_queries, extend_map
     from groma.cli.shared.mapping import run_map, say_map, write_map
     from groma.execution import work_with
     from groma.features.external import read_matches
     from groma.io import read_scene
+    from groma.localization.extension import in_world_of
     from groma.mapping.map import MapOptions
     from groma.mapping.photographs import image_files
 
@@ -185,7 +205,7 @@ def map_(
         camera_model=camera_model,
         camera_params=_parameters(camera_params),
         mapper=mapper,
-        rigs=() if model is not None or poses is not None else _rigs(console, images, rig),
+        rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
         threads=threads,
         seed=seed,
@@ -194,14 +214,24 @@ def map_(
     matches = read_matches(line_matches) if line_matches is not None else None
     true = read_scene(truth) if truth is not None else None
     work = output.with_name(output.name + ".work")
+    photographs, extended = images, None
+    if extend is not None:
+        extended = extend_map(console, extend, images, map_images, output, force)
+        photographs, start = extended.folder, extended.scene
     survey = None
     if measured:
-        survey = measured.read(images, lambda: [path.relative_to(images).as_posix() for path in image_files(images)])
+        survey = measured.read(
+            photographs, lambda: [path.relative_to(photographs).as_posix() for path in image_files(photographs)]
+        )
     with work_with(threads):
-        result = run_map(console, images, work, start, options, matches, survey)
+        result = run_map(console, photographs, work, start, options, matches, survey)
+        if extended is not None and survey is None:
+            result = in_world_of(result, extended.map)
         found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
         numbers = result.summary(found, result.contributions(true) if contributions else ())
-        write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
+        title = f"Map of {images.absolute().name}"
+        write_map(result, output, work, force, images=photographs, title=title, summary=numbers)
+    end_queries(output)
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
