@@ -170,11 +170,7 @@ def map_(
     if model is not None and camera_params is not None:
         raise InputError("--camera-params is for images without a model. Leave it out.")
 
-    if model is not None and poses is not None:
-        raise InputError("--model and --poses exclude each other: a model has points. Leave one of them out.")
-
-    if rig is not None and (model is not None or poses is not None):
-        raise InputError("--rig is for images without a model: a model has its own rigs. Leave it out.")
+    _check_start(model, poses, rig)
 
     if line_matches is not None and line_matcher is not None:
         raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
@@ -235,6 +231,14 @@ def map_(
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
+
+
+def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> None:
+    """Check that what is known beforehand does not exclude each other."""
+    if model is not None and poses is not None:
+        raise InputError("--model and --poses exclude each other: a model has points. Leave one of them out.")
+    if rig is not None and (model is not None or poses is not None):
+        raise InputError("--rig is for images without a model: a model has its own rigs. Leave it out.")
 
 
 def _rigs(console: "Console", images: Path, path: Path | None) -> "tuple[RigDescription, ...]":
