@@ -14,6 +14,7 @@ from groma.errors import InputError
 
 if TYPE_CHECKING:
     from groma.cli.shared.console import Console
+    from groma.io.colmap.rigs import RigDescription
     from groma.mapping.map import MapOptions
     from groma.scene import Scene
 
@@ -73,6 +74,18 @@ def map_(
         str,
         typer.Option(metavar="NAME", help="Without --model and --poses: place cameras incremental(ly) or global(ly)."),
     ] = "incremental",
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            "--rig",
+            metavar="FILE",
+            help="Images taken at the same moment by cameras fixed to each other: COLMAP's rig_config.json. Found by "
+            "itself in IMAGES.",
+        ),
+    ] = None,
+    refine_rig: Annotated[
+        bool, typer.Option("--refine-rig/--fix-rig", help="Estimate where the cameras sit on their rig.")
+    ] = False,
     line_matches: Annotated[
         Path | None,
         typer.Option(
@@ -149,14 +162,15 @@ def map_(
         positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
     )
     _measured.check_measured(measured)
-    check_inputs(images, model, poses, line_matches, truth, extend, map_images, *measured.files)
-    check_extension(extend, map_images, {"--model": model, "--poses": poses, "--camera-params": camera_params})
+    check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, *measured.files)
+    check_extension(
+        extend, map_images, {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params}
+    )
 
     if model is not None and camera_params is not None:
         raise InputError("--camera-params is for images without a model. Leave it out.")
 
-    if model is not None and poses is not None:
-        raise InputError("--model and --poses exclude each other: a model has points. Leave one of them out.")
+    _check_start(model, poses, rig)
 
     if line_matches is not None and line_matcher is not None:
         raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
@@ -187,6 +201,8 @@ def map_(
         camera_model=camera_model,
         camera_params=_parameters(camera_params),
         mapper=mapper,
+        rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
+        refine_rigs=refine_rig,
         threads=threads,
         seed=seed,
     )
@@ -215,6 +231,29 @@ def map_(
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
+
+
+def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> None:
+    """Check that what is known beforehand does not exclude each other."""
+    if model is not None and poses is not None:
+        raise InputError("--model and --poses exclude each other: a model has points. Leave one of them out.")
+    if rig is not None and (model is not None or poses is not None):
+        raise InputError("--rig is for images without a model: a model has its own rigs. Leave it out.")
+
+
+def _rigs(console: "Console", images: Path, path: Path | None) -> "tuple[RigDescription, ...]":
+    """Return the rigs of a file, or of the one in the folder of photographs, and say what they hold."""
+    from groma.io.colmap.rigs import RIG_FILE, check_rigs, read_rigs
+    from groma.mapping.photographs import image_files
+
+    if path is None and not (images / RIG_FILE).is_file():
+        return ()
+    file = path or images / RIG_FILE
+    found = read_rigs(file)
+    names = [image.relative_to(images).as_posix() for image in image_files(images)]
+    where = "Cameras" if path is not None else "Found in the folder: cameras"
+    console.say(f"{where} on rigs by {file}. {check_rigs(found, names)}")
+    return found
 
 
 def _start(
