@@ -30,7 +30,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
@@ -247,7 +247,7 @@ def _rows(test: _Test, level: float, power: float) -> Iterator[Measurement]:
     deviation = np.sqrt(np.einsum("nii->ni", np.linalg.inv(test.information)))
     scores = np.einsum("nij,nj->ni", test.information, test.full)
     of_scores = np.einsum("nij,njk,nki->ni", test.information, test.cofactor, test.information)
-    limit, shift = norm.isf(level / 2.0), noncentrality(level, power)
+    limit, shift = float(-ndtri(level / 2.0)), noncentrality(level, power)
     for row, name in enumerate(test.names):
         for k, coordinate in enumerate(_COORDINATES[test.kind]):
             share, variance = float(test.shares[row, k]), float(of_scores[row, k])
