@@ -14,4 +14,4 @@ result = groma.adjust(scene.start, groma.AdjustOptions(loss="none"))
 print(result.report.termination.sentence)
 for kind, rmse in result.report.to_dict()["rmse_px"].items():
     print(f"{kind}: {rmse['before']:.2f} px -> {rmse['after']:.2f} px")
-groma.write_scene(result.scene, "adjusted.npz")
+groma.write_scene(result.scene, "adjusted.npz", force=True)

@@ -49,4 +49,4 @@ for kind, rmse in result.report.rmse_px.items():
     print(f"{kind}: {rmse['before']:.2f} px -> {rmse['after']:.2f} px")
 print("first line, moment and direction:", result.scene.lines.plucker[0].round(3))
 print("its end points:", result.scene.lines.segments[0].round(3).tolist())
-groma.write_scene(result.scene, "model")  # a COLMAP model, with the lines beside it
+groma.write_scene(result.scene, "model", force=True)  # a COLMAP model, with the lines beside it

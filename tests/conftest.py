@@ -7,6 +7,7 @@ Compiled kernels go to a folder of the checkout rather than beside the sources. 
 
 import os
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
@@ -16,6 +17,8 @@ SHARED_DATA = ROOT.parent / "shared" / "data"
 SHARED_GOLDEN = ROOT.parent / "shared" / "math" / "golden"
 
 os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".cache" / "numba"))
+# Every worker of a run keeps a core busy by itself.
+os.environ.setdefault("GROMA_COMPILE_PROCESSES", "0")
 
 hypothesis.settings.register_profile(
     "groma",
@@ -26,6 +29,15 @@ hypothesis.settings.register_profile(
     database=None,
 )
 hypothesis.settings.load_profile("groma")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give whole files to the workers of ``-n``: fixtures of a module are made once, and two workers seldom need the
+    same function compiled at the same moment."""
+    from xdist.scheduler import LoadFileScheduling
+
+    return LoadFileScheduling(config, log) if config.getvalue("dist") == "load" else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

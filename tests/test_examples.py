@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Every example runs to its end, in an empty folder, and the first one is the code of the README."""
+"""Every example runs to its end, in an empty folder and again; the first one is the code of the README."""
 
 import runpy
 from pathlib import Path
@@ -13,7 +13,8 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 @pytest.mark.parametrize("path", EXAMPLES, ids=[path.stem for path in EXAMPLES])
 def test_example_runs(path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    runpy.run_path(str(path), run_name="__main__")
+    for _ in range(2):
+        runpy.run_path(str(path), run_name="__main__")
     assert capsys.readouterr().out
 
 

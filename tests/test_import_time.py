@@ -37,3 +37,8 @@ def test_nothing_heavy_is_loaded(code):
 
 def test_the_viewer_is_loaded_only_when_asked_for():
     assert "viser" not in _loaded_after("import groma\ngroma.adjust\ngroma.read_scene")
+
+
+@pytest.mark.parametrize("module", ["groma.adjustment.adjust", "groma.mapping.map"])
+def test_statistics_are_not_loaded_for_a_quantile(module):
+    assert "scipy.stats" not in _loaded_after(f"import {module}")

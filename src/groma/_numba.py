@@ -20,6 +20,7 @@ from groma._numba_cache import keep_on_disk
 
 _OPTIONS = {
     "nogil": True,
+    "no_cfunc_wrapper": True,  # for callers in C, of which there are none
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
 }
@@ -38,8 +39,3 @@ exact_kernel = _compiled(forceinline=True, fastmath=False)
 #: A step of a long loop, pasted into it before anything is optimised: compiled as if it were written there.
 inline_kernel = _compiled(inline="always")
 loop = _compiled()
-
-
-def uncached(function: Callable) -> Any:
-    """Compile a function that has no file of its own, such as the loops made for a user's factor."""
-    return njit(**_OPTIONS)(function)

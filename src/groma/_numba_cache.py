@@ -17,34 +17,41 @@ the names of its kernels: two models that have the same number in two processes 
 
 **Several processes.** Files are written under another name and moved into place, so a reader finds a whole file or
 none. There is no index: Numba's own keeps one per function, and two processes that compile the same function for
-different types at the same moment can leave an entry there that names the other one's code.
+different types at the same moment can leave an entry there that names the other one's code. A function that another
+process compiles at the moment is waited for (:mod:`groma._numba_turns`).
 """
 
 from __future__ import annotations
 
+import gc
 import hashlib
+import json
 import os
 import pickle
 import sys
 import threading
 import uuid
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from numba.core import sigutils
+from llvmlite.binding import get_host_cpu_features, get_process_triple
+from numba.core import config, sigutils
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
 from numba.core.registry import cpu_target
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
-from groma import _numba_digest
+from groma import _numba_digest, _numba_turns
 
 #: A file that contains one of these holds compiled code, or chooses it.
 _MARKS = (b"_numba import", b"njit(", b"numba.extending", b"llvmlite")
 _SUFFIX = ".nbc"
+#: Folder of the package with functions that were compiled ahead; only in wheels for one platform.
+SHIPPED = "_compiled_ahead"
 _DIGEST, _CHECKSUM = 64, 8
 
 
@@ -69,12 +76,45 @@ class Counts:
     loaded: int = 0
     #: Functions that were compiled and could not be written.
     unsaved: int = 0
+    #: Functions called from Python that were not found; another process may have compiled them meanwhile.
+    missed: int = 0
 
 
 counts = Counts()
-#: Files that were written or found.
-_used: set[Path] = set()
+#: Called with this process's counts whenever something that Python calls is not there and must be compiled.
+on_miss: list[Callable[[Counts], None]] = []
+#: Files that were written or found, and which function, for which argument types.
+_used: dict[Path, tuple[str, str, tuple]] = {}
+#: How many functions are being compiled: one inside the other.
+_depth = 0
 _lock = threading.Lock()
+#: Held while a file is written; a process that ends at once takes it first.
+writing = threading.Lock()
+
+
+@dataclass(frozen=True)
+class _Shipped:
+    """Functions that were compiled ahead for a named processor, and came with the installation."""
+
+    folder: Path
+    #: As Numba names processors: system, name, instructions.
+    processor: tuple[str, str, str]
+
+
+@lru_cache(maxsize=1)
+def _shipped() -> _Shipped | None:
+    """Return what came with the installation, if this processor has all that it was compiled for."""
+    place = Path(__file__).parent / SHIPPED
+    try:
+        said = json.loads((place / "processor.json").read_text())
+    except (OSError, ValueError):
+        return None
+    host = get_host_cpu_features()
+    wanted = [name[1:] for name in said["processor"][2].split(",") if name.startswith("+")]
+    chosen = config.CPU_NAME is not None or config.CPU_FEATURES is not None  # type: ignore[attr-defined]
+    if chosen or said["processor"][0] != get_process_triple() or not all(host.get(name) for name in wanted):
+        return None
+    return _Shipped(place, tuple(said["processor"]))
 
 
 @dataclass(frozen=True)
@@ -102,7 +142,7 @@ class _Files:
         """Return what was compiled for a key, or None."""
         if key is None:
             return None
-        path = self._path(key)
+        path = self.path(key)
         try:
             content = path.read_bytes()
         except OSError:
@@ -116,26 +156,34 @@ class _Files:
             return None
         with _lock:
             counts.loaded += 1
-            _used.add(path)
         return found
+
+    def has(self, key: _Key) -> bool:
+        """Whether there is a file for a key that is valid, going by its head."""
+        try:
+            with self.path(key).open("rb") as file:
+                return file.read(_DIGEST) == key.content.encode()
+        except OSError:
+            return False
 
     def save(self, key: _Key | None, data: Any) -> None:
         """Write what was compiled for a key."""
         if key is None:
             return
-        path, payload = self._path(key), dumps(data)
+        path, payload = self.path(key), dumps(data)
         draft = path.with_name(f"{path.name}.{uuid.uuid4().hex[:16]}.tmp")  # unique on a shared drive too
-        try:
-            draft.write_bytes(_head(key, payload) + payload)
-            os.replace(draft, path)
-        except OSError:
-            draft.unlink(missing_ok=True)
-            raise
+        with writing:
+            try:
+                draft.write_bytes(_head(key, payload) + payload)
+                os.replace(draft, path)
+            except OSError:
+                draft.unlink(missing_ok=True)
+                raise
         with _lock:
             counts.compiled += 1
-            _used.add(path)
 
-    def _path(self, key: _Key) -> Path:
+    def path(self, key: _Key) -> Path:
+        """Return the file of a key."""
         return self._folder / f"{self._stem}.{key.name[:16]}{_SUFFIX}"
 
 
@@ -159,34 +207,92 @@ class _Cache(FunctionCache):
 
     def __init__(self, function: Any, dispatcher: Any = None) -> None:
         super().__init__(function)
+        self._function = function
         self._compiled = function if dispatcher is None else dispatcher
         python = f"py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, 'abiflags', '')}"
         stem = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}-{python}"
-        self._cache_file = _Files(self.cache_path, stem.replace("<", "").replace(">", ""))
+        self._stem = stem.replace("<", "").replace(">", "")
+        self._cache_file = _Files(self.cache_path, self._stem)
+        #: Names of what is being compiled, one inside the other; None where nothing is kept.
+        self._turns: list[str | None] = []
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         """Return a key; None where functions or objects are arguments, whose types hold for this process only."""
+        return self._key(sig, codegen.magic_tuple())
+
+    def _key(self, sig: Any, processor: tuple) -> Any:
         kinds = repr(sig)
         if " at 0x" in kinds or "jitclass." in kinds:
             return None
         found = _numba_digest.dependence(self._compiled, sigutils.normalize_signature(sig)[0])
-        processor = codegen.magic_tuple()
         content = _digest((_numba_digest.environment(), kinds, processor, found.content))
         return _Key(_digest((kinds, processor, found.selected)), content)
+
+    def is_there(self, sig: Any, target_context: Any) -> bool:
+        """Whether the function need not be compiled, or is being compiled by another process."""
+        key = self._index_key(sig, target_context.codegen())
+        if key is None or self._cache_file.has(key):
+            return True
+        folder = Path(self.cache_path)
+        if not _numba_turns.take(folder, key.name):
+            return True
+        _numba_turns.give_back(folder, key.name)
+        return False
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load, without making the compiler ready to compile, which Numba does first and which takes longer."""
         rtsys.initialize(target_context)
         with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)
+            key = self._index_key(sig, target_context.codegen()) if self._enabled else None
+            data = self._find(key, sig)
+            if data is None:
+                self._turns.append(None if key is None else key.name)
+                return None
+            if key is not None:
+                self._note(self._cache_file.path(key), sig)
+            return self._impl.rebuild(target_context, data)
+
+    def _find(self, key: _Key | None, sig: Any) -> Any:
+        """Return what was compiled, by this process or another; or take the turn to compile it, and return None."""
+        if key is None:
+            return None
+        data = self._cache_file.load(key)
+        if data is None and (shipped := _shipped()) is not None:
+            place = _Files(str(shipped.folder / self._function.__module__), self._stem)
+            data = place.load(self._key(sig, shipped.processor))
+        if data is not None:
+            return data
+        if _depth == 0:
+            counts.missed += 1
+            for call in on_miss:
+                call(counts)
+        folder = Path(self.cache_path)
+        _numba_turns.wait(folder, key.name, lambda: self._cache_file.has(key))
+        data = self._cache_file.load(key)
+        if data is not None:
+            _numba_turns.give_back(folder, key.name)
+        return data
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save; a full disk, or a folder that became read-only, costs time in the next process and nothing else."""
         try:
             super().save_overload(sig, data)
+            if (key := self._index_key(sig, data.codegen)) is not None:
+                self._note(self._cache_file.path(key), sig)
         except OSError:
             with _lock:
                 counts.unsaved += 1
+        finally:
+            self.end_turn()
+
+    def end_turn(self) -> None:
+        """Let other processes compile what this one has compiled, or could not compile."""
+        if self._turns and (name := self._turns.pop()) is not None:
+            _numba_turns.give_back(Path(self.cache_path), name)
+
+    def _note(self, path: Path, sig: Any) -> None:
+        with _lock:
+            _used[path] = self._function.__module__, self._function.__qualname__, sigutils.normalize_signature(sig)[0]
 
 
 class _Unopened:
@@ -201,7 +307,31 @@ class _Unopened:
         except RuntimeError:  # Numba found no folder that can be written
             opened = NullCache()
         self._dispatcher._cache = opened
+        _watch(self._dispatcher._compiler, opened)
         return getattr(opened, name)
+
+
+def _watch(compiler: Any, cache: Any) -> None:
+    """Collect no garbage while a function is compiled, a tenth of the time, and end its turn if that fails."""
+    compile_function = compiler.compile
+
+    def compile_watched(*arguments: Any) -> Any:
+        global _depth
+        collects = gc.isenabled()
+        gc.disable()
+        _depth += 1
+        try:
+            return compile_function(*arguments)
+        except BaseException:
+            if isinstance(cache, _Cache):
+                cache.end_turn()
+            raise
+        finally:
+            _depth -= 1
+            if collects:
+                gc.enable()
+
+    compiler.compile = compile_watched
 
 
 def keep_on_disk(dispatcher: Any) -> Any:
@@ -230,3 +360,18 @@ def used_files() -> list[Path]:
     """Return the files that were written or found by this process."""
     with _lock:
         return sorted(_used)
+
+
+def used_paths() -> list[Path]:
+    """Return the files of :func:`used_functions`."""
+    with _lock:
+        return list(_used)
+
+
+def used_functions() -> list[tuple[str, str, tuple]]:
+    """Return module, name and argument types of what was written or found by this process, in the order of first use.
+
+    In a process that compiles nothing these are the functions that Python calls, and no others.
+    """
+    with _lock:
+        return list(_used.values())

@@ -93,7 +93,7 @@ def dependence(function: Any, argument_types: tuple) -> Dependence:
 def environment() -> tuple:
     """Return versions and settings that everything compiled depends on."""
     settings = tuple(repr(getattr(config, name, None)) for name in _SETTINGS)
-    return sys.version_info[:3], numba.__version__, llvmlite.__version__, np.__version__, settings
+    return sys.version_info[:2], numba.__version__, llvmlite.__version__, np.__version__, settings
 
 
 # --------------------------------------------------------------------------------------------------------- The graph

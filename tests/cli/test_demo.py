@@ -91,6 +91,10 @@ def few_images(tmp_path, monkeypatch):
 
 
 def test_demo_on_few_images(few_images, capsys):
+    few_images.mkdir()
+    (few_images / "scene.npz").write_bytes(b"of an earlier run")
+    assert run(["demo", "-o", str(few_images)]) == 1  # a folder that is named is not replaced unasked
+    assert "--force" in capsys.readouterr().err
     assert run(["demo"]) == 0
     said = capsys.readouterr().out
     assert f"Open {few_images / 'report.html'}" in said and "motion capture (rms)" in said
@@ -100,8 +104,9 @@ def test_demo_on_few_images(few_images, capsys):
     scene = read_scene(few_images / "scene.npz")
     assert (numbers["num_images"], numbers["num_lines"]) == (len(FEW), scene.num_lines)
     assert scene.num_lines >= 10 and numbers["cabinet"]["num_edges"] >= 3
+    (few_images / "notes.txt").write_text("of the user")
     assert run(["demo"]) == 1
-    assert "--force" in capsys.readouterr().err
+    assert "notes.txt" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -2,6 +2,9 @@
 """Factors of the user's own: the three ways to the derivative, any number of variables, degeneracy, clear errors."""
 
 import math
+import os
+import subprocess
+import sys
 
 import numba
 import numpy as np
@@ -178,3 +181,49 @@ def test_declarations_are_checked():
         One(x=Ref("x", [0, 1]), data=np.zeros((2, 2)))
     with pytest.raises(ShapeError, match="takes variables of 2 numbers; got 3"):
         One(x=Ref("x", [0]), data=np.zeros((1, 3))).prepare((np.zeros((1, 3)),))
+
+
+PROGRAM = """
+import numpy as np
+from groma._numba_cache import counts
+from groma.factors.checks.check import _ambients, _block_sizes, _linearize, _residuals
+from groma.factors.user import factor
+
+SCALE = 2.0
+
+@factor("first", slots=[("point", "point")], residual_size=1, data_size=1)
+def First(data, point, out):
+    out[0] = SCALE * (point[0] - data[0])
+
+@factor("second", slots=[("point", "point")], residual_size=1, data_size=1)
+def Second(data, point, out):
+    out[0] = point[1] - data[0]
+
+before = counts.compiled
+for kind in (First, Second):
+    example = kind.example(np.random.default_rng(0))
+    ambients = _ambients(example)
+    sizes = _block_sizes(example)
+    print(_residuals(example.factor, ambients)[0, 0].hex(), _linearize(example.factor, ambients, sizes)[1])
+print(counts.compiled - before)
+"""
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
+def test_what_is_compiled_is_kept_until_the_function_changes(tmp_path):
+    path = tmp_path / "program.py"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+
+    def results(program):
+        path.write_text(program)
+        call = [sys.executable, "-W", "error", path]
+        said = subprocess.run(call, capture_output=True, text=True, check=True, env=environment).stdout.split()
+        return said[:-1], int(said[-1])
+
+    first, compiled = results(PROGRAM)
+    assert compiled > 0
+    assert results(PROGRAM) == (first, 0)
+    changed, compiled = results(PROGRAM.replace("SCALE = 2.0", "SCALE = 4.0"))
+    assert compiled > 0
+    assert float.fromhex(changed[0]) == 2.0 * float.fromhex(first[0])
+    assert changed[2:] == first[2:]

@@ -222,6 +222,10 @@ def test_the_command_is_one_call(tmp_path, corner, monkeypatch):
             assert ("called" / name).read_bytes() == ("commanded" / name).read_bytes(), name
     ours, theirs = (json.loads((Path(folder) / "summary.json").read_text()) for folder in ("called", "commanded"))
     assert list(ours) == list(theirs) and ours["diagnosis"]["sentences"]
+    known, told = result.scene.lines.confidence, ours["line_confidence"]
+    assert len(known) > 20 and known.min() >= MapOptions().min_confidence == 0.5
+    assert told["expected_right"] == pytest.approx(known.sum())
+    assert told["lines_by_tenth"][:5] == [0] * 5 and sum(told["lines_by_tenth"]) == len(known)
     assert ours["diagnosis"].pop("seconds") and theirs["diagnosis"].pop("seconds")
     assert [name for name in ours if ours[name] != theirs[name]] == ["seconds", "history"]
     with pytest.raises(OutputError, match="exists already"):

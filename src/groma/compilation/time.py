@@ -11,7 +11,7 @@ class Compilation:
     """What went into compiled code."""
 
     seconds: float = 0.0
-    #: Whether something was compiled, and not all of it loaded.
+    #: Whether something was compiled, by this process or one beside it, and not all of it loaded.
     compiled: bool = False
 
 
@@ -22,12 +22,12 @@ def compilation_time() -> Iterator[Compilation]:
 
     from groma._numba_cache import counts
 
-    found, before = Compilation(), counts.compiled + counts.unsaved
+    found, before = Compilation(), counts.compiled + counts.unsaved + counts.missed
     # Numba holds its lock for as long as it compiles or loads, in every thread.
     with event.install_listener("numba:compiler_lock", event.TimingListener()) as listener:
         yield found
     found.seconds = listener.duration if listener.done else 0.0
-    found.compiled = counts.compiled + counts.unsaved > before
+    found.compiled = counts.compiled + counts.unsaved + counts.missed > before
 
 
 __all__ = ["Compilation", "compilation_time"]

@@ -2,7 +2,8 @@
 """The loops around a user's function: written for its slots, compiled with it.
 
 A loop that gets its kernel as an argument, or closes over it, cannot be typed for a changing number of variables. So
-the source of the two loops is written out for each user factor, as one would by hand, and compiled in this process.
+the source of the two loops is written out for each user factor, as one would by hand. It counts as part of the file of
+the user's function, beside which it is kept once it is compiled.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from groma._numba import kernel, uncached
+from groma._numba import kernel, loop
 from groma.errors import InputError
 from groma.factors._record import put_block, put_residual
 from groma.factors.contract import Slot
@@ -190,7 +191,6 @@ class Loops:
         return self._compiled
 
     def _compile(self) -> tuple[Callable, Callable]:
-        compiler = uncached  # what is written here has no file, and cannot be cached on disk
         real = [numba.float64[:, ::1] if slot.kind == "pose" else numba.float64[::1] for slot in self.slots]
         signatures = [(numba.float64[::1], *real, numba.float64[::1])]
         if self.derivative == "complex":
@@ -198,7 +198,8 @@ class Loops:
             signatures.append((numba.float64[::1], *vary, numba.complex128[::1]))
         names: dict[str, Any] = {
             "np": np,
-            "residual": self._compile_function(compiler, self.function, "residual", signatures),
+            "__name__": self.function.__module__,
+            "residual": self._compile_function(self.function, "residual", signatures),
             "put_block": put_block,
             "put_residual": put_residual,
         }
@@ -209,12 +210,17 @@ class Loops:
         names.update({helper.__name__: helper for helper in helpers})
         if self.jacobian is not None:
             signature = (numba.float64[::1], *real, *[numba.float64[:, ::1]] * len(real))
-            names["jacobian"] = self._compile_function(compiler, self.jacobian, "jacobian", [signature])
-        exec(_write_loops(self.slots, self.sizes, self.residual_size, self.derivative), names)
-        return compiler(names["residuals_all"]), compiler(names["linearize_all"])
+            names["jacobian"] = self._compile_function(self.jacobian, "jacobian", [signature])
+        source = _write_loops(self.slots, self.sizes, self.residual_size, self.derivative)
+        plain: Any = getattr(self.function, "py_func", self.function)
+        exec(compile(source, plain.__code__.co_filename, "exec"), names)
+        made = names["residuals_all"], names["linearize_all"]
+        for function in made:
+            function.__qualname__ = f"{plain.__qualname__}.{function.__name__}"  # its file is named after it
+        return loop(made[0]), loop(made[1])
 
-    def _compile_function(self, compiler, function, role: str, signatures) -> Callable:
-        compiled = function if hasattr(function, "py_func") else compiler(function)
+    def _compile_function(self, function, role: str, signatures) -> Callable:
+        compiled = function if hasattr(function, "py_func") else loop(function)
         if not hasattr(compiled, "compile"):  # NUMBA_DISABLE_JIT=1
             return compiled
         for signature in signatures:

@@ -43,7 +43,8 @@ moves by the left twist, :math:`T \leftarrow (I + h\,\hat\xi)\,T`):
 or they come from a function of yours, ``jacobian(data, *variables, *blocks)``, with one block (m, columns) per slot.
 
 The loop around the function is written for its number of slots and compiled together with it when the first factor is
-evaluated (a second or two). It is not kept on disk: a function from a notebook has no file to belong to.
+evaluated (a second or two). It is kept on disk like the functions of groma, and compiled again when the function, or
+something that it uses, has changed. A function that was typed in has no file to belong to, and is compiled each time.
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
 
 A lens with distortion images a straight edge as an arc, which a detector of straight segments breaks into short chords.
 Images of such cameras are therefore resampled without distortion, with the same camera matrix. Segments are detected
-there, and their end points are mapped back to the original image, in which the rest of groma measures.
+there, and their end points are mapped back to the original image, in which the rest of groma measures. Images wider
+than a plane can hold are resampled to several views (:mod:`groma.mapping.wide_views`).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from groma.features.segments import Segments
 from groma.gates import gate
 from groma.geometry import segment2
 from groma.mapping.photographs import read_gray
+from groma.mapping.wide_views import WideDetection, WideViews
 from groma.scene import Scene
 
 
@@ -151,8 +153,12 @@ def _detect_in(detector: SegmentDetector, work: tuple[Path, str, tuple[float, ..
 
 # Few are kept: they are larger than the image, and there may be a camera for every image.
 @lru_cache(maxsize=2)
-def _straightener(model: str, params: tuple[float, ...], width: int, height: int) -> Straightener | None:
-    return Straightener.of(camera_models.model(model), np.array(params), width, height)
+def _straightener(
+    model: str, params: tuple[float, ...], width: int, height: int
+) -> Straightener | WideDetection | None:
+    camera = camera_models.model(model), np.array(params), width, height
+    wide = WideViews.of(*camera)
+    return Straightener.of(*camera) if wide is None else WideDetection.of(wide)
 
 
 def given_segments(

@@ -36,19 +36,20 @@ from groma.features.matches import LineMatches
 from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
 from groma.gates import gate
+from groma.io.colmap.rigs import RigDescription
 from groma.io.colmap.sfm import PointModelOptions
 from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, SCENE, SEGMENTS
 from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
-from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider, explain, map_lines
+from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider, explain
 from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE, left_out, with_confidence
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
+from groma.mapping.lines.in_views import map_lines_in_views
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.photographs import (
-    check_cameras,
     check_images,
     check_number,
     image_files,
@@ -64,6 +65,7 @@ from groma.mapping.surveyed import adjust_with_survey, tied
 from groma.mapping.unused import without_unused
 from groma.scene import Scene
 from groma.scene.local_frame import usual_frame
+from groma.solver.linear.blas import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -133,13 +135,15 @@ class MapOptions:
     #: Where poses are reconstructed: ``incremental`` or ``global``, pycolmap's mappers.
     mapper: str = "incremental"
     seed: int = 0
+    #: Where points are reconstructed: images taken at the same moment by cameras fixed to each other.
+    rigs: tuple[RigDescription, ...] = ()
+    #: Estimate where cameras sit on their rig.
+    refine_rigs: bool = False
 
     def point_model(self, threads: bool = True) -> PointModelOptions:
         """How points are reconstructed, with or without the number of threads, on which no result depends."""
-        count = self.threads if threads else None
-        return PointModelOptions(
-            self.camera_model or "SIMPLE_RADIAL", self.camera_params, self.seed, count, self.mapper
-        )
+        lens, count = (self.camera_model or "SIMPLE_RADIAL", self.camera_params), self.threads if threads else None
+        return PointModelOptions(*lens, self.seed, count, self.mapper, self.rigs, self.refine_rigs)
 
 
 def map_images(
@@ -196,10 +200,9 @@ def map_images(
     if model is not None and near is not None:
         model = model.transformed(near)
     check_number(folder, names, model, options.lines.min_images)
-    check_cameras((options.point_model().camera_model,) if model is None else model.cameras.models)
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
-    with work_with(options.threads), Stages(Path(work), key, options, say) as stages:
+    with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
         placed = start_of(folder, names, model, stages)
         start = placed.scene
         points = stages.run(adjust_points, start)
@@ -269,7 +272,7 @@ def map_segments(
 
 
 # --------------------------------------------------------------------------------------------------------------- stages
-@stage("points", SCENE, lambda options: (options.refine_poses, options.refine_intrinsics, options.max_iterations))
+@stage("points", SCENE, lambda o: (o.refine_poses, o.refine_intrinsics, o.refine_rigs, o.max_iterations))
 def adjust_points(start: Scene, options: MapOptions, say: StageProgress) -> Scene:
     """A model whose poses and points are adjusted with robust losses."""
     return _adjusted(start, _robust(options), options, say, "adjusting points").scene
@@ -310,7 +313,7 @@ def _find_lines(
     options: MapOptions,
     say: StageProgress,
 ) -> LineMap:
-    return map_lines(scene, segments, matches, options.lines, say, neighbors, earlier)
+    return map_lines_in_views(scene, segments, matches, options.lines, say, neighbors, earlier)
 
 
 #: 3D lines from the segments; and again, with better poses.
@@ -333,14 +336,17 @@ def find_planes(scene: Scene, options: MapOptions, say: StageProgress) -> Scene:
 @stage("adjusted", ADJUSTED)
 def adjust_everything(scene: Scene, weighted: AdjustOptions, options: MapOptions, say: StageProgress) -> AdjustResult:
     """Everything adjusted together."""
-    return _adjusted(scene, weighted, options, say, "adjusting everything")
+    return _adjusted(scene, dataclasses.replace(weighted, check_lens=True), options, say, "adjusting everything")
 
 
 # -------------------------------------------------------------------------------------------------------------- helpers
 def _robust(options: MapOptions) -> AdjustOptions:
+    """Options of an adjustment of which the scene alone is wanted: the last one asks what the lenses lack."""
     return AdjustOptions(
         refine_intrinsics=bool(options.refine_intrinsics),
+        refine_rigs=options.refine_rigs,
         max_iterations=options.max_iterations,
+        check_lens=False,
         threads=options.threads,
     )
 

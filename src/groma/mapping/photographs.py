@@ -123,13 +123,12 @@ def check_number(folder: Path, names: Sequence[str], model: Scene | None, min_im
 
 
 def check_cameras(models: Sequence[str]) -> None:
-    """Check that a plane can hold the view of every camera, as segments are found in such images."""
+    """Check that a plane can hold the view of every camera, as photographs are placed by such images."""
     for name in models:
         if not camera_model(name).is_planar:
             raise InputError(
-                f"groma map finds lines in images that are flat, and {name} images are panoramas. Cut each into "
-                "perspective views that are held in a rig (as COLMAP's panorama_sfm.py does) and map those; groma "
-                "adjust takes panoramas as they are, with lines."
+                f"groma localize places images that are flat, and {name} images are panoramas. Map perspective views "
+                "of them that are held in a rig, as COLMAP's panorama_sfm.py cuts them."
             )
 
 

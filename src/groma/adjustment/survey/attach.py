@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from groma._counted import counted
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.survey.names import nearest, require_some, rows_by_name
 from groma.adjustment.survey.similarity import GATES, RobustSimilarity, robust_similarity, upright
 from groma.adjustment.survey.triangulate import triangulated
@@ -110,7 +110,7 @@ def with_survey(scene: Scene, survey: Survey) -> Surveyed:
     moved, similarity, fit = _in_place(scene, tables, survey, notes)
     if "control_points" in tables:
         seen, _ = triangulated(moved, tables["marks"], len(tables["control_points"]))
-        known = np.isfinite(seen).all(axis=1)
+        known: BoolArray = np.asarray(np.isfinite(seen).all(axis=1))
         start = np.where(known[:, None], seen, tables["control_points"].measured)
         tables["control_points"] = tables["control_points"].replace(xyz=start)
     if fit is not None:
@@ -135,7 +135,8 @@ def _positions(scene: Scene, survey: Survey, xyz: FloatArray, notes: list[str]) 
 def _control(
     scene: Scene, survey: Survey, given: ControlFile, xyz: FloatArray, notes: list[str]
 ) -> tuple[ControlPoints, Marks]:
-    places, known_place = given.places, np.isfinite(xyz).all(axis=1)
+    places = given.places
+    known_place: BoolArray = np.asarray(np.isfinite(xyz).all(axis=1))
     if unknown := [name for name in survey.check if name not in places.names]:
         raise InputError(
             f"--check names {unknown[0]!r}, which is no control point{nearest(unknown[0], places.names)}. The file has "
@@ -248,7 +249,7 @@ def _in_place(
         return _scaled(scene, tables, notes)
     if len(source) < 3:
         raise InputError(
-            f"Only {counted(len(source), 'places')} of the scene are known in the frame of the measurements; three are "
+            f"The measurements place only {len(source)} cameras or control points of the scene; three are "
             "needed. Add positions, or control points that two images show."
         )
     try:

@@ -30,8 +30,8 @@ import numpy as np
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.terms.contract import Draft, Group, Term
-from groma.cameras import CameraModel
 from groma.cameras import model as camera_model
+from groma.cameras.across import pixels_across
 from groma.factors.contract import Ref
 from groma.factors.observations.line_bearing import LineBearing
 from groma.factors.observations.line_normal import LineNormal
@@ -96,23 +96,8 @@ def _rays(draft: Draft, name: str, rows: IntArray) -> _Rays:
         first, second = unit(first), unit(second)
     pixels = model.focal_length(params[good])
     if draft.options.line_residual != "endpoints" or model.sees_behind:
-        pixels = _pixels_across(model, params[good], first, second)
+        pixels = pixels_across(model, params[good], first, second)
     return _Rays(rows[good], first, second, pixels)
-
-
-def _pixels_across(model: CameraModel, params: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """How many pixels the ends of a segment move across it (n, 2) as their rays leave its plane, per radian.
-
-    Across the image of the line there: under distortion it is a curve.
-    """
-    normal = unit(np.cross(first, second))
-    across = []
-    for ray in (first, second):
-        by_ray = model.project_jacobian(params, np.ascontiguousarray(ray))[1]
-        moved = np.einsum("nij,nj->ni", by_ray, normal)
-        along = unit(np.einsum("nij,nj->ni", by_ray, np.cross(normal, ray)))
-        across.append(np.abs(along[:, 0] * moved[:, 1] - along[:, 1] * moved[:, 0]))
-    return np.stack(across, axis=1)
 
 
 def _sines(draft: Draft, rays: _Rays, sigma: FloatArray) -> Group:

@@ -12,9 +12,10 @@ from groma.cli.shared.console import Console
 
 
 def demo(
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the results.")] = Path(
-        "groma_demo"
-    ),
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for the results. Default: groma_demo, replaced."),
+    ] = None,
     force: _options.Force = False,
     threads: _options.Threads = None,
     json_target: _options.Json = None,
@@ -28,7 +29,9 @@ def demo(
     The result is compared with poses by motion capture and with the size of the cabinet.
     """
     console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
+    replace, output = force or output is None, output or Path("groma_demo")
+    _output.check_outputs(replace, output)
+    _output.check_json(json_target, force)
 
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.mapping import run_map, say_map, write_map
@@ -39,11 +42,13 @@ def demo(
     console.say("58 photographs of a filing cabinet, nearly without texture (TUM RGB-D benchmark), about a minute.")
     folder, work = cabinet.folder(), output.with_name(output.name + ".work")
     images, reference = folder / "images", read_scene(folder / "motion_capture")
-    result = run_map(console, images, work, read_scene(folder / "model"), MapOptions(threads=threads))
+    # Blurred frames of a video show few lines, and some of them barely; all are kept to show what there is.
+    options = MapOptions(threads=threads, min_confidence=0.0)
+    result = run_map(console, images, work, read_scene(folder / "model"), options)
     found = try_diagnosis(result.diagnose, result.scene.num_images, console)
     numbers = result.summary(found) | cabinet.evaluate_cabinet(result.start, result.scene, reference)
     title = "A filing cabinet in 58 photographs"
-    write_map(result, output, work, force, images=images, title=title, summary=numbers)
+    write_map(result, output, work, replace, images=images, title=title, summary=numbers)
     say_map(console, result, numbers, explain=False)
     for sentence in cabinet.sentences(numbers):
         console.say(sentence)

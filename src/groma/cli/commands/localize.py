@@ -76,7 +76,7 @@ def localize(
     choice = CalibrationChoice(calibration, camera_model, parameters(camera_params))
     files = query_files(queries)
     options = LocalizeOptions(lines=lines, min_segment_length=min_length, pose=PoseOptions(seed=seed))
-    console.announce_compilation()
+    console.expect_compilation("localize")
     work = output.with_name(output.name + ".work")
     try:
         with interruptible() as interruption, console.stages() as stages:

@@ -14,6 +14,7 @@ from groma.errors import InputError
 
 if TYPE_CHECKING:
     from groma.cli.shared.console import Console
+    from groma.io.colmap.rigs import RigDescription
     from groma.mapping.map import MapOptions
     from groma.scene import Scene
 
@@ -43,6 +44,20 @@ def map_(
             "(TUM, KITTI), a g2o graph. Points are found, poses improved, wrong ones named.",
         ),
     ] = None,
+    extend: Annotated[
+        Path | None,
+        typer.Option(
+            "--extend",
+            metavar="MAP",
+            help="Place the photographs in this map, OUT of groma map or a COLMAP model, and map all of both.",
+        ),
+    ] = None,
+    map_images: Annotated[
+        Path | None,
+        typer.Option(
+            "--map-images", metavar="FOLDER", help="With --extend: the photographs of MAP, where it does not tell."
+        ),
+    ] = None,
     camera_model: Annotated[
         str | None,
         typer.Option(
@@ -59,6 +74,18 @@ def map_(
         str,
         typer.Option(metavar="NAME", help="Without --model and --poses: place cameras incremental(ly) or global(ly)."),
     ] = "incremental",
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            "--rig",
+            metavar="FILE",
+            help="Images taken at the same moment by cameras fixed to each other: COLMAP's rig_config.json. Found by "
+            "itself in IMAGES.",
+        ),
+    ] = None,
+    refine_rig: Annotated[
+        bool, typer.Option("--refine-rig/--fix-rig", help="Estimate where the cameras sit on their rig.")
+    ] = False,
     line_matches: Annotated[
         Path | None,
         typer.Option(
@@ -77,8 +104,8 @@ def map_(
     min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
     min_confidence: Annotated[
         float,
-        typer.Option(min=0.0, max=1.0, metavar="P", help="Leave out lines less probably right than this, such as 0.5."),
-    ] = 0.0,
+        typer.Option(min=0.0, max=1.0, metavar="P", help="Leave out lines less probably right than this; 0 keeps all."),
+    ] = 0.5,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
     refine_poses: Annotated[
         bool, typer.Option("--refine-poses/--fix-poses", help="Move the cameras too, or the landmarks alone.")
@@ -126,6 +153,7 @@ def map_(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
+    from groma.cli.shared.extending import check_extension
     from groma.cli.shared.input import check_inputs
 
     console = Console(quiet, verbose, json_target, threads)
@@ -134,13 +162,15 @@ def map_(
         positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
     )
     _measured.check_measured(measured)
-    check_inputs(images, model, poses, line_matches, truth, *measured.files)
+    check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, *measured.files)
+    check_extension(
+        extend, map_images, {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params}
+    )
 
     if model is not None and camera_params is not None:
         raise InputError("--camera-params is for images without a model. Leave it out.")
 
-    if model is not None and poses is not None:
-        raise InputError("--model and --poses exclude each other: a model has points. Leave one of them out.")
+    _check_start(model, poses, rig)
 
     if line_matches is not None and line_matcher is not None:
         raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
@@ -149,9 +179,12 @@ def map_(
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
 
     from groma.cli.shared.diagnosis import try_diagnosis
+    from groma.cli.shared.extending import end_queries, extend_map
     from groma.cli.shared.mapping import run_map, say_map, write_map
+    from groma.execution import work_with
     from groma.features.external import read_matches
     from groma.io import read_scene
+    from groma.localization.extension import in_world_of
     from groma.mapping.map import MapOptions
     from groma.mapping.photographs import image_files
 
@@ -168,6 +201,8 @@ def map_(
         camera_model=camera_model,
         camera_params=_parameters(camera_params),
         mapper=mapper,
+        rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
+        refine_rigs=refine_rig,
         threads=threads,
         seed=seed,
     )
@@ -175,16 +210,50 @@ def map_(
     matches = read_matches(line_matches) if line_matches is not None else None
     true = read_scene(truth) if truth is not None else None
     work = output.with_name(output.name + ".work")
+    photographs, extended = images, None
+    if extend is not None:
+        extended = extend_map(console, extend, images, map_images, output, force)
+        photographs, start = extended.folder, extended.scene
     survey = None
     if measured:
-        survey = measured.read(images, lambda: [path.relative_to(images).as_posix() for path in image_files(images)])
-    result = run_map(console, images, work, start, options, matches, survey)
-    found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
-    numbers = result.summary(found, result.contributions(true) if contributions else ())
-    write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
+        survey = measured.read(
+            photographs, lambda: [path.relative_to(photographs).as_posix() for path in image_files(photographs)]
+        )
+    with work_with(threads):
+        result = run_map(console, photographs, work, start, options, matches, survey)
+        if extended is not None and survey is None:
+            result = in_world_of(result, extended.map)
+        found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
+        numbers = result.summary(found, result.contributions(true) if contributions else ())
+        title = f"Map of {images.absolute().name}"
+        write_map(result, output, work, force, images=photographs, title=title, summary=numbers)
+    end_queries(output)
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
+
+
+def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> None:
+    """Check that what is known beforehand does not exclude each other."""
+    if model is not None and poses is not None:
+        raise InputError("--model and --poses exclude each other: a model has points. Leave one of them out.")
+    if rig is not None and (model is not None or poses is not None):
+        raise InputError("--rig is for images without a model: a model has its own rigs. Leave it out.")
+
+
+def _rigs(console: "Console", images: Path, path: Path | None) -> "tuple[RigDescription, ...]":
+    """Return the rigs of a file, or of the one in the folder of photographs, and say what they hold."""
+    from groma.io.colmap.rigs import RIG_FILE, check_rigs, read_rigs
+    from groma.mapping.photographs import image_files
+
+    if path is None and not (images / RIG_FILE).is_file():
+        return ()
+    file = path or images / RIG_FILE
+    found = read_rigs(file)
+    names = [image.relative_to(images).as_posix() for image in image_files(images)]
+    where = "Cameras" if path is not None else "Found in the folder: cameras"
+    console.say(f"{where} on rigs by {file}. {check_rigs(found, names)}")
+    return found
 
 
 def _start(

@@ -46,7 +46,7 @@ def selfcheck(
     _output.check_json(json_target, force)
     if golden is not None and not golden.is_dir():
         raise InputError(f"--golden must be a folder of reference values; there is none at {golden}. Check the path.")
-    console.announce_compilation()
+    console.expect_compilation("selfcheck")
     passed, numbers = _check_covariances(console, runs, seed) if nees else _check_derivatives(console, golden, seed)
     _output.write_json(json_target, numbers, force)
     if not passed:

@@ -99,7 +99,7 @@ def track(
         points=points, lines=lines, planes=planes, close_loops=loops, max_depth=max_depth, detector=line_detector
     )
     options.make_detector()  # refuses a wrong name now
-    console.announce_compilation()
+    console.expect_compilation("track")
     work = output.with_name(output.name + ".work")
     with console.stages() as stages:
 

@@ -63,7 +63,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     if wanted.output is not None:
         check_target(before, wanted.output)
     true = None if wanted.truth is None else read_scene(wanted.truth)
-    console.announce_compilation()
+    console.expect_compilation("adjust")
     with compilation_time() as compilation, console.progress() as progress:
         before, result, survey = _adjusted(before, options, wanted, progress)
     entries = ()

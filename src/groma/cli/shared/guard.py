@@ -45,6 +45,9 @@ def guard(command: Callable[P, None]) -> Callable[P, None]:
                 raise typer.Exit(PROCESS.tell()) from None
             _explain(error)
             raise
+        finally:
+            if (ahead := sys.modules.get("groma.compilation.ahead")) is not None:
+                ahead.end()
 
     return guarded
 

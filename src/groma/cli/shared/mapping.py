@@ -38,7 +38,7 @@ def run_map(
     from groma.mapping.map import map_images
 
     check_free(work)
-    console.announce_compilation()
+    console.expect_compilation("map")
     if has_stages(work):
         console.say(f"Going on from the finished stages in {work}, as far as they fit.")
     try:

@@ -94,7 +94,7 @@ def _adjust(
         paths = parts_of(source)
         losses, solver, assembly = settings_of(paths[0], options)
     if speaks:
-        console.announce_compilation()
+        console.expect_compilation("adjust")
         idle = reducer.size - len(paths)
         if idle > 0:
             console.warn(f"There are {len(paths)} parts for {reducer.size} ranks: {idle} have nothing to do.")

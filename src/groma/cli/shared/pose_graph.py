@@ -44,7 +44,7 @@ def adjust_graph_and_write(
     from groma.io.g2o import read_g2o, write_g2o
 
     graph = read_g2o(source)
-    console.announce_compilation()
+    console.expect_compilation("pose graph")
     with compilation_time() as compilation, console.progress() as progress:
         result = adjust_pose_graph(graph, PoseGraphOptions(**options), progress)
     if output is not None:

@@ -55,7 +55,7 @@ class Task:
     @property
     def calibrated(self) -> bool:
         """Whether the calibration is known and stays."""
-        return self.options.camera_params is not None
+        return self.options.is_calibrated
 
 
 Say = Callable[[str, int, int], None]
@@ -86,6 +86,7 @@ def map_globally(task: Task, say: Say) -> list[Any]:
     pycolmap, options = task.pycolmap, task.pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = task.options.seed
+    options.mapper.refine_sensor_from_rig = task.options.refine_rigs
     adjusting = options.mapper.bundle_adjustment
     adjusting.refine_focal_length = adjusting.refine_extra_params = not task.calibrated
     say("placing cameras", 0, task.count)
@@ -100,7 +101,7 @@ MAPPERS: dict[str, Callable[[Task, Say], list[Any]]] = {"incremental": map_incre
 def _free_calibration(pycolmap: Any, model: Any) -> None:
     """Adjust a model with its focal lengths and distortion; pycolmap's function for that writes to the terminal."""
     options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
-    options.print_summary = False
+    options.print_summary = options.refine_sensor_from_rig = False
     options.ceres.solver_options.num_threads = 1
     for number, image in model.images.items():
         if image.has_pose:
@@ -119,6 +120,7 @@ def _options(task: Task, angle: float, held: bool) -> Any:
     for part in (options, options.mapper, options.triangulation):
         part.random_seed = task.options.seed
     options.mapper.init_min_tri_angle = angle
+    options.ba_refine_sensor_from_rig = task.options.refine_rigs
     if held:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False

@@ -29,6 +29,7 @@ from groma.io.colmap.mappers import MAPPERS, Task
 from groma.io.colmap.model import from_pycolmap
 from groma.io.colmap.pairs import EXHAUSTIVE_LIMIT, OVERLAP, blocks_of_pairs, places_by_gps
 from groma.io.colmap.quiet import quiet
+from groma.io.colmap.rigs import RigDescription, by_frames, camera_of, check_rigs, map_frames
 from groma.scene import Scene
 
 #: Bytes that must be free before work is handed to pycolmap, whose threads end the process where they find a full disk:
@@ -54,6 +55,10 @@ class PointModelOptions:
     threads: int | None = None
     #: What places the cameras: ``incremental``, one after the other, or ``global``, all at once.
     mapper: str = "incremental"
+    #: Which images were taken at the same moment by cameras fixed to each other; none: every image stands alone.
+    rigs: tuple[RigDescription, ...] = ()
+    #: Estimate where the cameras sit on their rig; otherwise they stay where the description says.
+    refine_rigs: bool = False
 
     def __post_init__(self) -> None:
         if self.mapper not in MAPPERS:
@@ -73,6 +78,14 @@ class PointModelOptions:
                 f"The camera parameters ({', '.join(model.parameter_names)}) must be numbers, the focal length "
                 f"positive; got {', '.join(f'{value:g}' for value in given)}."
             )
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the calibration of all cameras is known, and kept."""
+        cameras = [camera for rig in self.rigs for camera in rig.cameras]
+        return self.camera_params is not None or (
+            bool(cameras) and all(camera.camera_params is not None for camera in cameras)
+        )
 
 
 def reconstruct_points(
@@ -116,6 +129,7 @@ def reconstruct_points(
     options = options or PointModelOptions()
     say = progress or (lambda stage, done, total: None)
     folder, names = Path(work), sorted(names)
+    check_rigs(options.rigs, names)
     database = folder / "database.db"
     pycolmap.set_random_seed(options.seed)
     with quiet(pycolmap), _explained(folder):
@@ -124,10 +138,18 @@ def reconstruct_points(
         _enter_images(pycolmap, database, Path(images), names, options)
         _find_features(pycolmap, database, Path(images), names, options, say)
         with _opened(pycolmap, database) as content:
-            places = places_by_gps(content, names)
-        _match(pycolmap, database, names, blocks_of_pairs(len(names), places), options, say)
+            ordered = by_frames(options.rigs, names)
+            places = places_by_gps(content, ordered)
+        _match(pycolmap, database, ordered, blocks_of_pairs(len(names), places), options, say)
         _check_room(folder)
-        models = MAPPERS[options.mapper](Task(pycolmap, database, Path(images), folder, len(names), options), say)
+        models = map_frames(
+            pycolmap,
+            database,
+            options.rigs,
+            lambda content: MAPPERS[options.mapper](
+                Task(pycolmap, content, Path(images), folder, len(names), options), say
+            ),
+        )
     if not models:
         with _opened(pycolmap, database) as content:
             features, matches = content.num_keypoints(), content.num_inlier_matches()
@@ -166,25 +188,28 @@ def _enter_images(pycolmap: Any, database: Path, images: Path, names: list[str],
             path.unlink()
         with _opened(pycolmap, database):
             pass
-    groups: dict[tuple[object, ...], list[str]] = {}
+    groups: dict[tuple[Any, ...], list[str]] = {}
     for name in names:
         bitmap = pycolmap.Bitmap.read(str(images / name), False)
         if bitmap is None:
             raise InputError(
                 f"{images / name} cannot be read by pycolmap, which finds the points. Convert it to JPEG or PNG."
             )
-        groups.setdefault((bitmap.width, bitmap.height, bitmap.exif_camera_model()), []).append(name)
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = camera_models.model(options.camera_model).colmap_name
-    if options.camera_params is not None:
-        if len(groups) > 1:
-            sizes = ", ".join(sorted({f"{key[0]}x{key[1]}" for key in groups}))
-            raise InputError(
-                f"One set of camera parameters was given, but the images come from {len(groups)} cameras ({sizes}). "
-                "Leave the parameters out, or map the images of one camera."
-            )
-        reader.camera_params = ",".join(repr(float(value)) for value in options.camera_params)
-    for members in groups.values():
+        key = (bitmap.width, bitmap.height, bitmap.exif_camera_model(), camera_of(options.rigs, name))
+        groups.setdefault(key, []).append(name)
+    if options.camera_params is not None and len({key[:3] for key in groups}) > 1:
+        sizes = ", ".join(sorted({f"{key[0]}x{key[1]}" for key in groups}))
+        raise InputError(
+            f"One set of camera parameters was given, but the images come from {len(groups)} cameras ({sizes}). "
+            "Leave the parameters out, or map the images of one camera."
+        )
+    for (*_, mounted), members in groups.items():
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = camera_models.model(options.camera_model).colmap_name
+        params = options.camera_params
+        if mounted is not None and mounted.camera_params is not None:
+            reader.camera_model, params = mounted.camera_model, mounted.camera_params
+        reader.camera_params = "" if params is None else ",".join(repr(float(value)) for value in params)
         pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, members, reader)
 
 

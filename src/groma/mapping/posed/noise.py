@@ -19,7 +19,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2, f
 
 from groma._typing import BoolArray, FloatArray
 from groma.gates import gate
@@ -56,6 +55,8 @@ def noise_of_given(squared: FloatArray, redundancy: FloatArray) -> GivenNoise:
 
     Values that are not there have a redundancy of 0; they are not gross.
     """
+    from scipy.stats import f  # takes half a second to import
+
     usable = np.flatnonzero(redundancy > GATES.least_redundancy)
     gross = np.zeros(len(squared), bool)
     if 2 * len(usable) <= np.count_nonzero(redundancy > 0.0) or len(usable) < 3:
@@ -77,6 +78,8 @@ def noise_of_given(squared: FloatArray, redundancy: FloatArray) -> GivenNoise:
 
 def _truncated(share: float) -> float:
     """Return the mean of the smallest share of squares of three normal coordinates, relative to that of all."""
+    from scipy.stats import chi2  # takes half a second to import
+
     return float(chi2.cdf(chi2.ppf(share, 3), 5) / share) if share < 1.0 else 1.0
 
 

@@ -60,7 +60,9 @@ def _examine(camera, image, own, pointers, active, X, U, squared, uncertainty, u
         for m in range(begin, end):
             if not active[m] or (m > begin and active[m - 1] and image[m] == image[m - 1]):
                 continue
-            without[:, :] = H
+            for a in range(4):
+                for b in range(4):
+                    without[a, b] = H[a, b]
             for k in range(m, end):
                 if image[k] != image[m]:
                     break

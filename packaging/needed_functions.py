@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Record which compiled functions the commands call: src/groma/compilation/needed.json.
+
+    python packaging/needed_functions.py
+
+Each kind of work is done on a small instance, in a process of its own that compiles nothing (another has done so
+before), and the cache is asked what was called. Run it after a function that Python calls was added or renamed, or
+takes other arguments; tests/cli/test_first_run.py notices.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from groma import _numba_cache
+from groma.cli.main import run
+from groma.compilation.needed import PLACE, Entry, function, read_type
+
+
+def _adjust(folder: Path) -> None:
+    from groma.io import write_scene
+    from groma.scene import synthetic
+
+    write_scene(synthetic.holistic(8, seed=1).start, folder / "start.npz")
+    run(["adjust", str(folder / "start.npz"), "-o", str(folder / "out"), "--quiet"])
+
+
+def _map(folder: Path) -> None:
+
+    run(["demo", "-o", str(folder / "demo"), "--quiet"])
+
+
+def _track(folder: Path) -> None:
+    from groma.compilation.runs import RUNS
+
+    for _, step in RUNS["track"]():
+        step()
+
+
+def _selfcheck(folder: Path) -> None:
+
+    run(["selfcheck", "--quiet"])
+
+
+#: Work that is known, and small instances of it.
+WORK: dict[str, Callable[[Path], None]] = {
+    "adjust": _adjust,
+    "map": _map,
+    "track": _track,
+    "selfcheck": _selfcheck,
+}
+
+
+def _is_readable(kind: Any) -> bool:
+    try:
+        return bool(read_type(repr(kind)) == kind)
+    except Exception:
+        return False
+
+
+def record(work: str) -> list[Entry]:
+    """Do some work and return what it called; in a process that compiles nothing and has done nothing before."""
+    with tempfile.TemporaryDirectory() as folder:
+        WORK[work](Path(folder))
+    if _numba_cache.counts.compiled:
+        raise RuntimeError(f"Functions had to be compiled, which others than Python call; record {work!r} once more.")
+    used = _numba_cache.used_functions()
+    own = [entry for entry in used if entry[0].startswith("groma.") and function(*entry[:2]) is not None]
+    return [entry for entry in own if all(map(_is_readable, entry[2]))]
+
+
+def _listed(entries: dict[str, list[Entry]]) -> dict[str, Any]:
+    """Return what is written, with modules and types by number."""
+    modules = sorted({module for found in entries.values() for module, _, _ in found})
+    kinds = sorted({repr(kind) for found in entries.values() for _, _, chosen in found for kind in chosen})
+    rows = {
+        work: [[modules.index(module), name, [kinds.index(repr(kind)) for kind in chosen]]
+               for module, name, chosen in found]
+        for work, found in entries.items()
+    }  # fmt: skip
+    return {"modules": modules, "types": kinds, "work": rows}
+
+
+def _record_elsewhere(work: str) -> list[Entry]:
+    """Record some work in a process of its own, after another has compiled it."""
+    call = [sys.executable, "-W", "ignore", __file__, work]
+    subprocess.run(call, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    said = json.loads(subprocess.run(call, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+    return [(module, name, tuple(map(read_type, kinds))) for module, name, kinds in said]
+
+
+def main() -> None:
+    """Record everything, or only say what one kind of work calls."""
+    if len(sys.argv) > 1:
+        found = [(module, name, [repr(kind) for kind in kinds]) for module, name, kinds in record(sys.argv[1])]
+        print(json.dumps(found))
+        return
+    listed = _listed({work: _record_elsewhere(work) for work in WORK})
+    PLACE.write_text(json.dumps(listed, separators=(",", ":")).replace("]],", "]],\n") + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Compile what a command needs in processes beside it, while it goes on.
+
+A command says what kind of work it does. Nothing happens until it has to compile: then as many processes as there are
+cores go through the list of what such work calls (:mod:`groma.compilation.needed`), in the order in which it is called,
+and leave out what is there or is being compiled (:mod:`groma._numba_turns`). The command finds the functions on disk
+when it gets to them, or waits for the process that is at it. The processes end with the command.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from importlib import import_module
+
+from groma import _numba_cache
+
+#: How many processes, if the user says so; 0 for none.
+VARIABLE = "GROMA_COMPILE_PROCESSES"
+_MOST = 8
+
+
+class Ahead:
+    """The processes beside a command; they start when it has missed more functions than it has found."""
+
+    def __init__(self, work: str, announce: Callable[[], None], threads: int | None = None) -> None:
+        self._work, self._announce, self._threads = work, announce, threads
+        self._running: list[subprocess.Popen[bytes]] = []
+        self._is_started = False
+
+    def __call__(self, counts: _numba_cache.Counts) -> None:
+        """Hear that a function is missing."""
+        if self._is_started or counts.missed <= counts.loaded:
+            return
+        self._is_started = True
+        self._announce()
+        for _ in range(_count(self._threads)):
+            self._start()
+
+    def _start(self) -> None:
+        call = [sys.executable, "-W", "ignore", "-m", "groma.compilation.ahead", self._work]
+        quiet = subprocess.DEVNULL
+        try:
+            self._running.append(subprocess.Popen(call, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet))
+        except OSError:
+            pass  # the command compiles alone
+
+    def stop(self) -> None:
+        """End the processes: what they wait for is the end of their input."""
+        for process in self._running:
+            if process.stdin is not None:
+                process.stdin.close()
+        for process in self._running:
+            process.wait()
+        self._running.clear()
+
+
+def expect(work: str, announce: Callable[[], None], threads: int | None = None) -> None:
+    """Let processes help with what some work needs, if it comes to that; ``announce`` is called then."""
+    _numba_cache.on_miss[:] = [Ahead(work, announce, threads)]
+
+
+def end() -> None:
+    """End the processes; nothing more is expected."""
+    for ahead in _numba_cache.on_miss:
+        if isinstance(ahead, Ahead):
+            ahead.stop()
+    _numba_cache.on_miss.clear()
+
+
+def _count(threads: int | None) -> int:
+    """Return how many processes are worth starting."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    wanted = min(usable, threads or usable, _MOST)
+    said = os.environ.get(VARIABLE, "")
+    return int(said) if said.isdigit() else wanted if wanted > 1 else 0
+
+
+def _end_with_the_command() -> None:
+    """End at once when the input does, but not in the middle of a file."""
+    sys.stdin.buffer.read()
+    with _numba_cache.writing:
+        os._exit(0)
+
+
+def compile_ahead(work: str) -> None:
+    """Compile what some work calls, other than what is there or is being compiled."""
+    from numba.core.registry import cpu_target
+
+    from groma.compilation.needed import IMPORTS, function, needed
+
+    if work in IMPORTS:
+        import_module(IMPORTS[work])
+    for module, name, kinds in needed(work):
+        compiled = function(module, name)
+        if compiled is not None and not compiled._cache.is_there(kinds, cpu_target.target_context):
+            with suppress(Exception):  # what the list is wrong about is compiled when it is called, or not
+                compiled.compile(kinds)
+
+
+if __name__ == "__main__":
+    threading.Thread(target=_end_with_the_command, daemon=True).start()
+    compile_ahead(sys.argv[1])

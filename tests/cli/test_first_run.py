@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The first run of a command: what it needs is known, processes beside it compile that, and it says so once."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import pytest
+
+import groma
+from groma._numba_cache import Counts
+from groma.cli.main import run
+from groma.compilation import ahead, needed
+from groma.scene import synthetic
+
+RECORDER = Path(__file__).resolve().parents[2] / "packaging" / "needed_functions.py"
+pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
+
+
+@pytest.mark.parametrize("work", needed.works())
+def test_what_is_listed_exists(work):
+    """After a function was renamed, or its arguments changed: python packaging/needed_functions.py."""
+    entries = needed.needed(work)
+    assert work in needed.IMPORTS
+    assert len(entries) > 30
+    for module, name, kinds in entries:
+        compiled = needed.function(module, name)
+        assert compiled is not None, f"{module}.{name}"
+        assert compiled.py_func.__code__.co_argcount == len(kinds), f"{module}.{name}"
+
+
+def test_the_list_is_what_an_adjustment_calls():
+    """Most of it: what is not listed is compiled when it is called."""
+    call = [sys.executable, "-W", "ignore", RECORDER, "adjust"]
+    said = subprocess.run(call, capture_output=True, text=True)
+    if said.returncode:  # it had to compile
+        said = subprocess.run(call, capture_output=True, text=True, check=True)
+    called = {(module, name, tuple(kinds)) for module, name, kinds in json.loads(said.stdout.splitlines()[-1])}
+    listed = {(module, name, tuple(map(repr, kinds))) for module, name, kinds in needed.needed("adjust")}
+    assert len(called & listed) >= 0.9 * len(listed)
+    assert len(called & listed) >= 0.9 * len([entry for entry in called if "_all" in entry[1]])
+
+
+def test_types_are_read_as_numba_writes_them():
+    kinds = [
+        numba.float64[:, ::1],
+        numba.types.UniTuple(numba.int64, 3),
+        numba.boolean,
+        numba.int32[:],
+        numba.types.none,
+    ]
+    assert [needed.read_type(repr(kind)) for kind in kinds] == kinds
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """Processes that would be started."""
+    calls = []
+    monkeypatch.setattr(ahead.Ahead, "_start", lambda self: calls.append(self._work))
+    monkeypatch.setenv(ahead.VARIABLE, "3")
+    return calls
+
+
+def test_processes_start_once_more_is_missing_than_there(started):
+    said = []
+    expected = ahead.Ahead("adjust", lambda: said.append("compiling"))
+    expected(Counts(missed=1, loaded=5))
+    assert not said and not started
+    expected(Counts(missed=6, loaded=5))
+    expected(Counts(missed=7, loaded=5))
+    assert said == ["compiling"] and started == ["adjust"] * 3
+
+
+@pytest.mark.parametrize(("threads", "count"), [(1, 0), (2, 2), (None, 2), (5, 2)])
+def test_as_many_processes_as_cores(monkeypatch, threads, count):
+    monkeypatch.delenv(ahead.VARIABLE, raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    assert ahead._count(threads) == count
+
+
+def test_nothing_is_said_before_arguments_are_checked(tmp_path, capsys, started):
+    assert run(["localize", str(tmp_path / "nowhere"), str(tmp_path), "-o", str(tmp_path / "out")]) == 1
+    assert run(["adjust", str(tmp_path / "nowhere.npz")]) == 1
+    assert "compiling" not in capsys.readouterr().out
+    assert not started
+
+
+COMPILE_AHEAD = """
+import sys
+from pathlib import Path
+from groma._numba_cache import counts
+from groma.compilation import needed
+from groma.compilation.ahead import compile_ahead
+needed.PLACE = Path(sys.argv[1])
+compile_ahead("few")
+print(counts.compiled)
+"""
+
+
+def test_what_is_listed_is_compiled_once(tmp_path):
+    module, name, kinds = next(entry for entry in needed.needed("adjust") if entry[0] == "groma.problem.sorting")
+    listed = {"modules": [module], "types": list(map(repr, kinds))}
+    listed["work"] = {"few": [[0, "a_function_of_before", []], [0, name, list(range(len(kinds)))]]}
+    (tmp_path / "needed.json").write_text(json.dumps(listed))
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    call = [sys.executable, "-c", COMPILE_AHEAD, str(tmp_path / "needed.json")]
+    found = [subprocess.run(call, capture_output=True, text=True, check=True, env=environment) for _ in range(2)]
+    assert int(found[0].stdout) >= 1
+    assert int(found[1].stdout) == 0
+
+
+@pytest.mark.slow
+def test_a_first_adjustment_is_compiled_by_several_processes(tmp_path):
+    """The result is that of one process, and no unfinished file stays behind."""
+    groma.write_scene(synthetic.holistic(4, seed=2).start.points_only(), tmp_path / "start.npz")
+    results = []
+    for count in ("0", "2"):
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / count), ahead.VARIABLE: count}
+        call = [sys.executable, "-m", "groma", "adjust", "start.npz", "-o", f"{count}.npz", "--max-iterations", "3"]
+        said = subprocess.run(call, capture_output=True, text=True, check=True, env=environment, cwd=tmp_path)
+        assert said.stdout.count("First run: compiling") == 1
+        results.append(groma.read_scene(tmp_path / f"{count}.npz"))
+        assert not list((tmp_path / count).rglob("*.tmp"))
+    assert results[0].cam_from_world.tobytes() == results[1].cam_from_world.tobytes()
