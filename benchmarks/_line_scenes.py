@@ -137,6 +137,15 @@ SCENES: dict[str, Callable[[Path], LineScene]] = {
     "boxes-held-many": lambda data: boxes(
         "boxes-held-many", BoxSettings(seed=404, num_images=48, texture=10.0, width=640, height=480, focal=560.0)
     ),
+    "boxes-round": lambda data: boxes(
+        "boxes-round", BoxSettings(seed=621, num_boxes=5, num_round=9, num_images=36, texture=6.0)
+    ),
+    "boxes-round-small": lambda data: boxes(
+        "boxes-round-small", BoxSettings(seed=622, num_boxes=4, num_round=9, width=640, height=480, focal=560.0)
+    ),
+    "boxes-round-random": lambda data: boxes(
+        "boxes-round-random", BoxSettings(seed=623, num_boxes=4, num_round=9, texture=10.0, cameras="random")
+    ),
     "pavilion": lambda data: pavilion("pavilion", data / "pavilion_chair"),
     "fountain": lambda data: strecha("fountain", data / "strecha_fountain_p11"),
     "herz-jesus": lambda data: strecha("herz-jesus", data / "strecha_herz_jesus_p8"),

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Rendered rooms of boxes whose edges are known exactly.
+"""Rendered rooms of boxes and round bodies whose edges are known exactly.
 
 A world is a list of convex polygons with a grey value each. Seen from a camera, whether a pixel's ray hits a polygon
 and at what depth depends on the pixel through linear functions only, so a picture is a few dozen array operations.
+
+Round bodies are cylinders, frusta of cones and ellipsoids. Their rims are edges; their contours are none.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from groma.scene import Cameras, PointObservations, Points, Scene
 PLACES = 200
 #: Half the side of the floor, scene units.
 FLOOR = 3.0
+#: Straight pieces of a rim.
+RIM = 64
 BACKGROUND = 30.0
 #: Rays per pixel, in either direction.
 SAMPLES = 3
@@ -34,6 +38,8 @@ class BoxSettings:
     height: int = 720
     focal: float = 850.0
     num_boxes: int = 8
+    #: Cylinders, cones and ellipsoids, in turn.
+    num_round: int = 0
     #: Standard deviation of the blotches on the faces, grey values.
     texture: float = 0.0
     #: Samples along a face's side of the pattern of blotches: more make them smaller.
@@ -57,10 +63,21 @@ class RenderedScene:
 
 
 @dataclass(frozen=True, eq=False)
+class _Round:
+    """A body that an affine map makes of x^2 + y^2 <= (1 - taper z)^2, 0 <= z <= 1, or of the unit ball."""
+
+    world_from_body: np.ndarray
+    #: None for the ball.
+    taper: float | None
+    shade: float
+
+
+@dataclass(frozen=True, eq=False)
 class _World:
     polygons: list[np.ndarray]
     shades: list[float]
     edges: np.ndarray
+    rounds: list[_Round]
 
 
 def render_boxes(settings: BoxSettings) -> RenderedScene:
@@ -104,7 +121,35 @@ def _boxes(settings: BoxSettings, rng: np.random.Generator) -> _World:
         polygons += [box[list(side)] for side in sides]
         shades += rng.permutation([50.0, 80, 150, 180, 210, 240]).tolist()
         edges += [box[list(pair)] for pair in pairs]
-    return _World(polygons, shades, np.array(edges))
+    rounds: list[_Round] = []
+    while len(rounds) < settings.num_round:
+        radius, height = rng.uniform(0.06, 0.3), rng.uniform(0.25, 0.9)
+        center = np.append(rng.uniform(-1.6, 1.6, 2), 0.0)
+        if any(np.linalg.norm((center - other)[:2]) < radius + far + 0.03 for other, far in placed):
+            continue
+        placed.append((center, radius))
+        ball = len(rounds) % 3 == 2
+        body = _Round(
+            np.column_stack([np.diag([radius, radius, height / 2 if ball else height]), center]),
+            None if ball else (0.0, 0.5)[len(rounds) % 3],
+            float(rng.choice([60.0, 90, 170, 200, 230])),
+        )
+        if ball:
+            body.world_from_body[2, 3] = height / 2
+        rounds.append(body)
+        edges += _rims(body)
+    return _World(polygons, shades, np.array(edges), rounds)
+
+
+def _rims(body: _Round) -> list[np.ndarray]:
+    """Straight pieces (2, 3) of the rims of a body."""
+    if body.taper is None:
+        return []
+    around = 2 * np.pi * np.arange(RIM + 1) / RIM
+    circle = np.column_stack([np.cos(around), np.sin(around)])
+    rims = [np.column_stack([circle * (1.0 - body.taper * z), np.full(RIM + 1, z)]) for z in (0.0, 1.0)]
+    places = [rim @ body.world_from_body[:, :3].T + body.world_from_body[:, 3] for rim in rims]
+    return [rim[[k, k + 1]] for rim in places for k in range(RIM)]
 
 
 def _ring(settings: BoxSettings, rng: np.random.Generator) -> np.ndarray:
@@ -192,9 +237,57 @@ def _picture(world, pose, camera, settings, blotches, rng) -> np.ndarray:
             value = value + np.float32(settings.texture) * cv2.remap(blotches[k], s, t, cv2.INTER_LINEAR)
         nearest[rows, columns] = np.where(hit, inverse, nearest[rows, columns])
         grey[rows, columns] = np.where(hit, value, grey[rows, columns])
+    for body in world.rounds:
+        columns, rows = _frame_of(body, pose, x, y)
+        rays = np.stack([*np.meshgrid(x[columns], y[rows]), np.ones((len(y[rows]), len(x[columns])))], axis=-1)
+        inverse, hit, normal = _round_hit(body, pose, rays)
+        hit &= inverse > np.maximum(nearest[rows, columns], 1e-9)
+        value = body.shade * (0.65 + 0.35 * (normal @ np.array([0.48, 0.36, 0.8])))
+        nearest[rows, columns] = np.where(hit, inverse, nearest[rows, columns])
+        grey[rows, columns] = np.where(hit, value, grey[rows, columns])
     small = grey.reshape(settings.height, SAMPLES, settings.width, SAMPLES).mean((1, 3))
     blurred = cv2.GaussianBlur(small, (0, 0), settings.blur) if settings.blur else small
     return np.clip(blurred + rng.normal(0, settings.noise, small.shape), 0, 255).astype(np.uint8)
+
+
+# -------------------------------------------------------------------------------------------------------- round bodies
+def _frame_of(body: _Round, pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[slice, slice]:
+    """Columns and rows of a picture in which a body lies."""
+    low = -1.0 if body.taper is None else 0.0
+    corners = np.array([[a, b, c, 1.0] for a in (-1, 1) for b in (-1, 1) for c in (low, 1)])
+    local = corners @ body.world_from_body.T @ quaternion.to_matrix(pose[None, :4])[0].T + pose[4:]
+    if local[:, 2].min() < 1e-3:
+        return slice(None), slice(None)
+    near = local[:, :2] / local[:, 2:]
+    limits = [slice(*np.searchsorted(axis, [v.min(), v.max()])) for axis, v in zip((x, y), near.T, strict=True)]
+    return limits[0], limits[1]
+
+
+def _round_hit(body: _Round, pose: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Inverse depth along rays (..., 3) in the camera frame to a body, whether they hit it, and its normals there."""
+    R = quaternion.to_matrix(pose[None, :4])[0]
+    body_from_world = np.linalg.inv(body.world_from_body[:, :3])
+    o, d = body_from_world @ (-R.T @ pose[4:] - body.world_from_body[:, 3]), rays @ R @ body_from_world.T
+    flat, taper = np.array([1.0, 1.0, 1.0 if body.taper is None else 0.0]), body.taper or 0.0
+    a = (d**2 @ flat) - (taper * d[..., 2]) ** 2
+    b = (d * o) @ flat + taper * d[..., 2] * (1.0 - taper * o[2])
+    c = o**2 @ flat - (1.0 - taper * o[2]) ** 2
+    root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (-b - root) / a
+        place = o + depth[..., None] * d
+        hit = (b * b > a * c) & (depth > 1e-6)
+        outward = place * flat + np.array([0, 0, 1.0]) * (taper * (1.0 - taper * place[..., 2:]))
+        if body.taper is not None:
+            hit &= (place[..., 2] > 0.0) & (place[..., 2] < 1.0)
+            top = (1.0 - o[2]) / d[..., 2]
+            over = (((o + top[..., None] * d)[..., :2] ** 2).sum(-1) < (1.0 - taper) ** 2) & (top > 1e-6)
+            over &= ~hit | (top < depth)
+            depth, hit = np.where(over, top, depth), hit | over
+            outward = np.where(over[..., None], [0, 0, 1.0], outward)
+        normal = outward @ body_from_world
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        return np.where(hit, 1.0 / depth, 0.0), hit, np.nan_to_num(normal)
 
 
 # ---------------------------------------------------------------------------------------------------------- visibility
@@ -209,18 +302,22 @@ def _seen(world, places, pose, camera, settings) -> tuple[np.ndarray, np.ndarray
     for polygon in world.polygons:
         inverse, hit = _inside(polygon @ R.T + pose[4:], rays, 1e-6)
         seen &= ~(hit & (inverse * local[:, 2] > 1.0 + 1e-5))
+    for body in world.rounds:
+        inverse, hit, _ = _round_hit(body, pose, rays)
+        seen &= ~(hit & (inverse * local[:, 2] > 1.0 + 1e-3))
     return pixel, seen
 
 
 def _visible(world: _World, poses: np.ndarray, camera: np.ndarray, settings: BoxSettings) -> np.ndarray:
     """Pieces of the edges that at least two images see."""
-    share = (np.arange(PLACES) + 0.5) / PLACES
+    number = PLACES if not world.rounds else PLACES // 5
+    share = (np.arange(number) + 0.5) / number
     places = world.edges[:, None, 0] + share[None, :, None] * (world.edges[:, 1] - world.edges[:, 0])[:, None]
     count = sum(_seen(world, places.reshape(-1, 3), pose, camera, settings)[1].astype(int) for pose in poses)
     pieces = []
-    for edge, seen in zip(world.edges, (np.asarray(count) >= 2).reshape(-1, PLACES), strict=True):
+    for edge, seen in zip(world.edges, (np.asarray(count) >= 2).reshape(-1, number), strict=True):
         steps = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(int)))
-        for begin, end in steps.reshape(-1, 2) / PLACES:
+        for begin, end in steps.reshape(-1, 2) / number:
             pieces.append([edge[0] + t * (edge[1] - edge[0]) for t in (begin, end)])
     return np.array(pieces)
 
@@ -231,6 +328,14 @@ def _points(world, poses, camera, settings, rng) -> tuple[Points, PointObservati
     for k, polygon in enumerate(world.polygons):
         s, t = rng.uniform(0.08, 0.92, (2, 300 if k == 0 else 25, 1))
         xyz.append(polygon[0] + s * (polygon[1] - polygon[0]) + t * (polygon[-1] - polygon[0]))
+    for body in world.rounds:
+        if body.taper is None:
+            unit = rng.normal(size=(40, 3))
+            unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        else:
+            around, z = rng.uniform(0, 2 * np.pi, 40), rng.uniform(0.05, 0.95, 40)
+            unit = np.column_stack([*((1.0 - body.taper * z) * [np.cos(around), np.sin(around)]), z])
+        xyz.append(unit @ body.world_from_body[:, :3].T + body.world_from_body[:, 3])
     xyz = np.concatenate(xyz)
     table = []
     for i, pose in enumerate(poses):

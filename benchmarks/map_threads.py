@@ -38,12 +38,13 @@ def run(images, model, threads):
 
     mark("imports")
     from groma.cli.app import app  # noqa: F401 - the command line is part of every run
+    from groma.execution import work_with
     from groma.io import read_scene
     from groma.mapping.map import MapOptions, map_images
 
     mark("reading the model")
     scene = read_scene(model)
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, work_with(threads):
         result = map_images(images, Path(folder) / "work", scene, MapOptions(threads=threads), mark)
         mark("diagnosis and uncertainty")
         summary = result.summary(result.diagnose())
@@ -54,12 +55,16 @@ def run(images, model, threads):
     return {"marks": marks, "peak": peak, "lines": result.scene.num_lines}
 
 
-def watched(command):
-    """Run a command; return what it printed, and how many of its threads could run: times and numbers."""
+def watched(command, bytecode):
+    """Run a command; return what it printed, and how many of its threads could run: times and numbers.
+
+    Bytecode, which an installation brings along, is kept in a folder.
+    """
     times, numbers = [], []
     limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    kept = {"PYTHONPYCACHEPREFIX": bytecode, "PYTHONDONTWRITEBYTECODE": ""}
     with tempfile.TemporaryFile("w+") as said:
-        process = subprocess.Popen(command, stdout=said, env=os.environ | limits)
+        process = subprocess.Popen(command, stdout=said, env=os.environ | limits | kept)
         tasks = Path(f"/proc/{process.pid}/task")
         while process.poll() is None:
             times.append(time.monotonic())
@@ -115,12 +120,13 @@ def main():
         print(json.dumps(run(arguments.images, arguments.model, arguments.row)))
         return
     command = [sys.executable, __file__, arguments.images, "--model", arguments.model, "--row"]
-    watched([*command, "2"])
     rounds = {1: [], 2: []}
-    for _ in range(arguments.rounds):
-        for threads, runs in rounds.items():
-            found, times, numbers = watched([*command, str(threads)])
-            runs.append((stages_of(found, times, numbers), found))
+    with tempfile.TemporaryDirectory() as bytecode:
+        watched([*command, "2"], bytecode)
+        for _ in range(arguments.rounds):
+            for threads, runs in rounds.items():
+                found, times, numbers = watched([*command, str(threads)], bytecode)
+                runs.append((stages_of(found, times, numbers), found))
     print(f"{'stage':28s} {'CPU 1':>7} {'wall 1':>7} {'CPU 2':>7} {'wall 2':>7} {'serial':>7} {'share':>6}")
     table = {
         stage: [

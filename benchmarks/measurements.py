@@ -26,7 +26,8 @@ from scipy.stats import norm
 
 import groma
 from groma.adjustment.survey.attach import Survey
-from groma.adjustment.survey.reliability import GATES, reliability
+from groma.adjustment.survey.records import GATES
+from groma.adjustment.survey.reliability import reliability
 from groma.geometry import quaternion
 from groma.io import read_scene
 from groma.io.survey import CoordinateSystem, Places

@@ -43,7 +43,8 @@ if TYPE_CHECKING:
     from groma.adjustment.report import AdjustResult
     from groma.adjustment.survey.align import Alignment, align
     from groma.adjustment.survey.attach import Survey
-    from groma.adjustment.survey.reliability import Reliability, reliability
+    from groma.adjustment.survey.records import Reliability
+    from groma.adjustment.survey.reliability import reliability
     from groma.adjustment.uncertainty import uncertainty
     from groma.compilation.warmup import warm_up
     from groma.errors import FileFormatError, GromaError, InputError, OutputError, ProblemError, ShapeError
@@ -115,7 +116,7 @@ _HOME = {
     "ProblemError": "groma.errors",
     "QueryCamera": "groma.localization.pose.camera",
     "Ref": "groma.factors.contract",
-    "Reliability": "groma.adjustment.survey.reliability",
+    "Reliability": "groma.adjustment.survey.records",
     "Scene": "groma.scene",
     "ShapeError": "groma.errors",
     "Similarity": "groma.scene",

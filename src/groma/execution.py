@@ -171,12 +171,41 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Sequence[_Item])
         return map_work(function, items)
 
 
+def together(*functions: Callable[[], Any]) -> tuple[Any, ...]:
+    """Return what some functions return, which are called in threads of this process."""
+    return tuple(map_in_threads(_called, functions))
+
+
+@contextmanager
+def beside(function: Callable[[], object]) -> Iterator[None]:
+    """Call a function in a thread of this process while the block goes on; without workers, when it has ended.
+
+    What it raises is raised at the end of the block, unless the block itself has raised.
+    """
+    crew = _CREW.get()
+    executor = None if crew is None else crew.here.executor
+    if executor is None:
+        yield
+        function()
+        return
+    future = executor.submit(function)
+    try:
+        yield
+    finally:
+        wait([future])
+    future.result()
+
+
 def map_ranges(function: Callable[[slice], Any], count: int, size: int) -> None:
     """Call a function that writes into arrays with slices of ``size`` rows that cover ``count``, in threads.
 
     The rows of a slice must depend on no other row.
     """
     map_in_threads(function, [slice(first, min(first + size, count)) for first in range(0, count, size)])
+
+
+def _called(function: Callable[[], _Result]) -> _Result:
+    return function()
 
 
 def _each(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
@@ -215,10 +244,12 @@ def _num_workers(executor: Any) -> int:
 
 __all__ = [
     "available_cores",
+    "beside",
     "map_in_threads",
     "map_ranges",
     "map_work",
     "num_threads",
     "num_workers",
+    "together",
     "work_with",
 ]

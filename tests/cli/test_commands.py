@@ -157,7 +157,7 @@ def test_a_map_is_diagnosed_at_its_own_noise(scenes):
     weakness = []
     for sigma in (20.0, 10.0):
         told = AdjustOptions(point_sigma_px=sigma, line_sigma_px=sigma)
-        result: Any = SimpleNamespace(scene=scene, adjusted_with=told)
+        result: Any = SimpleNamespace(num_photographs=0, scene=scene, adjusted_with=told)
         weakness.append(MapResult.diagnose(result).weakness["points"])
     # The loss, which is twelve times as wide as the noise, takes hardly anything off residuals of half a pixel.
     np.testing.assert_allclose(weakness[0], 2 * weakness[1], rtol=1e-3)

@@ -81,6 +81,17 @@ def test_adjust_with_everything(folder, tmp_path, capsys, monkeypatch):
     np.testing.assert_allclose(read_scene("again.npz").cam_centers_in_world, scene.cam_centers_in_world, atol=1e-3)
 
 
+def test_accuracies_that_are_too_good_are_told(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rows = [line.split()[:4] for line in (folder / "positions.txt").read_text().splitlines()]
+    (tmp_path / "good.txt").write_text("\n".join(" ".join([*row, "0.001"]) for row in rows))
+    assert run(["adjust", f"{folder}/scene.npz", "-o", "out.npz", "--positions", "good.txt", "--json", "r.json"]) == 0
+    told = json.loads((tmp_path / "r.json").read_text())["survey"]
+    assert told["variance_components"]["camera position"] > 4.0
+    error = capsys.readouterr().err
+    assert "camera positions are" in error and "times as large" in error and "Probably wrong" not in error
+
+
 def test_align(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     truth = read_scene(folder / "truth.npz")

@@ -25,15 +25,18 @@ import test_bundler
 import test_nvm
 import test_openmvg
 import test_opensfm
+import test_survey_files
 import test_transforms
 from _models import rig_scene
 from _mutations import gzip_stored
 from _views import views
 
+from groma.adjustment.survey.attach import Survey, with_survey
 from groma.features.external import read_matches
 from groma.io import read_g2o, read_scene, read_trajectory, structures_of, write_archive, write_colmap, write_scene
 from groma.io.reference import holds_scene, read_line3dpp, read_reference
 from groma.io.sequences import open_sequence
+from groma.io.survey import read_control, read_distances, read_exif_positions, read_positions
 from groma.mapping.checkpoint_files import LINE_MAP, SEGMENTS
 from groma.mapping.photographs import read_gray
 from groma.scene import Scene, synthetic
@@ -78,6 +81,7 @@ def _all(home: Path) -> Iterator[_Made]:
     yield from _sequences()
     yield from _images()
     yield from _interchange()
+    yield from _surveys()
 
 
 def _one(read: Callable[[Path], object], name: str) -> Callable[[Path], object]:
@@ -335,6 +339,50 @@ def _interchange() -> Iterator[_Made]:
         document = json.dumps({**said, "ply_file_path": "a.ply", "frames": frames}, indent=1).encode()
         images = {f"images/{name}": content for name, content in photographs.items()}
         yield name, {"transforms.json": document, "a.ply": PLY, **images}, _transforms
+
+
+def _surveys() -> Iterator[_Made]:
+    """Yield files of measurements, attached to a scene where they can be read."""
+    scene = synthetic.holistic(4, seed=1).truth.points_only()
+    centers = scene.cam_centers_in_world
+    lines = [f"{n} {x:.4f} {y:.4f} {z:.4f} 0.1" for n, (x, y, z) in zip(scene.images.names, centers, strict=True)]
+    listed, header = "\n".join(lines).encode(), b"name x y z sigma\n"
+    row, xyz = scene.point_observations, scene.points.xyz
+    marks = [
+        f"{x:.3f} {y:.3f} {z:.3f} {u:.2f} {v:.2f} {scene.images.names[image]} p{point}"
+        for image, point, (u, v) in zip(row.image_idx, row.point_idx, row.pixel, strict=True)
+        if point < 5 for x, y, z in [xyz[point]]
+    ]  # fmt: skip
+    width, height = scene.cameras.width[0], scene.cameras.height[0]
+    points = []
+    for point in range(5):
+        rows = np.flatnonzero(row.point_idx == point)
+        shots = [scene.images.names[image] for image in row.image_idx[rows]]
+        places = ((row.pixel[rows] - [width / 2, height / 2]) / max(width, height)).tolist()
+        x, y, z = xyz[point]
+        at = {"latitude": 52.5 + y / 111_270, "longitude": 13.4 + x / 67_880, "altitude": z}
+        seen = [{"shot_id": shot, "projection": place} for shot, place in zip(shots, places, strict=True)]
+        points.append({"id": str(point), "position": at, "observations": seen})
+
+    def attached(**files: str) -> Callable[[Path], object]:
+        def read(folder: Path) -> object:
+            given = {kind: _SURVEYS[kind](folder / name) for kind, name in files.items()}
+            survey = Survey(**given, position_sigma=(1.0,), control_sigma=(1.0,), distance_sigma=1.0)
+            return with_survey(scene, survey).scene
+
+        return read
+
+    yield "positions", {"positions.csv": header + listed}, attached(positions="positions.csv")
+    yield "geo", {"geo.txt": b"EPSG:32633\n" + listed}, attached(positions="geo.txt")
+    gcp = ("local\n" + "\n".join(marks)).encode()
+    bars = b"p0 p1 1.5 0.01\n" + f"{scene.images.names[0]},{scene.images.names[1]},2.0".encode()
+    yield "control", {"gcp_list.txt": gcp, "bars.csv": bars}, attached(control="gcp_list.txt", distances="bars.csv")
+    yield "ground control", {"gcp.json": json.dumps({"points": points}).encode()}, attached(control="gcp.json")
+    photo = test_survey_files.jpeg_with_position("<", 52.5, 13.4, 99.0)
+    yield "exif", {"a.jpg": photo}, lambda folder: read_exif_positions(folder, ["a.jpg"])
+
+
+_SURVEYS = {"positions": read_positions, "control": read_control, "distances": read_distances}
 
 
 def _transforms(folder: Path) -> Scene:

@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Models of points: which of several in a folder is read, and a reconstruction that needs a second try."""
 
+from itertools import combinations
+
+import numpy as np
 import pytest
 
 from groma.errors import InputError
 from groma.io import read_colmap, to_pycolmap, write_colmap
+from groma.io.colmap import mappers
 from groma.io.colmap import sfm as colmap_sfm
-from groma.io.colmap.sfm import FIRST_PAIR_ANGLES, PointModelOptions, reconstruct_points
+from groma.io.colmap.pairs import blocks_of_pairs, pair_blocks
+from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
 from groma.scene.synthetic.scenes import holistic
 
 
@@ -24,24 +29,55 @@ def test_of_several_models_the_one_with_most_images_is_read(tmp_path, form):
 @pytest.fixture
 def without_images(monkeypatch):
     """Reconstruction whose features and matches are those already in the database: none."""
-    for name in ("_enter_images", "_find_features", "_match"):
+    for name in ("_enter_images", "_find_features", "_match", "places_by_gps"):
         monkeypatch.setattr(colmap_sfm, name, lambda *arguments: None)
 
 
 def test_a_first_pair_of_narrow_angle_is_the_second_try(tmp_path, monkeypatch, without_images):
     scene, tried = holistic(6, seed=0).start.points_only(), []
 
-    def reconstruct(*arguments):
-        tried.append(arguments[6])
-        return [to_pycolmap(scene)] if arguments[6] == FIRST_PAIR_ANGLES[-1] else []
+    def reconstruct(task, options, say):
+        tried.append(options.mapper.init_min_tri_angle)
+        return [to_pycolmap(scene)] if tried[-1] == mappers.GATES.first_angles[-1] else []
 
-    monkeypatch.setattr(colmap_sfm, "_reconstruct", reconstruct)
+    monkeypatch.setattr(mappers, "_incremental", reconstruct)
     found = reconstruct_points(tmp_path, tmp_path, scene.images.names, PointModelOptions(threads=1))
-    assert found.num_images == 6 and tried == list(FIRST_PAIR_ANGLES)
+    assert found.num_images == 6 and tried == list(mappers.GATES.first_angles)
+
+
+def test_where_few_images_are_placed_the_focal_length_is_held_first(tmp_path, monkeypatch, without_images):
+    scene, held = holistic(6, seed=0).start.points_only(), []
+
+    def reconstruct(task, options, say):
+        held.append(not options.ba_refine_focal_length and not options.mapper.abs_pose_refine_focal_length)
+        return [to_pycolmap(scene if held[-1] else scene.subset([0, 1]))]
+
+    monkeypatch.setattr(mappers, "_incremental", reconstruct)
+    found = reconstruct_points(tmp_path, tmp_path, scene.images.names, PointModelOptions(threads=1))
+    assert found.num_images == 6 and held == [False, True]
+    assert (found.cameras.params[:, 0] != scene.cameras.params[:, 0]).any()  # estimated at the end
+    camera = scene.cameras.params_of(0)
+    options = PointModelOptions(scene.cameras.models[0], tuple(camera), threads=1)
+    assert np.array_equal(
+        reconstruct_points(tmp_path, tmp_path, scene.images.names, options).cameras.params, scene.cameras.params
+    )
+    with pytest.raises(InputError, match="one of incremental, global; got 'fast'"):
+        PointModelOptions(mapper="fast")
+
+
+def test_of_many_images_neighbours_in_space_are_matched_too():
+    count = 200
+    places = np.stack([np.arange(count) % 100, np.zeros(count), np.zeros(count)], axis=1)
+    pairs = {pair for block in blocks_of_pairs(count, places.astype(float)) for pair in block}
+    by_name = {pair for block in pair_blocks(count) for pair in block}
+    assert by_name < pairs and (3, 103) in pairs - by_name  # the same place, a hundred images later
+    away = np.where(np.arange(count)[:, None] < 100, [[0.0, 0.0, 1.0]], [[0.0, 0.0, -1.0]])
+    assert (3, 103) not in {pair for block in blocks_of_pairs(count, places.astype(float), away) for pair in block}
+    assert {pair for block in blocks_of_pairs(9) for pair in block} == set(combinations(range(9), 2))
 
 
 def test_what_is_said_without_a_model_depends_on_what_is_missing(tmp_path, monkeypatch, without_images):
-    monkeypatch.setattr(colmap_sfm, "_reconstruct", lambda *arguments: [])
+    monkeypatch.setattr(mappers, "_incremental", lambda *arguments: [])
     with pytest.raises(InputError, match="show no texture"):
         reconstruct_points(tmp_path, tmp_path, ["a.png", "b.png", "c.png"])
     assert "overlap too little" in colmap_sfm._why_none(5000, 200, 9)

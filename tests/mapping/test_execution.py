@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from _wireframe import arc, random_lines, wireframe
 
-from groma.execution import available_cores, map_ranges, map_work, num_workers, work_with
+from groma.execution import available_cores, beside, map_ranges, map_work, num_workers, work_with
 from groma.mapping.lines.build import MapLinesOptions, map_lines
 
 
@@ -66,6 +66,23 @@ def test_few_pieces_wait_at_a_time():
         map_work(work, range(60), progress)
     assert len(started) == 60
     assert taken <= 2 * 2 + 1
+
+
+def test_what_is_done_beside_a_block_goes_on_in_a_thread_and_is_done_when_it_ends():
+    met, done = threading.Barrier(2, timeout=30.0), []
+    with work_with(2), beside(lambda: (met.wait(), done.append("beside"))):
+        met.wait()  # neither gets past it without the other
+    assert done == ["beside"]
+    with work_with(1), beside(lambda: done.append("after")):
+        assert done == ["beside"]
+    assert done == ["beside", "after"]
+    for workers in (1, 2):
+        with work_with(workers):
+            with pytest.raises(ZeroDivisionError), beside(lambda: 1 // 0):
+                done.append("block")
+            with pytest.raises(KeyError, match="block"), beside(lambda: done.append("never lost") or 1 // 0):
+                raise KeyError("block")
+    assert done.count("block") == 2
 
 
 def test_workers_are_those_given_outermost_and_none_inside_a_worker():

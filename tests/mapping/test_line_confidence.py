@@ -1,11 +1,22 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Covers the probability that a line is right: what it is computed from, how it orders lines, where it is kept."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.io.archive import read_archive, write_archive
-from groma.mapping.lines.confidence import WEIGHTS, left_out, line_confidence, line_evidence, with_confidence
+from groma.mapping.lines.confidence import (
+    GATES,
+    WEIGHTS,
+    left_out,
+    line_accuracy,
+    line_confidence,
+    line_evidence,
+    with_confidence,
+)
 from groma.mapping.map import MapOptions
 from groma.scene import Cameras, LineObservations, Lines, Scene, Similarity
 
@@ -48,9 +59,8 @@ def test_evidence_by_hand():
     # Upright lines at depth 10, seen from 1 left and right: viewing planes 2 arctan(0.1) apart.
     ends = [[[0.0, -1, 10], [0, 1, 10]], [[0, -9, 10], [0, 12, 10]]]
     found = columns(scene_of(ends, [[-1.0, 0, 0], [1, 0, 0]], noise=0.0))
-    np.testing.assert_allclose(np.exp(found["images"]), 2.0)
     np.testing.assert_allclose(np.exp(found["spread"]), np.sin(np.arctan(0.1)), rtol=1e-9)
-    np.testing.assert_allclose(np.exp(found["length"]), [100.0, 1050.0], rtol=1e-9)
+    np.testing.assert_allclose(np.exp(found["length"]), np.array([100.0, 1050.0]) / 575.0, rtol=1e-9)
     # Both are seen by all images; the second leaves the frame, so that no image is expected to show it.
     np.testing.assert_allclose(np.exp(found["support"]), [5.0, 5.0])
     fewer = scene_of(ends, [[-1.0, 0, 0], [1, 0, 0], [0, 0, 1]], noise=0.0)
@@ -59,22 +69,49 @@ def test_evidence_by_hand():
     np.testing.assert_allclose(np.exp(support), [2.5 / 1.5, 5.0])
 
 
+def test_residuals_are_told_in_pixels_whatever_the_standard_deviations_say(scene):
+    rms = np.exp(columns(scene)["residual"])
+    # Lines at their true places: twelve residuals count as eight degrees of freedom.
+    assert np.sqrt(np.mean(rms**2)) == pytest.approx(0.3 * np.sqrt(12 / 8), rel=0.15)
+    seen = scene.line_observations
+    doubted = scene.replace(line_observations=seen.replace(sigma=seen.sigma * np.where(seen.line_idx < 20, 4.0, 1.0)))
+    np.testing.assert_allclose(np.exp(columns(doubted)["residual"]), rms, rtol=0.02)
+
+
 def test_evidence_has_no_unit_and_no_frame(scene):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     moved = scene.transformed(Similarity(7.0, turn, np.array([3.0, -2, 5])))
     np.testing.assert_allclose(line_evidence(moved), line_evidence(scene), atol=2e-3)  # a weak prior has a unit
 
 
-def test_uncertainty_is_the_standard_deviation_that_repetitions_have():
-    ends, centers = [[[0.0, -1, 10], [0, 1, 10]]], np.column_stack([np.linspace(-2, 2, 5), np.zeros((5, 2))])
-    stated = np.exp(columns(scene_of(ends, centers, noise=0.5))["uncertainty"])[0]
-    exact = scene_of(ends, centers, noise=0.0)
-    rng, x, depth = np.random.default_rng(1), centers[:, 0], []
-    for _ in range(300):  # upright lines: each end alone is x = f (X - c) / Z, solved for (X / Z, 1 / Z)
-        u = exact.line_observations.segment[:, 0] + rng.normal(0, 0.5, 5) - 500.0
-        b = np.linalg.lstsq(np.column_stack([np.ones(5), -x]), u / FOCAL, rcond=None)[0][1]
-        depth.append(1.0 / b)
-    assert stated * 10.0 == pytest.approx(np.std(depth), rel=0.5)  # the noise itself is estimated from five residuals
+def test_accuracy_is_the_share_of_repetitions_that_are_within_the_tolerance():
+    ends, centers = [[[0.0, -1, 10], [0, 1, 10]]], np.column_stack([np.linspace(-2, 2, 7), np.zeros((7, 2))])
+    gates, x, stated, within = replace(GATES, edge_px=1e9), centers[:, 0], [], []
+    for seed in range(150):  # upright lines: each end alone is x = f (X - c) / Z, solved for (X / Z, 1 / Z)
+        scene = scene_of(ends, centers, noise=0.8, seed=seed)
+        stated.append(line_accuracy(scene, gates)[0])
+        u = scene.line_observations.segment[:, 0] - 500.0
+        b = np.linalg.lstsq(np.column_stack([np.ones(7), -x]), u / FOCAL, rcond=None)[0][1]
+        within.append(abs(1.0 / b - 10.0) < gates.tolerance * 10.0)
+    assert 0.2 < np.mean(within) < 0.8
+    assert np.mean(stated) == pytest.approx(np.mean(within), abs=0.12)  # three deviations of 150 draws
+
+
+def test_contours_of_a_pillar_are_no_edges():
+    # A pillar about the axis x = 0, z = 10 of radius 1; its left contour is where the sight touches it.
+    centers = np.column_stack([np.linspace(-3.5, 3.5, 8), np.zeros((8, 2))])
+    toward = np.array([0.0, 0, 10]) - centers
+    away = np.linalg.norm(toward, axis=1)
+    turn = np.arcsin(1.0 / away)
+    u = FOCAL * np.tan(np.arctan2(toward[:, 0], toward[:, 2]) - turn)
+    edge = scene_of([[[-1.0, -1.5, 10], [-1.0, 1.5, 10]]], centers, noise=0.1)
+    seen = edge.line_observations
+    measured = seen.segment.copy()
+    noise = measured[:, [0, 2]] - (FOCAL * (-1.0 - centers[seen.image_idx, 0]) / 10.0 + 500.0)[:, None]
+    measured[:, [0, 2]] = u[seen.image_idx, None] + 500.0 + noise
+    contour = edge.replace(line_observations=seen.replace(segment=measured))
+    both = [line_confidence(adjust(one, AdjustOptions(refine_poses=False)).scene)[0] for one in (edge, contour)]
+    assert both[0] > 0.95 and both[1] < 0.5
 
 
 def test_good_lines_are_more_probable_than_lines_of_unrelated_segments(scene):
@@ -88,8 +125,8 @@ def test_good_lines_are_more_probable_than_lines_of_unrelated_segments(scene):
     assert ranks[wrong].mean() < 7.0 and np.median(after[10:]) > 5.0 * np.median(after[wrong])
     fewer = line_confidence(scene.keep(line_observations=seen.image_idx < 3))
     assert (fewer < before).mean() > 0.9
-    signs = {name: np.sign(WEIGHTS[name]) for name in ("images", "uncertainty", "misfit", "length")}
-    assert signs == {"images": 1, "uncertainty": -1, "misfit": -1, "length": 1}
+    signs = {name: np.sign(WEIGHTS[name]) for name in ("spread", "support", "length", "residual")}
+    assert signs == {"spread": 1, "support": 1, "length": 1, "residual": -1}
 
 
 def test_kept_in_archives(scene, tmp_path):

@@ -2,6 +2,7 @@
 """From photographs to a map: what is refused, line matches from elsewhere, real photographs, the command."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -44,8 +45,8 @@ def test_bad_input_is_refused_in_one_sentence(tmp_path, model):
     with pytest.raises(InputError, match="has 1 image with a pose"):
         map_images(tmp_path / "empty", tmp_path / "work", model.subset([0]))
     blind = model.replace(points=Points(), point_observations=PointObservations())
-    with pytest.raises(InputError, match="has no points that its images observe"):
-        map_images(tmp_path / "empty", tmp_path / "work", blind)
+    with pytest.raises(InputError, match=r"None of the .* images of the model is in"):
+        map_images(tmp_path / "empty", tmp_path / "work", blind)  # poses alone will do; other photographs will not
     for wrong, said in (("NOPE", r"one of SIMPLE_PINHOLE, .*got 'NOPE'"), ("BAL", "got 'BAL'")):
         with pytest.raises(InputError, match=said):
             PointModelOptions(wrong)
@@ -74,6 +75,10 @@ def test_images_of_one_colour_give_an_explained_empty_map(tmp_path, model, value
     result = map_images(folder, tmp_path / "work", model)
     assert result.scene.num_lines == 0
     assert any("No line was mapped" in sentence for sentence in result.warnings)
+    few = replace(result, num_photographs=29).diagnose()  # most were not placed: that is what the report begins with
+    assert few.sentences[0].startswith("25 of 29 photographs were not placed. All findings are about the other 4.")
+    assert not any("is determined" in sentence for sentence in few.sentences)
+    assert any("is determined" in sentence for sentence in replace(result, num_photographs=5).diagnose().sentences)
 
 
 def test_images_of_one_colour_without_a_model(tmp_path, model):
@@ -217,6 +222,10 @@ def test_the_command_is_one_call(tmp_path, corner, monkeypatch):
             assert ("called" / name).read_bytes() == ("commanded" / name).read_bytes(), name
     ours, theirs = (json.loads((Path(folder) / "summary.json").read_text()) for folder in ("called", "commanded"))
     assert list(ours) == list(theirs) and ours["diagnosis"]["sentences"]
+    known, told = result.scene.lines.confidence, ours["line_confidence"]
+    assert len(known) > 20 and known.min() >= MapOptions().min_confidence == 0.5
+    assert told["expected_right"] == pytest.approx(known.sum())
+    assert told["lines_by_tenth"][:5] == [0] * 5 and sum(told["lines_by_tenth"]) == len(known)
     assert ours["diagnosis"].pop("seconds") and theirs["diagnosis"].pop("seconds")
     assert [name for name in ours if ours[name] != theirs[name]] == ["seconds", "history"]
     with pytest.raises(OutputError, match="exists already"):

@@ -20,6 +20,7 @@ from groma.solver.termination import Termination
 from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.mapper import Mapper
 from groma.tracking.backend.submaps import Joint, Places, joined_map
+from groma.tracking.ending import Ending
 from groma.tracking.frame.features import Features
 from groma.tracking.frame.measurements import Measurements, PointMeasurements
 from groma.tracking.map.landmarks import ALIVE
@@ -196,3 +197,22 @@ def test_maps_are_joined_at_the_end_where_they_saw_the_same_place(monkeypatch):
     assert len(result.trajectory) == sum(row.pose is not None for row in rows)
     truth = Trajectory(np.arange(len(poses)) / 30.0, se3.inverse(poses))
     assert score_trajectory(result.trajectory, truth, max_time_difference=0.001).ate.rmse < 0.02
+
+
+def test_only_the_maps_that_a_step_changes_are_copied():
+    tracker = _tracked(2)
+    mapper = tracker._mapper
+    mapper.maps, ending = [_map(0.0), _map(3.0), _map(-5.0)], Ending(mapper, tracker._history)
+    before, held = list(mapper.maps), [_state(track_map) for track_map in mapper.maps]
+
+    def failing():
+        mapper.maps[1].points.xyz[:] = np.nan
+        mapper.current = 1
+        raise RuntimeError("half done")
+
+    assert ending.attempt("a step", failing, "left out", changes=(1,)) == "left out"
+    assert mapper.current == 0
+    assert [now is was for now, was in zip(mapper.maps, before, strict=True)] == [True, False, True]
+    for was, track_map in zip(held, mapper.maps, strict=True):
+        for one, two in zip(was, _state(track_map), strict=True):
+            np.testing.assert_array_equal(one, two)

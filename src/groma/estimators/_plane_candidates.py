@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -21,7 +22,7 @@ from groma.execution import map_in_threads, num_threads
 from groma.geometry.algebra import dot, norm
 
 #: Pairs looked at together.
-_CHUNK = 16384
+_CHUNK = 4096
 #: Candidates that are worth a thread.
 _SCORED_AT_ONCE = 8
 
@@ -56,7 +57,7 @@ def features_of(places: FloatArray, noise: FloatArray, partner: IntArray, carrie
     """Return places (N, 3) of points and segment ends with their covariances (N, 3, 3), and what is near what."""
     near = min(PLANE_SEARCH.neighbours, len(places))
     tree = KDTree(places)
-    distance, neighbours = tree.query(places, k=near)
+    distance, neighbours = tree.query(places, k=near, workers=num_threads())
     spacing = np.maximum(distance[:, min(PLANE_SEARCH.rank, near - 1)], 1e-12)
     order = np.asarray(tree.indices, dtype=np.int64)
     first = np.arange(0, len(order), BALL)
@@ -154,11 +155,12 @@ def from_segments(features: Features, num_points: int, gate: float) -> tuple[Flo
         return np.zeros((0, 4)), np.zeros(0, np.int64), 0
     middle = ends.mean(axis=1)
     count = min(PLANE_SEARCH.near_segments + 1, len(ends))
-    near = np.asarray(KDTree(middle).query(middle, k=count)[1], dtype=np.int64)
+    near = np.asarray(KDTree(middle).query(middle, k=count, workers=num_threads())[1], dtype=np.int64)
     first, second = np.repeat(np.arange(len(ends)), count - 1), near[:, 1:].ravel()
     once = np.unique(np.column_stack([np.minimum(first, second), np.maximum(first, second)]), axis=0)
     once = once[once[:, 0] != once[:, 1]]
-    parts = [_coplanar(features, num_points, once[k : k + _CHUNK], gate) for k in range(0, len(once), _CHUNK)]
+    chunks = [once[k : k + _CHUNK] for k in range(0, len(once), _CHUNK)]
+    parts = map_in_threads(partial(_coplanar, features, num_points, gate), chunks)
     pairs, planes, worth = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((-worth, pairs[:, 0]))
     owner = pairs[order, 0]
@@ -167,7 +169,7 @@ def from_segments(features: Features, num_points: int, gate: float) -> tuple[Flo
 
 
 def _coplanar(
-    features: Features, num_points: int, pairs: IntArray, gate: float
+    features: Features, num_points: int, gate: float, pairs: IntArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Those of some pairs (M, 2) of segments that span a plane, the planes (M, 4), and how well each is fixed (M,)."""
     corner = (num_points + 2 * pairs[:, [0, 0, 1, 1]]) + np.array([0, 1, 0, 1])

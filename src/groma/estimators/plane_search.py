@@ -177,6 +177,7 @@ def _extract(
     patience = max(PLANE_SEARCH.patience, len(candidates) // PLANE_SEARCH.candidates_per_failure)
     at = np.argsort(homes, kind="stable")
     first_at = np.searchsorted(homes[at], np.arange(len(places) + 1))
+    is_near = np.zeros(len(places), bool)
     while queue and failures < patience:
         progress(len(candidates) - len(queue), len(candidates))
         _, best = heappop(queue)
@@ -198,7 +199,8 @@ def _extract(
         alive[best] = False
         failures += 1
         if best not in growth.ready:
-            after = nsmallest(growth.at_once - 1, queue)
+            few = growth.at_once - 1  # the least so many of a heap are among its first so many levels
+            after = nsmallest(few, queue[: 2**few - 1])
             growth.prepare([best, *(k for _, k in after if alive[k])], candidates, homes, labels)
         grown, plane, rows = growth.ready[best]
         if grown is not None:
@@ -207,7 +209,9 @@ def _extract(
             labels[grown.taken] = len(found)
             found.append(grown)
         if len(rows):
-            around = np.unique(features.neighbours[rows])
+            is_near[:] = False
+            is_near[features.neighbours[rows]] = True
+            around = np.flatnonzero(is_near)
             left = at[_ranges(first_at[around], first_at[around + 1])]
             left = left[alive[left]]
             alive[left] = _are_other_planes(features, candidates[left], plane, rows)

@@ -42,7 +42,7 @@ def with_queries(scene: Scene, index: MapIndex, queries: Sequence[PlacedImage]) 
     )  # fmt: skip
     number = np.arange(scene.num_images, scene.num_images + len(queries))
     tables = {"points": points, **_images(scene, queries), **_seen(queries, number, row)}
-    return scene.replace(**{name: _joined(getattr(scene, name), table) for name, table in tables.items()})
+    return scene.replace(**{name: joined(getattr(scene, name), table) for name, table in tables.items()})
 
 
 def _images(scene: Scene, queries: Sequence[PlacedImage]) -> dict[str, Table]:
@@ -102,8 +102,8 @@ def _camera_key(one: PlacedImage) -> tuple[object, ...]:
     return (one.model, *one.params.tolist(), *one.size.tolist())
 
 
-def _joined(table: _Table, other: _Table) -> _Table:
-    """Rows of two tables, one after the other."""
+def joined(table: _Table, other: _Table) -> _Table:
+    """Return the rows of two tables, one after the other."""
     columns = {}
     for item in fields(table):
         first, second = getattr(table, item.name), getattr(other, item.name)
@@ -118,4 +118,4 @@ def _joined(table: _Table, other: _Table) -> _Table:
     return type(table)(**columns)
 
 
-__all__ = ["with_queries"]
+__all__ = ["joined", "with_queries"]

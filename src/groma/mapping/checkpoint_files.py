@@ -18,6 +18,7 @@ from groma.features.segments import Segments
 from groma.io import atomic_output, read_archive, write_archive
 from groma.io.reading import reading
 from groma.mapping.lines.line_map import LineMap
+from groma.mapping.posed.placed import PlacedPhotographs
 from groma.scene import Scene
 from groma.solver.report import Iteration, SolveReport
 from groma.solver.termination import Termination
@@ -121,9 +122,24 @@ def _read_adjusted(path: Path) -> AdjustResult:
     return AdjustResult(read_archive(path), _read_report(path.with_suffix(".report.npz")))
 
 
+def _write_placed(placed: PlacedPhotographs, path: Path) -> None:
+    # The scene comes last: where it is, the words are.
+    _write_arrays(path.with_suffix(".words.npz"), {"words": np.array(json.dumps([placed.notes, placed.warnings]))})
+    _write_scene(placed.scene, path)
+
+
+def _read_placed(path: Path) -> PlacedPhotographs:
+    words = path.with_suffix(".words.npz")
+    saved = _read_arrays(words)
+    with reading(words, "finished stage"):
+        notes, warnings = json.loads(str(saved["words"]))
+        return PlacedPhotographs(read_archive(path), tuple(notes), tuple(warnings))
+
+
 SCENE = FileKind(_write_scene, read_archive)
 SEGMENTS = FileKind(_write_segments, _read_segments)
 LINE_MAP = FileKind(_write_line_map, _read_line_map)
 ADJUSTED = FileKind(_write_adjusted, _read_adjusted)
+PLACED = FileKind(_write_placed, _read_placed)
 
-__all__ = ["ADJUSTED", "LINE_MAP", "SCENE", "SEGMENTS", "FileKind"]
+__all__ = ["ADJUSTED", "LINE_MAP", "PLACED", "SCENE", "SEGMENTS", "FileKind"]

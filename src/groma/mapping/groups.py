@@ -6,12 +6,13 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import IntArray
+from groma.problem.sorting import argsort_by
 
 
 def grouped(owner: IntArray, count: int) -> tuple[IntArray, IntArray]:
     """Rows (N,) sorted by their owner, stably, and pointers (count + 1,) to those of each owner."""
-    order = np.argsort(owner, kind="stable")
-    return order, np.searchsorted(owner[order], np.arange(count + 1))
+    order = argsort_by(((owner, count),), len(owner))
+    return order, np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=count))])
 
 
 def distinct_pairs(first: IntArray, second: IntArray) -> tuple[IntArray, IntArray]:

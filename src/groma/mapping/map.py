@@ -3,7 +3,8 @@
 
 Stages, each saved when it is finished, so that an interrupted run goes on where it was:
 
-1. ``model``      points and poses: read, or reconstructed from the images; adjusted with robust losses (``points``);
+1. ``model``      points and poses: read, reconstructed from the images, or found at poses without points
+                  (``placed``); adjusted with robust losses (``points``);
                   the points' observations placed anew by their grey levels, and adjusted again (``measured``);
 2. ``segments``   line segments in every image, one image at a time;
 3. ``lines``      3D lines from the segments;
@@ -35,7 +36,7 @@ from groma.features.matches import LineMatches
 from groma.features.registry import DETECTORS
 from groma.features.segments import Segments
 from groma.gates import gate
-from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
+from groma.io.colmap.sfm import PointModelOptions
 from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, SCENE, SEGMENTS
 from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
@@ -56,12 +57,14 @@ from groma.mapping.photographs import (
 )
 from groma.mapping.refine_points import PointRefinementOptions, refine_points
 from groma.mapping.result import MapResult
+from groma.mapping.start import start_of
 from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.surveyed import adjust_with_survey, tied
 from groma.mapping.unused import without_unused
 from groma.scene import Scene
 from groma.scene.local_frame import usual_frame
+from groma.solver.linear.blas import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -128,12 +131,15 @@ class MapOptions:
     camera_model: str | None = None
     #: Where points are reconstructed: the parameters of the cameras if they are known, seed.
     camera_params: tuple[float, ...] | None = None
+    #: Where poses are reconstructed: ``incremental`` or ``global``, pycolmap's mappers.
+    mapper: str = "incremental"
     seed: int = 0
 
     def point_model(self, threads: bool = True) -> PointModelOptions:
         """How points are reconstructed, with or without the number of threads, on which no result depends."""
+        count = self.threads if threads else None
         return PointModelOptions(
-            self.camera_model or "SIMPLE_RADIAL", self.camera_params, self.seed, self.threads if threads else None
+            self.camera_model or "SIMPLE_RADIAL", self.camera_params, self.seed, count, self.mapper
         )
 
 
@@ -155,7 +161,8 @@ def map_images(
     work : path
         Folder for finished stages. A second call with the same images, model and options goes on from them.
     model : Scene, optional
-        Poses, cameras and points of the images; reconstructed from the images if not given.
+        Poses, cameras and points of the images; reconstructed from the images if not given. Where it has no points,
+        they are found, and the poses are measurements whose noise is estimated.
     options : MapOptions, optional
         Lengths, gates and what is estimated.
     progress : callable, optional
@@ -193,8 +200,9 @@ def map_images(
     check_cameras((options.point_model().camera_model,) if model is None else model.cameras.models)
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
-    with work_with(options.threads), Stages(Path(work), key, options, say) as stages:
-        start = stages.run(find_start, folder, names, model, stages.place)
+    with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
+        placed = start_of(folder, names, model, stages)
+        start = placed.scene
         points = stages.run(adjust_points, start)
         if options.refine_points:
             points = stages.run(measure_points, folder, points)
@@ -206,9 +214,15 @@ def map_images(
         matches = matches_for(options, folder, points, segments, line_matches)
         result = map_segments(points, segments, matches, stages, neighbors_for(options, folder))
     say("done", 1, 1)
-    left_out = images_left_out(names, start.images.names, model is not None)
-    surveyed = None if in_place is None else in_place.surveyed
-    result = dataclasses.replace(result, start=start, warnings=(*left_out, *result.warnings), surveyed=surveyed)
+    left_out = images_left_out(names, (model or start).images.names, model is not None)
+    result = dataclasses.replace(
+        result,
+        start=start,
+        num_photographs=len(names) if model is None else model.num_images,
+        explanation=" ".join([*placed.notes, result.explanation]),
+        warnings=(*left_out, *placed.warnings, *result.warnings),
+        surveyed=None if in_place is None else in_place.surveyed,
+    )
     if near is None:
         return result
     scene, start, before = (part.transformed(near.inverse()) for part in (result.scene, result.start, result.before))
@@ -256,19 +270,6 @@ def map_segments(
 
 
 # --------------------------------------------------------------------------------------------------------------- stages
-@stage("model", SCENE, lambda options: options.point_model(threads=False))
-def find_start(
-    folder: Path,
-    names: list[str],
-    model: Scene | None,
-    place: Callable[[str], Path],
-    options: MapOptions,
-    say: StageProgress,
-) -> Scene:
-    """Poses and points: the given ones, or reconstructed from the images."""
-    return reconstruct_points(folder, place("sfm"), names, options.point_model(), say) if model is None else model
-
-
 @stage("points", SCENE, lambda options: (options.refine_poses, options.refine_intrinsics, options.max_iterations))
 def adjust_points(start: Scene, options: MapOptions, say: StageProgress) -> Scene:
     """A model whose poses and points are adjusted with robust losses."""
@@ -333,14 +334,16 @@ def find_planes(scene: Scene, options: MapOptions, say: StageProgress) -> Scene:
 @stage("adjusted", ADJUSTED)
 def adjust_everything(scene: Scene, weighted: AdjustOptions, options: MapOptions, say: StageProgress) -> AdjustResult:
     """Everything adjusted together."""
-    return _adjusted(scene, weighted, options, say, "adjusting everything")
+    return _adjusted(scene, dataclasses.replace(weighted, check_lens=True), options, say, "adjusting everything")
 
 
 # -------------------------------------------------------------------------------------------------------------- helpers
 def _robust(options: MapOptions) -> AdjustOptions:
+    """Options of an adjustment of which the scene alone is wanted: the last one asks what the lenses lack."""
     return AdjustOptions(
         refine_intrinsics=bool(options.refine_intrinsics),
         max_iterations=options.max_iterations,
+        check_lens=False,
         threads=options.threads,
     )
 

@@ -119,11 +119,6 @@ def check_number(folder: Path, names: Sequence[str], model: Scene | None, min_im
             f"The model has {_images(model.num_images)} with a pose; a map needs at least {max(2, min_images)} that "
             "overlap. Pass a model with more, or none to have it made."
         )
-    if len(model.point_observations.image_idx) == 0:
-        raise InputError(
-            "The model has no points that its images observe; they tell which images see the same, and hold the poses. "
-            "Pass a model with points, or none to have it made."
-        )
     check_names(folder, names, model)
 
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from groma._json import json_text
+from groma._typing import FloatArray
 from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.contributions import Contribution, contributions
@@ -18,12 +23,13 @@ from groma.adjustment.stages import with_loss
 from groma.adjustment.survey.attach import Surveyed
 from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
+from groma.execution import beside
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
 from groma.mapping.surveyed import has_survey, reliability_of, survey_numbers
 from groma.problem.problem import Problem
 from groma.scene import Scene
-from groma.solver.observability.diagnosis import Diagnosis
+from groma.solver.observability.diagnosis import Diagnosis, Finding
 from groma.viz.pictures import ImageFiles
 from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.survey import survey_card
@@ -51,12 +57,24 @@ class MapResult:
     outcomes: dict[str, int]
     #: Sentences for the user.
     warnings: tuple[str, ...]
+    #: Photographs that were to be placed; 0 where that is not known.
+    num_photographs: int = 0
     #: How the map got into the frame of measurements, where there are any.
     surveyed: Surveyed | None = None
 
     def diagnose(self) -> Diagnosis:
         """Say in words what the observations determine, at the noise and with the loss of the last adjustment."""
-        return diagnose_scene(self.scene, problem=_problem_of(self.scene, self.adjusted_with))
+        found = diagnose_scene(self.scene, problem=_problem_of(self.scene, self.adjusted_with))
+        missing = self.num_photographs - self.scene.num_images
+        if 2 * missing <= self.num_photographs:
+            return found
+        sentence = (
+            f"{missing} of {self.num_photographs} photographs were not placed. All findings are about the other "
+            f"{self.scene.num_images}."
+        )
+        left = Finding("photographs_left_out", "problem", sentence, values={"count": float(missing)})
+        others = tuple(finding for finding in found.findings if finding.kind != "determined")
+        return replace(found, findings=(left, *others))
 
     def pose_uncertainty(self) -> dict[str, Any] | None:
         """Return how well the cameras are known, at the noise that the observations show."""
@@ -73,6 +91,7 @@ class MapResult:
             "num_images": self.scene.num_images,
             "num_points": self.scene.num_points,
             "num_lines": self.scene.num_lines,
+            "line_confidence": _confidence_numbers(self.scene.lines.confidence),
             "num_planes": self.scene.num_planes,
             "num_directions": self.scene.num_directions,
             "sigma_px": self.sigma_px,
@@ -123,27 +142,41 @@ class MapResult:
         if isinstance(images, str | os.PathLike):
             numbers["images"] = os.path.abspath(images)  # where groma localize looks for them
         with atomic_output(folder, force, work) as draft:
-            write_scene(self.scene, draft, format="colmap")
-            write_scene(self.scene, draft / "scene.npz")
-            write_geometry(self.scene, draft)
-            write_report(
-                draft / "report.html",
-                self.before,
-                self.scene,
-                self.report,
-                images,
-                title,
-                PageContents(
-                    self.outcomes,
-                    self.explanation,
-                    self.warnings,
-                    numbers.get("diagnosis"),
-                    contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
-                ),
-            )
-            if "survey" in numbers:
-                (draft / "adjustment.txt").write_text(protocol(numbers), encoding="utf-8")
-            (draft / "summary.json").write_text(json_text(numbers), encoding="utf-8")
+            others = draft.with_name("others")
+            others.mkdir()
+            with beside(partial(write_scene, self.scene, draft, format="colmap")):
+                self._write_others(others, images, title, numbers)
+            for file in others.iterdir():
+                file.rename(draft / file.name)
+
+    def _write_others(self, folder: Path, images: ImageFiles | None, title: str, numbers: dict[str, Any]) -> None:
+        """Write what is not part of the COLMAP model."""
+        write_scene(self.scene, folder / "scene.npz")
+        write_geometry(self.scene, folder)
+        write_report(
+            folder / "report.html",
+            self.before,
+            self.scene,
+            self.report,
+            images,
+            title,
+            PageContents(
+                self.outcomes,
+                self.explanation,
+                self.warnings,
+                numbers.get("diagnosis"),
+                contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
+            ),
+        )
+        if "survey" in numbers:
+            (folder / "adjustment.txt").write_text(protocol(numbers), encoding="utf-8")
+        (folder / "summary.json").write_text(json_text(numbers), encoding="utf-8")
+
+
+def _confidence_numbers(confidence: FloatArray) -> dict[str, Any]:
+    """How many lines are expected to be right, and how many have a probability of 0 to 0.1, to 0.2 and so on."""
+    counts = np.histogram(confidence, np.linspace(0.0, 1.0, 11))[0]
+    return {"expected_right": float(confidence.sum()), "lines_by_tenth": counts.tolist()}
 
 
 def _problem_of(scene: Scene, told: AdjustOptions) -> Problem:

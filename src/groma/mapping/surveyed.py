@@ -14,7 +14,8 @@ from typing import Any
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
 from groma.adjustment.survey.attach import Survey, Surveyed, with_survey
-from groma.adjustment.survey.reliability import Reliability, reliability
+from groma.adjustment.survey.records import Reliability
+from groma.adjustment.survey.reliability import reliability
 from groma.errors import ProblemError
 from groma.gates import gate
 from groma.io.survey import WorldFrame

@@ -7,7 +7,7 @@ it, so that nothing that was found is lost to a failure at the end.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TypeVar
@@ -59,12 +59,17 @@ class Ending:
         #: What was left out, for the reader.
         self.warnings: list[str] = []
 
-    def attempt(self, what: str, step: Callable[[], T], otherwise: T) -> T:
-        """Return what a step gives; where it fails, the maps are as before and ``otherwise`` is returned."""
+    def attempt(self, what: str, step: Callable[[], T], otherwise: T, changes: Sequence[int] | None = None) -> T:
+        """Return what a step gives; where it fails, the maps are as before and ``otherwise`` is returned.
+
+        ``changes`` are the numbers of the maps that the step may change, which are copied before it; None means all.
+        """
         if self._interrupted:
             return otherwise
         mapper = self._mapper
-        kept, current = [track_map.copy() for track_map in mapper.maps], mapper.current
+        kept, current = list(mapper.maps), mapper.current
+        for number in range(len(kept)) if changes is None else changes:
+            kept[number] = kept[number].copy()
         try:
             return step()
         except KeyboardInterrupt:
@@ -105,21 +110,22 @@ class Ending:
             f"the search for places common to maps {one + 1} and {two + 1}",
             lambda: best_joint(mapper.maps, mapper.camera, one, two, mapper.options.gates),
             None,
+            changes=(),
         )
         return places if joint is None else self._joined(places, joint)
 
     def _joined(self, places: Places, joint: Joint) -> Places:
         what = f"joining maps {joint.older + 1} and {joint.newer + 1}"
-        return self.attempt(what, lambda: places.joined(joint), places)
+        return self.attempt(what, lambda: places.joined(joint), places, changes=())
 
     def adjust(self, number: int) -> Adjusted:
         """Adjust all keyframes of a map together, and with planes that are found in its points and lines."""
         mapper, turn = self._mapper, self._mapper.right.turn
         report, turn = self.attempt(
-            "the adjustment of all keyframes", lambda: mapper.adjust_at_end(number), (None, turn)
+            "the adjustment of all keyframes", lambda: mapper.adjust_at_end(number), (None, turn), changes=(number,)
         )
         what = "the planes of the map's points and lines"
-        again, planes = self.attempt(what, lambda: mapper.adjust_with_planes(number), (None, None))
+        again, planes = self.attempt(what, lambda: mapper.adjust_with_planes(number), (None, None), (number,))
         report = again or report
         if report is not None and not report.converged:
             self.warnings.append(

@@ -1,20 +1,27 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Finished keyframes on disk while a track goes on, so that little is lost when it is killed."""
+"""Finished keyframes on disk while a track goes on, so that little is lost when it is killed; and what it sees now."""
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from groma.geometry import se3
 from groma.io import write_scene
 from groma.io.trajectories import write_tum
+from groma.tracking.map.keyframes import Followed
 
 if TYPE_CHECKING:
+    from groma.io.sequences.frame import Frame
     from groma.tracking.tracker import TrackedFrame, Tracker
 
+#: The frame of the moment is written every so many seconds, reduced to at most so many columns.
+GLANCE, COLUMNS = 0.4, 640
 #: The whole map is written when this many seconds have passed, and writing took less than this share of the time.
 EVERY, SHARE = 2.0, 0.03
 
@@ -22,23 +29,44 @@ EVERY, SHARE = 2.0, 0.03
 class Journal:
     """A folder with ``frames.txt`` and ``keyframes.txt`` (as they were tracked), ``trajectory.txt`` and ``scene.npz``.
 
-    Rows are those of TUM: time, place, quaternion; in ``frames.txt`` the number of the map follows.
+    Rows are those of TUM: time, place, quaternion; in ``frames.txt`` the number of the map follows. ``statuses.txt``
+    has a row for every frame (time, status, numbers of points, lines and planes that agree, whether it is a keyframe),
+    and ``now.npz`` the latest picture with what is followed in it.
     """
 
     def __init__(self, folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         self._folder = folder
-        self._next = 0.0
+        self._next = self._next_glance = 0.0
 
     def begun_anew(self) -> Journal:
         """Return an empty journal in place of this one."""
         return Journal(self._folder)
 
-    def frame(self, frame: TrackedFrame) -> None:
-        """Note a frame that has a pose."""
-        if frame.pose is not None:
-            self._append("frames.txt", frame, str(frame.submap))
+    def frame(self, tracked: TrackedFrame, frame: Frame, tracker: Tracker) -> None:
+        """Note what became of a frame, its pose if it has one, and now and then the picture."""
+        if tracked.pose is not None:
+            self._append("frames.txt", tracked, str(tracked.submap))
+        counts = [str(tracked.counts.get(kind, 0)) for kind in ("points", "lines", "planes")]
+        with (self._folder / "statuses.txt").open("a", encoding="utf-8") as file:
+            file.write(" ".join([repr(tracked.timestamp), tracked.status, *counts, str(int(tracked.keyframe))]) + "\n")
+        if time.monotonic() >= self._next_glance:
+            self._glance(tracked, frame, tracker)
+            self._next_glance = time.monotonic() + GLANCE
+
+    def _glance(self, tracked: TrackedFrame, frame: Frame, tracker: Tracker) -> None:
+        """Write the picture of a frame and what is followed in it, in the pixels of the reduced picture."""
+        import cv2
+
+        scale = min(1.0, COLUMNS / frame.gray.shape[1])
+        picture = cv2.resize(frame.gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        followed = tracker._present.followed if tracked.pose is not None else Followed.nothing()
+        points, segments = followed.points.pixel, followed.lines.ends
+        draft = self._folder / "now.draft"
+        with draft.open("wb") as file:
+            np.savez(file, picture=picture, points=scale * points, segments=scale * segments)
+        os.replace(draft, self._folder / "now.npz")
 
     def _append(self, name: str, frame: TrackedFrame, *more: str) -> None:
         assert frame.pose is not None

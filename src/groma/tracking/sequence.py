@@ -244,7 +244,7 @@ def _follow(
             tracked = tracker.process(frame, following)
             frames.append(tracked)
             if journal is not None:
-                journal.frame(tracked)
+                journal.frame(tracked, frame, tracker)
             event = TrackProgress("tracking frame", len(frames), total, tracked, frame.name)
             go_on = progress is None or progress(event) is not False
             if journal is not None and tracked.keyframe:

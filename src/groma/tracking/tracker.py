@@ -382,14 +382,7 @@ class Tracker:
         """Return counts and times so far as plain numbers."""
         out: dict = {
             "frames": dict(self._history.statuses),
-            "keyframes": len(self.map.living()),
-            "points": int(self.map.points.alive.sum()),
-            "lines": int(self.map.lines.alive.sum()),
-            "planes": int(self.map.planes.alive.sum()),
-            "loops": self._mapper.loops,
-            "maps": max(sum(bool(submap.keyframes) for submap in self._mapper.maps), 1),
-            "maps_joined": len(self._mapper.joints),
-            "metric": self._mapper.metric,
+            **self._mapper.numbers(),
             "milliseconds": self._history.milliseconds(),
         }
         if self.camera.baseline > 0:

@@ -248,7 +248,7 @@ def _in_place(
         return _scaled(scene, tables, notes)
     if len(source) < 3:
         raise InputError(
-            f"Only {counted(len(source), 'places')} of the scene are known in the frame of the measurements; three are "
+            f"The measurements place only {len(source)} cameras or control points of the scene; three are "
             "needed. Add positions, or control points that two images show."
         )
     try:

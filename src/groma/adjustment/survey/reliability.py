@@ -26,9 +26,8 @@ estimation in linear models*, 1987; Foerstner and Wrobel, *Photogrammetric compu
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.stats import norm
@@ -36,9 +35,9 @@ from scipy.stats import norm
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.places import at_places_of
+from groma.adjustment.survey.records import GATES, CheckPoint, Measurement, Reliability, noncentrality
 from groma.errors import ProblemError
 from groma.factors.contract import Factor
-from groma.gates import gate
 from groma.problem.gauge import world_motions
 from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of, residuals_of
@@ -50,102 +49,6 @@ from groma.solver.covariance.marginals import Covariances
 _COORDINATES = {"camera position": "xyz", "control point": "xyz", "mark": "uv", "distance": ("",)}
 #: A redundancy number below this says that nothing checks a measurement.
 _UNCHECKED = 1e-6
-
-
-@dataclass(frozen=True)
-class ReliabilityGates:
-    """The test for gross errors."""
-
-    level: float = gate(1e-3, "probability", "of calling a good measurement wrong", "convention: Baarda")
-    power: float = gate(0.8, "probability", "of finding an error of the size told", "convention: Baarda")
-
-
-GATES = ReliabilityGates()
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """One measured coordinate after the adjustment; lengths in scene units, of marks in pixels."""
-
-    #: ``camera position``, ``control point``, ``mark`` or ``distance``.
-    kind: str
-    #: Image, point, point and image, or both ends.
-    name: str
-    #: ``x``, ``y``, ``z``, ``u``, ``v``, or nothing.
-    coordinate: str
-    #: Standard deviation as stated.
-    sigma: float
-    #: Measured less computed.
-    residual: float
-    #: How far the others check it, from 0 to 1.
-    redundancy: float
-    #: Normalised residual; None where nothing checks the measurement.
-    normalized: float | None
-    #: Smallest error that the test finds with the stated power, and how far a smaller one moves the result, in
-    #: standard deviations of that; None where nothing checks the measurement.
-    detectable: float | None
-    external: float | None
-    #: Whether the test calls it wrong.
-    is_suspect: bool
-    #: Weight that the robust loss left it.
-    weight: float = 1.0
-
-
-@dataclass(frozen=True)
-class CheckPoint:
-    """A point whose coordinates took no part."""
-
-    name: str
-    #: (3,) computed less measured, and standard deviations of that: of the scene and of the measurement together.
-    difference: tuple[float, float, float]
-    sigma: tuple[float, float, float]
-    #: Squared difference in units of its covariance; 3 on average.
-    normalized_square: float
-
-
-@dataclass(frozen=True)
-class Reliability:
-    """What an adjustment says of the measurements of other instruments than the cameras."""
-
-    measurements: tuple[Measurement, ...]
-    check_points: tuple[CheckPoint, ...]
-    #: Standard deviations that the residuals show over those stated, by kind, of what is not suspect; None where
-    #: nothing is redundant.
-    components: dict[str, float | None] = field(default_factory=dict)
-    #: Sums of redundancy numbers by kind.
-    redundancy: dict[str, float] = field(default_factory=dict)
-    #: Level and power of the test, and the limit of normalised residuals.
-    level: float = GATES.level
-    power: float = GATES.power
-
-    @property
-    def limit(self) -> float:
-        """Normalised residuals beyond are called wrong."""
-        return float(norm.isf(self.level / 2.0))
-
-    @property
-    def suspects(self) -> tuple[Measurement, ...]:
-        """Measurements that the test calls wrong, the worst first."""
-        found = [one for one in self.measurements if one.is_suspect]
-        return tuple(sorted(found, key=lambda one: -abs(one.normalized or 0.0)))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, for JSON."""
-        return {
-            "level": self.level,
-            "power": self.power,
-            "limit": self.limit,
-            "variance_components": dict(self.components),
-            "redundancy": dict(self.redundancy),
-            "measurements": [asdict(one) for one in self.measurements],
-            "check_points": [asdict(one) for one in self.check_points],
-            "suspects": [f"{one.kind} {one.name} {one.coordinate}".rstrip() for one in self.suspects],
-        }
-
-
-def noncentrality(level: float = GATES.level, power: float = GATES.power) -> float:
-    """Return by how many standard deviations a mean must be off for a two-sided test to find it with a power."""
-    return float(norm.isf(level / 2.0) + norm.ppf(power))
 
 
 def reliability(
@@ -185,7 +88,7 @@ def reliability(
     frame = _frame(problem, [factor for _, _, factor in entries])
     tests = [_tested(frame, *entry) for entry in entries]
     measurements = [row for test in tests for row in _rows(test, level, power)]
-    wrong = {(one.kind, one.name) for one in measurements if one.is_suspect}
+    wrong = _outliers(measurements)
     components, redundancy = {}, {}
     for kind in dict.fromkeys(test.kind for test in tests):
         parts = [_squares_and_shares(test, wrong) for test in tests if test.kind == kind]
@@ -365,6 +268,17 @@ def _rows(test: _Test, level: float, power: float) -> Iterator[Measurement]:
             )
 
 
+def _outliers(measurements: Sequence[Measurement]) -> set[tuple[str, str]]:
+    """Return kind and name of suspect measurements, of kinds of which few are: where many are, all are worse."""
+    found = set()
+    for kind in {one.kind for one in measurements}:
+        names = {one.name for one in measurements if one.kind == kind}
+        suspect = {one.name for one in measurements if one.kind == kind and one.is_suspect}
+        if len(suspect) <= GATES.outliers * len(names):
+            found |= {(kind, name) for name in suspect}
+    return found
+
+
 def _squares_and_shares(test: _Test, wrong: set[tuple[str, str]]) -> tuple[float, float]:
     """Return the weighted squares and the redundancy of the measurements of a group that are not wrong."""
     good = np.array([(test.kind, name) not in wrong for name in test.names], bool)
@@ -391,6 +305,4 @@ def _checked(frame: _Frame, scene: Scene) -> tuple[CheckPoint, ...]:
     return tuple(found)
 
 
-__all__ = [
-    "GATES", "CheckPoint", "Measurement", "Reliability", "ReliabilityGates", "noncentrality", "reliability",
-]  # fmt: skip
+__all__ = ["CheckPoint", "Measurement", "Reliability", "noncentrality", "reliability"]

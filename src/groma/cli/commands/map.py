@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """``groma map``: points, lines and planes from photographs."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -10,6 +11,11 @@ from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
 from groma.cli.shared.ranks import led_by_first_rank
 from groma.errors import InputError
+
+if TYPE_CHECKING:
+    from groma.cli.shared.console import Console
+    from groma.mapping.map import MapOptions
+    from groma.scene import Scene
 
 
 @led_by_first_rank
@@ -28,6 +34,29 @@ def map_(
             "are reconstructed.",
         ),
     ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            "--poses",
+            metavar="FILE",
+            help="Poses from elsewhere, without points: a model, transforms.json, reconstruction.json, a trajectory "
+            "(TUM, KITTI), a g2o graph. Points are found, poses improved, wrong ones named.",
+        ),
+    ] = None,
+    extend: Annotated[
+        Path | None,
+        typer.Option(
+            "--extend",
+            metavar="MAP",
+            help="Place the photographs in this map, OUT of groma map or a COLMAP model, and map all of both.",
+        ),
+    ] = None,
+    map_images: Annotated[
+        Path | None,
+        typer.Option(
+            "--map-images", metavar="FOLDER", help="With --extend: the photographs of MAP, where it does not tell."
+        ),
+    ] = None,
     camera_model: Annotated[
         str | None,
         typer.Option(
@@ -40,6 +69,10 @@ def map_(
         str | None,
         typer.Option(metavar="F,CX,CY,...", help="Without --model: the calibration, if it is known; it is then kept."),
     ] = None,
+    mapper: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="Without --model and --poses: place cameras incremental(ly) or global(ly)."),
+    ] = "incremental",
     line_matches: Annotated[
         Path | None,
         typer.Option(
@@ -58,8 +91,8 @@ def map_(
     min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
     min_confidence: Annotated[
         float,
-        typer.Option(min=0.0, max=1.0, metavar="P", help="Leave out lines less probably right than this, such as 0.5."),
-    ] = 0.0,
+        typer.Option(min=0.0, max=1.0, metavar="P", help="Leave out lines less probably right than this; 0 keeps all."),
+    ] = 0.5,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
     refine_poses: Annotated[
         bool, typer.Option("--refine-poses/--fix-poses", help="Move the cameras too, or the landmarks alone.")
@@ -107,6 +140,7 @@ def map_(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
+    from groma.cli.shared.extending import check_extension
     from groma.cli.shared.input import check_inputs
 
     console = Console(quiet, verbose, json_target, threads)
@@ -115,10 +149,14 @@ def map_(
         positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
     )
     _measured.check_measured(measured)
-    check_inputs(images, model, line_matches, truth, *measured.files)
+    check_inputs(images, model, poses, line_matches, truth, extend, map_images, *measured.files)
+    check_extension(extend, map_images, {"--model": model, "--poses": poses, "--camera-params": camera_params})
 
     if model is not None and camera_params is not None:
         raise InputError("--camera-params is for images without a model. Leave it out.")
+
+    if model is not None and poses is not None:
+        raise InputError("--model and --poses exclude each other: a model has points. Leave one of them out.")
 
     if line_matches is not None and line_matcher is not None:
         raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
@@ -127,9 +165,12 @@ def map_(
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
 
     from groma.cli.shared.diagnosis import try_diagnosis
+    from groma.cli.shared.extending import end_queries, extend_map
     from groma.cli.shared.mapping import run_map, say_map, write_map
+    from groma.execution import work_with
     from groma.features.external import read_matches
     from groma.io import read_scene
+    from groma.localization.extension import in_world_of
     from groma.mapping.map import MapOptions
     from groma.mapping.photographs import image_files
 
@@ -145,23 +186,52 @@ def map_(
         max_iterations=max_iterations,
         camera_model=camera_model,
         camera_params=_parameters(camera_params),
+        mapper=mapper,
         threads=threads,
         seed=seed,
     )
-    start = read_scene(model) if model is not None else None
+    start, options = _start(console, images, model, poses, options)
     matches = read_matches(line_matches) if line_matches is not None else None
     true = read_scene(truth) if truth is not None else None
     work = output.with_name(output.name + ".work")
+    photographs, extended = images, None
+    if extend is not None:
+        extended = extend_map(console, extend, images, map_images, output, force)
+        photographs, start = extended.folder, extended.scene
     survey = None
     if measured:
-        survey = measured.read(images, lambda: [path.relative_to(images).as_posix() for path in image_files(images)])
-    result = run_map(console, images, work, start, options, matches, survey)
-    found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
-    numbers = result.summary(found, result.contributions(true) if contributions else ())
-    write_map(result, output, work, force, images=images, title=f"Map of {images.absolute().name}", summary=numbers)
+        survey = measured.read(
+            photographs, lambda: [path.relative_to(photographs).as_posix() for path in image_files(photographs)]
+        )
+    with work_with(threads):
+        result = run_map(console, photographs, work, start, options, matches, survey)
+        if extended is not None and survey is None:
+            result = in_world_of(result, extended.map)
+        found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
+        numbers = result.summary(found, result.contributions(true) if contributions else ())
+        title = f"Map of {images.absolute().name}"
+        write_map(result, output, work, force, images=photographs, title=title, summary=numbers)
+    end_queries(output)
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
+
+
+def _start(
+    console: "Console", images: Path, model: Path | None, poses: Path | None, options: "MapOptions"
+) -> "tuple[Scene | None, MapOptions]":
+    """Return the scene to start from, None where the photographs must do; and options that know its calibration."""
+    from groma.io import read_scene
+    from groma.mapping.posed.given import scene_at_poses
+
+    if poses is None:
+        return (None if model is None else read_scene(model)), options
+    given = scene_at_poses(images, poses, options.point_model())
+    for sentence in given.sentences:
+        console.say(sentence)
+    if given.calibrated:  # a model that came with parameters is the one of the scene
+        return given.scene, options if options.camera_params is None else replace(options, camera_model=None)
+    return given.scene, replace(options, camera_model=None, refine_intrinsics=options.refine_intrinsics is not False)
 
 
 def _parameters(text: str | None) -> tuple[float, ...] | None:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from groma.cli.shared.console import Console
 
 PANEL = "Measurements"
+#: Residuals so many times as large as stated are told.
+WORSE = 2.0
 Positions = Annotated[
     str | None,
     typer.Option(
@@ -205,7 +207,13 @@ def say_survey(console: Console, numbers: dict[str, Any]) -> None:
     for one in numbers.get("check_points", ()):
         dx, dy, dz = one["difference"]
         console.say(f"Check point {one['name']}: off by {dx:.3f}, {dy:.3f}, {dz:.3f}.")
-    suspects = [one for one in numbers.get("measurements", ()) if one["is_suspect"]]
+    worse = {kind: size for kind, size in numbers.get("variance_components", {}).items() if size and size > WORSE}
+    for kind, size in worse.items():
+        console.warn(
+            f"The residuals of the {kind}s are {size:.1f} times as large as their standard deviations say. Repeat with "
+            "larger ones, or look for what is wrong with all of them."
+        )
+    suspects = [one for one in numbers.get("measurements", ()) if one["is_suspect"] and one["kind"] not in worse]
     for one in sorted(suspects, key=lambda one: -abs(one["normalized"]))[:5]:
         console.warn(
             f"Probably wrong: {one['kind']} {one['name']} {one['coordinate']}".rstrip()

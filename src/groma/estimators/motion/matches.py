@@ -17,13 +17,18 @@ beyond its segment. Points differ by :math:`y - b`, with :math:`\sigma_a^2 D D^\
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.estimators.motion.groups import FREEDOM, Kind, generators
 from groma.geometry.algebra import finite_rows
+
+#: One standard deviation, one in a and one in b, or both of every line and of every point.
+Sigma: TypeAlias = float | tuple[float, float] | tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +46,14 @@ class LandmarkMatches:
     point_sigma: FloatArray
 
     @classmethod
-    def of(cls, lines_in_a=None, lines_in_b=None, points_in_a=None, points_in_b=None, sigma=1.0) -> LandmarkMatches:
+    def of(
+        cls,
+        lines_in_a: npt.ArrayLike | None = None,
+        lines_in_b: npt.ArrayLike | None = None,
+        points_in_a: npt.ArrayLike | None = None,
+        points_in_b: npt.ArrayLike | None = None,
+        sigma: Sigma = 1.0,
+    ) -> LandmarkMatches:
         """Return checked matches; ``sigma`` is one number, or one for a and one for b, or (lines, points) of those.
 
         Parameters
@@ -115,7 +127,7 @@ class LandmarkMatches:
         return replace(self, **spread)
 
 
-def _sigmas(sigma, num_lines: int, num_points: int) -> tuple[FloatArray, FloatArray]:
+def _sigmas(sigma: Sigma, num_lines: int, num_points: int) -> tuple[FloatArray, FloatArray]:
     if isinstance(sigma, tuple) and np.ndim(sigma[0]) == 2:
         out = np.asarray(sigma[0], float), np.asarray(sigma[1], float)
     else:

@@ -25,23 +25,15 @@ from groma import cameras as camera_models
 from groma._counted import counted
 from groma.errors import GromaError, InputError, OutputError
 from groma.io.colmap.load import load_pycolmap
+from groma.io.colmap.mappers import MAPPERS, Task
 from groma.io.colmap.model import from_pycolmap
+from groma.io.colmap.pairs import EXHAUSTIVE_LIMIT, OVERLAP, blocks_of_pairs, places_by_gps
 from groma.io.colmap.quiet import quiet
 from groma.scene import Scene
 
-#: Up to this many images every pair is matched; beyond it each image is matched with its followers by name.
-EXHAUSTIVE_LIMIT = 120
-#: Followers, and then every second power of two, so that a walk around a building is closed.
-_OVERLAP = 12
-_FARTHEST = 2**9
-#: Images whose pairs are matched in one call; their features are loaded once for all of them.
-_BLOCK = 8
 #: Bytes that must be free before work is handed to pycolmap, whose threads end the process where they find a full disk:
 #: in any case, for the features of an image, for the matches of a pair.
 _ROOM, _IMAGE_ROOM, _PAIR_ROOM = 8 << 20, 4 << 20, 1 << 18
-#: Degrees under which the rays of the first two images should meet; the second where the first finds none. A camera
-#: that drives forward has no wide angles, and pycolmap lowers what it is given only twice by half.
-FIRST_PAIR_ANGLES = (16.0, 4.0)
 #: Matches per image from which overlap and texture are not what is missing.
 FEW_MATCHES = 100
 
@@ -60,8 +52,12 @@ class PointModelOptions:
     seed: int = 0
     #: Most threads of pycolmap; None: as many as there are processors.
     threads: int | None = None
+    #: What places the cameras: ``incremental``, one after the other, or ``global``, all at once.
+    mapper: str = "incremental"
 
     def __post_init__(self) -> None:
+        if self.mapper not in MAPPERS:
+            raise InputError(f"The mapper must be one of {', '.join(MAPPERS)}; got {self.mapper!r}.")
         known = {model.name: model for model in camera_models.models() if model.colmap_name is not None}
         model = known.get(self.camera_model)
         if model is None:
@@ -127,10 +123,11 @@ def reconstruct_points(
         _check_room(folder)
         _enter_images(pycolmap, database, Path(images), names, options)
         _find_features(pycolmap, database, Path(images), names, options, say)
-        _match(pycolmap, database, names, options, say)
-        models = []
-        for angle in FIRST_PAIR_ANGLES:
-            models = models or _reconstruct(pycolmap, database, Path(images), folder, len(names), options, angle, say)
+        with _opened(pycolmap, database) as content:
+            places = places_by_gps(content, names)
+        _match(pycolmap, database, names, blocks_of_pairs(len(names), places), options, say)
+        _check_room(folder)
+        models = MAPPERS[options.mapper](Task(pycolmap, database, Path(images), folder, len(names), options), say)
     if not models:
         with _opened(pycolmap, database) as content:
             features, matches = content.num_keypoints(), content.num_inlier_matches()
@@ -212,12 +209,20 @@ def _find_features(
         )
 
 
-def _match(pycolmap: Any, database: Path, names: list[str], options: PointModelOptions, say: Progress) -> None:
+def _match(
+    pycolmap: Any,
+    database: Path,
+    names: list[str],
+    blocks: list[list[tuple[int, int]]],
+    options: PointModelOptions,
+    say: Progress,
+) -> None:
+    """Match pairs of images, which come in blocks of few images each."""
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.num_threads = options.threads or -1
     verification.ransac.random_seed = options.seed
     common = {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
-    total = sum(len(block) for block in pair_blocks(len(names)))
+    total = sum(map(len, blocks))
     if any(name.split() != [name] for name in names):
         # A list of pairs is cut at white space; these calls need none, but tell nothing before they end.
         say("matching points of image pairs", 0, total)
@@ -226,74 +231,19 @@ def _match(pycolmap: Any, database: Path, names: list[str], options: PointModelO
             pycolmap.match_exhaustive(database, **common)
         else:
             pairing = pycolmap.SequentialPairingOptions()
-            pairing.overlap = _OVERLAP
+            pairing.overlap = OVERLAP
             pycolmap.match_sequential(database, pairing_options=pairing, **common)
         return
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = database.with_name("pairs.txt")
     done = 0
-    for block in pair_blocks(len(names)):
+    for block in blocks:
         say("matching points of image pairs", done, total)
         _check_room(database.parent, len(block) * _PAIR_ROOM)
         done += len(block)
         lines = "".join(f"{names[i]} {names[j]}\n" for i, j in block)
         pairing.match_list_path.write_text(lines, encoding="utf-8")
         pycolmap.match_image_pairs(database, pairing_options=pairing, **common)
-
-
-def pair_blocks(count: int) -> Iterator[list[tuple[int, int]]]:
-    """Yield the pairs of images to match, in blocks that need the features of few images."""
-    steps = {*range(1, _OVERLAP + 1), *(2**k for k in range(_FARTHEST.bit_length()))}
-    if count <= EXHAUSTIVE_LIMIT:
-        steps = set(range(1, count))
-    starts = range(0, count, _BLOCK)
-    for row in starts:
-        for column in range(row, count, _BLOCK):
-            block = [
-                (i, j)
-                for i in range(row, min(row + _BLOCK, count))
-                for j in range(max(i + 1, column), min(column + _BLOCK, count))
-                if j - i in steps
-            ]
-            if block:
-                yield block
-
-
-def _reconstruct(
-    pycolmap: Any,
-    database: Path,
-    images: Path,
-    work: Path,
-    count: int,
-    options: PointModelOptions,
-    angle: float,
-    say: Progress,
-) -> list[Any]:
-    pipeline = pycolmap.IncrementalPipelineOptions()
-    pipeline.num_threads = 1  # with more, sums depend on which thread is first, and so do the points kept
-    for part in (pipeline, pipeline.mapper, pipeline.triangulation):
-        part.random_seed = options.seed
-    pipeline.mapper.init_min_tri_angle = angle
-    if options.camera_params is not None:
-        pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = False
-        pipeline.mapper.abs_pose_refine_focal_length = pipeline.mapper.abs_pose_refine_extra_params = False
-    placed = [0]
-
-    def one_more(number: int) -> None:
-        placed[0] += number
-        say("placing cameras", min(placed[0], count), count)
-
-    say("placing cameras", 0, count)
-    _check_room(work)
-    found = pycolmap.incremental_mapping(
-        database,
-        images,
-        work / "models",
-        options=pipeline,
-        initial_image_pair_callback=lambda: one_more(2),
-        next_image_callback=lambda: one_more(1),
-    )
-    return [found[number] for number in sorted(found)]
 
 
 # ----------------------------------------------------------------------------------------------------------- helpers
@@ -340,4 +290,4 @@ def _explained(folder: Path) -> Iterator[None]:
         ) from error
 
 
-__all__ = ["EXHAUSTIVE_LIMIT", "PointModelOptions", "pair_blocks", "reconstruct_points"]
+__all__ = ["EXHAUSTIVE_LIMIT", "PointModelOptions", "reconstruct_points"]

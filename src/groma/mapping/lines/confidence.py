@@ -1,22 +1,34 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""How probable it is that a line is right, from what its observations say.
 
-A line is called right where an edge of the object runs along it. Its probability is a logistic model
+A line is called right where an edge of the object runs along it, at least along half of it, within 2.5 thousandths of
+the usual distance of lines from their cameras. Three things must be true of it:
 
 .. math:: p = \frac{1}{1 + \exp(-w_0 - \sum_k w_k x_k)}
+          \operatorname{erf}\frac{\tau}{\sqrt 2\, u}\; \operatorname{erf}\frac{1}{\sqrt 2\, r}.
 
-of six quantities that a scene has of every line (:func:`line_evidence`); none depends on the unit of length. The
-weights were fitted on rendered scenes whose edges are known exactly, and the probabilities compared with those of other
-scenes (``benchmarks/line_confidence.py``, and its page of the documentation).
+The first factor, that there is an edge at all, is a logistic model of four quantities (:func:`line_evidence`). The
+second is the probability of a normal error within :math:`\tau = 0.0025`, where u is the standard deviation of the ends
+over the usual distance. The third is the share of normal residuals of r pixels root mean square within the width of an
+edge, a pixel: contours that move with the view and chords of curves fit no single line, and where segments of a
+curve are bowed their standard deviations, and with them r, say so.
+
+No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
+of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes
+(``benchmarks/line_confidence.py``, and its page of the documentation).
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
-from scipy.special import expit
+from scipy.special import erf, expit
 
 from groma._typing import BoolArray, FloatArray
 from groma.cameras import model as camera_model
+from groma.gates import gate
 from groma.geometry import quaternion, segment2
 from groma.geometry.algebra import norm
 from groma.mapping.groups import num_distinct
@@ -25,21 +37,31 @@ from groma.scene import Scene
 
 #: The quantities, and the weight of each as ``benchmarks/line_confidence.py`` found it.
 WEIGHTS: dict[str, float] = {
-    "constant": -21.845,
-    "images": 0.170,
-    "spread": -0.476,
-    "uncertainty": -1.160,
-    "misfit": -2.026,
-    "support": 0.331,
-    "length": 3.316,
+    "constant": 0.481,
+    "spread": 1.210,
+    "support": 1.363,
+    "length": 1.539,
+    "residual": -2.072,
 }
-#: Lines of a smaller probability are no part of a map: all are, unless it is asked for fewer. The probability was
-#: fitted on rendered photographs of few sizes; on others, fisheyes above all, it is too strict to decide unasked.
-DEFAULT_CONFIDENCE = 0.0
+
+
+@dataclass(frozen=True)
+class ConfidenceGates:
+    """What a line must be within to be right."""
+
+    tolerance: float = gate(
+        0.0025, "1", "error of a right line over the usual distance", "convention: two pixels of a usual lens"
+    )
+    edge_px: float = gate(1.0, "px", "residual of a segment of a right line", "derived from the width of an edge")
+
+
+GATES = ConfidenceGates()
+#: Lines of a smaller probability are no part of a map: they are more likely wrong than right.
+DEFAULT_CONFIDENCE = 0.5
 #: An image that would show less of a line than this, pixels, is not expected to show it: the default of detection.
 _MIN_LENGTH = 12.0
 #: Smallest misfit and spread, below which they say nothing more.
-_MIN_MISFIT, _MIN_SPREAD = 0.1, 1e-4
+_MIN_MISFIT, _MIN_SPREAD = 0.3, 1e-4
 
 
 def with_confidence(scene: Scene) -> Scene:
@@ -58,40 +80,51 @@ def left_out(kept: BoolArray, min_confidence: float) -> str:
 
 def line_confidence(scene: Scene) -> FloatArray:
     """Return the probability (L,) that each line is right."""
-    return expit(line_evidence(scene) @ np.array(list(WEIGHTS.values())))
+    return expit(line_evidence(scene) @ np.array(list(WEIGHTS.values()))) * line_accuracy(scene)
+
+
+def line_accuracy(scene: Scene, gates: ConfidenceGates = GATES) -> FloatArray:
+    """Return the probability (L,) that each line lies along its edge, given that there is one."""
+    noise = line_noise(scene)
+    deviation = _deviation(noise) * np.maximum(noise.misfit, 1.0) / usual_distance(scene)
+    within = erf(gates.tolerance / (math.sqrt(2.0) * deviation))
+    return within * erf(gates.edge_px / (math.sqrt(2.0) * _residual_px(scene, noise)))
 
 
 def line_evidence(scene: Scene) -> FloatArray:
-    r"""Return what the probability of each line is computed from, (L, 7), in the order of ``WEIGHTS``.
+    r"""Return what the probability that there is an edge is computed from, (L, 5), in the order of ``WEIGHTS``.
 
-    ===============  ================================================================================================
-    ``constant``     1
-    ``images``       logarithm of the number of images that show it
-    ``spread``       logarithm of :math:`\sqrt{\lambda}`, the smaller eigenvalue of the mean of :math:`n n^\top` over
-                     the normals of its viewing planes: how far apart the views are, as the sine of an angle
-    ``uncertainty``  logarithm of the largest standard deviation of its ends across it, over the usual distance of
-                     lines from their cameras
-    ``misfit``       logarithm of its reduced chi: residuals over their expected size
-    ``support``      log odds of an image showing it, among the images in whose frame it lies
-    ``length``       logarithm of its longest observed segment, pixels
-    ===============  ================================================================================================
+    ============  =================================================================================================
+    ``constant``  1
+    ``spread``    logarithm of :math:`\sqrt{\lambda}`, the smaller eigenvalue of the mean of :math:`n n^\top` over the
+                  normals of its viewing planes: how far apart the views are, as the sine of an angle
+    ``support``   log odds of an image showing it, among the images in whose frame it lies
+    ``length``    logarithm of its longest observed segment over the median of those of all lines
+    ``residual``  logarithm of the root mean square of its residuals, pixels
+    ============  =================================================================================================
     """
     seen, noise = scene.line_observations, line_noise(scene)
     images = num_distinct(seen.line_idx, seen.image_idx, scene.num_lines)
-    longest = np.zeros(scene.num_lines)
-    np.maximum.at(longest, seen.line_idx, segment2.length(seen.segment))
     expected = np.maximum(_num_in_frame(scene), images)
+    longest = np.ones(scene.num_lines)
+    np.maximum.at(longest, seen.line_idx, segment2.length(seen.segment))
     return np.column_stack(
         [
             np.ones(scene.num_lines),
-            np.log(np.maximum(images, 1)),
             np.log(_spread(scene, noise)),
-            np.log(_deviation(noise) / _usual_distance(scene)),
-            np.log(np.maximum(noise.misfit, _MIN_MISFIT)),
             np.log((images + 0.5) / (expected - images + 0.5)),
-            np.log(np.maximum(longest, 1.0)),
+            np.log(longest / (np.median(longest) if len(longest) else 1.0)),
+            np.log(_residual_px(scene, noise)),
         ]
     )
+
+
+def _residual_px(scene: Scene, noise: LineNoise) -> FloatArray:
+    """(L,) root mean square residual of each line: its misfit times the noise of its segments, pixels."""
+    line, logs = scene.line_observations.line_idx, np.log(scene.line_observations.sigma)
+    count = np.maximum(np.bincount(line, minlength=scene.num_lines), 1)
+    usual = np.exp(np.bincount(line, logs, scene.num_lines) / count)
+    return np.maximum(noise.misfit, _MIN_MISFIT) * usual * noise.sigma_px
 
 
 def _deviation(noise: LineNoise) -> FloatArray:
@@ -101,7 +134,7 @@ def _deviation(noise: LineNoise) -> FloatArray:
     return np.sqrt(np.maximum(np.linalg.eigvalsh(ends)[..., 1].max(axis=1), 1e-300))
 
 
-def _usual_distance(scene: Scene) -> float:
+def usual_distance(scene: Scene) -> float:
     """Median over lines of the mean distance from the cameras that see them."""
     seen = scene.line_observations
     if len(seen) == 0:
@@ -148,4 +181,15 @@ def _inside(pixels: FloatArray, size: FloatArray) -> BoolArray:
     return np.asarray(inside.all(axis=(1, 2)), np.bool_)
 
 
-__all__ = ["DEFAULT_CONFIDENCE", "WEIGHTS", "left_out", "line_confidence", "line_evidence", "with_confidence"]
+__all__ = [
+    "DEFAULT_CONFIDENCE",
+    "GATES",
+    "WEIGHTS",
+    "ConfidenceGates",
+    "left_out",
+    "line_accuracy",
+    "line_confidence",
+    "line_evidence",
+    "usual_distance",
+    "with_confidence",
+]

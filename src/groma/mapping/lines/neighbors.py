@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 from scipy import sparse
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_work
 from groma.gates import gate
 from groma.geometry import quaternion
@@ -101,14 +101,17 @@ class _Shared:
         # Angles are looked at for four times as many as are wanted.
         order = np.argsort(-counts, kind="stable")[: 4 * num]
         others, counts = others[order], counts[order]
-        safe = np.maximum(np.array([self._angle(i, int(j)) for j in others]), 1e-6)
+        seen = np.zeros(len(self.xyz), bool)
+        seen[self._seen_by(i)] = True
+        safe = np.maximum(np.array([self._angle(i, int(j), seen) for j in others]), 1e-6)
         low, high = np.deg2rad(gates.min_angle_deg), np.deg2rad(gates.max_angle_deg)
         score = counts * np.minimum(1.0, safe / low) * np.minimum(1.0, high / safe)
         return others[np.argsort(-score, kind="stable")[:num]].astype(np.int64)
 
-    def _angle(self, i: int, j: int) -> float:
-        """Median angle under which rays of shared points meet."""
-        common = np.intersect1d(self._seen_by(i), self._seen_by(j), assume_unique=True)
+    def _angle(self, i: int, j: int, seen: BoolArray) -> float:
+        """Median angle under which rays of shared points meet; ``seen`` (P,) tells the points that image i sees."""
+        common = self._seen_by(j)
+        common = common[seen[common]]
         xyz = self.xyz[common[:: max(1, len(common) // self.gates.sample)]]
         return float(np.median(_angles(xyz - self.centers[i], xyz - self.centers[j])))
 

@@ -26,9 +26,10 @@ from groma.adjustment.terms.relations import lengths_per_pixel
 from groma.errors import InputError
 from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines, orthogonal_pairs
 from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
+from groma.execution import together
 from groma.geometry.algebra import norm
 from groma.mapping.groups import num_distinct
-from groma.mapping.noise.landmarks import line_noise, point_noise
+from groma.mapping.noise.landmarks import LineNoise, PointNoise, line_noise, point_noise
 from groma.mapping.structure.relations import Landmarks, Pairs, along_directions, on_lines, on_planes, spacings
 from groma.scene import Directions, Planes, Relations, Scene
 
@@ -225,11 +226,17 @@ def _orthogonal(planes: PlaneSet, directions: DirectionSet) -> tuple[IntArray, I
 
 def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
     """Points and lines with their noise, and which of them may take part."""
-    points = point_noise(scene, options.point_sigma_px).widened(
-        options.surface_sigma_px * lengths_per_pixel(scene, "point")
-    )
-    lines = line_noise(scene, options.line_sigma_px).widened(
-        options.surface_sigma_px * lengths_per_pixel(scene, "line")
+
+    def noise_of_points() -> PointNoise:
+        flat = options.surface_sigma_px * lengths_per_pixel(scene, "point")
+        return point_noise(scene, options.point_sigma_px).widened(flat)
+
+    def noise_of_lines() -> LineNoise:
+        flat = options.surface_sigma_px * lengths_per_pixel(scene, "line")
+        return line_noise(scene, options.line_sigma_px).widened(flat)
+
+    points, lines, (point_spacing, end_spacing) = together(
+        noise_of_points, noise_of_lines, partial(spacings, scene.points.xyz, scene.lines.segments)
     )
     table = scene.point_observations
     seen = num_distinct(table.point_idx, table.image_idx, scene.num_points)
@@ -238,7 +245,6 @@ def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
     point_usable = (seen >= options.min_views) & (points.misfit < options.max_misfit)
     line_usable = (lines_seen >= options.min_views) & (lines.misfit < options.max_misfit)
     line_usable &= norm(scene.lines.segments[:, 1] - scene.lines.segments[:, 0]) > 0.0
-    spacing = spacings(scene.points.xyz, scene.lines.segments)
     return Landmarks(
         scene.points.xyz,
         points,
@@ -246,7 +252,8 @@ def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
         scene.lines.segments,
         lines,
         line_usable,
-        *spacing,
+        point_spacing,
+        end_spacing,
         scene.line_intervals,
     )
 

@@ -9,6 +9,7 @@ uncertain to decide; and it lies where the structure was observed, not on its ex
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -17,6 +18,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import inlier_probability
 from groma.estimators.directions import DirectionSet
 from groma.estimators.plane_search import BAND, PlaneSet, connected_to
+from groma.execution import map_in_threads, num_threads
 from groma.gates import chi_square_gate, gate
 from groma.geometry.algebra import dot, norm, perpendicular, unit
 from groma.mapping.groups import distinct_pairs
@@ -98,7 +100,7 @@ def spacings(
     places = np.concatenate([points, segments.reshape(-1, 3)])
     if len(places) < 2:
         return np.ones(len(points)), np.ones((len(segments), 2))
-    distance, _ = KDTree(places).query(places, k=min(gates.neighbor + 1, len(places)))
+    distance, _ = KDTree(places).query(places, k=min(gates.neighbor + 1, len(places)), workers=num_threads())
     return distance[: len(points), -1], distance[len(points) :, -1].reshape(-1, 2)
 
 
@@ -111,27 +113,30 @@ def on_planes(
 ) -> tuple[Pairs, Pairs]:
     """Points on planes and lines on planes; their probabilities have to exceed the least of their kind."""
     num = len(found)
-    points, lines = [_nothing()], [_nothing()]
-    point_gate, line_gate = chi_square_gate(1.0 - level, 1), chi_square_gate(1.0 - level, 2)
-    usable_points, usable_lines = np.flatnonzero(marks.point_usable), np.flatnonzero(marks.line_usable)
-    for k, (plane, covariance) in enumerate(zip(found.planes, found.covariance, strict=True)):
-        height = np.abs(marks.points[usable_points] @ plane[:3] + plane[3])
-        rows = usable_points[height < found.band[k]]
-        rows = rows[connected_to(found.places[k], marks.points[rows], marks.point_spacing[rows], plane)]
-        points.append(_with_plane(rows, k, *_point_heights(marks, rows, plane, covariance), point_gate))
-        ends = marks.segments[usable_lines]
-        rows = usable_lines[(np.abs(ends @ plane[:3] + plane[3]) < found.band[k]).all(axis=1)]
-        near = connected_to(
-            found.places[k], marks.segments[rows].reshape(-1, 3), marks.end_spacing[rows].ravel(), plane
-        )
-        rows = rows[near.reshape(-1, 2).all(axis=1)]
-        lines.append(_with_plane(rows, k, *_line_heights(marks, rows, plane, covariance), line_gate))
+    parts = map_in_threads(partial(_near_plane, marks, found, level), range(num))
+    points, lines = ([_nothing(), *tables] for tables in (list(zip(*parts, strict=True)) or [(), ()]))
     competing = np.arccos(np.clip(np.abs(found.planes[:, :3] @ found.planes[:, :3].T), 0.0, 1.0)) < gates.competing
     results = []
     for table, enough in zip((np.concatenate(points), np.concatenate(lines)), least, strict=True):
         probability, _ = inlier_probability(table[:, 2], table[:, 3], table[:, 1].astype(np.int64), found.band)
         results.append(_best_of_competing(_passing(table, probability, enough), competing, num))
     return results[0], results[1]
+
+
+def _near_plane(marks: Landmarks, found: PlaneSet, level: float, k: int) -> tuple[FloatArray, FloatArray]:
+    """Points and lines in the layer of a plane, where it is connected: tables as :func:`_with_plane` makes them."""
+    point_gate, line_gate = chi_square_gate(1.0 - level, 1), chi_square_gate(1.0 - level, 2)
+    usable_points, usable_lines = np.flatnonzero(marks.point_usable), np.flatnonzero(marks.line_usable)
+    plane, covariance = found.planes[k], found.covariance[k]
+    height = np.abs(marks.points[usable_points] @ plane[:3] + plane[3])
+    rows = usable_points[height < found.band[k]]
+    rows = rows[connected_to(found.places[k], marks.points[rows], marks.point_spacing[rows], plane)]
+    points = _with_plane(rows, k, *_point_heights(marks, rows, plane, covariance), point_gate)
+    ends = marks.segments[usable_lines]
+    rows = usable_lines[(np.abs(ends @ plane[:3] + plane[3]) < found.band[k]).all(axis=1)]
+    near = connected_to(found.places[k], marks.segments[rows].reshape(-1, 3), marks.end_spacing[rows].ravel(), plane)
+    rows = rows[near.reshape(-1, 2).all(axis=1)]
+    return points, _with_plane(rows, k, *_line_heights(marks, rows, plane, covariance), line_gate)
 
 
 def along_directions(
@@ -257,7 +262,7 @@ def _near_segments(points: FloatArray, segments: FloatArray, gates: RelationGate
     share = (np.arange(len(owner)) - first) / (count[owner] - 1)
     samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
     nearest = min(gates.num_nearest, len(samples))
-    _, index = KDTree(samples).query(points, k=nearest)
+    _, index = KDTree(samples).query(points, k=nearest, workers=num_threads())
     return distinct_pairs(np.repeat(np.arange(len(points)), nearest), owner[index.reshape(len(points), -1)].ravel())[0]
 
 

@@ -13,7 +13,8 @@ recursion, by fronts). With :math:`X = L_{21}L_{11}^{-1}`
 .. math:: Z_{21} = -Z_{22}X, \qquad Z_{11} = L_{11}^{-\top}L_{11}^{-1} + X^\top Z_{22} X .
 
 Every block of S lies in some front, so all blocks of Z that landmarks ask for are found, and no other is ever formed.
-All work is in dense products of LAPACK and BLAS; for a chain of cameras it grows linearly with their number.
+The work is in dense products of LAPACK and BLAS, and in compiled loops over small fronts without children
+(:mod:`groma.solver.linear.leaf_fronts`); for a chain of cameras it grows linearly with their number.
 
 References
 ----------
@@ -23,6 +24,8 @@ Takahashi, Fagan and Chen, 1973; Erisman and Tinney, *On computing certain eleme
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,6 +34,7 @@ from scipy.linalg import get_lapack_funcs, solve_triangular
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.problem.layout import Layout
 from groma.solver.linear.blocks import Blocks
+from groma.solver.linear.leaf_fronts import Leaves
 from groma.solver.linear.ordering import fill_reducing_order
 from groma.solver.linear.visible_motion import distinct
 
@@ -40,6 +44,8 @@ FULL_SHARE = 0.4
 FEW_BLOCKS = 12
 #: A front joins its parent where its columns get longer by at most this share.
 EXTRA_ZEROS = 0.15
+#: Fronts without children that eliminate at most so many unknowns are done many at once.
+LEAF_SIZE = 8
 
 
 @dataclass
@@ -57,7 +63,9 @@ class _Front:
     in_parent: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     #: For each class pair: slots of S, and their first row and column in the front.
     entries: dict[tuple[int, int], tuple[IntArray, IntArray, IntArray]] = field(default_factory=dict)
+    #: How many fronts below this one are no leaves, and which are.
     children: int = 0
+    leaves: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 class Fronts:
@@ -81,56 +89,104 @@ class Fronts:
         position, fronts = _arrange(pairs, int(first[-1]), self._widths)
         self._fronts = fronts
         self._complete(position, pairs)
-        self._L: list[tuple[FloatArray, FloatArray]] = []
+        self._L: dict[int, tuple[FloatArray, FloatArray]] = {}
 
     def _complete(self, position: IntArray, pairs: dict) -> None:
-        """Number the unknowns of every front and sort the blocks of S into the fronts."""
-        home = np.empty(len(position), np.int64)
-        for f, front in enumerate(self._fronts):
-            home[front.blocks[: front.num_eliminated]] = f
-            front.unknowns = _ranges(self._starts[front.blocks], self._widths[front.blocks])
-            front.size = int(self._widths[front.blocks[: front.num_eliminated]].sum())
-        local = np.zeros(len(position), np.int64)
-        sorted_pairs = {}
-        for pair, (rows, columns) in pairs.items():
+        """Number the unknowns of every front, and sort the blocks of S into the fronts; leaves into flat arrays."""
+        fronts, count = self._fronts, len(position)
+        lengths = np.array([len(front.blocks) for front in fronts])
+        blocks, owner = np.concatenate([front.blocks for front in fronts]), np.repeat(np.arange(len(fronts)), lengths)
+        starts = np.cumsum(lengths) - lengths
+        numbers = np.array([front.num_eliminated for front in fronts])
+        eliminated = np.arange(len(blocks)) - starts[owner] < numbers[owner]
+        home = np.empty(count, np.int64)
+        home[blocks[eliminated]] = owner[eliminated]
+        widths = self._widths[blocks]
+        local = np.cumsum(widths) - widths
+        local -= local[starts][owner]
+        size = np.bincount(owner[eliminated], weights=widths[eliminated], minlength=len(fronts)).astype(np.int64)
+        first = np.concatenate([[0], np.cumsum(np.bincount(owner, weights=widths).astype(np.int64))])
+        by_key = np.argsort(owner * count + blocks)
+        keys = (owner * count + blocks)[by_key]
+
+        def place(front: IntArray, block: IntArray) -> IntArray:
+            """First unknown of blocks in fronts."""
+            return local[by_key[np.searchsorted(keys, front * count + block)]]
+
+        has_parent = numbers < lengths
+        parent = np.full(len(fronts), -1)
+        parent[has_parent] = home[blocks[(starts + numbers)[has_parent]]]
+        above = np.zeros(len(blocks), np.int64)
+        above[~eliminated] = place(parent[owner[~eliminated]], blocks[~eliminated])
+        in_parent, unknowns = _ranges(above, widths), _ranges(self._starts[blocks], widths)
+        children = np.bincount(parent[has_parent], minlength=len(fronts))
+        is_leaf = has_parent & (children == 0) & (size <= LEAF_SIZE)
+        for f in np.flatnonzero(~is_leaf):
+            front, span = fronts[f], slice(int(first[f]), int(first[f + 1]))
+            front.size, front.parent, front.unknowns = int(size[f]), int(parent[f]), unknowns[span]
+            front.in_parent = in_parent[span][front.size :]
+        order = np.flatnonzero(is_leaf)[np.argsort(parent[is_leaf], kind="stable")]
+        bounds = np.searchsorted(parent[order], np.arange(len(fronts) + 1))
+        for f in np.flatnonzero(np.diff(bounds)):
+            fronts[f].leaves = order[bounds[f] : bounds[f + 1]]
+        for f, number in enumerate(children - np.diff(bounds)):
+            fronts[f].children = int(number)
+        self._inner = np.flatnonzero(~is_leaf).tolist()
+        pointers, places, shapes = self._sorted_into_fronts(pairs, position, home, place, is_leaf)
+        at = np.concatenate([[0], np.cumsum(np.where(is_leaf, np.diff(first) * size, 0))])
+        self._leaves = Leaves(order, size, first, at, unknowns, in_parent, pointers, places, shapes, np.empty(at[-1]))
+
+    def _sorted_into_fronts(
+        self,
+        pairs: dict,
+        position: IntArray,
+        home: IntArray,
+        place: Callable[[IntArray, IntArray], IntArray],
+        is_leaf: BoolArray,
+    ) -> tuple[IntArray, IntArray, IntArray]:
+        """Give the blocks of S to the front of their first block; return those of leaves as they are stored there."""
+        begin, owners, places, shapes = 0, [], [], []
+        for (a, b), (rows, columns) in pairs.items():
+            height, width = self._layout.kept[a].width, self._layout.kept[b].width
             front_of = np.where(position[rows] <= position[columns], home[rows], home[columns])
+            row, column = place(front_of, rows), place(front_of, columns)
+            mine = np.flatnonzero(is_leaf[front_of])
+            owners.append(front_of[mine])
+            places.append(np.column_stack([begin + mine * height * width, row[mine], column[mine]]))
+            shapes.append(np.tile([height, width], (len(mine), 1)))
+            begin += len(rows) * height * width
             order = np.argsort(front_of, kind="stable")
-            bounds = np.searchsorted(front_of[order], np.arange(len(self._fronts) + 1))
-            sorted_pairs[pair] = (rows, columns, order, bounds)
-        for f, front in enumerate(self._fronts):
-            widths = self._widths[front.blocks]
-            local[front.blocks] = np.concatenate([[0], np.cumsum(widths)[:-1]])
-            for pair, (rows, columns, order, bounds) in sorted_pairs.items():
+            bounds = np.searchsorted(front_of[order], np.arange(len(is_leaf) + 1))
+            for f in np.flatnonzero(np.diff(bounds) * ~is_leaf):
                 slots = order[bounds[f] : bounds[f + 1]]
-                if len(slots):
-                    front.entries[pair] = (slots, local[rows[slots]], local[columns[slots]])
-        for front in self._fronts:
-            later = front.blocks[front.num_eliminated :]
-            if len(later):
-                front.parent = int(home[later[0]])
-                parent = self._fronts[front.parent]
-                parent.children += 1
-                local[parent.blocks] = np.concatenate([[0], np.cumsum(self._widths[parent.blocks])[:-1]])
-                front.in_parent = _ranges(local[later], self._widths[later])
+                self._fronts[f].entries[a, b] = slots, row[slots], column[slots]
+        owner = np.concatenate(owners)
+        order = np.argsort(owner, kind="stable")
+        pointers = np.searchsorted(owner[order], np.arange(len(is_leaf) + 1))
+        return pointers, np.concatenate(places)[order], np.concatenate(shapes)[order]
 
     @property
     def largest(self) -> int:
         """Unknowns of the largest front."""
-        return max(len(front.unknowns) for front in self._fronts)
+        return int(np.diff(self._leaves.first).max())
 
     def factorize(self, blocks: Blocks) -> bool:
         """Factorise S, given by its upper blocks; False if it is not positive definite."""
-        self._L = []
+        self._L = {}
         updates: dict[int, list[tuple[IntArray, FloatArray]]] = {}
         (potrf,) = get_lapack_funcs(("potrf",), (np.zeros((1, 1)),))
-        for f, front in enumerate(self._fronts):
+        values = np.concatenate([blocks[pair].reshape(-1) for pair in self._layout.blocks] if self._leaves else [[]])
+        for f in self._inner:
+            front = self._fronts[f]
             F = np.zeros((len(front.unknowns),) * 2)
             for (a, b), (slots, rows, columns) in front.entries.items():
-                values = blocks[a, b][slots]
-                r = rows[:, None, None] + np.arange(values.shape[1])[:, None]
-                c = columns[:, None, None] + np.arange(values.shape[2])
-                F[r, c] = values
-                F[c, r] = values
+                own = blocks[a, b][slots]
+                r = rows[:, None, None] + np.arange(own.shape[1])[:, None]
+                c = columns[:, None, None] + np.arange(own.shape[2])
+                F[r, c] = own
+                F[c, r] = own
+            if len(front.leaves) and not self._leaves.eliminate(front.leaves, values, F):
+                return False
             for index, U in updates.pop(f, []):
                 F[np.ix_(index, index)] += U
             n = front.size
@@ -140,34 +196,41 @@ class Fronts:
             below = solve_triangular(L, F[:n, n:], lower=True, check_finite=False).T
             if front.parent >= 0:
                 updates.setdefault(front.parent, []).append((front.in_parent, F[n:, n:] - below @ below.T))
-            self._L.append((L, below))
+            self._L[f] = L, below
         return True
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return S^-1 times the columns of ``rhs`` (unknowns, k)."""
         x = np.array(rhs, dtype=np.float64)
-        for front, (L, below) in zip(self._fronts, self._L, strict=True):
+        self._leaves.solve(x)
+        for f, (L, below) in self._L.items():
+            front = self._fronts[f]
             n = front.size
             y = solve_triangular(L, x[front.unknowns[:n]], lower=True, check_finite=False)
             x[front.unknowns[:n]] = y
             x[front.unknowns[n:]] -= below @ y
-        for front, (L, below) in zip(reversed(self._fronts), reversed(self._L), strict=True):
+        for f, (L, below) in reversed(self._L.items()):
+            front = self._fronts[f]
             n = front.size
             y = x[front.unknowns[:n]] - below.T @ x[front.unknowns[n:]]
             x[front.unknowns[:n]] = solve_triangular(L, y, lower=True, trans=1, check_finite=False)
+        self._leaves.solve(x, back=True)
         return x
 
     def inverse_on_pattern(self) -> Blocks:
         """Return the blocks of S^-1 at the places of the blocks of S."""
         layout = self._layout
-        result = {
-            (a, b): np.empty((len(rows), layout.kept[a].width, layout.kept[b].width))
+        shapes = {
+            (a, b): (len(rows), layout.kept[a].width, layout.kept[b].width)
             for (a, b), (rows, _) in layout.blocks.items()
         }
+        values = np.empty(sum(map(math.prod, shapes.values())))
+        parts = np.split(values, np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1])
+        result = {pair: part.reshape(shape) for part, (pair, shape) in zip(parts, shapes.items(), strict=True)}
         kept: dict[int, FloatArray] = {}
         waiting = [front.children for front in self._fronts]
         (potri,) = get_lapack_funcs(("potri",), (np.zeros((1, 1)),))
-        for f in range(len(self._fronts) - 1, -1, -1):
+        for f in reversed(self._inner):
             front, (L, below) = self._fronts[f], self._L[f]
             n = front.size
             Z = np.empty((len(front.unknowns),) * 2)
@@ -187,6 +250,8 @@ class Fronts:
                 r = rows[:, None, None] + np.arange(layout.kept[a].width)[:, None]
                 c = columns[:, None, None] + np.arange(layout.kept[b].width)
                 result[a, b][slots] = Z[r, c]
+            if len(front.leaves):
+                self._leaves.invert(front.leaves, Z, values)
             if front.children:
                 kept[f] = Z
         return result

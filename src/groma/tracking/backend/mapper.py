@@ -115,6 +115,19 @@ class Mapper:
         """The map that is followed now."""
         return self.maps[self.current]
 
+    def numbers(self) -> dict:
+        """What the present map holds, and how many maps there are, as plain numbers."""
+        return {
+            "keyframes": len(self.map.living()),
+            "points": int(self.map.points.alive.sum()),
+            "lines": int(self.map.lines.alive.sum()),
+            "planes": int(self.map.planes.alive.sum()),
+            "loops": self.loops,
+            "maps": max(sum(bool(submap.keyframes) for submap in self.maps), 1),
+            "maps_joined": len(self.joints),
+            "metric": self.metric,
+        }
+
     def begin_anew(self, present: Present) -> None:
         """Leave the present map, and begin another."""
         self.leave(present)

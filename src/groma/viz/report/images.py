@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.execution import map_in_threads
 from groma.scene.line_intervals import one_line_per_interval
 from groma.viz.pack import pack, pack_whole, thin
 from groma.viz.pictures import ImageFiles, image_file, jpeg_address, read_picture, warn_of_names_outside
@@ -103,7 +106,9 @@ def _projected(scene: Scene, image: int, lines: IntArray, samples: int) -> Float
     """Return the images of 3D segments (n, 2 * samples); zeros where they are not before the camera."""
     found = np.zeros((len(lines), samples, 2))
     for row, places in enumerate(projected_segments(scene, image, lines) if len(lines) else []):
-        if len(places) >= 2:
+        if len(places) == samples:
+            found[row] = places
+        elif len(places) >= 2:
             at = np.linspace(0.0, len(places) - 1.0, samples)
             found[row] = np.stack([np.interp(at, np.arange(len(places)), places[:, axis]) for axis in (0, 1)], axis=1)
     width, height = scene.cameras.width, scene.cameras.height
@@ -132,9 +137,12 @@ def _photographs(names: Sequence[str], images: ImageFiles | None) -> list[str]:
     warn_of_names_outside(images, names)
     files = {place: path for place, name in enumerate(names) if (path := image_file(images, name)) is not None}
     chosen = np.array(list(files))[thin(len(files), MAX_PHOTOS)].tolist() if files else []
-    budget = PHOTO_BUDGET // max(len(chosen), 1)
-    for place in chosen:
-        picture = read_picture(files[place], PHOTO_SIZE)
-        if picture is not None:
-            found[place] = jpeg_address(picture, budget)
+    show = partial(_photograph, budget=PHOTO_BUDGET // max(len(chosen), 1))
+    for place, address in zip(chosen, map_in_threads(show, [files[place] for place in chosen]), strict=True):
+        found[place] = address
     return found
+
+
+def _photograph(file: Path, budget: int) -> str:
+    picture = read_picture(file, PHOTO_SIZE)
+    return "" if picture is None else jpeg_address(picture, budget)

@@ -2,16 +2,17 @@
 """A running track in the browser: its path, keyframes, points, lines and planes as they come.
 
 ``groma track`` keeps what is finished in ``OUT.work`` while it runs, and leaves ``OUT`` at its end. This module reads
-those files again whenever they change, and draws them on a viser server.
+those files again whenever they change, and draws them on a viser server. The panel shows the picture of the moment with
+what is followed in it, what became of the frames, and switches.
 """
 
 from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from groma.scene.patches import patch_groups, plane_patches, triangle_fans
 from groma.viz import colours as _colours
 from groma.viz.pack import thin
 from groma.viz.viewer import arrays as _view_arrays
+from groma.viz.viewer.glance import Picture, Statuses, read_now, read_statuses, timeline
 from groma.viz.viewer.server import Say, start_server, stop_server
 
 if TYPE_CHECKING:
@@ -41,6 +43,8 @@ QUIET = 20.0
 WAITING, RUNNING, FINISHED = "waiting", "running", "finished"
 _PATH, _NOW, _KEYFRAMES, _POINTS, _LINES = (40, 110, 220), (230, 60, 40), (120, 126, 134), (96, 104, 116), (20, 130, 90)
 _MAX_CAMERAS = 200
+#: What can be switched off.
+_SWITCHES = ("path", "keyframes", "points", "lines", "planes")
 
 
 class LiveView:
@@ -60,6 +64,7 @@ class LiveView:
         self._seen: dict[Path, float] = {}
         self._placed = False
         self._size = 1.0
+        self._nodes: dict[str, list[Any]] = {}
         #: ``waiting``, ``running`` or ``finished``.
         self.state = WAITING
         self.num_frames = 0
@@ -69,8 +74,30 @@ class LiveView:
         server.gui.main_panel.dock_right()
         # The world is the first camera, whose y points down.
         server.scene.set_up_direction("-y")
+        self.statuses: Statuses | None = None
+        self._path = np.zeros((0, 7))
         self._words = server.gui.add_markdown("")
+        self._add_panel()
         self._say()
+
+    def _add_panel(self) -> None:
+        gui = self.server.gui
+        self.picture = gui.add_image(np.full((3, 4, 3), 40, np.uint8), label="Now", format="jpeg", visible=False)
+        self.timeline = gui.add_html("", visible=False)
+        self.frame_shown = gui.add_slider("Frame", min=1, max=2, step=1, initial_value=2, visible=False)
+        self.frame_shown.hint = "Where the camera was; at the right end, where it is."
+        self.frame_shown.on_update(lambda _: self._draw_now())
+        with gui.add_folder("Show"):
+            self.shown = {name: gui.add_checkbox(name.capitalize(), True) for name in _SWITCHES}
+        for name, box in self.shown.items():
+            box.on_update(lambda _, name=name: self._switch(name))
+        self.follow = gui.add_checkbox("Follow the camera", False)
+        self.follow.hint = "Keep the camera of the track in the middle of the view."
+
+    def _switch(self, name: str) -> None:
+        """Show or hide all nodes of a kind."""
+        for node in self._nodes.get(name, []):
+            node.visible = self.shown[name].value
 
     def refresh(self) -> bool:
         """Look at the files, draw what is new, and return whether anything was."""
@@ -83,17 +110,26 @@ class LiveView:
             state = RUNNING if running else FINISHED
             changed = state != self.state
             self.state = state
-            path = folder / ("frames.txt" if running else "trajectory.txt")
-            with contextlib.suppress(GromaError, OSError, ValueError):
-                # A file that is being replaced is read the next time.
-                if self._is_new(path):
-                    self._draw_path(read_frames(path) if running else read_tum(path).world_from_cam)
-                    changed = True
-                if self._is_new(folder / "scene.npz"):
-                    self._draw_scene(read_scene(folder / "scene.npz"))
-                    changed = True
+            for name, show in self._files(running).items():
+                # A file that is not there yet, or is being replaced, is read the next time.
+                with contextlib.suppress(GromaError, OSError, ValueError):
+                    if self._is_new(folder / name):
+                        show(folder / name)
+                        changed = True
         self._say()
         return changed
+
+    def _files(self, running: bool) -> dict[str, Callable[[Path], None]]:
+        """Return what is read, by name, and what is done with it."""
+        scene: dict[str, Callable[[Path], None]] = {"scene.npz": lambda path: self._draw_scene(read_scene(path))}
+        if not running:
+            return {"trajectory.txt": lambda path: self._draw_path(read_tum(path).world_from_cam), **scene}
+        return {
+            "frames.txt": lambda path: self._draw_path(read_frames(path)),
+            "statuses.txt": lambda path: self._show_statuses(read_statuses(path)),
+            "now.npz": lambda path: self._show_picture(read_now(path)),
+            **scene,
+        }
 
     def _is_new(self, path: Path) -> bool:
         stamp = path.stat().st_mtime_ns
@@ -102,15 +138,41 @@ class LiveView:
         self._seen[path] = stamp
         return True
 
+    def _show_picture(self, picture: Picture) -> None:
+        self.picture.image = picture
+        self.picture.visible = True
+
+    def _show_statuses(self, statuses: Statuses) -> None:
+        self.statuses = statuses
+        self.timeline.content = timeline(statuses)
+        self.timeline.visible = len(statuses) > 0
+
     def _draw_path(self, world_from_cam: FloatArray) -> None:
-        self.num_frames = len(world_from_cam)
+        at_end = self.frame_shown.value >= self.frame_shown.max
+        self._path, self.num_frames = world_from_cam, len(world_from_cam)
         if not self.num_frames:
             return
+        self.frame_shown.max = max(self.num_frames, 2)
+        self.frame_shown.visible = self.num_frames > 2
+        if at_end or self.frame_shown.value > self.frame_shown.max:
+            self.frame_shown.value = self.frame_shown.max
         centers = world_from_cam[:, 4:]
         if len(centers) > 1:
             pieces = np.stack([centers[:-1], centers[1:]], axis=1).astype(np.float32)
-            self._segments("/path", pieces, _PATH, 3.0)
-        self._camera("/now", world_from_cam[-1], _NOW, 1.5)
+            self._nodes["path"] = [self._segments("/path", pieces, _PATH, 3.0, self.shown["path"].value)]
+        self._draw_now()
+
+    def _draw_now(self) -> None:
+        """Draw the camera of the chosen frame, and move the view along with it if that is wanted."""
+        if not len(self._path):
+            return
+        pose = self._path[min(int(self.frame_shown.value), len(self._path)) - 1]
+        self._now = self._camera("/now", pose, _NOW, 1.5)
+        if self.follow.value:
+            for client in self.server.get_clients().values():
+                with client.atomic():
+                    client.camera.position = client.camera.position + pose[4:] - client.camera.look_at
+                    client.camera.look_at = pose[4:]
 
     def _draw_scene(self, scene: Scene) -> None:
         self.scene = scene
@@ -120,16 +182,22 @@ class LiveView:
             return
         low, high = np.percentile(places, [10, 90], axis=0)
         self._size = max(float(np.linalg.norm(high - low)), 1e-3)
+        shown, nodes = {name: box.value for name, box in self.shown.items()}, self._nodes
         with self.server.atomic():
-            self.server.scene.add_point_cloud(
+            nodes["points"] = [self.server.scene.add_point_cloud(
                 "/points", scene.points.xyz.astype(np.float32),
                 np.tile(np.array(_POINTS, np.uint8), (scene.num_points, 1)),
                 point_size=0.004 * self._size, point_shape="circle", precision="float32",
-            )  # fmt: skip
-            self._segments("/lines", scene.lines.segments.astype(np.float32), _LINES, 2.0)
+                visible=shown["points"],
+            )]  # fmt: skip
+            segments = scene.lines.segments.astype(np.float32)
+            self.server.scene.remove_by_name("/lines")
+            nodes["lines"] = [self._segments("/lines", segments, _LINES, 2.0, shown["lines"])] if len(segments) else []
             self.server.scene.remove_by_name("/keyframes")
-            for row in thin(len(world), _MAX_CAMERAS):
-                self._camera(f"/keyframes/{row}", world[row], _KEYFRAMES, 1.0)
+            nodes["keyframes"] = [
+                self._camera(f"/keyframes/{row}", world[row], _KEYFRAMES, 1.0, shown["keyframes"])
+                for row in thin(len(world), _MAX_CAMERAS)
+            ]
             self._draw_planes(scene)
         if not self._placed:
             self._placed = True
@@ -137,32 +205,39 @@ class LiveView:
 
     def _draw_planes(self, scene: Scene) -> None:
         self.server.scene.remove_by_name("/planes")
+        self._nodes["planes"] = []
         patches, members = plane_patches(scene)
         group = patch_groups(members) if patches else np.zeros(0, np.int64)
         for colour in np.unique(group):
             vertices, faces = triangle_fans([patches[plane] for plane in np.flatnonzero(group == colour)])
             red, green, blue = (int(channel) for channel in _colours.PALETTE[colour])
-            self.server.scene.add_mesh_simple(
+            self._nodes["planes"].append(self.server.scene.add_mesh_simple(
                 f"/planes/{colour}", vertices.astype(np.float32), faces.astype(np.uint32),
                 color=(red, green, blue), opacity=0.28, side="double", flat_shading=True,
-                cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
+                cast_shadow=False, receive_shadow=False, visible=self.shown["planes"].value,
+            ))  # fmt: skip
 
-    def _segments(self, name: str, pieces: np.ndarray, colour: tuple[int, int, int], width: float) -> None:
+    def _segments(
+        self, name: str, pieces: np.ndarray, colour: tuple[int, int, int], width: float, visible: bool
+    ) -> viser.LineSegmentsHandle:
         ends = _view_arrays.by_end(np.tile(np.array(colour, np.uint8), (len(pieces), 1)))
-        self.server.scene.add_line_segments(name, pieces, ends, thickness=width, thickness_units="screen")
+        return self.server.scene.add_line_segments(
+            name, pieces, ends, thickness=width, thickness_units="screen", visible=visible
+        )
 
-    def _camera(self, name: str, world_from_cam: FloatArray, colour: tuple[int, int, int], size: float) -> None:
+    def _camera(
+        self, name: str, world_from_cam: FloatArray, colour: tuple[int, int, int], size: float, visible: bool = True
+    ) -> viser.CameraFrustumHandle:
         scene = self.scene
         opening, aspect = 0.8, 4.0 / 3.0
         if scene is not None and len(scene.cameras.width):
             width, height = float(scene.cameras.width[0]), float(scene.cameras.height[0])
             opening, aspect = 2.0 * float(np.arctan2(0.5 * height, scene.cameras.params[0][1])), width / height
-        self.server.scene.add_camera_frustum(
+        return self.server.scene.add_camera_frustum(
             name, fov=opening, aspect=aspect, scale=0.03 * size * self._size, color=colour,
             thickness=1.5, thickness_units="screen",
             wxyz=quaternion.to_wxyz(world_from_cam[:4]), position=world_from_cam[4:],
-            cast_shadow=False, receive_shadow=False,
+            cast_shadow=False, receive_shadow=False, visible=visible,
         )  # fmt: skip
 
     def _look_at(self, middle: FloatArray) -> None:
@@ -183,6 +258,8 @@ class LiveView:
             silence = time.time() - max(self._seen.values()) * 1e-9
             if silence > QUIET:
                 lines = f"**Nothing new for {silence:.0f} s.** The track may have been stopped."
+        if self.statuses is not None and len(self.statuses) and self.state == RUNNING:
+            lines += f"\n\n{self.statuses.sentence()}"
         if self.scene is not None:
             scene = self.scene
             lines += f"\n\n{counted(self.num_frames, 'frames')}, {counted(scene.num_images, 'keyframes')}\n\n"

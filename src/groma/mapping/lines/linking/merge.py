@@ -268,12 +268,12 @@ def _candidates(X: FloatArray, reach: FloatArray, gates: MergeGates = MergeGates
 def _pixel_size(tracks: Tracks) -> FloatArray:
     """(L,) size of a pixel at the line, scene units: median over its observations."""
     views = tracks.views
-    rows, pointers = tracks.table()
-    line = tracks.line_of[rows]
+    rows, line = tracks.members()
     P = views.camera[views.image_idx[rows]]
     depth = np.einsum("mc,mc->m", P[:, 2, :3], tracks.lines[line].mean(1)) + P[:, 2, 3]
     size = np.abs(depth) / np.linalg.norm(P[:, 0, :3], axis=1)
     order = np.lexsort([size, line])
+    pointers = np.concatenate([[0], np.cumsum(np.bincount(line, minlength=tracks.num_lines))])
     middle = (pointers[:-1] + pointers[1:]) // 2
     return size[order][np.minimum(middle, len(rows) - 1)]
 

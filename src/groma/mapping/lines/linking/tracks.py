@@ -13,7 +13,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.line_ends import SegmentRays, trim
 from groma.gates import gate
-from groma.mapping.groups import grouped, num_distinct
+from groma.mapping.groups import grouped
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.linking.fit import fit_lines
 from groma.mapping.lines.outcomes import Outcome
@@ -101,32 +101,36 @@ class Tracks:
     def table(self) -> tuple[IntArray, IntArray]:
         """Rows of the observations by line, and the pointers of each line's."""
         rows, line = self.members()
-        rows = rows[np.argsort(line, kind="stable")]  # rows are sorted by image, and stay so per line
-        return rows, np.searchsorted(self.line_of[rows], np.arange(self.num_lines + 1))
+        order, pointers = grouped(line, self.num_lines)  # rows are sorted by image, and stay so per line
+        return rows[order], pointers
 
     def num_images(self) -> IntArray:
         """(L,) number of images of each line."""
-        rows, line = self.members()
-        return num_distinct(line, self.views.image_idx[rows], self.num_lines)
+        rows, _ = self.table()
+        line, image = self.line_of[rows], self.views.image_idx[rows]
+        is_new = np.ones(len(rows), bool)
+        is_new[1:] = (line[1:] != line[:-1]) | (image[1:] != image[:-1])
+        return np.bincount(line[is_new], minlength=self.num_lines)
 
     def lines_near_images(self, neighbors: list[IntArray]) -> list[IntArray]:
         """Lines to look for in each image: those seen in it or in a neighbour."""
-        rows, line = self.members()
-        order, bounds = grouped(self.views.image_idx[rows], len(neighbors))
-        seen = [np.unique(line[order[bounds[i] : bounds[i + 1]]]) for i in range(len(neighbors))]
-        return [np.unique(np.concatenate([seen[i], *(seen[j] for j in row)])) for i, row in enumerate(neighbors)]
+        pointers, near, looked_for = self.views.pointers, [], np.zeros(self.num_lines + 1, bool)
+        for i, row in enumerate(neighbors):
+            looked_for[:] = False
+            for j in (i, *row):
+                looked_for[self.line_of[pointers[j] : pointers[j + 1]]] = True  # the last one stands for no line
+            near.append(np.flatnonzero(looked_for[:-1]))
+        return near
 
     def direction(self) -> FloatArray:
         """(L,) +1 or -1: whether most observations run from the first end point to the second in the image."""
         views = self.views
-        rows, _ = self.table()
-        P, X = views.camera[views.image_idx[rows]], self.lines[self.line_of[rows]]
+        rows, line = self.members()
+        P, X = views.camera[views.image_idx[rows]], self.lines[line]
         x = np.einsum("mij,mkj->mki", P[:, :, :3], X) + P[:, None, :, 3]
         x = x[..., :2] / x[..., 2:]
         along = ((x[:, 1] - x[:, 0]) * (views.ends[rows, 2:] - views.ends[rows, :2])).sum(-1)
-        votes = np.zeros(self.num_lines)
-        np.add.at(votes, self.line_of[rows], np.sign(along))
-        return np.sign(votes)
+        return np.sign(np.bincount(line, weights=np.sign(along), minlength=self.num_lines))
 
     def with_groups(self, members: IntArray, representative: IntArray, ends: FloatArray) -> Tracks:
         """Return the tracks with a new line for each group of segments.

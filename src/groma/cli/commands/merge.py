@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""``groma merge``: two maps of one place become one."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from groma.cli.shared import options as _options
+
+
+def merge(
+    first: Annotated[Path, typer.Argument(metavar="A", help="OUT of groma map, or a COLMAP model.")],
+    second: Annotated[Path, typer.Argument(metavar="B", help="Another one, of a place that overlaps.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")],
+    first_images: Annotated[
+        Path | None,
+        typer.Option("--images-a", metavar="FOLDER", help="The photographs of A, where it does not tell."),
+    ] = None,
+    second_images: Annotated[
+        Path | None,
+        typer.Option("--images-b", metavar="FOLDER", help="The photographs of B, where it does not tell."),
+    ] = None,
+    scale: Annotated[
+        bool, typer.Option("--scale/--no-scale", help="B may have another scale; without, both have the same.")
+    ] = True,
+    force: _options.Force = False,
+    threads: _options.Threads = None,
+    seed: _options.Seed = 0,
+    json_target: _options.Json = None,
+    quiet: _options.Quiet = False,
+    verbose: _options.Verbose = False,
+) -> None:
+    """Join two maps of one place.
+
+    Photographs of B are localised in A, which matches points and lines of both; these give the motion between the two
+    worlds. All photographs are then mapped together, in the world of A. OUT is that of groma map; OUT.images holds
+    links to the photographs of both.
+    """
+    from groma.cli.shared import output as _output
+    from groma.cli.shared.console import Console
+    from groma.cli.shared.input import check_inputs
+
+    console = Console(quiet, verbose, json_target, threads)
+    _output.check_outputs(force, output, json_target=json_target)
+    check_inputs(first, second, first_images, second_images)
+
+    from groma.cli.shared.extending import merge_maps
+    from groma.cli.shared.mapping import run_map, say_map, write_map
+    from groma.localization.extension import in_world_of
+    from groma.mapping.map import MapOptions
+
+    merged = merge_maps(console, (first, second), (first_images, second_images), scale, output, force)
+    work = output.with_name(output.name + ".work")
+    result = run_map(console, merged.folder, work, merged.scene, MapOptions(threads=threads, seed=seed))
+    result = in_world_of(result, merged.map)
+    numbers = {**result.summary(), "merged": merged.sentence()}
+    title = f"Map of {first.absolute().name} and {second.absolute().name}"
+    write_map(result, output, work, force, images=merged.folder, title=title, summary=numbers)
+    say_map(console, result, numbers, explain=False)
+    console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
+    _output.write_json(json_target, numbers, force)

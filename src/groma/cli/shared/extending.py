@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Maps that are there as the beginning of others: with photographs added, or two of them joined; with progress."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import typer
+
+from groma.cli.shared.interrupt import PROCESS
+from groma.errors import InputError, OutputError
+
+if TYPE_CHECKING:
+    from groma.cli.shared.console import Console
+    from groma.localization.extension import ExtendedModel
+    from groma.localization.merging import MergedModel
+
+_Made = TypeVar("_Made")
+
+
+def extend_map(
+    console: Console, map_: Path, new: Path, map_images: Path | None, output: Path, force: bool
+) -> ExtendedModel:
+    """Localise photographs in a map; return the model of all of them."""
+    from groma.localization.calibration import CalibrationChoice
+    from groma.localization.extension import extended_model
+    from groma.localization.localizer import Localizer
+    from groma.localization.run import query_files
+
+    files = query_files([new])
+    folder, work = photograph_folder(output, force), output.with_name(f"{output.name}.queries")
+
+    def made(say: Callable[[str, int, int], None]) -> ExtendedModel:
+        return extended_model(Localizer(map_, map_images, progress=say), files, work, folder, CalibrationChoice(), say)
+
+    extended = _with_progress(console, made, f"finished photographs are kept in {work}")
+    for sentence in extended.warnings():
+        console.warn(sentence)
+    return extended
+
+
+def merge_maps(
+    console: Console,
+    maps: tuple[Path, Path],
+    images: tuple[Path | None, Path | None],
+    scale: bool,
+    output: Path,
+    force: bool,
+) -> MergedModel:
+    """Find how two maps lie to each other; return the model of the photographs of both."""
+    from groma.localization.localizer import Localizer
+    from groma.localization.merging import merged_model
+
+    folder = photograph_folder(output, force)
+
+    def made(say: Callable[[str, int, int], None]) -> MergedModel:
+        first, second = (Localizer(one, where, progress=say) for one, where in zip(maps, images, strict=True))
+        return merged_model(first, second, folder, "similarity" if scale else "rigid", say)
+
+    merged = _with_progress(console, made, "the descriptions of the maps are kept beside them")
+    console.say(merged.sentence())
+    return merged
+
+
+def photograph_folder(output: Path, force: bool) -> Path:
+    """Return the folder for links to the photographs; refuse one that holds something else."""
+    folder = output.with_name(f"{output.name}.images")
+    if force and folder.is_dir():
+        if any(path.is_file() and not path.is_symlink() for path in folder.rglob("*")):
+            raise OutputError(f"{folder} holds files that are no links to photographs. Move it away.")
+        shutil.rmtree(folder)
+    return folder
+
+
+def end_queries(output: Path) -> None:
+    """Remove what was kept of photographs that were localised."""
+    shutil.rmtree(output.with_name(f"{output.name}.queries"), ignore_errors=True)
+
+
+def check_extension(extend: Path | None, map_images: Path | None, others: dict[str, object]) -> None:
+    """Refuse options that do not go with the map that is extended, or that need one."""
+    if extend is None and map_images is not None:
+        raise InputError("--map-images tells where the photographs of --extend MAP are. Add --extend, or leave it out.")
+    given = [name for name, value in others.items() if value is not None]
+    if extend is not None and given:
+        raise InputError(f"--extend and {given[0]} exclude each other. Leave one of them out.")
+
+
+def _with_progress(console: Console, made: Callable[[Callable[[str, int, int], None]], _Made], kept: str) -> _Made:
+    from groma.cli.shared.interrupt import interruptible
+
+    console.announce_compilation()
+    try:
+        with interruptible() as interruption, console.stages() as stages:
+            return made(interruption.checking(stages))
+    except KeyboardInterrupt:
+        raise typer.Exit(PROCESS.tell(f"{kept}: the same command goes on from there.")) from None
+
+
+__all__ = ["check_extension", "end_queries", "extend_map", "merge_maps", "photograph_folder"]

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Poses of photographs from any file that holds some: which pose belongs to which photograph.
+
+===============================================  ===================================================================
+a model: COLMAP, ``transforms.json``,            images are found by name: the whole path, else its end, else the
+OpenSfM, OpenMVG, VisualSFM, an archive          name without its ending, wherever exactly one photograph fits
+a trajectory of TUM or EuRoC                     where the names of the photographs are times: the nearest within 20
+                                                 ms; else in order, if there are as many of both
+a trajectory of KITTI                            in order, if there are as many; else the numbers in the names are
+                                                 lines, from 0
+a pose graph of g2o                              the numbers in the names are ids; else in order, if there are as many
+===============================================  ===================================================================
+
+Whatever else is refused. What was concluded and is not in the file is said in a sentence.
+"""
+
+from __future__ import annotations
+
+import os
+import posixpath
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from groma._counted import counted
+from groma._typing import FloatArray, IntArray
+from groma.bounded.text import read_lines
+from groma.errors import InputError
+from groma.geometry import se3
+from groma.io.g2o import looks_like_g2o, read_g2o
+from groma.io.reading import existing, reading
+from groma.io.registry import HEAD_BYTES, formats, read_scene
+from groma.io.trajectories import read_trajectory
+from groma.scene import Cameras
+
+#: Seconds by which a time may miss that of a photograph: the convention of the TUM benchmark.
+NEAR_SECONDS = 0.02
+#: Digits from which a whole number is nanoseconds.
+_NANOSECOND_DIGITS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class PosesOfPhotographs:
+    """Which photographs have a pose, and which."""
+
+    #: Names of the photographs, in their folder.
+    names: tuple[str, ...]
+    #: (N, 7) their poses.
+    cam_from_world: FloatArray
+    #: Calibrations, and (N,) which each photograph has; None where the file holds none.
+    cameras: Cameras | None
+    camera_idx: IntArray
+    #: What was concluded.
+    sentences: tuple[str, ...]
+
+
+def read_poses(path: str | os.PathLike[str], photographs: Sequence[str]) -> PosesOfPhotographs:
+    """Read poses of photographs; see the module for the files and for what belongs to what.
+
+    Parameters
+    ----------
+    path : path
+        A file or the folder of a model. Points in it are not used.
+    photographs : sequence of str
+        Names in the folder of photographs.
+
+    Raises
+    ------
+    InputError
+        If no photograph has a pose, or it cannot be told which pose is whose.
+    FileFormatError
+        If the file is damaged or of an unknown kind.
+    """
+    place = existing(path)
+    head = b""
+    if place.is_file():
+        with reading(place, "file"), place.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    if place.is_dir() or any(one.recognise is not None and one.recognise(place, head) for one in formats()):
+        return _of_model(place, photographs)
+    first = b""
+    with reading(place, "file of poses"):
+        first = next((line for _, line in read_lines(place)), "").encode()
+    return _of_graph(place, photographs) if looks_like_g2o(first) else _of_trajectory(place, photographs)
+
+
+# ------------------------------------------------------------------------------------------------------------- kinds
+def _of_model(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:
+    scene = read_scene(place)
+    if not scene.num_images:
+        raise InputError(f"{place} holds no image with a pose. Pass a file of poses.")
+    found, sentences = _by_name(place, scene.images.names, photographs)
+    rows = [row for row, name in enumerate(found) if name is not None]
+    missing = len(found) - len(rows)
+    if missing:
+        example = next(name for name, match in zip(scene.images.names, found, strict=True) if match is None)
+        sentences += (
+            f"{missing} of {counted(len(found), 'poses')} in {place} have no photograph, for example {example!r}.",
+        )
+    return PosesOfPhotographs(
+        tuple(str(found[row]) for row in rows),
+        scene.cam_from_world[rows],
+        scene.cameras,
+        scene.images.camera_idx[rows],
+        sentences,
+    )
+
+
+def _of_trajectory(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:
+    trajectory = read_trajectory(place)
+    poses, names = trajectory.cam_from_world, sorted(photographs, key=_natural)
+    count = len(poses)
+    times, numbers = _times(names), _numbers(names)
+    has_times = bool((np.diff(trajectory.timestamps, prepend=-1.0) != 1.0).any())
+    if has_times and times is not None:
+        order = np.argsort(trajectory.timestamps, kind="stable")
+        of_pose = trajectory.timestamps[order]
+        at = np.clip(np.searchsorted(of_pose, times), 1, max(1, count - 1))
+        at = np.where(times - of_pose[at - 1] < of_pose[np.minimum(at, count - 1)] - times, at - 1, at)
+        at = np.minimum(at, count - 1)
+        apart = np.abs(of_pose[at] - times)
+        near = apart <= NEAR_SECONDS
+        if near.any():
+            said = (
+                ()
+                if apart[near].max() < 1e-4
+                else (f"Poses are those nearest in time to the names, {1e3 * apart[near].max():.2g} ms away at most.",)
+            )
+            return _without_calibration(
+                [name for name, use in zip(names, near, strict=True) if use], poses[order[at[near]]], said
+            )
+    if count == len(names):
+        return _in_order(place, names, poses)
+    if not has_times and numbers is not None and numbers.max() < count and numbers.min() == 0:
+        said = (f"The numbers in the names were taken as lines of {place}, from 0.",)
+        return _without_calibration(names, poses[numbers], said)
+    raise _unclear(place, count, names, "times" if has_times else "lines, counted from 0")
+
+
+def _of_graph(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:
+    graph = read_g2o(place)
+    if graph.planar:
+        raise InputError(f"{place} holds poses of the plane (SE2); photographs need poses of space (SE3).")
+    poses, names = se3.inverse(graph.poses.world_from_body), sorted(photographs, key=_natural)
+    numbers, row_of = _numbers(names), {int(number): row for row, number in enumerate(graph.poses.ids)}
+    if numbers is not None and all(int(number) in row_of for number in numbers):
+        said = (f"The numbers in the names were taken as ids of {place}.",)
+        return _without_calibration(names, poses[[row_of[int(number)] for number in numbers]], said)
+    if len(poses) == len(names):
+        return _in_order(place, names, poses[np.argsort(graph.poses.ids)])
+    raise _unclear(place, len(poses), names, "ids")
+
+
+def _in_order(place: Path, names: Sequence[str], poses: FloatArray) -> PosesOfPhotographs:
+    said = (f"The {len(names)} poses of {place} were given to the photographs in the order of their names.",)
+    return _without_calibration(names, poses, said)
+
+
+def _without_calibration(names: Sequence[str], poses: FloatArray, said: tuple[str, ...]) -> PosesOfPhotographs:
+    return PosesOfPhotographs(tuple(names), poses, None, np.zeros(len(names), np.int64), said)
+
+
+def _unclear(place: Path, count: int, names: Sequence[str], what: str) -> InputError:
+    return InputError(
+        f"It cannot be told which of the {counted(count, 'poses')} in {place} is whose: there are "
+        f"{counted(len(names), 'photographs')}, and their names, for example {names[0]!r}, are not {what} of the file. "
+        "Name the photographs so, keep only those with a pose, or pass a file with names (transforms.json)."
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------- names
+def _by_name(place: Path, names: Sequence[str], photographs: Sequence[str]) -> tuple[list[str | None], tuple[str, ...]]:
+    """Return the photograph of each name, None where there is none, and what was concluded."""
+    ways: tuple[tuple[str, Callable[[str], str]], ...] = (
+        ("", lambda name: name),
+        ("the last part of their paths", posixpath.basename),
+        ("their names without the endings", lambda name: posixpath.splitext(posixpath.basename(name))[0].lower()),
+    )
+    for said, key in ways:
+        by_key: dict[str, list[str]] = {}
+        for photograph in photographs:
+            by_key.setdefault(key(photograph), []).append(photograph)
+        found = [by_key.get(key(name.replace("\\", "/")), []) for name in names]
+        if not any(found):
+            continue
+        twice = next((one for one in found if len(one) > 1), None)
+        if twice is not None:
+            raise InputError(
+                f"It cannot be told which pose in {place} is whose: the photographs {twice[0]!r} and {twice[1]!r} both "
+                "fit one of its names. Use whole paths in the file."
+            )
+        again = Counter(one[0] for one in found if one).most_common(1)[0]
+        if again[1] > 1:
+            raise InputError(f"{place} has {again[1]} poses for the photograph {again[0]!r}. Remove the wrong ones.")
+        return [one[0] if one else None for one in found], (f"Photographs were found by {said}.",) if said else ()
+    raise InputError(
+        f"None of the {counted(len(names), 'names')} in {place} is that of a photograph: there it is for example "
+        f"{names[0]!r}, here {photographs[0]!r}. Pass the folder that the file belongs to, or rename."
+    )
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Return a key by which img2 comes before img10."""
+    parts = re.split(r"(\d+)", name)
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
+
+
+def _stems(names: Sequence[str]) -> list[str]:
+    return [posixpath.splitext(posixpath.basename(name))[0] for name in names]
+
+
+def _times(names: Sequence[str]) -> FloatArray | None:
+    """Return the seconds that names are: with a decimal point, or whole nanoseconds; None where they are none."""
+    stems = _stems(names)
+    if all(re.fullmatch(r"\d+\.\d+", stem) for stem in stems):
+        return np.array([float(stem) for stem in stems])
+    if all(re.fullmatch(r"\d+", stem) and len(stem) >= _NANOSECOND_DIGITS for stem in stems):
+        return np.array([int(stem) * 1e-9 for stem in stems])
+    return None
+
+
+def _numbers(names: Sequence[str]) -> IntArray | None:
+    """Return the numbers at the ends of names that are the same before them; None where there are none."""
+    found = [re.fullmatch(r"(.*?)(\d{1,15})", stem) for stem in _stems(names)]
+    parts = [(match[1], int(match[2])) for match in found if match is not None]
+    if len(parts) < len(names) or len({before for before, _ in parts}) != 1:
+        return None
+    numbers = np.array([number for _, number in parts], np.int64)
+    return numbers if len(np.unique(numbers)) == len(numbers) else None
+
+
+__all__ = ["NEAR_SECONDS", "PosesOfPhotographs", "read_poses"]

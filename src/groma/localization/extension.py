@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""New photographs in a map: localised in it, those that only see each other in turns; then a model of all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from groma.errors import InputError
+from groma.evaluation.alignment import align_poses
+from groma.localization.calibration import CalibrationChoice
+from groma.localization.localizer import Localizer
+from groma.localization.map_index import Progress
+from groma.localization.placed import PlacedImage
+from groma.localization.posed_model import gather_photographs, with_photographs
+from groma.localization.run import localize_images
+from groma.mapping.result import MapResult
+from groma.scene import Scene, Similarity
+
+
+@dataclass(frozen=True, eq=False)
+class ExtendedModel:
+    """The photographs of a map and new ones, ready to be mapped."""
+
+    #: All of them with poses in the world of the map, and points.
+    scene: Scene
+    #: The folder with links to all of them, by their names.
+    folder: Path
+    #: The map before.
+    map: Scene
+    #: What became of the new ones.
+    queries: tuple[PlacedImage, ...]
+
+    def warnings(self) -> list[str]:
+        """Say which photographs are left out."""
+        left = [one for one in self.queries if one.status != "localized"]
+        if not left:
+            return []
+        named = "; ".join(f"{one.name} ({one.status}: {one.sentence})" for one in left[:3])
+        more = f"; and {len(left) - 3} more" if len(left) > 3 else ""
+        return [
+            f"Left out, as the map does not tell where: {len(left)} of {len(self.queries)} photographs. {named}{more}"
+        ]
+
+
+def extended_model(
+    localizer: Localizer,
+    files: Mapping[str, Path],
+    work: Path,
+    folder: Path,
+    choice: CalibrationChoice,
+    say: Progress,
+) -> ExtendedModel:
+    """Return the model of a map and new photographs.
+
+    Parameters
+    ----------
+    localizer
+        The map.
+    files
+        The new photographs by name.
+    work
+        Folder where localised ones are kept.
+    folder
+        Made here: links to all photographs.
+    choice
+        Where calibrations come from.
+    say
+        Progress.
+
+    Raises
+    ------
+    InputError
+        If no photograph is found in the map.
+    """
+    before, done = localizer.scene, dict[str, PlacedImage]()
+    waiting, scene = dict(files), localizer.scene
+    for turn in range(len(files)):
+        found = localize_images(localizer, waiting, work / str(turn), choice, say)
+        done |= {one.name: one for one in found}
+        placed = [one for one in found if one.status == "localized"]
+        if not placed and turn == 0:
+            raise InputError(f"None of the {len(files)} photographs is found in the map: {found[0].sentence}")
+        if not placed:
+            break
+        waiting = {one.name: waiting[one.name] for one in found if one.status != "localized"}
+        paths = [*localizer.files, *(files[one.name] for one in placed)]
+        scene = with_photographs(localizer.scene, localizer.index, placed, paths, say)
+        gather_photographs(folder, dict(zip(scene.images.names, paths, strict=True)))
+        if not waiting:
+            break
+        # What shows nothing of the map may show what the photographs do that are in it now.
+        localizer = Localizer(scene, folder, options=localizer.options, progress=say)
+    return ExtendedModel(scene, folder, before, tuple(done[name] for name in files))
+
+
+def in_world_of(result: MapResult, before: Scene) -> MapResult:
+    """Return a map in the world of the one that it extends, by the poses of the images that both have."""
+    place = {name: row for row, name in enumerate(result.scene.images.names)}
+    both = [(place[name], row) for row, name in enumerate(before.images.names) if name in place]
+    if len(both) < 2:
+        return result
+    now, then = np.array(both).T
+    moved: Similarity = align_poses(result.scene.cam_from_world[now], before.cam_from_world[then])
+    return replace(result, scene=result.scene.transformed(moved), before=result.before.transformed(moved))
+
+
+__all__ = ["ExtendedModel", "extended_model", "in_world_of"]

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What is said about poses from elsewhere: how good they are, which are wrong, and what was left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray
+from groma.evaluation.alignment import camera_centers
+from groma.geometry import quaternion
+from groma.scene import Scene
+
+#: Names in a sentence.
+_NAMES = 12
+
+
+def about_noise(place: float | None, turn: float | None, unit: float, count: int) -> list[str]:
+    """Say how good the given poses are: standard deviations of a coordinate, in units of the file."""
+    if place is None and turn is None:
+        return [f"The {count} given poses agree with the photographs as closely as these can tell."]
+    parts = [] if place is None else [f"{place * unit:.2g} units of length in each coordinate"]
+    parts += [] if turn is None else [f"{np.degrees(turn):.2g} degrees about each axis"]
+    return [f"Noise of the {count} given poses that were used, as the photographs show it: {' and '.join(parts)}."]
+
+
+def about_gross_errors(
+    names: Sequence[str], gross: BoolArray, scene: Scene, given: FloatArray, unit: float
+) -> list[str]:
+    """Say which given poses were wrong, by how much, and that they were placed anew."""
+    rows = np.flatnonzero(gross)
+    if not len(rows):
+        return []
+    poses = scene.cam_from_world[rows]
+    apart = unit * np.linalg.norm(camera_centers(poses) - camera_centers(given[rows]), axis=1)
+    between = quaternion.multiply(poses[:, :4], quaternion.conjugate(given[rows, :4]))
+    angle = np.degrees(np.linalg.norm(quaternion.log(between), axis=1))
+    each = [
+        f"{names[row]} ({distance:.3g} units, {degrees:.3g} degrees off)"
+        for row, distance, degrees in zip(rows[:_NAMES].tolist(), apart, angle, strict=False)
+    ]
+    more = f" and {len(rows) - _NAMES} more" if len(rows) > _NAMES else ""
+    if len(rows) == 1:
+        return [f"The given pose of {each[0]} is wrong beyond its noise; the image was placed anew by its matches."]
+    return [
+        f"The given poses of {len(rows)} images are wrong beyond their noise; the images were placed anew by their "
+        f"matches: {', '.join(each)}{more}."
+    ]
+
+
+def about_left_out(names: Sequence[str], seen: BoolArray) -> list[str]:
+    """Say which images share too few points with the others."""
+    rows = np.flatnonzero(~seen)
+    if not len(rows):
+        return []
+    listed = ", ".join([names[int(row)] for row in rows[:_NAMES]])
+    more = f" and {len(rows) - _NAMES} more" if len(rows) > _NAMES else ""
+    return [
+        f"{len(rows)} of {len(seen)} images see too few points of the others for their poses to be checked, and were "
+        f"left out: {listed}{more}."
+    ]
+
+
+__all__ = ["about_gross_errors", "about_left_out", "about_noise"]

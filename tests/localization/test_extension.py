@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Photographs added to a map, and two maps joined: the embedded cabinet, by motion capture poses."""
+
+import shutil
+from collections import Counter
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from groma.cli.main import run
+from groma.errors import InputError, OutputError
+from groma.evaluation import cabinet
+from groma.geometry import so3
+from groma.io import read_scene, write_scene
+from groma.localization import extension
+from groma.localization.calibration import CalibrationChoice
+from groma.localization.extension import extended_model
+from groma.localization.localizer import Localizer
+from groma.localization.merging import GATES, _line_sigma, _one_to_one, _same_lines, merged_model
+from groma.localization.posed_model import gather_photographs
+from groma.scene import Similarity
+
+FRAMES = [f"{number:04d}.jpg" for number in range(24, 36)]
+HALVES = {"a": FRAMES[0::2], "b": FRAMES[1::2]}
+#: The world of the second map.
+MOVED = Similarity(2.5, so3.exp(np.array([0.3, -0.5, 1.0])), np.array([1.0, 2.0, 3.0]))
+
+
+def quiet(stage, done, total):
+    pass
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return read_scene(cabinet.folder() / "model")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory, truth):
+    folder = tmp_path_factory.mktemp("halves")
+    names = list(truth.images.names)
+    for half, chosen in HALVES.items():
+        scene = truth.subset([names.index(name) for name in chosen])
+        write_scene(scene if half == "a" else scene.transformed(MOVED), folder / f"{half}.npz")
+        (folder / half).mkdir()
+        for name in chosen:
+            shutil.copy(cabinet.folder() / "images" / name, folder / half / name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def maps(place):
+    return {half: Localizer(place / f"{half}.npz", place / half) for half in HALVES}
+
+
+def _off(scene, truth):
+    rows = [list(truth.images.names).index(name.rpartition("/")[2]) for name in scene.images.names]
+    return np.linalg.norm(scene.cam_centers_in_world - truth.cam_centers_in_world[rows], axis=1)
+
+
+def _extended(maps, place, tmp_path, names=HALVES["b"]):
+    files = {name: place / "b" / name for name in names}
+    return extended_model(maps["a"], files, tmp_path / "work", tmp_path / "images", CalibrationChoice(), quiet)
+
+
+def test_new_photographs_get_poses_and_points_with_the_others(maps, place, truth, tmp_path):
+    made = _extended(maps, place, tmp_path)
+    scene = made.scene
+    assert set(scene.images.names) == set(FRAMES) and not made.warnings()
+    assert _off(scene, truth).max() < 0.2 and np.median(_off(scene, truth)[6:]) < 0.12
+    np.testing.assert_array_equal(scene.cam_from_world[: len(HALVES["a"])], made.map.cam_from_world)
+    assert scene.num_lines == 0 and scene.num_points > made.map.num_points
+    # Points tie the new photographs to those of the map and to each other.
+    new = np.array([name in HALVES["b"] for name in scene.images.names])[scene.point_observations.image_idx]
+    count = [np.bincount(scene.point_observations.point_idx[kind], minlength=scene.num_points) for kind in (~new, new)]
+    assert ((count[0] > 0) & (count[1] > 0)).sum() > 100
+    assert {path.name: path.resolve() for path in made.folder.iterdir()} == {
+        name: (place / half / name).resolve() for half, names in HALVES.items() for name in names
+    }
+
+
+def test_photographs_that_show_only_new_ones_follow_in_turn(maps, place, truth, tmp_path, monkeypatch):
+    late, turns = HALVES["b"][2], []
+    original = extension.localize_images
+
+    def first_without(localizer, files, *others):
+        turns.append((localizer.scene.num_images, sorted(files)))
+        found = original(localizer, files, *others)
+        if len(turns) > 1:
+            return found
+        return [extension.replace(one, status="failed") if one.name == late else one for one in found]
+
+    monkeypatch.setattr(extension, "localize_images", first_without)
+    made = _extended(maps, place, tmp_path, HALVES["b"][1:4])
+    assert turns == [(6, HALVES["b"][1:4]), (8, [late])]
+    assert late in made.scene.images.names and _off(made.scene, truth).max() < 0.2
+
+
+def test_photographs_of_something_else_are_left_out(maps, place, tmp_path):
+    cv2.imwrite(str(tmp_path / "blank.png"), np.full((480, 640), 120, np.uint8))
+    files = {"blank.png": tmp_path / "blank.png", HALVES["b"][1]: place / "b" / HALVES["b"][1]}
+    made = extended_model(maps["a"], files, tmp_path / "w", tmp_path / "images", CalibrationChoice(), quiet)
+    assert "blank.png" not in made.scene.images.names
+    assert len(made.warnings()) == 1 and "1 of 2 photographs. blank.png" in made.warnings()[0]
+    with pytest.raises(InputError, match="None of the 1 photographs"):
+        extended_model(
+            maps["a"], {"blank.png": files["blank.png"]}, tmp_path / "w", tmp_path / "i", CalibrationChoice(), quiet
+        )
+
+
+def test_two_maps_are_joined_with_their_scale(maps, truth, tmp_path):
+    made = merged_model(maps["a"], maps["b"], tmp_path / "images", "similarity", quiet)
+    assert abs(made.motion.similarity[7] * MOVED.scale - 1.0) < 0.02
+    assert set(made.scene.images.names) == set(FRAMES) and made.num_common == 0
+    assert _off(made.scene, truth).max() < 0.2
+    assert "matched points" in made.sentence() and "scale 0.4" in made.sentence()
+
+
+def test_photographs_of_both_maps_are_taken_once(place, maps, truth, tmp_path):
+    names = list(truth.images.names)
+    both = [*HALVES["b"], HALVES["a"][2]]
+    scene = truth.subset([names.index(name) for name in both]).transformed(MOVED)
+    gather_photographs(tmp_path / "b", {name: cabinet.folder() / "images" / name for name in both})
+    made = merged_model(maps["a"], Localizer(scene, tmp_path / "b"), tmp_path / "images", "similarity", quiet)
+    assert made.num_common == 1 and sorted(made.scene.images.names) == FRAMES
+
+
+def test_a_photograph_that_one_map_has_in_a_wrong_place_gets_that_of_the_other(maps, place, truth, tmp_path):
+    scene = read_scene(place / "b.npz")
+    poses = scene.frames.rig_from_world.copy()
+    poses[2, 4:] += 2.0
+    other = Localizer(scene.replace(frames=replace(scene.frames, rig_from_world=poses)), place / "b")
+    made = merged_model(maps["a"], other, tmp_path / "images", "similarity", quiet)
+    assert _off(made.scene, truth).max() < 0.2
+
+
+def test_maps_of_different_places_are_not_joined(place, maps, tmp_path):
+    (tmp_path / "b").mkdir()
+    for name in HALVES["b"]:
+        image = cv2.imread(str(place / "b" / name))
+        cv2.imwrite(str(tmp_path / "b" / name), image[:, ::-1])
+    other = Localizer(read_scene(place / "b.npz"), tmp_path / "b")
+    with pytest.raises(InputError, match="cannot be joined"):
+        merged_model(maps["a"], other, tmp_path / "images", "similarity", quiet)
+
+
+def test_segments_that_show_one_line_are_paired():
+    observed = np.array([[100, 100, 200, 100], [100, 150, 200, 160], [300, 50, 300, 200.0]])
+    query = np.array([[110, 100.5, 190, 101], [120, 153, 180, 157.5], [300, 260, 300, 400], [110, 120, 190, 120.0]])
+    seen = SimpleNamespace(image_idx=np.array([4, 4, 4]), line_idx=np.array([7, 8, 9]), segment=observed)
+    pose = SimpleNamespace(line_inliers=np.ones(4, bool), matches=SimpleNamespace(segments2d=query))
+    found = SimpleNamespace(pose=pose, line=np.array([30, 31, 32, 33]))
+    pairs = _same_lines(SimpleNamespace(scene=SimpleNamespace(line_observations=seen)), 4, found, GATES)
+    assert pairs.tolist() == [[7, 30], [8, 31]]
+
+
+def test_pairs_that_most_photographs_show_win():
+    votes = Counter({(1, 5): 3, (1, 6): 2, (2, 6): 1, (3, 5): 1})
+    assert _one_to_one(votes).tolist() == [[1, 5], [2, 6]]
+
+
+def test_noise_of_a_line_across_its_ends():
+    """Against draws of the line's moment and direction."""
+    rng = np.random.default_rng(3)
+    ends = np.array([[1.0, 2.0, 0.5], [2.0, 2.5, 1.5]])
+    direction = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    across = np.linalg.svd(direction[None])[2][1:].T
+    shifts = rng.normal(0, 0.01, (20000, 2, 2)) @ across.T
+    moved = ends + shifts
+    step = moved[:, 1] - moved[:, 0]
+    unit = step / np.linalg.norm(step, axis=1, keepdims=True)
+    lines = np.concatenate([np.cross(moved[:, 0], unit), unit], axis=1)
+    assert _line_sigma(ends[None], np.cov(lines.T)[None])[0] == pytest.approx(0.01, rel=0.03)
+
+
+def test_a_folder_of_links_holds_nothing_else(tmp_path):
+    (tmp_path / "one.jpg").write_bytes(b"1")
+    (tmp_path / "two.jpg").write_bytes(b"2")
+    gather_photographs(tmp_path / "links", {"a/x.jpg": tmp_path / "one.jpg"})
+    gather_photographs(tmp_path / "links", {"a/x.jpg": tmp_path / "one.jpg"})
+    with pytest.raises(InputError, match="there already"):
+        gather_photographs(tmp_path / "links", {"a/x.jpg": tmp_path / "two.jpg"})
+    with pytest.raises(InputError, match="leads out"):
+        gather_photographs(tmp_path / "links", {"../x.jpg": tmp_path / "one.jpg"})
+
+
+def test_the_command_extends_a_map(place, truth, tmp_path, capsys):
+    out = tmp_path / "out"
+    (tmp_path / "new").mkdir()
+    for name in HALVES["b"][1:4]:
+        shutil.copy(place / "b" / name, tmp_path / "new")
+    given = ["map", tmp_path / "new", "--extend", place / "a.npz", "--map-images", place / "a", "-o", out]
+    assert run([*map(str, given), "--no-diagnosis", "--no-planes"]) == 0
+    scene = read_scene(out / "scene.npz")
+    assert sorted(scene.images.names) == sorted([*HALVES["a"], *HALVES["b"][1:4]])
+    # The result is in the world of the map, and can be extended or asked itself.
+    assert np.median(_off(scene, truth)) < 0.1
+    assert Localizer(out).files[0].parent == tmp_path / "out.images"
+    assert not (tmp_path / "out.queries").exists() and not (tmp_path / "out.work").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["map", "b", "--extend", "a.npz", "--model", "a.npz"], "--extend and --model exclude each other"),
+        (["map", "b", "--map-images", "a"], "Add --extend"),
+        (["map", "b", "--extend", "nothing.npz"], "nothing.npz"),
+        (["map", "b", "--extend", "a/0024.jpg"], "0024.jpg"),
+        (["merge", "a.npz", "nothing"], "nothing"),
+        (["merge", "a.npz", "a"], "a"),
+    ],
+)
+def test_one_line_for_what_cannot_be_used(place, tmp_path, capsys, monkeypatch, given, words):
+    monkeypatch.chdir(place)
+    assert run([*given, "-o", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert words in said and len(said.strip().splitlines()) == 1 and not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_other_files_is_not_replaced(tmp_path):
+    from groma.cli.shared.extending import photograph_folder
+
+    (tmp_path / "out.images").mkdir()
+    (tmp_path / "out.images" / "mine.jpg").write_bytes(b"1")
+    with pytest.raises(OutputError, match="no links"):
+        photograph_folder(tmp_path / "out", force=True)
