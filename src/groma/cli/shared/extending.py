@@ -92,7 +92,7 @@ def check_extension(extend: Path | None, map_images: Path | None, others: dict[s
 def _with_progress(console: Console, made: Callable[[Callable[[str, int, int], None]], _Made], kept: str) -> _Made:
     from groma.cli.shared.interrupt import interruptible
 
-    console.announce_compilation()
+    console.expect_compilation("map")
     try:
         with interruptible() as interruption, console.stages() as stages:
             return made(interruption.checking(stages))
