@@ -304,7 +304,7 @@ class _Unopened:
     def __getattr__(self, name: str) -> Any:
         try:
             opened: Any = _Cache(self._dispatcher.py_func, self._dispatcher)
-        except RuntimeError:  # Numba found no folder that can be written
+        except (RuntimeError, OSError):  # no folder that can be written, or no source: loops written for a notebook
             opened = NullCache()
         self._dispatcher._cache = opened
         _watch(self._dispatcher._compiler, opened)

@@ -166,16 +166,3 @@ def test_a_panorama_without_size_is_refused():
 def test_a_panorama_is_not_followed():
     with pytest.raises(groma.InputError, match=r"EQUIRECTANGULAR images are panoramas"):
         SequenceCamera("EQUIRECTANGULAR", np.array([2000.0, 1000.0]), 2000, 1000)
-
-
-def test_a_view_without_a_plane_is_not_mapped(tmp_path):
-    truth, _, _ = room("EQUIRECTANGULAR")
-    cv2 = pytest.importorskip("cv2")
-    for name in truth.images.names:
-        cv2.imwrite(str(tmp_path / name), np.zeros((1000, 2000), np.uint8))
-    from groma.mapping.map import map_images
-
-    with pytest.raises(
-        groma.InputError, match=r"EQUIRECTANGULAR images are panoramas.*perspective views.*groma adjust"
-    ):
-        map_images(tmp_path, tmp_path / "work", truth)

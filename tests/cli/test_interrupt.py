@@ -77,7 +77,7 @@ def test_ctrl_c_while_mapping_says_how_to_go_on(tmp_path, monkeypatch, capsys):
 
     (tmp_path / "photos").mkdir()
 
-    def interrupted(images, work, model, options, progress, matches):
+    def interrupted(*arguments):
         os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr(mapping, "map_images", interrupted)

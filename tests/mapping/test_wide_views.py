@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Panoramas and wide fisheyes: the views that they are seen in, segments found there, and lines mapped from them."""
 
-import _room
+import _box_room as _room
 import cv2
 import numpy as np
 import pytest

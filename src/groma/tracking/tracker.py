@@ -370,7 +370,8 @@ class Tracker:
         others = [root for root in roots if root != main and (count[root] or self._saved is None)]
         for root in others:
             ending.adjust(root)
-        statistics = self.statistics() | ending.adjust(main).numbers(self.camera)
+        adjusted = ending.adjust(main).numbers(self.camera)  # finds planes, which are counted
+        statistics = self.statistics() | adjusted
         whole, *submaps = [ending.submap(root) for root in (main, *others)]
         warnings = [*self._checks.warnings, *ending.warnings]
         if not history.entries:
