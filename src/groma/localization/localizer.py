@@ -196,8 +196,17 @@ def _folder(map_: object, images: str | os.PathLike[str] | None, index: Path | N
     if told is None and not isinstance(map_, Scene):
         told = images_in_summary(Path(str(map_)))
     if told is None:
-        raise InputError("Where the photographs of the map are is not known. Pass their folder with --images.")
+        name = "The scene" if isinstance(map_, Scene) else str(map_)
+        raise InputError(
+            f"{name} does not tell where its photographs are. Pass their folder (--images; of groma merge --images-a "
+            "and --images-b)."
+        )
     return told
+
+
+def photographs_of(map_: str | os.PathLike[str], images: str | os.PathLike[str] | None = None) -> Path:
+    """Return the folder of the photographs of a map: as given, or as it tells; InputError where it does not."""
+    return _folder(map_, images, index_file(Path(map_)))
 
 
 def unknown_camera(width: int, height: int) -> QueryCamera:
@@ -219,4 +228,13 @@ def check_map(scene: Scene) -> None:
     check_cameras(scene.cameras.models)
 
 
-__all__ = ["GATES", "LocalizeOptions", "LocalizedImage", "Localizer", "LocalizerGates", "index_file", "unknown_camera"]
+__all__ = [
+    "GATES",
+    "LocalizeOptions",
+    "LocalizedImage",
+    "Localizer",
+    "LocalizerGates",
+    "index_file",
+    "photographs_of",
+    "unknown_camera",
+]

@@ -51,9 +51,11 @@ def merge_maps(
     force: bool,
 ) -> MergedModel:
     """Find how two maps lie to each other; return the model of the photographs of both."""
-    from groma.localization.localizer import Localizer
+    from groma.localization.localizer import Localizer, photographs_of
     from groma.localization.merging import merged_model
 
+    for one, where in zip(maps, images, strict=True):
+        photographs_of(one, where)  # before minutes are spent on the other
     folder = photograph_folder(output, force)
 
     def made(say: Callable[[str, int, int], None]) -> MergedModel:
