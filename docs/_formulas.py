@@ -15,12 +15,19 @@ _logger = logging.getLogger(__name__)
 _SIZE = 17.0
 
 
+def _has_rows(latex: str) -> bool:
+    """Whether a formula has rows of its own, aligned at &, besides those of its matrices."""
+    return bool(re.search(r"&|\\\\", re.sub(r"\\begin\{(\w+)\}.*?\\end\{\1\}", "", latex, flags=re.DOTALL)))
+
+
 @cache
 def _drawing(source: str, inline: bool) -> str:
     """Return a formula as an SVG element that stands on the line of the text."""
     # A bracket at the head of a cell would be read as an option of the environment, and \lVert would be stretched.
     latex = re.sub(r"(\\begin\{[bp]?matrix\}|\\\\|&)\s*\[([^\[\]]*)\]", r"\1 {[\2]}", source)
     latex = re.sub(r"\\[lr]Vert(?![A-Za-z])", lambda _: r"\|", latex)
+    if _has_rows(latex):
+        latex = rf"\begin{{array}}{{rl}} {latex} \end{{array}}"
     formula = ziamath.Latex(latex, size=_SIZE, inline=inline, color="currentColor")
     style = f'<svg role="img" aria-label="{html.escape(source)}" style="vertical-align: {formula.getyofst():.2f}px"'
     return formula.svg().replace("<svg", style, 1)
