@@ -118,8 +118,8 @@ class AdjustOptions:
     #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss or with lines (1 where
     #: points are tied to lines and there is no loss), else 0.
     landmark_steps: int | None = None
-    #: Look into the residuals of points for lens distortion that the cameras lack and for rigs that do not fit; warnings
-    #: then say so.
+    #: Look for lens distortion that cameras lack, in the residuals of points, and for rigs that do not fit; warnings
+    #: say so.
     check_lens: bool = True
     #: Threads; None takes one for small problems and all cores for large ones.
     threads: int | None = None

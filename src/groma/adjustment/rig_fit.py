@@ -117,7 +117,7 @@ def _is_held(sensors: Variables) -> bool:
 def _with_free_sensors(problem: Problem, reference: BoolArray) -> Problem:
     """Return the problem with cameras that may move on their rigs."""
     old = problem.variables[SENSORS]
-    return Problem(problem.variables | {SENSORS: Variables(old.manifold, old.state, reference)}, problem.factors)
+    return Problem({**problem.variables, SENSORS: Variables(old.manifold, old.state, reference)}, problem.factors)
 
 
 def _with_free_images(problem: Problem, reference: BoolArray) -> Problem:
@@ -126,7 +126,7 @@ def _with_free_images(problem: Problem, reference: BoolArray) -> Problem:
     pairs = [np.column_stack([f.extrinsics.index, f.pose.index]) for f in _seen(problem) if f.extrinsics is not None]
     every, of = np.unique(np.vstack(pairs), axis=0, return_inverse=True)
     sensor = every[:, 0]
-    variables = problem.variables | {ALONE: Variables(old.manifold, old.state[sensor], reference[sensor])}
+    variables = {**problem.variables, ALONE: Variables(old.manifold, old.state[sensor], reference[sensor])}
     factors: list[Factor] = []
     begin, of = 0, of.ravel()
     for factor in problem.factors:
