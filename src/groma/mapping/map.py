@@ -215,7 +215,6 @@ def map_images(
         segments = stages.run(find_segments, folder, points, line_matches, given=line_matches)
         matches = matches_for(options, folder, points, segments, line_matches)
         result = map_segments(points, segments, matches, stages, neighbors_for(options, folder))
-    say("done", 1, 1)
     left_out = images_left_out(names, (model or start).images.names, model is not None)
     result = dataclasses.replace(
         result,

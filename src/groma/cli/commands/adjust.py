@@ -6,9 +6,10 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from groma.cli.shared import command as _complete
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
-from groma.errors import InputError
+from groma.errors import InputError, did_you_mean
 
 LineResidual = Literal["endpoints", "bearing", "normal"]
 PlaneResidual = Literal["normal_offset", "quaternion"]
@@ -22,7 +23,8 @@ def _check_linear_solver(name: str) -> None:
 
     if name not in linear_solver_names():
         known = ", ".join(linear_solver_names())
-        raise typer.BadParameter(f"{name!r} is not one of {known}.", param_hint="'--linear-solver'")
+        suggestion = did_you_mean(name, linear_solver_names())
+        raise typer.BadParameter(f"{name!r} is not one of {known}.{suggestion}", param_hint="'--linear-solver'")
 
 
 def adjust(
@@ -40,6 +42,7 @@ def adjust(
     loss: Annotated[
         str,
         typer.Option(
+            autocompletion=_complete.one_of(*_complete.LOSSES),
             metavar="NAME",
             help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron, truncated, or one of an installed "
             "package. auto: robust "
@@ -54,6 +57,7 @@ def adjust(
         str | None,
         typer.Option(
             "--camera-model",
+            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
             metavar="NAME",
             help="Change the lens model of all cameras first (PINHOLE to OPENCV, ...); what it adds starts at 0 and is "
             "estimated.",
@@ -81,6 +85,7 @@ def adjust(
     linear_solver: Annotated[
         str,
         typer.Option(
+            autocompletion=_complete.one_of(*_complete.LINEAR_SOLVERS),
             metavar="NAME",
             help="How each step is solved: auto, dense, sparse, pcg, or a solver of an installed package.",
         ),
@@ -88,6 +93,7 @@ def adjust(
     line_chart: Annotated[
         str | None,
         typer.Option(
+            autocompletion=_complete.one_of(*_complete.LINE_CHARTS),
             metavar="NAME",
             help="Line parametrisation: cartesian (default), orthonormal_left, orthonormal_right, free_left, "
             "free_right, or one of an installed package.",
@@ -107,6 +113,7 @@ def adjust(
     gauge: Annotated[
         str | None,
         typer.Option(
+            autocompletion=_complete.one_of(*_complete.GAUGES),
             metavar="NAME",
             help="free; first_camera, to hold the first camera and the scale; or auto (default): free, unless distances"
             " between landmarks are in scene units.",

@@ -65,7 +65,10 @@ def align(
     if output is not None:
         write_scene(found.scene, output, force=force, like=structures_of(source))
     _say(console, found)
-    console.say(f"Wrote {output}" if output is not None else "No -o given: the moved scene was not written.")
+    if output is not None:
+        console.wrote(output)
+    else:
+        console.say("No -o given: the moved scene was not written.")
     _output.write_json(json_target, found.to_dict(), force)
 
 

@@ -2,11 +2,21 @@
 """``groma localize``: where photographs were taken, in a map that is there already."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from groma._counted import counted
+from groma.cli.shared import command as _complete
 from groma.cli.shared import options as _options
+
+if TYPE_CHECKING:
+    from groma.cli.shared.console import Console
+    from groma.localization.placed import PlacedImage
+    from groma.localization.result import LocalizeResult
+
+#: Localised photographs in the table; those that are not are always told.
+_SHOWN = 12
 
 
 def localize(
@@ -28,13 +38,18 @@ def localize(
         str,
         typer.Option(
             "--calibration",
+            autocompletion=_complete.one_of(*_complete.CALIBRATIONS),
             metavar="SOURCE",
             help="Of the queries: map, exif, unknown; or auto, the first of these that fits.",
         ),
     ] = "auto",
     camera_model: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Lens model of the queries, by COLMAP's name; with its parameters."),
+        typer.Option(
+            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
+            metavar="NAME",
+            help="Lens model of the queries, by COLMAP's name; with its parameters.",
+        ),
     ] = None,
     camera_params: Annotated[
         str | None, typer.Option(metavar="F,CX,CY,...", help="The parameters, if they are known; they are then kept.")
@@ -65,8 +80,9 @@ def localize(
 
     import shutil
 
-    from groma._counted import counted
+    from groma.cli.shared.extending import DESCRIBING, LOCALIZING
     from groma.cli.shared.interrupt import PROCESS, interruptible
+    from groma.cli.shared.mapping import WRITING
     from groma.localization.calibration import CalibrationChoice, parameters
     from groma.localization.localizer import LocalizeOptions, Localizer
     from groma.localization.pose.absolute_pose import PoseOptions
@@ -77,6 +93,7 @@ def localize(
     files = query_files(queries)
     options = LocalizeOptions(lines=lines, min_segment_length=min_length, pose=PoseOptions(seed=seed))
     console.expect_compilation("localize")
+    console.expect_stages(*DESCRIBING, LOCALIZING, WRITING)
     work = output.with_name(output.name + ".work")
     try:
         with interruptible() as interruption, console.stages() as stages:
@@ -90,11 +107,36 @@ def localize(
         console.warn(localizer.warning)
     result = LocalizeResult(localizer.scene, localizer.index, tuple(found))
     _output.check_output(output, force)
-    result.write(output, files, f"Photographs in {map_.absolute().name}", force=force)
+    with console.stages() as say:
+        say(WRITING, 0, 1)
+        result.write(output, files, f"Photographs in {map_.absolute().name}", force=force)
     shutil.rmtree(work, ignore_errors=True)
+    _say(console, result)
+    console.wrote_page(output)
+    _output.write_json(json_target, result.to_dict(), force)
+
+
+def _say(console: "Console", result: "LocalizeResult") -> None:
+    """A row for every photograph, at most a dozen of those that are localised; why the others are not; a count."""
+    found = result.queries
+    localized = [one for one in found if one.status == "localized"]
+    hidden = 0 if console.verbose else max(len(localized) - _SHOWN, 0)
+    left_out = {one.name for one in localized[len(localized) - hidden :]}
+    console.table(
+        ("photograph", "status", "points", "lines", "centre known to", "rotation"),
+        [_row(one) for one in found if one.name not in left_out],
+    )
+    if hidden:
+        console.say(f"  and {hidden:,} more that are localised; --verbose shows them.")
     for one in found:
-        (console.detail if one.status == "localized" else console.say)(f"{one.name}: {one.status}. {one.sentence}")
+        (console.detail if one.status == "localized" else console.say)(f"{one.name}: {one.sentence}")
     numbers = ", ".join(f"{result.count(status)} {status}" for status in ("localized", "uncertain", "failed"))
     console.say(f"{counted(len(found), 'photographs')}: {numbers}.")
-    console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
-    _output.write_json(json_target, result.to_dict(), force)
+
+
+def _row(one: "PlacedImage") -> tuple[str, ...]:
+    numbers = one.to_dict()
+    sigma, turn = numbers["center_sigma"], numbers["rotation_sigma_deg"]
+    center = "" if sigma is None else f"{sum(value * value for value in sigma) ** 0.5:.2g}"
+    seen = (f"{numbers['num_point_inliers']:,}", f"{numbers['num_line_inliers']:,}")
+    return one.name, one.status, *seen, center, "" if turn is None else f"{turn:.2g}°"

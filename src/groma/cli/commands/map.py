@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from groma.cli.shared import command as _complete
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
 from groma.cli.shared.ranks import led_by_first_rank
@@ -61,6 +62,7 @@ def map_(
     camera_model: Annotated[
         str | None,
         typer.Option(
+            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
             metavar="NAME",
             help="Lens model, by COLMAP's name. Without --model the one to estimate (SIMPLE_RADIAL); with it the one "
             "that its cameras are changed to, and what it adds is estimated.",
@@ -72,7 +74,11 @@ def map_(
     ] = None,
     mapper: Annotated[
         str,
-        typer.Option(metavar="NAME", help="Without --model and --poses: place cameras incremental(ly) or global(ly)."),
+        typer.Option(
+            autocompletion=_complete.one_of(*_complete.MAPPERS),
+            metavar="NAME",
+            help="Without --model and --poses: place cameras incremental(ly) or global(ly).",
+        ),
     ] = "incremental",
     rig: Annotated[
         Path | None,
@@ -97,6 +103,7 @@ def map_(
         str | None,
         typer.Option(
             "--line-matcher",
+            autocompletion=_complete.one_of(*_complete.MATCHERS),
             metavar="NAME",
             help="Match segments by wide_baseline, flow, or a matcher of an installed package. Default: poses alone.",
         ),
@@ -180,7 +187,7 @@ def map_(
 
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.extending import end_queries, extend_map
-    from groma.cli.shared.mapping import run_map, say_map, write_map
+    from groma.cli.shared.mapping import run_map, say_map, stages_of_map, write_map
     from groma.execution import work_with
     from groma.features.external import read_matches
     from groma.io import read_scene
@@ -212,7 +219,8 @@ def map_(
     work = output.with_name(output.name + ".work")
     photographs, extended = images, None
     if extend is not None:
-        extended = extend_map(console, extend, images, map_images, output, force)
+        stages = stages_of_map(options, "model", bool(measured), matches is not None)
+        extended = extend_map(console, extend, images, map_images, output, force, stages)
         photographs, start = extended.folder, extended.scene
     survey = None
     if measured:
@@ -226,10 +234,10 @@ def map_(
         found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
         numbers = result.summary(found, result.contributions(true) if contributions else ())
         title = f"Map of {images.absolute().name}"
-        write_map(result, output, work, force, images=photographs, title=title, summary=numbers)
+        write_map(console, result, output, work, force, images=photographs, title=title, summary=numbers)
     end_queries(output)
     say_map(console, result, numbers)
-    console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
+    console.wrote_page(output)
     _output.write_json(json_target, numbers, force)
 
 

@@ -6,11 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
-from groma._counted import counted
+from groma.cli.shared import command as _complete
 from groma.cli.shared import options as _options
 
 if TYPE_CHECKING:
     from groma.cli.shared.console import Console
+
+#: As :func:`groma.tracking.track` names them.
+_STAGES = ("tracking frame", "adjusting all keyframes")
 
 
 def track(
@@ -36,7 +39,13 @@ def track(
         ),
     ] = None,
     kind: Annotated[
-        str | None, typer.Option("--kind", metavar="KIND", help="rgbd, stereo or mono; told by the files otherwise.")
+        str | None,
+        typer.Option(
+            "--kind",
+            autocompletion=_complete.one_of(*_complete.SEQUENCES),
+            metavar="KIND",
+            help="rgbd, stereo or mono; told by the files otherwise.",
+        ),
     ] = None,
     points: Annotated[bool, typer.Option("--points/--no-points", help="Follow points.")] = True,
     lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Follow line segments.")] = True,
@@ -84,6 +93,7 @@ def track(
 
     import shutil
 
+    from groma.cli.shared.mapping import WRITING
     from groma.io.sequences import open_sequence
     from groma.tracking.options import TrackOptions
     from groma.tracking.saved import FrameSource
@@ -101,6 +111,7 @@ def track(
     options.make_detector()  # refuses a wrong name now
     console.expect_compilation("track")
     work = output.with_name(output.name + ".work")
+    console.expect_stages(*(() if map_ is None else ("reading the map",)), *_STAGES, WRITING)
     with console.stages() as stages:
 
         def show(event: TrackProgress) -> None:
@@ -114,19 +125,22 @@ def track(
     if result.interrupted:
         console.warn("interrupted; what was tracked so far is written.")
     _output.check_output(output, force)
-    for sentence in result.write(output, f"Track of {sequence.absolute().name}", force):
+    with console.stages() as say:
+        say(WRITING, 0, 1)
+        unwritten = result.write(output, f"Track of {sequence.absolute().name}", force)
+    for sentence in unwritten:
         console.warn(sentence)
     shutil.rmtree(work, ignore_errors=True)
     numbers = result.summary()
     _say(console, numbers)
-    console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
+    console.wrote_page(output)
     _output.write_json(json_target, numbers, force)
 
 
 def _say(console: "Console", numbers: dict[str, Any]) -> None:
-    statuses = ", ".join(f"{count:,} {status}" for status, count in sorted(numbers["frames"].items()))
+    statuses = [[f"frames {status}", f"{count:,}"] for status, count in sorted(numbers["frames"].items())]
     kinds = ("keyframes", "points", "lines", "planes", "loops")
-    console.say(f"Frames: {statuses}; {', '.join(counted(numbers[kind], kind) for kind in kinds)}")
+    console.table(("", "number"), [*statuses, *([kind, f"{numbers[kind]:,}"] for kind in kinds)])
     total = numbers["milliseconds"].get("total")
     if total:
         console.say(f"Time per frame: median {total['median']:.1f} ms, 95 % below {total['p95']:.1f} ms")

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from groma.adjustment.adjust import AdjustOptions
     from groma.adjustment.report import AdjustResult, Progress
     from groma.cli.shared.console import Console
+    from groma.compilation.time import Compilation
     from groma.scene import Scene
 
 
@@ -112,11 +113,11 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
             reasons = why_no_covariances(result.scene, wanted.covariance)
             numbers["warnings"] += reasons
             failure = None if reasons else error  # raised at the end, when all else is written and said
-    _say(console, numbers, compilation.compiled)
+    _say(console, numbers, compilation)
     say_survey(console, survey or {})
     for path in (wanted.output, wanted.page, wanted.protocol, wanted.covariance if "uncertainty" in numbers else None):
         if path is not None:
-            console.say(f"Wrote {path}")
+            console.wrote(path)
     if all(place is None for place in (wanted.output, wanted.page, wanted.covariance, wanted.json_target)):
         console.say("No -o given: the adjusted scene was not written.")
     _output.write_json(wanted.json_target, numbers, wanted.force)
@@ -162,16 +163,15 @@ def why_no_covariances(scene: Scene, path: Path) -> list[str]:
     ]
 
 
-def _say(console: Console, numbers: dict[str, Any], compiled: bool) -> None:
+def _say(console: Console, numbers: dict[str, Any], compilation: Compilation) -> None:
     """Say the main numbers, what the data do not determine, and the warnings."""
     from groma.cli.shared.diagnosis import say_diagnosis
-    from groma.cli.shared.sentences import describe, describe_contributions, describe_uncertainty
+    from groma.cli.shared.sentences import describe_uncertainty, say_adjustment, say_contributions
 
-    lines = describe(numbers, numbers["termination_sentence"], verbose=console.verbose, compiled=compiled)
-    lines += describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else []
-    lines += describe_contributions(numbers.get("contributions", []))
-    for line in lines:
+    say_adjustment(console, numbers, numbers["termination_sentence"], compilation)
+    for line in describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else ():
         console.say(line)
+    say_contributions(console, numbers.get("contributions", []))
     say_diagnosis(numbers["diagnosis"], console)
     for sentence in numbers["warnings"]:
         console.warn(sentence)

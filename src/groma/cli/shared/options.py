@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from groma.cli.shared import command as _complete
+
 Json = Annotated[
     str | None,
     typer.Option("--json", metavar="FILE", help="Write a machine-readable report to FILE; '-' is standard output."),
@@ -36,7 +38,10 @@ Truth = Annotated[
 LineDetector = Annotated[
     str,
     typer.Option(
-        "--line-detector", metavar="NAME", help="What finds line segments: lsd, or a detector of an installed package."
+        "--line-detector",
+        autocompletion=_complete.one_of(*_complete.DETECTORS),
+        metavar="NAME",
+        help="What finds line segments: lsd, or a detector of an installed package.",
     ),
 ]
 Input = Annotated[
