@@ -47,7 +47,7 @@ def here(tmp_path, monkeypatch):
 def test_adjust(scenes, here, capsys):
     assert run(["adjust", str(scenes / "points.npz"), "-o", "out.npz", "--json", "r.json", "--report", "p.html"]) == 0
     said = capsys.readouterr()
-    assert "points error" in said.out and "Wrote out.npz" in said.out
+    assert "rms of inliers" in said.out and "Wrote out.npz" in said.out
     assert "\r" not in said.err  # progress is for terminals
     report = json.loads((here / "r.json").read_text())
     start = read_scene(scenes / "points.npz")

@@ -108,14 +108,4 @@ def _focal_length(path: Path) -> float | None:
     return float(focal) if focal and np.isfinite(focal) and focal > 0 else None
 
 
-def parameters(text: str | None) -> tuple[float, ...] | None:
-    """Camera parameters from numbers with commas between them."""
-    if text is None:
-        return None
-    try:
-        return tuple(float(number) for number in text.split(","))
-    except ValueError:
-        raise InputError(f"--camera-params must be numbers with commas between them; got {text!r}.") from None
-
-
-__all__ = ["SOURCES", "Calibration", "CalibrationChoice", "calibration_of", "parameters"]
+__all__ = ["SOURCES", "Calibration", "CalibrationChoice", "calibration_of"]

@@ -183,7 +183,7 @@ def adjust(
     truth: _options.Truth = None,
     force: _options.Force = False,
     threads: _options.Threads = None,
-    seed: _options.Seed = 0,
+    seed: _options.NoSeed = 0,
     json_target: _options.Json = None,
     quiet: _options.Quiet = False,
     verbose: _options.Verbose = False,
@@ -194,12 +194,11 @@ def adjust(
     is never changed. LIMAP's structures beside a COLMAP model are read and written too, with what they hold besides.
     What the data do not determine is said in words at the end. A pose graph (.g2o, .g2o.gz) is adjusted, too, and so is
     a folder of parts (groma convert --parts), by one process or by all that mpiexec starts.
-    The result is deterministic; --seed is accepted so that scripts can pass it to every command.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.adjusting import Wanted, adjust_and_write
     from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.input import check_inputs, refuse_idle
     from groma.cli.shared.parts import PartsWanted, adjust_parts_and_write, has_company, is_parts
     from groma.cli.shared.pose_graph import adjust_graph_and_write, is_pose_graph
 
@@ -219,6 +218,11 @@ def adjust(
         raise InputError(f"--sigma0 must be positive; got {sigma0}.")
     if truth is not None and not contributions:
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
+    refuse_idle(
+        ("--covariance-gauge", covariance_gauge != "auto" and covariance is None, "with --covariance"),
+        ("--sigma0", sigma0 != 1.0 and covariance is None, "with --covariance"),
+        ("--keep", keep != "auto" and not in_parts, "on a folder of parts"),
+    )
     if not in_parts:
         check_inputs(source, truth, *measured.files)
     if is_pose_graph(source) and not in_parts:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 #: Localised photographs in the table; those that are not are always told.
 _SHOWN = 12
+_MIN_LENGTH = 15.0
 
 
 def localize(
@@ -55,7 +56,9 @@ def localize(
         str | None, typer.Option(metavar="F,CX,CY,...", help="The parameters, if they are known; they are then kept.")
     ] = None,
     lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Use lines besides points.")] = True,
-    min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 15.0,
+    min_length: Annotated[
+        float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")
+    ] = _MIN_LENGTH,
     force: _options.Force = False,
     threads: _options.Threads = None,
     seed: _options.Seed = 0,
@@ -72,24 +75,25 @@ def localize(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.input import camera_parameters, check_inputs, refuse_idle
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
     check_inputs(map_, *queries, images)
+    refuse_idle(("--min-length", min_length != _MIN_LENGTH and not lines, "with lines"))
 
     import shutil
 
     from groma.cli.shared.extending import DESCRIBING, LOCALIZING
     from groma.cli.shared.interrupt import PROCESS, interruptible
     from groma.cli.shared.mapping import WRITING
-    from groma.localization.calibration import CalibrationChoice, parameters
+    from groma.localization.calibration import CalibrationChoice
     from groma.localization.localizer import LocalizeOptions, Localizer
     from groma.localization.pose.absolute_pose import PoseOptions
     from groma.localization.result import LocalizeResult
     from groma.localization.run import localize_images, query_files
 
-    choice = CalibrationChoice(calibration, camera_model, parameters(camera_params))
+    choice = CalibrationChoice(calibration, camera_model, camera_parameters(camera_params))
     files = query_files(queries)
     options = LocalizeOptions(lines=lines, min_segment_length=min_length, pose=PoseOptions(seed=seed))
     console.expect_compilation("localize")

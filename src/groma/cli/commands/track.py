@@ -35,8 +35,22 @@ def track(
         typer.Option(
             "--camera",
             metavar="CAMERA",
-            help="File or numbers: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: what the sequence says.",
+            help="Calibration file, or its numbers as OpenCV has them: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: what "
+            "the sequence says.",
         ),
+    ] = None,
+    camera_model: Annotated[
+        str | None,
+        typer.Option(
+            "--camera-model",
+            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
+            metavar="NAME",
+            help="Lens model, by COLMAP's name; with its parameters, in place of --camera.",
+        ),
+    ] = None,
+    camera_params: Annotated[
+        str | None,
+        typer.Option("--camera-params", metavar="F,CX,CY,...", help="The parameters, pixels counted as COLMAP does."),
     ] = None,
     kind: Annotated[
         str | None,
@@ -84,12 +98,18 @@ def track(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.errors import InputError
+    from groma.cli.shared.input import camera_line, refuse_idle
+    from groma.errors import InputError, did_you_mean
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
-    if kind not in (None, "rgbd", "stereo", "mono"):
-        raise InputError(f"--kind must be rgbd, stereo or mono; got {kind!r}.")
+    if kind not in (None, *_complete.SEQUENCES):
+        raise InputError(f"--kind must be rgbd, stereo or mono; got {kind!r}.{did_you_mean(kind, _complete.SEQUENCES)}")
+    line = camera_line(camera_model, camera_params)
+    if camera is not None and line is not None:
+        raise InputError("--camera and --camera-model exclude each other. Leave one of them out.")
+    camera = camera or line
+    refuse_idle(("--line-detector", line_detector != "lsd" and not lines, "with lines"))
 
     import shutil
 

@@ -21,6 +21,8 @@ Threads = Annotated[
     ),
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Seed of the random numbers.")]
+#: Of commands that draw no random numbers: accepted, so that a script can pass it to every command, and not shown.
+NoSeed = Annotated[int, typer.Option("--seed", min=0, hidden=True)]
 Force = Annotated[bool, typer.Option("--force", "-f", help="Replace what is there.")]
 Contributions = Annotated[
     bool,
