@@ -134,7 +134,8 @@ def say_contributions(console: Console, entries: Sequence[Mapping[str, Any]]) ->
     if not entries:
         return
     kinds = list(dict.fromkeys(kind for entry in entries for kind in entry["rmse_px"]))
-    header = ["with", *(f"rms of {kind}" for kind in kinds), "cameras moved", "centres known to", "centres off"]
+    header = ["with", *(f"rms {kind}" for kind in kinds), "moved", "known to", "off"]
+    console.say("By kind of landmark: how far camera centres moved, how well they are known, how far they are off.")
     rows = []
     for number, entry in enumerate(entries):
         known, off = entry["center_sigma"], entry["center_error"]
