@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from groma.adjustment.adjust import AdjustOptions
     from groma.adjustment.report import AdjustResult, Progress
+    from groma.adjustment.uncertainty import SceneUncertainty
     from groma.cli.shared.console import Console
     from groma.compilation.time import Compilation
     from groma.scene import Scene
@@ -84,25 +85,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
 
         with _output.atomic_output(wanted.protocol, wanted.force) as draft:
             draft.write_text(protocol(numbers), encoding="utf-8")
-    if wanted.page is not None:
-        from groma.viz.report.page import PageContents, write_report
-        from groma.viz.report.survey import survey_card
-        from groma.viz.report.tables import contributions_card
-
-        with _output.atomic_output(wanted.page, wanted.force) as draft:
-            write_report(
-                draft,
-                before,
-                result.scene,
-                result.report,
-                title=f"Adjustment of {source.absolute().name}",
-                contents=PageContents(
-                    warnings=numbers["warnings"],
-                    diagnosis=numbers["diagnosis"],
-                    cards=contributions_card(numbers.get("contributions")) + survey_card(survey),
-                ),
-            )
-    failure = None
+    found, failure = None, None
     if wanted.covariance is not None:
         try:
             found = result.uncertainty(wanted.gauge, wanted.sigma0)
@@ -113,6 +96,8 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
             reasons = why_no_covariances(result.scene, wanted.covariance)
             numbers["warnings"] += reasons
             failure = None if reasons else error  # raised at the end, when all else is written and said
+    if wanted.page is not None:
+        _write_page(wanted.page, wanted.force, source, before, result, numbers, found)
     _say(console, numbers, compilation)
     say_survey(console, survey or {})
     for path in (wanted.output, wanted.page, wanted.protocol, wanted.covariance if "uncertainty" in numbers else None):
@@ -123,6 +108,32 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     _output.write_json(wanted.json_target, numbers, wanted.force)
     if failure is not None:
         raise failure
+
+
+def _write_page(
+    path: Path,
+    force: bool,
+    source: Path,
+    before: Scene,
+    result: AdjustResult,
+    numbers: dict[str, Any],
+    found: SceneUncertainty | None,
+) -> None:
+    """Write the page, before and after; with standard deviations of what is measured on it if there are covariances."""
+    from groma.viz.report.covariances import covariances_of
+    from groma.viz.report.page import PageContents, write_report
+    from groma.viz.report.survey import survey_card
+    from groma.viz.report.tables import contributions_card
+
+    contents = PageContents(
+        warnings=numbers["warnings"],
+        diagnosis=numbers["diagnosis"],
+        cards=contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
+        covariances=None if found is None else covariances_of(result.scene, found),
+    )
+    title = f"Adjustment of {source.absolute().name}"
+    with _output.atomic_output(path, force) as draft:
+        write_report(draft, before, result.scene, result.report, title=title, contents=contents)
 
 
 def _adjusted(
