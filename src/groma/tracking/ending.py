@@ -121,6 +121,8 @@ class Ending:
     def adjust(self, number: int) -> Adjusted:
         """Adjust all keyframes of a map together, and with planes that are found in its points and lines."""
         mapper, turn = self._mapper, self._mapper.right.turn
+        if mapper.options.close_loops and not mapper.metric:
+            self.attempt("the loops of one camera", lambda: mapper.close_scaled_loops(number), None, changes=(number,))
         report, turn = self.attempt(
             "the adjustment of all keyframes", lambda: mapper.adjust_at_end(number), (None, turn), changes=(number,)
         )
