@@ -95,7 +95,7 @@ class Ending:
         places = Places.apart(mapper.maps)
         for joint in mapper.joints.values():
             places = self._joined(places, joint)
-        if mapper.metric and mapper.options.close_loops:
+        if mapper.options.close_loops:
             for one, two in combinations(range(len(mapper.maps)), 2):
                 if places.where[one][0] != places.where[two][0]:
                     places = self._searched(places, one, two)
@@ -108,7 +108,7 @@ class Ending:
         mapper = self._mapper
         joint = self.attempt(
             f"the search for places common to maps {one + 1} and {two + 1}",
-            lambda: best_joint(mapper.maps, mapper.camera, one, two, mapper.options.gates),
+            lambda: best_joint(mapper.maps, mapper.camera, one, two, mapper.options),
             None,
             changes=(),
         )

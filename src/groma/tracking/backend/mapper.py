@@ -243,7 +243,7 @@ class Mapper:
     def _what_to_search(self) -> LoopSearch | None:
         """Search the older maps until this one is joined to one of them, then this map for loops."""
         newest = len(self.maps) - 1
-        if 0 < newest == self.current and newest not in self.joints and self.metric:
+        if 0 < newest == self.current and newest not in self.joints:
             return search_older_maps(self.maps, self.map.last, self.options.gates)
         # Those of a single camera are closed at the end: its scale changes then.
         return search_for_loop(self.map, self.map.last, self.options.gates) if self.metric else None
@@ -252,7 +252,7 @@ class Mapper:
         if search.newest is not self.map.keyframes[search.newest.index]:
             return
         if pairs and not any(pair[0] in self.map.living() for pair in pairs):
-            joint = find_joint(self.maps, self.camera, self.current, search.newest, pairs, self.options.gates)
+            joint = find_joint(self.maps, self.camera, self.current, search.newest, pairs, self.options)
             if joint is not None:
                 self.joints[self.current] = joint
                 self.map.pinned.add(joint.newest)

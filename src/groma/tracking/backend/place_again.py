@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -38,17 +39,16 @@ class KnownMap:
     """A map, and how well it knows its points."""
 
     track_map: TrackMap
-    #: (N, 3, 3) covariance of each point, scene units; infinite where it is not known.
-    covariance: FloatArray
+    camera: TrackCamera
 
-    @classmethod
-    def of(cls, track_map: TrackMap, camera: TrackCamera) -> KnownMap:
-        """Find out from what was measured, with the keyframes held."""
-        scene = map_to_scene(track_map, camera, relations=False)
-        covariance = np.full((len(track_map.points), 3, 3), np.inf)
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """(N, 3, 3) of each point, scene units, with keyframes held; infinite where it is not known."""
+        scene = map_to_scene(self.track_map, self.camera, relations=False)
+        covariance = np.full((len(self.track_map.points), 3, 3), np.inf)
         if scene.num_points:
             covariance[scene.points.ids - 1] = point_noise(scene).covariance
-        return cls(track_map, covariance)
+        return covariance
 
     def depths(self, pose: FloatArray, index: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the logarithms of the depths (n,) of points in a camera, and their variances; infinite if unknown."""
@@ -76,6 +76,11 @@ class PlaceAgain:
     known: KnownFeatures
     pairs: IntArray
 
+    def matches(self, k: int) -> tuple[IntArray, IntArray]:
+        """Return the features that agree of the k-th keyframe of those known, and of the newest."""
+        pairs = self.pairs[self.known.of[self.pairs[:, 0]] == k]
+        return self.known.row[pairs[:, 0]], pairs[:, 1]
+
     @property
     def log_scale(self) -> float:
         """Logarithm of how much longer lengths of the newest are in the unit of the older keyframe."""
@@ -85,7 +90,6 @@ class PlaceAgain:
 def measure_place(
     older: KnownMap,
     newer: KnownMap,
-    camera: TrackCamera,
     keyframe: Keyframe,
     newest: Keyframe,
     matches: tuple[IntArray, IntArray],
@@ -95,7 +99,7 @@ def measure_place(
 
     Enough features must agree on one pose, and enough depths on one scale.
     """
-    gates = options.gates
+    camera, gates = older.camera, options.gates
     found = agreeing_pose(older.track_map, camera, keyframe, newest, *matches, gates)
     if found is None:
         return None
@@ -106,12 +110,11 @@ def measure_place(
         pairs = match_near(camera, known, newest.features, pose, factor * gates.finding.near)
         if len(pairs) < gates.loops.min_inliers:
             return None
-        measured = Measurements.empty()
-        table = described(newest, pairs[:, 1], options)
+        measured = replace(Measurements.empty(), points=described(newest, pairs[:, 1], options))
         view = replace(older.track_map.view, points=Places(known.places[pairs[:, 0]]))
-        estimate = estimate_pose(camera, view, replace(measured, points=table), pose, _ANYWHERE, pose)
+        estimate = estimate_pose(camera, view, measured, pose, _ANYWHERE, pose)
         pose, information, pairs = estimate.pose, estimate.information, pairs[estimate.points]
-    scale = _scale(older, newer, camera, near, newest, pose, gates)
+    scale = _scale(older, newer, near, newest, pose, gates)
     if scale is None or len(pairs) < gates.loops.min_inliers or estimate.weak:
         return None
     log_scale, variance = scale
@@ -136,15 +139,22 @@ def described(keyframe: Keyframe, rows: IntArray, options: TrackOptions) -> Poin
 
 def _around(track_map: TrackMap, keyframe: Keyframe, newest: Keyframe, gates: TrackingGates) -> list[Keyframe]:
     """Return a keyframe and those that see most of what it sees, of the same time."""
-    others = [one for one in track_map.living() if one is not keyframe and abs(one.index - keyframe.index) < gates.loops.gap]
-    others = [one for one in others if one is not newest]
+    others = [
+        one
+        for one in track_map.living()
+        if one is not keyframe and one is not newest and abs(one.index - keyframe.index) < gates.loops.gap
+    ]
     shared = track_map.shared(keyframe, others)
     best = np.argsort(-shared, kind="stable")[: gates.verification.nearest]
     return [keyframe, *(others[k] for k in best if shared[k] >= gates.loops.shared)]
 
 
 def _scale(
-    older: KnownMap, newer: KnownMap, camera: TrackCamera, near: list[Keyframe], newest: Keyframe, pose: FloatArray,
+    older: KnownMap,
+    newer: KnownMap,
+    near: list[Keyframe],
+    newest: Keyframe,
+    pose: FloatArray,
     gates: TrackingGates,
 ) -> tuple[float, float] | None:
     """Return the logarithm of the scale of older lengths in terms of newer ones, and its variance."""
@@ -157,7 +167,7 @@ def _scale(
     rows = np.flatnonzero(newer.track_map.points.state[seen.index] == ALIVE)
     if not len(old) or not len(rows):
         return None
-    pixel = camera.project(into(pose, points.xyz[old]))
+    pixel = older.camera.project(into(pose, points.xyz[old]))
     old, pixel = old[np.isfinite(pixel[:, 0])], pixel[np.isfinite(pixel[:, 0])]
     if not len(old):
         return None

@@ -49,8 +49,7 @@ def join_place(track_map: TrackMap, place: PlaceAgain, options: TrackOptions) ->
     """Make one of points that a place has twice; where it has them once, the newest keyframe sees them too."""
     newest = place.newest
     for k, keyframe in enumerate(place.known.keyframes):
-        pairs = place.pairs[place.known.of[place.pairs[:, 0]] == k]
-        first, second = place.known.row[pairs[:, 0]], pairs[:, 1]
+        first, second = place.matches(k)
         join_points(track_map, keyframe, newest, first, second)
         old, own = keyframe.features.point[first], newest.features.point[second]
         alone = (own < 0) | (track_map.points.state[own] != ALIVE)
@@ -64,12 +63,11 @@ def join_place(track_map: TrackMap, place: PlaceAgain, options: TrackOptions) ->
 
 def _find_loops(track_map: TrackMap, camera: TrackCamera, options: TrackOptions) -> list[PlaceAgain]:
     """Search all keyframes for places seen before; the map is not changed."""
-    known, out, gates = None, [], options.gates
+    known, out, gates = KnownMap(track_map, camera), [], options.gates
     for newest in track_map.living():
         search, best = search_for_loop(track_map, newest, gates), None
         for keyframe, *matches in search.run() if search is not None else []:
-            known = known or KnownMap.of(track_map, camera)
-            place = measure_place(known, known, camera, keyframe, newest, (matches[0], matches[1]), options)
+            place = measure_place(known, known, keyframe, newest, (matches[0], matches[1]), options)
             if place is None or (best is not None and len(place.pairs) <= len(best.pairs)):
                 continue
             if can_be(track_map, keyframe, newest, place.pose, gates.loops, place.log_scale):
