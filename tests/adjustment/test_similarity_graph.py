@@ -35,7 +35,11 @@ def _drifted(growth: float) -> tuple[np.ndarray, np.ndarray, SimilarityMotions]:
     rows = np.arange(COUNT - 1)
     covariance = np.tile(np.diag(SIGMA**2), (COUNT, 1, 1))
     measured = np.concatenate([odometry, loop])
-    return truth, np.array(start), SimilarityMotions(np.append(rows, 0), np.append(rows + 1, COUNT - 1), measured, covariance)
+    return (
+        truth,
+        np.array(start),
+        SimilarityMotions(np.append(rows, 0), np.append(rows + 1, COUNT - 1), measured, covariance),
+    )
 
 
 def _centers(cam_from_world: np.ndarray) -> np.ndarray:
@@ -47,7 +51,9 @@ def test_a_loop_takes_the_drift_of_scale_out(growth):
     truth, start, motions = _drifted(growth)
     result = adjust_similarity_graph(start, motions)
     assert result.report.converged
-    before, after = (np.linalg.norm(_centers(at) - _centers(truth), axis=1).max() for at in (start, result.cam_from_world))
+    before, after = (
+        np.linalg.norm(_centers(at) - _centers(truth), axis=1).max() for at in (start, result.cam_from_world)
+    )
     # Drift in proportion to the way, which a graph of equal neighbours spreads evenly: what is left is of second order.
     assert before > 0.8
     assert after < 0.05 * before

@@ -3,8 +3,8 @@ r"""Adjustment of a graph of similarities: what a pose graph is for cameras whos
 
 The map of a single camera has no unit of its own: the scale that it began with drifts from keyframe to keyframe. Each
 camera then is a similarity :math:`S` (``cam_from_world``), whose scale is the length of the world's unit in that of the
-camera. With the measured :math:`Z_{ij}` (``first_from_second``: poses with scale 1 between neighbours, and a scale where a
-place was recognised) it minimises
+camera. With the measured :math:`Z_{ij}` (``first_from_second``: poses with scale 1 between neighbours, and a scale
+where a place was recognised) it minimises
 
 .. math:: \tfrac12 \sum_{ij} \rho\big(\lVert r(Z_{ij}, S_i, S_j) \rVert^2_{\Sigma_{ij}^{-1}}\big)
 
@@ -100,15 +100,15 @@ def adjust_similarity_graph(
     named = np.concatenate([motions.first_idx, motions.second_idx])
     if named.min() < 0 or named.max() >= count:
         raise InputError(f"A motion names camera {named.max()} or {named.min()}; the cameras are 0 to {count - 1}.")
-    held = np.arange(count) == 0 if held is None else held
+    constant: BoolArray = np.asarray(np.arange(count) == 0 if held is None else held, dtype=bool)
     factor = SimilarityBetween(
         first=Ref("cameras", motions.first_idx),
         second=Ref("cameras", motions.second_idx),
         first_from_second=motions.first_from_second,
-        sqrt_information=np.linalg.inv(np.linalg.cholesky(motions.covariance)),
+        sqrt_information=np.asarray(np.linalg.inv(np.linalg.cholesky(motions.covariance)), np.float64),
         loss=loss or Trivial(),
     )
-    problem = Problem({"cameras": Variables(SIMILARITY_CHARTS["left"], cam_from_world, held)}, [factor])
+    problem = Problem({"cameras": Variables(SIMILARITY_CHARTS["left"], cam_from_world, constant)}, [factor])
     solution = solve(problem, options or SolverOptions())
     squares = squared_norms(factor, solution.problem.variables)
     return SimilarityGraphResult(solution["cameras"], squares, solution.report)

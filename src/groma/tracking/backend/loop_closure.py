@@ -90,7 +90,12 @@ def close_loop(
 
 
 def can_be(
-    track_map: TrackMap, keyframe: Keyframe, newest: Keyframe, pose: FloatArray, gates: LoopGates, log_scale: float = 0.0
+    track_map: TrackMap,
+    keyframe: Keyframe,
+    newest: Keyframe,
+    pose: FloatArray,
+    gates: LoopGates,
+    log_scale: float = 0.0,
 ) -> bool:
     """Whether errors that add up at random between two keyframes explain how far the newest is from a pose (7,).
 

@@ -26,7 +26,7 @@ from groma.tracking.gates import TrackingGates
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
-from groma.tracking.pose.estimate import estimate_pose
+from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
 from groma.tracking.pose.relocalise import KnownFeatures, Places, known_features, match_near
 from groma.tracking.result import map_to_scene
 
@@ -105,26 +105,39 @@ def measure_place(
         return None
     near = _around(older.track_map, keyframe, newest, gates)
     known = known_features(older.track_map, camera, near)
-    pose, information, pairs = found[0], np.zeros((6, 6)), np.zeros((0, 2), np.int64)
-    for factor in gates.finding.rounds:
-        pairs = match_near(camera, known, newest.features, pose, factor * gates.finding.near)
-        if len(pairs) < gates.loops.min_inliers:
-            return None
-        measured = replace(Measurements.empty(), points=described(newest, pairs[:, 1], options))
-        view = replace(older.track_map.view, points=Places(known.places[pairs[:, 0]]))
-        estimate = estimate_pose(camera, view, measured, pose, _ANYWHERE, pose)
-        pose, information, pairs = estimate.pose, estimate.information, pairs[estimate.points]
-    scale = _scale(older, newer, near, newest, pose, gates)
-    if scale is None or len(pairs) < gates.loops.min_inliers or estimate.weak:
+    refined = _refined(older, known, newest, found[0], options)
+    if refined is None:
+        return None
+    estimate, pairs = refined
+    pose, scale = estimate.pose, _scale(older, newer, near, newest, estimate.pose, gates)
+    if scale is None:
         return None
     log_scale, variance = scale
     relative = se3.compose(keyframe.pose[None], se3.inverse(pose[None]))[0]
     covariance = np.zeros((7, 7))
     unit = np.exp([-log_scale] * 3 + [0.0] * 3)
-    covariance[:6, :6] = unit[:, None] * np.linalg.inv(information) * unit
+    covariance[:6, :6] = unit[:, None] * np.linalg.inv(estimate.information) * unit
     covariance[6, 6] = variance
     similarity = np.append(relative, math.exp(log_scale))
     return PlaceAgain(keyframe, newest, pose, similarity, covariance, known, pairs)
+
+
+def _refined(
+    older: KnownMap, known: KnownFeatures, newest: Keyframe, pose: FloatArray, options: TrackOptions
+) -> tuple[PoseEstimate, IntArray] | None:
+    """Return the pose of the newest by all known features that agree near it, and their pairs; None where few do."""
+    gates, refined = options.gates, None
+    for factor in gates.finding.rounds:
+        pairs = match_near(older.camera, known, newest.features, pose, factor * gates.finding.near)
+        if len(pairs) < gates.loops.min_inliers:
+            return None
+        measured = replace(Measurements.empty(), points=described(newest, pairs[:, 1], options))
+        view = replace(older.track_map.view, points=Places(known.places[pairs[:, 0]]))
+        estimate = estimate_pose(older.camera, view, measured, pose, _ANYWHERE, pose)
+        pose, refined = estimate.pose, (estimate, pairs[estimate.points])
+    if refined is None or len(refined[1]) < gates.loops.min_inliers or refined[0].weak:
+        return None
+    return refined
 
 
 def described(keyframe: Keyframe, rows: IntArray, options: TrackOptions) -> PointMeasurements:
@@ -188,7 +201,7 @@ def _common(values: FloatArray, variance: FloatArray, least: int, floor: float) 
     if len(values) < least:
         return None
     variance = variance + floor**2
-    middle = float(np.median(values))
+    middle, weight = float(np.median(values)), 1.0 / variance
     for _ in range(5):
         agree = (values - middle) ** 2 < chi_square_gate(0.01, 1) * variance
         if agree.sum() < max(least, 0.5 * len(values)):

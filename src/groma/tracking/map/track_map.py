@@ -113,7 +113,9 @@ class TrackMap:
         keyframe = self.keyframes[index]
         if keyframe.from_parent is None:
             return keyframe.pose
-        return se3.compose(in_unit(keyframe.from_parent, self.unit_of(index))[None], self.pose_of(keyframe.parent)[None])[0]
+        return se3.compose(
+            in_unit(keyframe.from_parent, self.unit_of(index))[None], self.pose_of(keyframe.parent)[None]
+        )[0]
 
     def unit_of(self, index: int) -> float:
         """Unit of a keyframe, also of one that was dropped: that of the keyframe which tells its pose."""
