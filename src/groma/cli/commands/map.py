@@ -86,6 +86,7 @@ def map_(
     refine_rig: Annotated[
         bool, typer.Option("--refine-rig/--fix-rig", help="Estimate where the cameras sit on their rig.")
     ] = False,
+    rolling_shutter: _options.RollingShutter = None,
     line_matches: Annotated[
         Path | None,
         typer.Option(
@@ -171,7 +172,6 @@ def map_(
         raise InputError("--camera-params is for images without a model. Leave it out.")
 
     _check_start(model, poses, rig)
-
     if line_matches is not None and line_matcher is not None:
         raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
 
@@ -203,6 +203,7 @@ def map_(
         mapper=mapper,
         rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
+        rolling_shutter=rolling_shutter,
         threads=threads,
         seed=seed,
     )
