@@ -25,6 +25,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from groma._log import log_warnings, logged_stages
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
@@ -185,7 +186,7 @@ def map_images(
         If another run works in ``work``, or it cannot be written.
     """
     options = with_parts(options or MapOptions())
-    say = progress or (lambda doing, done, total: None)
+    say = logged_stages("mapping", progress)
     folder = Path(images)
     files = image_files(folder)
     names = [path.relative_to(folder).as_posix() for path in files]
@@ -214,7 +215,6 @@ def map_images(
         seen = taken_at_once(points, segments)
         result = map_segments(seen.scene, seen.segments, matches, stages, neighbors_for(options, folder))
         result = mapped_as_measured(result, seen, stages)
-    say("done", 1, 1)
     left_out = images_left_out(names, (model or start).images.names, model is not None)
     result = dataclasses.replace(
         result,
@@ -224,6 +224,7 @@ def map_images(
         warnings=(*left_out, *placed.warnings, *result.warnings),
         surveyed=None if in_place is None else in_place.surveyed,
     )
+    log_warnings("mapping", [sentence for sentence in result.warnings if sentence not in result.report.warnings])
     if near is None:
         return result
     scene, start, before = (part.transformed(near.inverse()) for part in (result.scene, result.start, result.before))
