@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A made scene with measurements of other instruments, whose truth and noise are known."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from groma.geometry import se3
-from groma.scene import CameraDistances, CameraPositions, ControlPoints, Marks, PointDistances, Similarity
-from groma.scene.survey import CHECK, CONTROL, diagonal_covariance
+from groma.io.survey import ControlFile, CoordinateSystem, Places
+from groma.scene import CameraPositions, ControlPoints, Distances, Marks, Similarity
+from groma.scene.survey import CHECK, CONTROL, Kind, diagonal_covariance
 from groma.scene.synthetic.noise import project_pinhole
 from groma.scene.synthetic.scenes import holistic
 
@@ -58,20 +61,19 @@ def distances(truth, xyz, rng, sigma=SIGMA_DISTANCE):
     between = np.linalg.norm(xyz[1] - xyz[0]) + rng.normal() * sigma
     centers = truth.cam_centers_in_world
     apart = np.linalg.norm(centers[1] - centers[0]) + rng.normal() * sigma
-    one, two, noise = np.array([0]), np.array([1]), np.array([sigma])
-    return PointDistances(one, two, np.array([between]), noise), CameraDistances(one, two, np.array([apart]), noise)
+    kinds, numbers = np.array([Kind.CONTROL_POINT, Kind.IMAGE]), np.array([between, apart])
+    zero, one = np.zeros(2, int), np.ones(2, int)
+    return Distances(kinds, zero, kinds, one, np.zeros((2, 3)), numbers, np.full(2, sigma))
 
 
 def with_everything(truth, rng):
-    """The scene with every table of measurements."""
+    """The scene with positions, control points and distances."""
     points, marks, xyz = control(truth, rng)
-    between, apart = distances(truth, xyz, rng)
     return truth.replace(
         camera_positions=positions(truth, rng),
         control_points=points,
         marks=marks,
-        point_distances=between,
-        camera_distances=apart,
+        distances=distances(truth, xyz, rng),
     )
 
 
@@ -93,3 +95,25 @@ def on_rigs(scene):
         cameras=scene.cameras, rigs=Rigs(np.array([1])), sensors=sensors,
         frames=Frames(np.arange(frames) + 1, np.zeros(frames, int), first), images=images, points=scene.points,
     )  # fmt: skip
+
+
+def places_of(names, xyz, sigma=SIGMA, system=""):
+    """Places as a file has them."""
+    return Places(tuple(names), xyz, np.full(xyz.shape, sigma), CoordinateSystem(system), "positions.csv")
+
+
+def measured_positions(truth, rng, shift=0.0):
+    """Measured positions of all cameras as a file has them."""
+    return places_of(truth.images.names, positions(truth, rng).xyz + shift)
+
+
+def control_file(truth, rng, normalized=False):
+    """Control points as a file has them, and where they truly are."""
+    points, marks, xyz = control(truth, rng)
+    names = tuple(truth.images.names[row] for row in marks.image_idx)
+    given = places_of(points.names, points.measured, np.nan)
+    found = ControlFile(given, points.role == CHECK, names, marks.point_idx, marks.pixel, False)
+    if normalized:
+        size = np.array([truth.cameras.width[0], truth.cameras.height[0]], float)
+        found = replace(found, pixels=(marks.pixel - size / 2) / size.max(), normalized=True)
+    return found, xyz

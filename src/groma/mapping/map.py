@@ -28,7 +28,7 @@ from pathlib import Path
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
-from groma.adjustment.survey.attach import Survey
+from groma.adjustment.survey.given import Survey
 from groma.execution import work_with
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches

@@ -15,7 +15,7 @@ all references are checked when it is made. Every change gives a new scene.
     plane_observations -> images, planes          line_depths   -> line_observations
     pose_priors        -> frames                  line_intervals -> lines
     camera_positions   -> images                  marks -> images, control_points
-    camera_distances   -> images                  point_distances -> control_points
+    camera_poses       -> images                  distances, known_planes, known_directions, held -> any objects
 
 Each column declares in its table what it refers to and how it changes when the world moves (see
 :func:`groma.scene.table.column`); checks, selections and transforms here go by that.
@@ -43,7 +43,16 @@ from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths,
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
 from groma.scene.standing_alone import standing_alone
-from groma.scene.survey import CameraDistances, CameraPositions, ControlPoints, Marks, PointDistances
+from groma.scene.survey import (
+    CameraPoses,
+    CameraPositions,
+    ControlPoints,
+    Distances,
+    Held,
+    KnownDirections,
+    KnownPlanes,
+    Marks,
+)
 from groma.scene.table import moved_column, new_index_of, references, rows_of
 
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
@@ -91,13 +100,17 @@ class Scene:
     plane_observations: PlaneObservations = field(default_factory=PlaneObservations)
     #: Poses known beforehand.
     pose_priors: PosePriors = field(default_factory=PosePriors)
-    #: Measured places of cameras, and distances between them.
+    #: Measured places and poses of cameras.
     camera_positions: CameraPositions = field(default_factory=CameraPositions)
-    camera_distances: CameraDistances = field(default_factory=CameraDistances)
-    #: Control and check points, where they are in the images, and distances between them.
+    camera_poses: CameraPoses = field(default_factory=CameraPoses)
+    #: Control and check points, and where they are in the images.
     control_points: ControlPoints = field(default_factory=ControlPoints)
     marks: Marks = field(default_factory=Marks)
-    point_distances: PointDistances = field(default_factory=PointDistances)
+    #: What was measured of cameras, control points and landmarks, and what keeps its place.
+    distances: Distances = field(default_factory=Distances)
+    known_planes: KnownPlanes = field(default_factory=KnownPlanes)
+    known_directions: KnownDirections = field(default_factory=KnownDirections)
+    held: Held = field(default_factory=Held)
 
     def __post_init__(self) -> None:
         check_scene(self)
@@ -198,13 +211,21 @@ class Scene:
 
     @property
     def is_surveyed(self) -> bool:
-        """Whether positions of cameras or control points tell where the scene is, and its scale."""
-        return len(self.camera_positions) + int(self.control_points.is_control.sum()) > 1
+        """Whether places of cameras or control points were measured that tell where the scene is, and its scale."""
+        return len(self.camera_positions) + len(self.camera_poses) + int(self.control_points.is_control.sum()) > 1
+
+    @property
+    def is_tied(self) -> bool:
+        """Whether anything measured outside the images, or held, says where the scene is, how it is turned, how large.
+
+        Then the scene is not free to move: measurements hold it.
+        """
+        return self.is_surveyed or any(map(len, (self.known_planes, self.known_directions, self.held)))
 
     @property
     def has_scale(self) -> bool:
         """Whether anything measured tells the scale."""
-        return self.is_metric or self.is_surveyed or len(self.camera_distances) + len(self.point_distances) > 0
+        return self.is_metric or self.is_surveyed or len(self.distances) > 0
 
     # Poses
 
@@ -301,10 +322,11 @@ class Scene:
         """Return the scene without lines, planes, directions, and what was measured of them."""
         return self.keep(lines=[], planes=[], directions=[])
 
-    def transformed(self, new_from_old: Similarity | FloatArray) -> Self:
+    def transformed(self, new_from_old: Similarity | FloatArray, measured: bool = True) -> Self:
         """Return the scene seen from another world frame; what the cameras see stays the same.
 
         Lengths in camera and rig frames are scaled too. An array (8,) of :mod:`groma.geometry.sim3` will do as well.
+        Without ``measured`` the scene is moved under what other instruments say of its places, which stays.
         """
         if not isinstance(new_from_old, Similarity):
             new_from_old = Similarity.from_array(new_from_old)
@@ -314,7 +336,9 @@ class Scene:
             columns = {
                 column.name: moved_column(getattr(table, column.name), column.metadata, new_from_old)
                 for column in fields(table)
-                if (column.metadata.get("world") or column.metadata.get("length")) and len(getattr(table, column.name))
+                if (column.metadata.get("world") or column.metadata.get("length"))
+                and (measured or not column.metadata.get("measured"))
+                and len(getattr(table, column.name))
             }
             if columns:
                 tables[item.name] = replace(table, **columns)

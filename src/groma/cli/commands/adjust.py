@@ -162,6 +162,13 @@ def adjust(
     check: _measured.Check = None,
     distances: _measured.Distances = None,
     distance_sigma: _measured.DistanceSigma = None,
+    directions: _measured.Directions = None,
+    direction_sigma: _measured.DirectionSigma = None,
+    known_planes: _measured.KnownPlanes = None,
+    plane_sigma: _measured.PlaneSigma = None,
+    poses: _measured.Poses = None,
+    pose_sigma: _measured.PoseSigma = None,
+    hold: _measured.Hold = None,
     crs: _measured.Crs = None,
     protocol: Annotated[
         Path | None,
@@ -200,8 +207,9 @@ def adjust(
         _check_linear_solver(linear_solver)
     console = Console(quiet, verbose, json_target, threads)
     measured = _measured.Measured(
-        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
-    )
+        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, directions,
+        direction_sigma, known_planes, plane_sigma, poses, pose_sigma, hold, crs,
+    )  # fmt: skip
     _measured.check_measured(measured)
     in_parts = has_company() or is_parts(source)
     if not in_parts:

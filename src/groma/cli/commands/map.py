@@ -41,7 +41,7 @@ def map_(
             "--poses",
             metavar="FILE",
             help="Poses from elsewhere, without points: a model, transforms.json, reconstruction.json, a trajectory "
-            "(TUM, KITTI), a g2o graph. Points are found, poses improved, wrong ones named.",
+            "(TUM, KITTI), a g2o graph, or name x y z qx qy qz qw. Points are found, poses improved, wrong ones named.",
         ),
     ] = None,
     extend: Annotated[
@@ -135,6 +135,12 @@ def map_(
     check: _measured.Check = None,
     distances: _measured.Distances = None,
     distance_sigma: _measured.DistanceSigma = None,
+    directions: _measured.Directions = None,
+    direction_sigma: _measured.DirectionSigma = None,
+    known_planes: _measured.KnownPlanes = None,
+    plane_sigma: _measured.PlaneSigma = None,
+    pose_sigma: _measured.PoseSigma = None,
+    hold: _measured.Hold = None,
     crs: _measured.Crs = None,
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
@@ -159,8 +165,10 @@ def map_(
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
     measured = _measured.Measured(
-        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
-    )
+        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, directions,
+        direction_sigma, known_planes, plane_sigma, poses if _has_noise(poses, pose_sigma) else None, pose_sigma, hold,
+        crs,
+    )  # fmt: skip
     _measured.check_measured(measured)
     check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, *measured.files)
     check_extension(
@@ -231,6 +239,13 @@ def map_(
     say_map(console, result, numbers)
     console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
     _output.write_json(json_target, numbers, force)
+
+
+def _has_noise(poses: Path | None, stated: str | None) -> bool:
+    """Whether it is known how exact given poses are; else that is estimated."""
+    from groma.io.survey import holds_covariances
+
+    return poses is not None and (stated is not None or holds_covariances(poses))
 
 
 def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> None:

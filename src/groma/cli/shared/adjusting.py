@@ -134,7 +134,7 @@ def _adjusted(
     if not wanted.measured and not has_survey(before):
         if wanted.protocol is not None:
             raise InputError(
-                "--protocol is of measurements; there are none. Add --positions, --control or --distances."
+                "--protocol is of measurements; there are none. Add --positions, --control, --distances or others."
             )
         return before, adjust(before, options, progress), None
     survey = wanted.measured.read(None, lambda: before.images.names) if wanted.measured else None
