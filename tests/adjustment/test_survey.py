@@ -9,6 +9,7 @@ from _survey import (
     made,
     on_rigs,
     with_everything,
+    with_objects,
 )
 
 import groma
@@ -18,8 +19,8 @@ from groma.adjustment.parts import adjust_parts, join_parts, write_parts
 from groma.factors.losses import Trivial
 from groma.io.archive import read_archive
 from groma.problem.residuals import residuals_of
-from groma.scene import CameraPositions
-from groma.scene.survey import diagonal_covariance
+from groma.scene import CameraPositions, Held
+from groma.scene.survey import Kind, diagonal_covariance
 
 LEAST_SQUARES = AdjustOptions(loss="none", point_sigma_px=0.5, check_lens=False)
 UTM = np.array([4e5, 5.4e6, 200.0])
@@ -41,8 +42,9 @@ def test_positions_are_of_cameras_not_of_their_rigs(truth_and_start):
 
 def test_parts_are_the_whole(truth_and_start, tmp_path):
     """What other instruments measured is in the first part and counts once."""
-    scene = with_everything(truth_and_start[0], np.random.default_rng(0))
-    scene = scene.replace(distances=scene.distances.take([1]))
+    rng = np.random.default_rng(0)
+    scene = with_objects(with_everything(truth_and_start[0], rng), rng)
+    scene = scene.replace(distances=scene.distances.take([1]), held=Held([Kind.POINT, Kind.IMAGE], [70, 3]))
     whole = adjust(scene, LEAST_SQUARES)
     paths = write_parts(scene, tmp_path / "parts", observations=150)
     assert len(paths) > 2
@@ -51,6 +53,10 @@ def test_parts_are_the_whole(truth_and_start, tmp_path):
     assert result.report.final_cost == pytest.approx(whole.report.solve.final_cost, rel=1e-6)
     joined = join_parts([tmp_path / "adjusted" / path.name for path in paths])
     np.testing.assert_allclose(joined.cam_centers_in_world, whole.scene.cam_centers_in_world, atol=1e-4)
+    assert scene.points.ids[70] in read_archive(paths[0]).points.ids
+    kept = joined.points.xyz[joined.points.ids == scene.points.ids[70]]
+    np.testing.assert_array_equal(kept[0], scene.points.xyz[70])
+    assert joined.held.kind.tolist() == [Kind.POINT, Kind.IMAGE] and len(joined.known_planes) == 8
     np.testing.assert_allclose(joined.control_points.xyz, whole.scene.control_points.xyz, atol=1e-4)
 
 

@@ -12,6 +12,7 @@ from _survey import (
     made,
     positions,
     with_everything,
+    with_objects,
 )
 
 from groma.adjustment.adjust import AdjustOptions, adjust
@@ -56,7 +57,7 @@ def small(rng, seed=1):
     """A small scene with every kind of measurement, adjusted by least squares."""
     truth, _ = made(6, seed=seed)
     truth = truth.keep(points=np.arange(truth.num_points) < 60)
-    scene = with_everything(truth, rng)
+    scene = with_objects(with_everything(truth, rng), rng)
     result = adjust(scene, replace(LEAST_SQUARES, function_tolerance=1e-12))
     return truth, result
 
@@ -81,7 +82,8 @@ def test_redundancy_numbers_and_tests_are_those_of_the_dense_adjustment():
             assert one.detectable == pytest.approx(noncentrality() * one.sigma / np.sqrt(leave[k]), rel=1e-4)
     assert next(rows, None) is None
     kinds = [one.kind for one in found.measurements]
-    assert set(kinds) == {"camera position", "control point", "mark", "distance"}
+    known = {"known plane", "known direction", "camera pose"}
+    assert set(kinds) == {"camera position", "control point", "mark", "distance"} | known
     for kind in set(kinds):
         of_kind = sum(one.redundancy for one in found.measurements if one.kind == kind and not one.is_suspect)
         assert found.redundancy[kind] == pytest.approx(of_kind, rel=0.05)
@@ -125,7 +127,8 @@ def test_predicted_errors_are_those_that_occur():
     for draw in range(12):
         rng = np.random.default_rng(100 + draw)
         pixel = exact + rng.normal(size=exact.shape) * 0.5
-        scene = with_everything(truth.replace(point_observations=truth.point_observations.replace(pixel=pixel)), rng)
+        drawn = truth.replace(point_observations=truth.point_observations.replace(pixel=pixel))
+        scene = with_objects(with_everything(drawn, rng), rng)
         result = adjust(scene, LEAST_SQUARES)
         off = result.scene.cam_centers_in_world - truth.cam_centers_in_world
         squares.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(result.uncertainty().centers), off).mean())

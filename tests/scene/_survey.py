@@ -5,9 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from groma.geometry import se3
+from groma.geometry import quaternion, se3
 from groma.io.survey import ControlFile, CoordinateSystem, Places
-from groma.scene import CameraPositions, ControlPoints, Distances, Marks, Similarity
+from groma.scene import (
+    CameraPoses,
+    CameraPositions,
+    ControlPoints,
+    Distances,
+    KnownDirections,
+    KnownPlanes,
+    Marks,
+    Similarity,
+)  # fmt: skip
 from groma.scene.survey import CHECK, CONTROL, Kind, diagonal_covariance
 from groma.scene.synthetic.noise import project_pinhole
 from groma.scene.synthetic.scenes import holistic
@@ -64,6 +73,27 @@ def distances(truth, xyz, rng, sigma=SIGMA_DISTANCE):
     kinds, numbers = np.array([Kind.CONTROL_POINT, Kind.IMAGE]), np.array([between, apart])
     zero, one = np.zeros(2, int), np.ones(2, int)
     return Distances(kinds, zero, kinds, one, np.zeros((2, 3)), numbers, np.full(2, sigma))
+
+
+def with_objects(truth, rng):
+    """The scene with poses, gravity, heights, and what is known of its first line and plane if it has some."""
+    count, down = truth.num_images, np.array([0.0, 0.0, -1.0])
+    noise = rng.normal(size=(count, 6)) * np.repeat([SIGMA, 0.005], 3)
+    poses = se3.compose(se3.inverse(se3.exp(noise)), truth.cam_from_world)
+    covariance = np.diag(np.repeat([SIGMA, 0.005], 3) ** 2)
+    seen = quaternion.rotate(truth.cam_from_world[:, :4], np.tile(down, (count, 1)))
+    seen = quaternion.rotate(quaternion.exp(rng.normal(size=(count, 3)) * 0.01), seen)
+    kinds, rows = [Kind.IMAGE] * count, list(range(count))
+    vectors, places = np.tile(down, (count, 1)), truth.cam_centers_in_world
+    hesse = np.column_stack([np.tile([0, 0, 1.0], (count, 1)), rng.normal(size=count) * SIGMA - places[:, 2]])
+    planes = KnownPlanes(kinds, rows, places, hesse, np.full(count, SIGMA))
+    if truth.num_lines and truth.num_planes:
+        kinds, rows = [*kinds, Kind.LINE, Kind.PLANE], [*rows, 0, 0]
+        known = np.stack([truth.lines.plucker[0, 3:], truth.planes.hesse[0, :3]])
+        vectors, seen = np.concatenate([vectors, known]), np.concatenate([seen, known])
+    gravity = KnownDirections(kinds, rows, vectors, seen, np.full(len(rows), 0.01))
+    table = CameraPoses(np.arange(count), poses, np.tile(covariance, (count, 1, 1)))
+    return truth.replace(camera_poses=table, known_directions=gravity, known_planes=planes)
 
 
 def with_everything(truth, rng):

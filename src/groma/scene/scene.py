@@ -43,16 +43,9 @@ from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths,
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
 from groma.scene.standing_alone import standing_alone
-from groma.scene.survey import (
-    CameraPoses,
-    CameraPositions,
-    ControlPoints,
-    Distances,
-    Held,
-    KnownDirections,
-    KnownPlanes,
-    Marks,
-)
+from groma.scene.survey import CameraPoses, CameraPositions, ControlPoints, Distances, Held
+
+from groma.scene.survey import KnownDirections, KnownPlanes, Marks  # isort: skip
 from groma.scene.table import moved_column, new_index_of, references, rows_of
 
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
@@ -106,7 +99,7 @@ class Scene:
     #: Control and check points, and where they are in the images.
     control_points: ControlPoints = field(default_factory=ControlPoints)
     marks: Marks = field(default_factory=Marks)
-    #: What was measured of cameras, control points and landmarks, and what keeps its place.
+    #: What was measured of cameras, control points and landmarks; what keeps its place.
     distances: Distances = field(default_factory=Distances)
     known_planes: KnownPlanes = field(default_factory=KnownPlanes)
     known_directions: KnownDirections = field(default_factory=KnownDirections)
@@ -146,8 +139,6 @@ class Scene:
             Further tables of the scene, by field name.
         """
         return cls(**standing_alone(cameras, names, camera_idx, cam_from_world), **tables)
-
-    # Counts
 
     @property
     def num_images(self) -> int:
@@ -216,10 +207,7 @@ class Scene:
 
     @property
     def is_tied(self) -> bool:
-        """Whether anything measured outside the images, or held, says where the scene is, how it is turned, how large.
-
-        Then the scene is not free to move: measurements hold it.
-        """
+        """Whether anything measured outside the images, or held, says where the scene is or how it is turned."""
         return self.is_surveyed or any(map(len, (self.known_planes, self.known_directions, self.held)))
 
     @property
@@ -286,10 +274,9 @@ class Scene:
                 "with_poses needs a scene in which each frame holds one image; this one has rigs. "
                 "Use with_rig_poses(rig_from_world, cam_from_rig)."
             )
-        poses = np.asarray(cam_from_world, float)
+        rig_from_world, poses = np.empty_like(self.frames.rig_from_world), np.asarray(cam_from_world, float)
         if poses.shape != (self.num_images, 7):
             raise ShapeError(f"cam_from_world must have shape ({self.num_images}, 7); got {poses.shape}.")
-        rig_from_world = np.empty_like(self.frames.rig_from_world)
         rig_from_world[self.images.frame_idx] = poses
         return self.with_rig_poses(rig_from_world)
 
@@ -326,7 +313,7 @@ class Scene:
         """Return the scene seen from another world frame; what the cameras see stays the same.
 
         Lengths in camera and rig frames are scaled too. An array (8,) of :mod:`groma.geometry.sim3` will do as well.
-        Without ``measured`` the scene is moved under what other instruments say of its places, which stays.
+        Without ``measured`` what other instruments say of places in the world stays, and the scene moves.
         """
         if not isinstance(new_from_old, Similarity):
             new_from_old = Similarity.from_array(new_from_old)

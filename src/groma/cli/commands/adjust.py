@@ -210,7 +210,6 @@ def adjust(
         positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, directions,
         direction_sigma, known_planes, plane_sigma, poses, pose_sigma, hold, crs,
     )  # fmt: skip
-    _measured.check_measured(measured)
     in_parts = has_company() or is_parts(source)
     if not in_parts:
         _output.check_outputs(force, output, page, covariance, protocol, json_target=json_target)

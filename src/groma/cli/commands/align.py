@@ -47,7 +47,10 @@ def align(
     from groma.cli.shared.console import Console
     from groma.cli.shared.input import check_inputs
 
-    measured = _measured.Measured(positions=positions, position_sigma="1", control=control, control_sigma="1", crs=crs)
+    measured = _measured.Measured(
+        positions=positions, position_sigma="1" if positions else None,
+        control=control, control_sigma="1" if control else None, crs=crs,
+    )  # fmt: skip
     if (reference is None) == (not measured):
         raise InputError("Pass either a REFERENCE scene, or --positions or --control.")
     console = Console(quiet, verbose, json_target, threads)

@@ -169,16 +169,12 @@ def map_(
         direction_sigma, known_planes, plane_sigma, poses if _has_noise(poses, pose_sigma) else None, pose_sigma, hold,
         crs,
     )  # fmt: skip
-    _measured.check_measured(measured)
     check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, *measured.files)
     check_extension(
         extend, map_images, {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params}
     )
 
-    if model is not None and camera_params is not None:
-        raise InputError("--camera-params is for images without a model. Leave it out.")
-
-    _check_start(model, poses, rig)
+    _check_start(model, poses, rig, camera_params)
 
     if line_matches is not None and line_matcher is not None:
         raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
@@ -243,13 +239,15 @@ def map_(
 
 def _has_noise(poses: Path | None, stated: str | None) -> bool:
     """Whether it is known how exact given poses are; else that is estimated."""
-    from groma.io.survey import holds_covariances
+    from groma.io.measured_poses import holds_covariances
 
     return poses is not None and (stated is not None or holds_covariances(poses))
 
 
-def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> None:
+def _check_start(model: Path | None, poses: Path | None, rig: Path | None, camera_params: str | None) -> None:
     """Check that what is known beforehand does not exclude each other."""
+    if model is not None and camera_params is not None:
+        raise InputError("--camera-params is for images without a model. Leave it out.")
     if model is not None and poses is not None:
         raise InputError("--model and --poses exclude each other: a model has points. Leave one of them out.")
     if rig is not None and (model is not None or poses is not None):

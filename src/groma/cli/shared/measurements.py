@@ -188,6 +188,22 @@ class Measured:
     hold: str | None = None
     crs: str | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse options that nothing is given for."""
+        needs = {
+            "--position-sigma": (self.position_sigma, self.positions, "--positions"),
+            "--control-sigma": (self.control_sigma, self.control, "--control"),
+            "--check": (self.check, self.control, "--control"),
+            "--distance-sigma": (self.distance_sigma, self.distances, "--distances"),
+            "--direction-sigma": (self.direction_sigma, self.directions, "--directions"),
+            "--plane-sigma": (self.plane_sigma, self.known_planes, "--known-planes"),
+            "--pose-sigma": (self.pose_sigma, self.poses, "--poses"),
+            "--crs": (self.crs, self.positions or self.control, "--positions or --control"),
+        }
+        for option, (given, needed, name) in needs.items():
+            if given is not None and needed is None:
+                raise InputError(f"{option} belongs to {name}. Add it, or leave {option} out.")
+
     @property
     def files(self) -> tuple[Path | None, ...]:
         """Files that must be there."""
@@ -218,6 +234,7 @@ class Measured:
         """
         from groma.adjustment.survey.given import Survey
         from groma.io import survey as files
+        from groma.io.measured_poses import read_camera_poses
 
         return Survey(
             positions=self._positions(images, names),
@@ -225,7 +242,7 @@ class Measured:
             distances=_read(files.read_distances, self.distances),
             directions=_read(files.read_directions, self.directions),
             planes=_read(files.read_known_planes, self.known_planes),
-            poses=None if self.poses is None else files.read_camera_poses(self.poses, names()),
+            poses=None if self.poses is None else read_camera_poses(self.poses, names()),
             position_sigma=_sigma(self.position_sigma, "--position-sigma"),
             control_sigma=_sigma(self.control_sigma, "--control-sigma"),
             distance_sigma=self.distance_sigma,
@@ -258,23 +275,6 @@ def _read(reader: Callable[[Path], Any], path: Path | None) -> Any:
 
 def _names(text: str | None) -> tuple[str, ...]:
     return tuple(name.strip() for name in (text or "").split(",") if name.strip())
-
-
-def check_measured(measured: Measured) -> None:
-    """Refuse options that nothing is given for."""
-    needs = {
-        "--position-sigma": (measured.position_sigma, measured.positions, "--positions"),
-        "--control-sigma": (measured.control_sigma, measured.control, "--control"),
-        "--check": (measured.check, measured.control, "--control"),
-        "--distance-sigma": (measured.distance_sigma, measured.distances, "--distances"),
-        "--direction-sigma": (measured.direction_sigma, measured.directions, "--directions"),
-        "--plane-sigma": (measured.plane_sigma, measured.known_planes, "--known-planes"),
-        "--pose-sigma": (measured.pose_sigma, measured.poses, "--poses"),
-        "--crs": (measured.crs, measured.positions or measured.control, "--positions or --control"),
-    }
-    for option, (given, needed, name) in needs.items():
-        if given is not None and needed is None:
-            raise InputError(f"{option} belongs to {name}. Add it, or leave {option} out.")
 
 
 def _exif(text: str) -> str | None:
@@ -326,5 +326,5 @@ def say_survey(console: Console, numbers: dict[str, Any]) -> None:
 __all__ = [
     "Check", "Control", "ControlSigma", "Crs", "DirectionSigma", "Directions", "DistanceSigma", "Distances", "Hold",
     "KnownPlanes", "MarkSigma", "Measured", "PlaneSigma", "PoseSigma", "Poses", "PositionSigma", "Positions",
-    "check_measured", "say_survey",
+    "say_survey",
 ]  # fmt: skip

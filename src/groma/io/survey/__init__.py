@@ -6,7 +6,6 @@ stand there. Bringing them into one frame is :mod:`~groma.io.survey.coordinates`
 they belong to is :mod:`groma.adjustment.survey`.
 """
 
-from groma.io.survey.camera_poses import holds_covariances, read_camera_poses
 from groma.io.survey.control import ControlFile, read_control
 from groma.io.survey.coordinates import CoordinateSystem, Places, WorldFrame, common_frame
 from groma.io.survey.exif import read_exif_positions
@@ -32,8 +31,6 @@ __all__ = [
     "PosesFile",
     "WorldFrame",
     "common_frame",
-    "holds_covariances",
-    "read_camera_poses",
     "read_control",
     "read_directions",
     "read_distances",

@@ -32,6 +32,8 @@ from groma.io.reading import existing, reading
 from groma.io.survey.positions import split
 
 _NAN = float("nan")
+#: Numbers beyond are damaged.
+_LARGEST = 1e50
 _AXES = {"x": 0, "y": 1, "z": 2, "height": 2}
 
 
@@ -101,7 +103,7 @@ def read_distances(path: str | os.PathLike[str]) -> DistancesFile:
     """
     found: list[tuple[str, str, float, float]] = []
     for where, words in _rows(path, "file of distances", "name name distance sigma", (3, 4), 2):
-        numbers = finite(words[2:], where, "a distance and its standard deviation")
+        numbers = _numbers(words[2:], where, "a distance and its standard deviation")
         if min(numbers) <= 0.0:
             raise FileFormatError(f"{where}: a distance and its standard deviation must be positive; got {numbers}.")
         found.append((words[0], words[1], numbers[0], numbers[1] if len(numbers) > 1 else _NAN))
@@ -123,7 +125,7 @@ def read_known_planes(path: str | os.PathLike[str]) -> PlanesFile:
         axis = _AXES.get(words[1].lower())
         if (axis is None and len(words) < 5) or (axis is not None and len(words) > 4):
             raise FileFormatError(f"{where}: expected {expected}; got {shown(' '.join(words))}.")
-        numbers = finite(words[1 if axis is None else 2 :], where, "numbers of a plane")
+        numbers = _numbers(words[1 if axis is None else 2 :], where, "numbers of a plane")
         plane = np.array(numbers[:4]) if axis is None else np.append(np.eye(3)[axis], -numbers[0])
         rest = numbers[4:] if axis is None else numbers[1:]
         length = float(np.linalg.norm(plane[:3]))
@@ -149,7 +151,7 @@ def read_directions(path: str | os.PathLike[str]) -> DirectionsFile:
         vertical = words[1].lower() == "vertical"
         if (len(words) > 3) if vertical else (len(words) < 4):
             raise FileFormatError(f"{where}: expected {expected}; got {shown(' '.join(words))}.")
-        numbers = finite(words[2 if vertical else 1 :], where, "a direction and its standard deviation in degrees")
+        numbers = _numbers(words[2 if vertical else 1 :], where, "a direction and its standard deviation in degrees")
         numbers = [0.0, 0.0, -1.0, *numbers] if vertical else numbers
         vector, world = np.array(numbers[:3]), np.array(numbers[4:] or [0.0, 0.0, -1.0])
         if min(np.linalg.norm(vector), np.linalg.norm(world)) == 0.0:
@@ -172,7 +174,7 @@ def read_measured_poses(path: str | os.PathLike[str]) -> PosesFile:
     expected = "name x y z qx qy qz qw, and two standard deviations or a covariance"
     names, poses, covariances = [], [], []
     for where, words in _rows(path, "file of poses", expected, (8, 10, 29, 44), 1):
-        numbers = finite(words[1:], where, expected)
+        numbers = _numbers(words[1:], where, expected)
         length = float(np.linalg.norm(numbers[3:7]))
         if abs(length - 1.0) > 1e-3:
             raise FileFormatError(f"{where}: expected a unit quaternion qx qy qz qw; its length is {length:.4g}.")
@@ -209,6 +211,14 @@ def _covariance(numbers: list[float], where: str) -> FloatArray:
     if np.linalg.eigvalsh(matrix / size / size[:, None])[0] <= 1e-12:
         raise FileFormatError(f"{where}: the covariance is not positive definite. Give what is not known a large one.")
     return matrix
+
+
+def _numbers(words: Sequence[str], where: str, expected: str) -> list[float]:
+    """Return words as numbers of which squares can be computed with."""
+    numbers = finite(words, where, expected)
+    if max(map(abs, numbers), default=0.0) > _LARGEST:
+        raise FileFormatError(f"{where}: {max(numbers, key=abs):g} is no measurement. Correct the file.")
+    return numbers
 
 
 def _positive(numbers: Sequence[float], where: str) -> float:
