@@ -14,6 +14,7 @@ all references are checked when it is made. Every change gives a new scene.
     point_depths       -> images, points          right_columns -> point_observations
     plane_observations -> images, planes          line_depths   -> line_observations
     pose_priors        -> frames                  line_intervals -> lines
+    camera_motions     -> images
     camera_positions   -> images                  marks -> images, control_points
     camera_poses       -> images                  distances, known_planes, known_directions, held -> any objects
 
@@ -40,6 +41,7 @@ from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
 from groma.scene.line_intervals import LineIntervals
 from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
+from groma.scene.motions import CameraMotions
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
 from groma.scene.standing_alone import standing_alone
@@ -93,6 +95,8 @@ class Scene:
     plane_observations: PlaneObservations = field(default_factory=PlaneObservations)
     #: Poses known beforehand.
     pose_priors: PosePriors = field(default_factory=PosePriors)
+    #: Images that were read row by row, and how their cameras moved meanwhile.
+    camera_motions: CameraMotions = field(default_factory=CameraMotions)
     #: Measured places and poses of cameras.
     camera_positions: CameraPositions = field(default_factory=CameraPositions)
     camera_poses: CameraPoses = field(default_factory=CameraPoses)
@@ -215,8 +219,6 @@ class Scene:
         """Whether anything measured tells the scale."""
         return self.is_metric or self.is_surveyed or len(self.distances) > 0
 
-    # Poses
-
     @property
     def cam_from_world(self) -> FloatArray:
         """(N, 7) poses of the images: ``cam_from_rig`` of the sensor after ``rig_from_world`` of the frame."""
@@ -240,8 +242,6 @@ class Scene:
             np.array_equal(np.sort(self.images.frame_idx), np.arange(len(self.frames)))
             and (self.sensors.cam_from_rig[self.images.sensor_idx] == _IDENTITY).all()
         )
-
-    # New scenes
 
     def replace(self, **tables: Any) -> Self:
         """Return a copy with some tables replaced.
