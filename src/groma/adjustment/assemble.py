@@ -21,11 +21,9 @@ from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.terms import (
     camera_motions,
     camera_poses,
-    camera_positions,
     control_points,
     distances,
-    known_directions,
-    known_planes,
+    known_geometry,
     line_depths,
     lines,
     plane_observations,
@@ -63,13 +61,13 @@ TERMS: tuple[Term, ...] = (
     relations_in_pixels.TERM,
     pose_priors.TERM,
     camera_motions.TERM,
-    camera_positions.TERM,
-    camera_poses.TERM,
+    camera_poses.POSITIONS,
+    camera_poses.POSES,
     control_points.MARKS,
     control_points.CONTROL,
     distances.TERM,
-    known_planes.TERM,
-    known_directions.TERM,
+    known_geometry.PLANES,
+    known_geometry.DIRECTIONS,
 )
 #: Types of factors that are observations of points and of lines in images.
 POINT_FACTORS = ("point_reprojection", "stereo_point")

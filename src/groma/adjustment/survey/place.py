@@ -23,11 +23,9 @@ from groma.adjustment.assemble import camera_variables, structure_variables
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.terms import (
     camera_poses,
-    camera_positions,
     control_points,
     distances,
-    known_directions,
-    known_planes,
+    known_geometry,
     pose_priors,
 )
 from groma.adjustment.terms.contract import Draft
@@ -47,8 +45,8 @@ _STEPS, _TOLERANCE = 50, 1e-6
 _UNKNOWN = 1e-13
 #: Terms whose measurements notice where the scene is.
 _TERMS = (
-    pose_priors.TERM, camera_positions.TERM, camera_poses.TERM, control_points.CONTROL, distances.TERM,
-    known_planes.TERM, known_directions.TERM,
+    pose_priors.TERM, camera_poses.POSITIONS, camera_poses.POSES, control_points.CONTROL, distances.TERM,
+    known_geometry.PLANES, known_geometry.DIRECTIONS,
 )  # fmt: skip
 
 
