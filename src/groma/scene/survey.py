@@ -166,10 +166,9 @@ class Distances(Table):
         cls, kind: Kind, first: npt.ArrayLike, second: npt.ArrayLike, distance: npt.ArrayLike, sigma: npt.ArrayLike
     ) -> Self:
         """Return distances between objects of one kind: cameras or control points."""
-        kinds = np.full(len(np.atleast_1d(first)), kind)
-        return cls(
-            kinds, np.atleast_1d(first), kinds, np.atleast_1d(second), np.zeros((len(kinds), 3)), distance, sigma
-        )
+        one, two = np.atleast_1d(first), np.atleast_1d(second)
+        kinds, numbers = np.full(len(one), kind), (np.asarray(distance, float), np.asarray(sigma, float))
+        return cls(kinds, one, kinds, two, np.zeros((len(one), 3)), *numbers)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from groma._typing import BoolArray
 from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.in_place import placing
 from groma.adjustment.survey.objects import (
@@ -89,9 +90,9 @@ def with_survey(scene: Scene, survey: Survey) -> Surveyed:
     moved = measured.transformed(found.similarity, measured=False)
     if len(moved.control_points):
         seen, _ = triangulated(moved, moved.marks, len(moved.control_points))
-        known = np.isfinite(seen).all(axis=1)[:, None]
+        known: BoolArray = np.asarray(np.isfinite(seen).all(axis=1))
         points = moved.control_points
-        moved = moved.replace(control_points=points.replace(xyz=np.where(known, seen, points.measured)))
+        moved = moved.replace(control_points=points.replace(xyz=np.where(known[:, None], seen, points.measured)))
     if len(moved.pose_priors) and survey.poses is not None:
         moved = moved.replace(pose_priors=PosePriors())  # the same poses, with the noise that is known
     elif len(moved.pose_priors) and found.fit is not None:

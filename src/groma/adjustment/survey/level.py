@@ -114,7 +114,7 @@ def _of_landmarks(scene: Scene) -> FloatArray:
 
 def _rotation(seen: FloatArray, wanted: FloatArray) -> FloatArray:
     """Return the rotation (3, 3) that takes unit vectors (N, 3) to others, as most of them agree."""
-    rotation, weight = np.eye(3), np.ones(len(seen))
+    rotation, new, weight = np.eye(3), np.eye(3), np.ones(len(seen))
     for _ in range(50):
         cross = np.einsum("n,ni,nj->ij", weight, wanted, seen)
         U, size, Vt = np.linalg.svd(cross)

@@ -107,7 +107,7 @@ def bases_of(directions: FloatArray) -> FloatArray:
     least = np.argmin(np.abs(directions), axis=1)
     first = np.cross(directions, np.eye(3)[least])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(directions, first), directions], axis=1)
+    return np.stack([first, np.cross(directions, first), directions], axis=1).astype(np.float64)
 
 
 @register("camera_direction")
