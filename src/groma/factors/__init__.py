@@ -46,6 +46,7 @@ from groma.factors.priors.on_known_plane import OnKnownPlane
 from groma.factors.priors.pose_between import PoseBetween
 from groma.factors.priors.pose_prior import PosePrior
 from groma.factors.priors.position_prior import PositionPrior
+from groma.factors.priors.similarity_between import SimilarityBetween
 from groma.factors.priors.vector_prior import VectorPrior
 from groma.factors.relations.line_direction import LineDirection
 from groma.factors.relations.line_on_plane import LineOnPlane, SegmentOnPlane
@@ -121,6 +122,7 @@ __all__ = [
     "SegmentOnPlanePixels",
     "SelfCheckReport",
     "SelfCheckRow",
+    "SimilarityBetween",
     "Slot",
     "SoftL1",
     "StereoLine",
