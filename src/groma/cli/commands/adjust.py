@@ -213,10 +213,7 @@ def adjust(
     if linear_solver != "auto":
         _check_linear_solver(linear_solver)
     console = Console(quiet, verbose, json_target, threads)
-    measured = _measured.Measured(
-        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, directions,
-        direction_sigma, known_planes, plane_sigma, poses, pose_sigma, hold, crs,
-    )  # fmt: skip
+    measured = _measured.given(locals())
     in_parts = has_company() or is_parts(source)
     if not in_parts:
         _output.check_outputs(force, output, page, covariance, protocol, json_target=json_target)

@@ -171,11 +171,7 @@ def map_(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
-    measured = _measured.Measured(
-        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, directions,
-        direction_sigma, known_planes, plane_sigma, poses if _has_noise(poses, pose_sigma) else None, pose_sigma, hold,
-        crs,
-    )  # fmt: skip
+    measured = _measured.given(locals() | {"poses": poses if _has_noise(poses, pose_sigma) else None})
     check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, *measured.files)
     check_extension(
         extend, map_images, {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params}

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -269,6 +269,11 @@ class Measured:
         return read_exif_positions(where, names())
 
 
+def given(options: Mapping[str, Any]) -> Measured:
+    """Return the measurements among the options of a command, whose names are those of the fields."""
+    return Measured(**{item.name: options[item.name] for item in fields(Measured)})
+
+
 def _read(reader: Callable[[Path], Any], path: Path | None) -> Any:
     return None if path is None else reader(path)
 
@@ -326,5 +331,5 @@ def say_survey(console: Console, numbers: dict[str, Any]) -> None:
 __all__ = [
     "Check", "Control", "ControlSigma", "Crs", "DirectionSigma", "Directions", "DistanceSigma", "Distances", "Hold",
     "KnownPlanes", "MarkSigma", "Measured", "PlaneSigma", "PoseSigma", "Poses", "PositionSigma", "Positions",
-    "say_survey",
+    "given", "say_survey",
 ]  # fmt: skip
