@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.pose_graph import motion_problem
+from groma.adjustment.graphs.pose_graph import motion_problem
 from groma.factors.losses import Huber
 from groma.geometry import se3
 from groma.scene.landmarks import Lines

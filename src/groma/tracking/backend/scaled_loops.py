@@ -3,8 +3,8 @@
 
 A place that is recognised is in the map twice, as it was seen first and as it was seen again, with a similarity between
 both copies (:mod:`groma.tracking.backend.place_again`). A graph of similarities spreads the error, scale included,
-over the keyframes (:mod:`groma.adjustment.similarity_graph`); landmarks follow the keyframes that saw them first, and
-what was matched becomes one.
+over the keyframes (:mod:`groma.adjustment.graphs.similarity_graph`); landmarks follow the keyframes that saw them
+first, and what was matched becomes one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from groma.adjustment.similarity_graph import SimilarityGraphResult, SimilarityMotions, adjust_similarity_graph
+from groma.adjustment.graphs.similarity_graph import SimilarityGraphResult, SimilarityMotions, adjust_similarity_graph
 from groma.geometry import sim3
 from groma.solver.options import SolverOptions
 from groma.tracking.backend.loop_closure import can_be, join_points, known_loops, move, neighbours, search_for_loop
