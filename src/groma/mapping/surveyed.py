@@ -15,7 +15,7 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
 from groma.adjustment.survey.attach import Survey, Surveyed, with_survey
 from groma.adjustment.survey.records import Reliability
-from groma.adjustment.survey.reliability import reliability
+from groma.adjustment.survey.reliability import has_survey, reliability
 from groma.errors import ProblemError
 from groma.gates import gate
 from groma.io.survey import WorldFrame
@@ -41,12 +41,6 @@ class SurveyedGates:
 
 
 GATES = SurveyedGates()
-
-
-def has_survey(scene: Scene) -> bool:
-    """Tell whether a scene holds measurements of other instruments than the cameras."""
-    tables = (scene.camera_positions, scene.control_points, scene.camera_distances, scene.point_distances)
-    return any(map(len, tables))
 
 
 @dataclass(frozen=True, eq=False)

@@ -156,7 +156,9 @@ def _adjusted(
         before = with_rolling_shutter(before, wanted.rolling_shutter)
     surveyed = bool(wanted.measured) or has_survey(before)
     if not surveyed and wanted.protocol is not None:
-        raise InputError("--protocol is of measurements; there are none. Add --positions, --control or --distances.")
+        raise InputError(
+            "--protocol is of measurements; there are none. Add --positions, --control, --distances or others."
+        )
     rolled = adjust_rolling_shutter(before, options, progress) if len(before.camera_motions) else None
     if not surveyed:
         if rolled is None:
