@@ -197,6 +197,11 @@ class Scene:
         return any(map(len, (self.point_depths, self.right_columns, self.line_depths, self.plane_observations)))
 
     @property
+    def has_survey(self) -> bool:
+        """Whether there are measurements of other instruments than the cameras."""
+        return any(map(len, (self.camera_positions, self.control_points, self.camera_distances, self.point_distances)))
+
+    @property
     def is_surveyed(self) -> bool:
         """Whether positions of cameras or control points tell where the scene is, and its scale."""
         return len(self.camera_positions) + int(self.control_points.is_control.sum()) > 1

@@ -129,14 +129,15 @@ def _adjusted(
 ) -> tuple[Scene, AdjustResult, dict[str, Any] | None]:
     """Return the scene as it went into the adjustment, the result, and what is told of measurements if there are."""
     from groma.adjustment.adjust import adjust
-    from groma.mapping.surveyed import adjust_surveyed, has_survey
 
-    if not wanted.measured and not has_survey(before):
+    if not wanted.measured and not before.has_survey:
         if wanted.protocol is not None:
             raise InputError(
                 "--protocol is of measurements; there are none. Add --positions, --control or --distances."
             )
         return before, adjust(before, options, progress), None
+    from groma.mapping.surveyed import adjust_surveyed  # with what finds noise in images
+
     survey = wanted.measured.read(None, lambda: before.images.names) if wanted.measured else None
     found = adjust_surveyed(before, survey, options, progress)
     return found.surveyed.scene, found.result, found.to_dict()
