@@ -153,7 +153,7 @@ def distinct_pairs(groups: IntArray, values: IntArray, num_groups: int) -> tuple
 
 
 def connected_parts(first: IntArray, second: IntArray, count: int) -> IntArray:
-    """Return the part (count,) that each of ``count`` things is in, if pairs of them are tied; parts by their first thing.
+    """Return the part (count,) of ``count`` things that each is in, where pairs are tied; parts by their first thing.
 
     In a round every part is joined to the lowest of those it is tied to. ``scipy.sparse.csgraph`` takes less time for
     very large graphs, and a quarter of a second to import.

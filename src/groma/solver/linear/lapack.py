@@ -4,8 +4,7 @@
 ``scipy.linalg`` has them; importing all of it takes a quarter of a second, ten times as long as the module of LAPACK in
 it, which is looked up here by itself. Where SciPy keeps it elsewhere, the whole is imported.
 
-``potrf``, ``potrs`` and ``potri`` are LAPACK's (see :mod:`scipy.linalg.lapack`). All of them, and the factors they return,
-are in Fortran order.
+``potrf``, ``potrs`` and ``potri`` are LAPACK's (see :mod:`scipy.linalg.lapack`); the factors are in Fortran order.
 """
 
 from __future__ import annotations

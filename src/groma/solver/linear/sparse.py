@@ -109,9 +109,7 @@ class SparseMatrix:
         matrix, source = self._pattern
         matrix.data = np.concatenate([blocks[pair].reshape(-1) for pair in self._layout.blocks])[source]
         try:
-            factor = splu(
-                matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
+            factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         except RuntimeError:  # exactly singular
             return None
         if (factor.U.diagonal() <= PIVOT_TOLERANCE * matrix.diagonal()[np.argsort(factor.perm_c)]).any():
