@@ -27,8 +27,9 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
-from groma.execution import work_with
+from groma.execution import beside, work_with
 from groma.mapping.lines.filtering.filters import Evidence, filtered
+from groma.mapping.lines.filtering.texture import load_minimiser
 from groma.mapping.lines.hypotheses.directions import depth_ratios
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.hypotheses.places import Places, find_places
@@ -119,7 +120,8 @@ def map_lines(
             ratios = depth_ratios(scene, segments, views)
         else:
             ratios = np.zeros((len(views.image_idx), 2))
-        places = find_places(scene, views, ratios, compared, matches, options, partial(report, "proposals"), known)
+        with beside(load_minimiser):
+            places = find_places(scene, views, ratios, compared, matches, options, partial(report, "proposals"), known)
         unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, partial(report, "tracks"))
         evidence = Evidence(
             options=options,
