@@ -29,7 +29,7 @@ def adjust_graph_and_write(
     force : bool
         Replace what is there.
     options : dict
-        Fields of :class:`groma.adjustment.pose_graph.PoseGraphOptions` that were chosen.
+        Fields of :class:`groma.adjustment.graphs.pose_graph.PoseGraphOptions` that were chosen.
     refused : dict
         Options of the command that mean nothing for a pose graph, and their values.
     """
@@ -39,7 +39,7 @@ def adjust_graph_and_write(
     if output is not None and not is_pose_graph(output):
         raise InputError(f"A pose graph is written as .g2o or .g2o.gz; got {output}.")
 
-    from groma.adjustment.pose_graph import PoseGraphOptions, adjust_pose_graph
+    from groma.adjustment.graphs.pose_graph import PoseGraphOptions, adjust_pose_graph
     from groma.compilation.time import compilation_time
     from groma.io.g2o import read_g2o, write_g2o
 
@@ -51,15 +51,20 @@ def adjust_graph_and_write(
         write_g2o(result.graph, output, force)
     numbers = result.summary()
     numbers["seconds"]["compilation"] = compilation.seconds
-    console.say(f"{counted(numbers['num_poses'], 'poses')}, {counted(numbers['num_motions'], 'motions')} between them")
-    console.say(f"  {'cost':<16}{numbers['initial_cost']:>10.5g}     ->{numbers['final_cost']:>9.5g}")
-    time = spent(numbers["seconds"]["total"], compilation.seconds, compilation.compiled)
-    console.say(f"  {counted(numbers['iterations'], 'steps')} in {time}. {result.report.termination.sentence}")
+    rows = [[kind, f"{numbers[f'num_{kind}']:,}"] for kind in ("poses", "motions")]
     if len(result.outliers):
-        console.say(f"  {counted(len(result.outliers), 'motions')} beyond the scale of the loss")
+        rows.append(["beyond the scale of the loss", f"{len(result.outliers):,}"])
+    console.table(("", "number"), rows)
+    time = spent(numbers["seconds"]["total"], compilation.seconds, compilation.compiled)
+    costs = f"Cost {numbers['initial_cost']:.5g} -> {numbers['final_cost']:.5g}"
+    steps = counted(numbers["iterations"], "steps")
+    console.say(f"{costs}, {steps} in {time}. {result.report.termination.sentence}")
     for sentence in result.warnings:
         console.warn(sentence)
-    console.say(f"Wrote {output}" if output is not None else "No -o given: the adjusted graph was not written.")
+    if output is not None:
+        console.wrote(output)
+    else:
+        console.say("No -o given: the adjusted graph was not written.")
     return numbers
 
 
