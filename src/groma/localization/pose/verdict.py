@@ -146,6 +146,29 @@ def doubted_if_mirrored(verdict: Verdict, own: int, mirror: Evidence, gates: Ver
     return Verdict("uncertain", 1.0 - gates.right, words)
 
 
+def votes_of_a_rival(agree: int, gates: VerdictGates = VERDICT) -> int:
+    """How many cells must agree with another place for it to make one with so many doubtful."""
+    votes = np.arange(agree + 1)
+    return int(np.argmax(_tail(votes, agree) > 1.0 - gates.right))
+
+
+def votes_of_a_better_one(agree: int, gates: VerdictGates = VERDICT) -> int:
+    """How many cells must agree with the mirror image of a photograph for it to make one with so many doubtful."""
+    from scipy.special import bdtr
+
+    votes = agree + 1
+    while bdtr(agree, agree + votes, 0.5) > 1.0 - gates.right:
+        votes += 1
+    return votes
+
+
+def most_votes(matches: Matches, camera: QueryCamera, gates: VerdictGates = VERDICT) -> int:
+    """How many cells and segments could agree with a pose at most: those that have matches."""
+    cells = cells_of(matches.points2d, camera, gates.cells)
+    lines = np.unique(matches.segments3d.reshape(-1, 6), axis=0) if matches.num_lines else ()
+    return int(cells.max(initial=-1)) + 1 + len(lines)
+
+
 def moved(camera: QueryCamera, first: FloatArray, second: FloatArray, places: FloatArray) -> float:
     """Median way in pixels of what is seen at some places in the world, from one pose to another."""
     way = np.linalg.norm(camera.project(first, places) - camera.project(second, places), axis=1)
@@ -187,9 +210,14 @@ def _as_good(first: Evidence, second: Evidence | None) -> float:
     """Probability that a second pose gets so few votes of both if both are equally good."""
     if second is None or not second.significant:
         return 0.0
+    return float(_tail(np.array(second.agree), first.agree))
+
+
+def _tail(fewer, more):
+    """Probability that of two alike one gets so few votes or fewer."""
     from scipy.special import bdtr
 
-    return min(1.0, 2.0 * float(bdtr(second.agree, first.agree + second.agree, 0.5)))
+    return np.minimum(1.0, 2.0 * bdtr(fewer, fewer + more, 0.5))
 
 
 def _log_choose(n: int, k: int) -> float:
@@ -203,4 +231,16 @@ def _open(sigma: FloatArray) -> str:
     return f"its standard deviation is {shift:.3g} scene units and {turn:.2g} degrees"
 
 
-__all__ = ["Evidence", "Status", "Verdict", "doubted_if_mirrored", "evidence_of", "judge", "median_distance", "moved"]
+__all__ = [
+    "Evidence",
+    "Status",
+    "Verdict",
+    "doubted_if_mirrored",
+    "evidence_of",
+    "judge",
+    "median_distance",
+    "most_votes",
+    "moved",
+    "votes_of_a_better_one",
+    "votes_of_a_rival",
+]
