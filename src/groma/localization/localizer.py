@@ -164,7 +164,7 @@ class Localizer:
         start = time.perf_counter()
         query = find_features(gray, camera, self.options.lines, self.options.min_segment_length)
         described = time.perf_counter()
-        images = self._alike(query)
+        images = self._alike(query.points)
         pose, last = self._coarsely(query, camera, options, images)
         if pose.status != "localized" or pose.votes < self.options.gates.plain:
             pose, last = self._fully(query, camera, options, images)
@@ -173,17 +173,17 @@ class Localizer:
 
     def _coarsely(self, query: DescribedImage, camera: QueryCamera, options: PoseOptions, images: IntArray) -> _Found:
         """Look for the coarsest points among all that the images see: enough where the place is plain."""
-        few, landmarks = query.with_points(query.points.take(coarsest(query.points))), seen_in(self.index, images)
+        few = query.with_points(query.points.take(coarsest(query.points)))
 
-        def matched(points: DescribedPoints) -> Candidates:
-            return Candidates(self._landmarks.match(points, landmarks), np.zeros((0, 2), np.int64))
+        def matched(points: DescribedPoints, images: IntArray) -> Candidates:
+            return Candidates(self._landmarks.match(points, seen_in(self.index, images)), np.zeros((0, 2), np.int64))
 
-        return self._pose(query, few, camera, options, images, matched(few.points), matched)
+        return self._pose(query, few, camera, options, images, matched(few.points, images), matched)
 
     def _fully(self, query: DescribedImage, camera: QueryCamera, options: PoseOptions, images: IntArray) -> _Found:
         """Match everything, lines too, with one image after the other."""
 
-        def matched(points: DescribedPoints) -> Candidates:
+        def matched(points: DescribedPoints, images: IntArray) -> Candidates:
             return described_alike(query.with_points(points), self.scene, self.index, images, lines=False)
 
         found = described_alike(query, self.scene, self.index, images, self.options.lines)
@@ -197,7 +197,7 @@ class Localizer:
         options: PoseOptions,
         images: IntArray,
         found: Candidates,
-        matched: Callable[[DescribedPoints], Candidates],
+        matched: Callable[[DescribedPoints, IntArray], Candidates],
     ) -> _Found:
         """The pose from matches of a part of a query, those that it guides to, and what mirrored points match."""
         count = counted_in(self.index, images, found.points[:, 1])
@@ -214,18 +214,18 @@ class Localizer:
 
         def mirror() -> Matches:
             points = mirrored(part.points, camera.width)
-            return matched(points).matches(part.with_points(points), self.scene, self.index)
+            return matched(points, self._alike(points)).matches(part.with_points(points), self.scene, self.index)
 
         matches = found.matches(part, self.scene, self.index)
         pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, mirror)
         return pose, last[0]
 
-    def _alike(self, query: DescribedImage) -> IntArray:
+    def _alike(self, points: DescribedPoints) -> IntArray:
         """The images of the map to match with, the most alike first."""
         wanted = self.options.gates.images
         if len(self.index.image) <= wanted:
             return np.arange(len(self.index.image))
-        described = self._retrieval.gather(query.points.descriptors)
+        described = self._retrieval.gather(points.descriptors)
         return np.argsort(-self._retrieval.similarity(described, self.index.image), kind="stable")[:wanted]  # type: ignore[arg-type]
 
 

@@ -19,18 +19,19 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
 from groma.localization.pose.matches import Matches
+from groma.localization.pose.pieces import cells_elsewhere
 from groma.localization.pose.refinement import Refined, fitted, refine
 from groma.localization.pose.verdict import (
     Evidence,
     Status,
     Verdict,
+    doubted_if_in_pieces,
     doubted_if_mirrored,
     evidence_of,
     judge,
     median_distance,
     most_votes,
     moved,
-    votes_of_a_better_one,
     votes_of_a_rival,
 )
 
@@ -191,16 +192,21 @@ def pose_from_matches(
     if best is None:
         return _failed(camera, matches)
     first = evidence_of(best, matches, places)
+    own = best
     other = _rival(matches, best, options, places, first) if options.look_for_rival and first.significant else None
     used = matches
     if guided is not None and first.significant:
         used = guided(best)
         errors = _errors(used, options)
         best = refine(best.camera, used, best.pose, errors, options.refine_lens)
-        first = evidence_of(fitted(best.camera, matches, best.pose, errors, options.refine_lens), matches, places)
+        own = fitted(best.camera, matches, best.pose, errors, options.refine_lens)
+        first = evidence_of(own, matches, places)
     covariance = best.covariance(used)
     distance = median_distance(best.pose, _seen(used, best))
     verdict = judge(best, covariance, distance, first, None if other is None else other[1])
+    if verdict.status == "localized":
+        beyond = VERDICT.distinct * max_errors(matches)[0]
+        verdict = doubted_if_in_pieces(verdict, first.agree, cells_elsewhere(own, matches, beyond))
     if mirror is not None and verdict.status == "localized":
         verdict = _unless_mirrored(verdict, best, mirror(), matches, options)
     failed = verdict.status == "failed"
@@ -225,10 +231,9 @@ def _unless_mirrored(
 ) -> Verdict:
     """Return a verdict, or another one where the mirror image of a photograph fits clearly better."""
     points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
-    own = 0
-    if points.num_points:
-        own = evidence_of(fitted(best.camera, points, best.pose, _errors(points, options)), points).agree
-    other = _best_of_others(best.camera, mirror, options, votes_of_a_better_one(own))
+    own = evidence_of(fitted(best.camera, points, best.pose, _errors(points, options)), points)
+    # Of what agrees as well, half as many must.
+    other = _best_of_others(best.camera, mirror, options, own.agree // 2)
     return verdict if other is None else doubted_if_mirrored(verdict, own, evidence_of(other, mirror))
 
 

@@ -60,6 +60,11 @@ class VerdictGates:
     distinct: float = gate(
         5.0, "thresholds", "by which another pose moves what is seen, in the median", "derived from noise: well beyond"
     )
+    beside: float = gate(0.125, "share", "of the longer side: cells as near are neighbours", "convention: an eighth")
+    bend: float = gate(
+        0.15, "share", "of their distance, by which neighbours may be off differently",
+        "derived from perspective: as between views 10 degrees apart",
+    )  # fmt: skip
 
 
 #: The numbers in use.

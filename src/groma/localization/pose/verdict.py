@@ -133,16 +133,28 @@ def judge(
     return Verdict("localized", probability, f"{agree} agree.")
 
 
-def doubted_if_mirrored(verdict: Verdict, own: int, mirror: Evidence, gates: VerdictGates = VERDICT) -> Verdict:
-    """Return a verdict, or ``uncertain`` where more cells speak for the mirror image than for the photograph (own).
+def doubted_if_mirrored(verdict: Verdict, own: Evidence, mirror: Evidence, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where the mirror image fits far better than the photograph (own).
 
-    Mirrored photographs are rare, and what is symmetric fits both ways: the sign test must exclude that both are alike.
+    Mirrored photographs are as rare as wrong poses may be: by so much less likely by chance must be what agrees with
+    the mirror image.
     """
-    from scipy.special import bdtr
-
-    if not mirror.significant or mirror.agree <= own or bdtr(own, own + mirror.agree, 0.5) > 1.0 - gates.right:
+    if not mirror.significant or mirror.log_alarms > own.log_alarms + math.log(1.0 - gates.right):
         return verdict
-    words = f"{mirror.agree} measurements speak for its mirror image, {own} for the photograph: it may be mirrored."
+    words = (
+        f"{mirror.agree} measurements speak for its mirror image, {own.agree} for the photograph: it may be mirrored."
+    )
+    return Verdict("uncertain", 1.0 - gates.right, words)
+
+
+def doubted_if_in_pieces(verdict: Verdict, agree: int, elsewhere: int, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where about as much of the photograph shows the map elsewhere."""
+    if not elsewhere or _tail(elsewhere, agree) <= 1.0 - gates.right:
+        return verdict
+    words = (
+        f"{agree} measurements speak for this place, and {elsewhere} cells of the image show the map where this place "
+        "does not have it: it may repeat itself, or be put together of pieces."
+    )
     return Verdict("uncertain", 1.0 - gates.right, words)
 
 
@@ -150,16 +162,6 @@ def votes_of_a_rival(agree: int, gates: VerdictGates = VERDICT) -> int:
     """How many cells must agree with another place for it to make one with so many doubtful."""
     votes = np.arange(agree + 1)
     return int(np.argmax(_tail(votes, agree) > 1.0 - gates.right))
-
-
-def votes_of_a_better_one(agree: int, gates: VerdictGates = VERDICT) -> int:
-    """How many cells must agree with the mirror image of a photograph for it to make one with so many doubtful."""
-    from scipy.special import bdtr
-
-    votes = agree + 1
-    while bdtr(agree, agree + votes, 0.5) > 1.0 - gates.right:
-        votes += 1
-    return votes
 
 
 def most_votes(matches: Matches, camera: QueryCamera, gates: VerdictGates = VERDICT) -> int:
@@ -241,6 +243,5 @@ __all__ = [
     "median_distance",
     "most_votes",
     "moved",
-    "votes_of_a_better_one",
     "votes_of_a_rival",
 ]

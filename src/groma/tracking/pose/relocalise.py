@@ -94,8 +94,8 @@ def pose_from_matches(
     max_error: float = DEFAULT.finding.max_error,
 ) -> tuple[FloatArray, BoolArray] | None:
     """Pose (7,) from places in the world and their pixels, and which agree; None where chance explains them as well."""
-    options = PoseOptions(max_error=max_error, look_for_rival=False)
-    pose = estimate_absolute_pose(camera.query, pixel, places, options=options).cam_from_world
+    options, sigma = PoseOptions(max_error=max_error, look_for_rival=False), 0.5 * max_error
+    pose = estimate_absolute_pose(camera.query, pixel, places, sigma=(sigma, sigma), options=options).cam_from_world
     if pose is None:
         return None
     away = np.linalg.norm(camera.project(into(pose, places)) - pixel, axis=1)
