@@ -4,17 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from groma._counted import counted
+from groma._log import log_warnings, logger_of
 from groma._typing import FloatArray
 from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, disassemble
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.fit import inliers, noise_of
-from groma.adjustment.lens import unmodelled_distortion
+from groma.adjustment.misfit.lens import unmodelled_distortion
+from groma.adjustment.misfit.rig import rig_that_does_not_fit
 from groma.adjustment.pixel_residuals import redundancy_of, squared_residuals_px
 from groma.adjustment.places import at_places_of
 from groma.adjustment.relation_outcome import drop_failed_relations
@@ -117,7 +119,8 @@ class AdjustOptions:
     #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss or with lines (1 where
     #: points are tied to lines and there is no loss), else 0.
     landmark_steps: int | None = None
-    #: Look into the residuals of points for lens distortion that the cameras lack; warnings then say so.
+    #: Look for lens distortion that cameras lack, in the residuals of points, and for rigs that do not fit; warnings
+    #: say so.
     check_lens: bool = True
     #: Threads; None takes one for small problems and all cores for large ones.
     threads: int | None = None
@@ -223,6 +226,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
 
         def tell(record, spent=spent, patient=patient, stopped=stopped) -> bool:
             event = Progress(spent + record.iteration, options.max_iterations, record.cost)
+            logger_of("adjustment").debug("step %d of at most %d, cost %.6g", *astuple(event))
             if progress is not None and progress(event) is False:
                 stopped.append(event)
             return not stopped and (record.accepted or patient)
@@ -247,9 +251,19 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
     if any(map(len, moved)):
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
     outcome = _outcome(scene, assembly, problem, report, relations, stage_entries(stages, reports))
-    if options.check_lens and (lens := unmodelled_distortion(problem, options.threads)):
-        outcome = replace(outcome, warnings=(*outcome.warnings, lens))
+    if options.check_lens:
+        found = unmodelled_distortion(problem, options.threads), rig_that_does_not_fit(scene, problem, options.threads)
+        outcome = replace(outcome, warnings=(*outcome.warnings, *filter(None, found)))
+    _log(outcome)
     return AdjustResult(adjusted, outcome, problem)
+
+
+def _log(outcome: AdjustReport) -> None:
+    cost = f"cost {outcome.solve.initial_cost:.5g} -> {outcome.solve.final_cost:.5g}"
+    steps = counted(outcome.solve.iterations, "steps")
+    images, observations = counted(outcome.num_images, "images"), counted(outcome.num_observations, "observations")
+    logger_of("adjustment").info("%s, %s: %s, %s", images, observations, cost, steps)
+    log_warnings("adjustment", outcome.warnings)
 
 
 def _outcome(

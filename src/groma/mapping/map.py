@@ -25,6 +25,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from groma._log import log_warnings, logged_stages
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
@@ -188,7 +189,7 @@ def map_images(
         If another run works in ``work``, or it cannot be written.
     """
     options = with_parts(options or MapOptions())
-    say = progress or (lambda doing, done, total: None)
+    say = logged_stages("mapping", progress)
     folder = Path(images)
     files = image_files(folder)
     names = [path.relative_to(folder).as_posix() for path in files]
@@ -215,7 +216,6 @@ def map_images(
         segments = stages.run(find_segments, folder, points, line_matches, given=line_matches)
         matches = matches_for(options, folder, points, segments, line_matches)
         result = map_segments(points, segments, matches, stages, neighbors_for(options, folder))
-    say("done", 1, 1)
     left_out = images_left_out(names, (model or start).images.names, model is not None)
     result = dataclasses.replace(
         result,
@@ -225,6 +225,7 @@ def map_images(
         warnings=(*left_out, *placed.warnings, *result.warnings),
         surveyed=None if in_place is None else in_place.surveyed,
     )
+    log_warnings("mapping", [sentence for sentence in result.warnings if sentence not in result.report.warnings])
     if near is None:
         return result
     scene, start, before = (part.transformed(near.inverse()) for part in (result.scene, result.start, result.before))

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
     from groma.adjustment.adjust import AdjustOptions
     from groma.adjustment.report import AdjustResult, Progress
+    from groma.adjustment.rolling_shutter import Motions
+    from groma.adjustment.uncertainty import SceneUncertainty
     from groma.cli.shared.console import Console
+    from groma.compilation.time import Compilation
     from groma.scene import Scene
 
 
@@ -43,6 +46,8 @@ class Wanted:
     #: Measurements of other instruments, and where their protocol goes.
     measured: Measured = field(default_factory=Measured)
     protocol: Path | None = None
+    #: What images were read along, if not at once.
+    rolling_shutter: str | None = None
 
 
 def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wanted: Wanted) -> None:
@@ -65,7 +70,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     true = None if wanted.truth is None else read_scene(wanted.truth)
     console.expect_compilation("adjust")
     with compilation_time() as compilation, console.progress() as progress:
-        before, result, survey = _adjusted(before, options, wanted, progress)
+        before, result, survey, motions = _adjusted(before, options, wanted, progress)
     entries = ()
     if wanted.contributions:
         from groma.adjustment.contributions import contributions  # with evaluation, half a second to import
@@ -75,6 +80,9 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     numbers = result.summary(diagnosis, entries)
     numbers["seconds"]["compilation"] = compilation.seconds
     numbers |= {} if survey is None else {"survey": survey}
+    if motions is not None:
+        numbers["rolling_shutter"] = motions.to_dict()
+        numbers["warnings"] += motions.warnings()
 
     if wanted.output is not None:
         write_scene(result.scene, wanted.output, force=wanted.force, like=structures_of(source))
@@ -83,25 +91,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
 
         with _output.atomic_output(wanted.protocol, wanted.force) as draft:
             draft.write_text(protocol(numbers), encoding="utf-8")
-    if wanted.page is not None:
-        from groma.viz.report.page import PageContents, write_report
-        from groma.viz.report.survey import survey_card
-        from groma.viz.report.tables import contributions_card
-
-        with _output.atomic_output(wanted.page, wanted.force) as draft:
-            write_report(
-                draft,
-                before,
-                result.scene,
-                result.report,
-                title=f"Adjustment of {source.absolute().name}",
-                contents=PageContents(
-                    warnings=numbers["warnings"],
-                    diagnosis=numbers["diagnosis"],
-                    cards=contributions_card(numbers.get("contributions")) + survey_card(survey),
-                ),
-            )
-    failure = None
+    found, failure = None, None
     if wanted.covariance is not None:
         try:
             found = result.uncertainty(wanted.gauge, wanted.sigma0)
@@ -112,11 +102,15 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
             reasons = why_no_covariances(result.scene, wanted.covariance)
             numbers["warnings"] += reasons
             failure = None if reasons else error  # raised at the end, when all else is written and said
-    _say(console, numbers, compilation.compiled)
+    if wanted.page is not None:
+        _write_page(wanted.page, wanted.force, source, before, result, numbers, found)
+    _say(console, numbers, compilation)
     say_survey(console, survey or {})
+    for sentence in motions.sentences() if motions else ():
+        console.say(sentence)
     for path in (wanted.output, wanted.page, wanted.protocol, wanted.covariance if "uncertainty" in numbers else None):
         if path is not None:
-            console.say(f"Wrote {path}")
+            console.wrote(path)
     if all(place is None for place in (wanted.output, wanted.page, wanted.covariance, wanted.json_target)):
         console.say("No -o given: the adjusted scene was not written.")
     _output.write_json(wanted.json_target, numbers, wanted.force)
@@ -124,22 +118,54 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
         raise failure
 
 
+def _write_page(
+    path: Path,
+    force: bool,
+    source: Path,
+    before: Scene,
+    result: AdjustResult,
+    numbers: dict[str, Any],
+    found: SceneUncertainty | None,
+) -> None:
+    """Write the page, before and after; with standard deviations of what is measured on it if there are covariances."""
+    from groma.viz.report.covariances import covariances_of
+    from groma.viz.report.page import PageContents, write_report
+    from groma.viz.report.survey import survey_card
+    from groma.viz.report.tables import contributions_card
+
+    contents = PageContents(
+        warnings=numbers["warnings"],
+        diagnosis=numbers["diagnosis"],
+        cards=contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
+        covariances=None if found is None else covariances_of(result.scene, found),
+    )
+    title = f"Adjustment of {source.absolute().name}"
+    with _output.atomic_output(path, force) as draft:
+        write_report(draft, before, result.scene, result.report, title=title, contents=contents)
+
+
 def _adjusted(
     before: Scene, options: AdjustOptions, wanted: Wanted, progress: Callable[[Progress], bool | None]
-) -> tuple[Scene, AdjustResult, dict[str, Any] | None]:
-    """Return the scene as it went into the adjustment, the result, and what is told of measurements if there are."""
+) -> tuple[Scene, AdjustResult, dict[str, Any] | None, Motions | None]:
+    """Return the scene as it went into the adjustment, the result, and what is told of measurements and motions."""
     from groma.adjustment.adjust import adjust
+    from groma.adjustment.rolling_shutter import adjust_rolling_shutter, motions_of, with_rolling_shutter
     from groma.mapping.surveyed import adjust_surveyed, has_survey
 
-    if not wanted.measured and not has_survey(before):
-        if wanted.protocol is not None:
-            raise InputError(
-                "--protocol is of measurements; there are none. Add --positions, --control or --distances."
-            )
-        return before, adjust(before, options, progress), None
+    if wanted.rolling_shutter is not None:
+        before = with_rolling_shutter(before, wanted.rolling_shutter)
+    surveyed = bool(wanted.measured) or has_survey(before)
+    if not surveyed and wanted.protocol is not None:
+        raise InputError("--protocol is of measurements; there are none. Add --positions, --control or --distances.")
+    rolled = adjust_rolling_shutter(before, options, progress) if len(before.camera_motions) else None
+    if not surveyed:
+        if rolled is None:
+            return before, adjust(before, options, progress), None, None
+        return before, rolled.result, None, rolled.motions
     survey = wanted.measured.read(None, lambda: before.images.names) if wanted.measured else None
-    found = adjust_surveyed(before, survey, options, progress)
-    return found.surveyed.scene, found.result, found.to_dict()
+    found = adjust_surveyed(before if rolled is None else rolled.result.scene, survey, options, progress)
+    motions = None if rolled is None else motions_of(found.result.scene, found.result.problem)
+    return found.surveyed.scene, found.result, found.to_dict(), motions
 
 
 def why_no_covariances(scene: Scene, path: Path) -> list[str]:
@@ -162,16 +188,15 @@ def why_no_covariances(scene: Scene, path: Path) -> list[str]:
     ]
 
 
-def _say(console: Console, numbers: dict[str, Any], compiled: bool) -> None:
+def _say(console: Console, numbers: dict[str, Any], compilation: Compilation) -> None:
     """Say the main numbers, what the data do not determine, and the warnings."""
     from groma.cli.shared.diagnosis import say_diagnosis
-    from groma.cli.shared.sentences import describe, describe_contributions, describe_uncertainty
+    from groma.cli.shared.sentences import describe_uncertainty, say_adjustment, say_contributions
 
-    lines = describe(numbers, numbers["termination_sentence"], verbose=console.verbose, compiled=compiled)
-    lines += describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else []
-    lines += describe_contributions(numbers.get("contributions", []))
-    for line in lines:
+    say_adjustment(console, numbers, numbers["termination_sentence"], compilation)
+    for line in describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else ():
         console.say(line)
+    say_contributions(console, numbers.get("contributions", []))
     say_diagnosis(numbers["diagnosis"], console)
     for sentence in numbers["warnings"]:
         console.warn(sentence)
