@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Counts as a person reads them, for every sentence, table and message; names in the order a person puts them in."""
+"""Numbers as a person reads them: counts in every sentence, table and message, and numbers in names."""
+
+from __future__ import annotations
 
 import re
 

@@ -15,7 +15,8 @@ from groma._typing import FloatArray
 from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, disassemble
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.fit import inliers, noise_of
-from groma.adjustment.lens import unmodelled_distortion
+from groma.adjustment.misfit.lens import unmodelled_distortion
+from groma.adjustment.misfit.rig import rig_that_does_not_fit
 from groma.adjustment.pixel_residuals import redundancy_of, squared_residuals_px
 from groma.adjustment.places import at_places_of
 from groma.adjustment.relation_outcome import drop_failed_relations
@@ -23,7 +24,6 @@ from groma.adjustment.report import AdjustReport, AdjustResult, Progress, not_co
 from groma.adjustment.rescue.clusters import settle_clusters
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
-from groma.adjustment.rig_fit import rig_that_does_not_fit
 from groma.adjustment.stages import (
     METRIC_LOSS,
     METRIC_RELATION_LOSS,

@@ -19,6 +19,7 @@ from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.contributions import Contribution, contributions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.report import AdjustReport
+from groma.adjustment.rolling_shutter import motions_of
 from groma.adjustment.stages import with_loss
 from groma.adjustment.survey.attach import Surveyed
 from groma.adjustment.survey.protocol import protocol
@@ -103,6 +104,9 @@ class MapResult:
         }
         if contributions:
             numbers["contributions"] = [entry.to_dict() for entry in contributions]
+        if len(self.scene.camera_motions):
+            problem = _problem_of(self.scene, self.adjusted_with)
+            numbers["rolling_shutter"] = motions_of(self.scene, problem).to_dict()
         if has_survey(self.scene):
             found = reliability_of(self.scene, _problem_of(self.scene, self.adjusted_with))
             numbers["survey"] = survey_numbers(self.surveyed, found)

@@ -92,6 +92,7 @@ def map_(
     refine_rig: Annotated[
         bool, typer.Option("--refine-rig/--fix-rig", help="Estimate where the cameras sit on their rig.")
     ] = False,
+    rolling_shutter: _options.RollingShutter = None,
     line_matches: Annotated[
         Path | None,
         typer.Option(
@@ -209,6 +210,7 @@ def map_(
         mapper=mapper,
         rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
+        rolling_shutter=rolling_shutter,
         threads=threads,
         seed=seed,
     )

@@ -74,6 +74,10 @@ class LineNoise:
         """Return the noise with a standard deviation (L,) of both ends across the line added, scene units."""
         return replace(self, covariance=self.covariance + length[:, None, None] ** 2 * np.eye(4))
 
+    def by_misfit(self) -> LineNoise:
+        """Return the noise that each line shows in its own residuals where that is more than the usual one."""
+        return replace(self, covariance=self.covariance * np.maximum(self.misfit, 1.0)[:, None, None] ** 2)
+
     def at(self, first_share: FloatArray, second_share: FloatArray, rows: IntArray) -> FloatArray:
         """Cross-covariance (N, 2, 2), along ``across``, of the points at two shares of the segments ``rows``."""
         first = np.stack([1.0 - first_share, first_share], axis=-1)
