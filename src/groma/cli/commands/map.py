@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from groma.cli.shared import depth as _depth
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
 from groma.cli.shared.ranks import led_by_first_rank
@@ -136,6 +137,9 @@ def map_(
     distances: _measured.Distances = None,
     distance_sigma: _measured.DistanceSigma = None,
     crs: _measured.Crs = None,
+    depth: _depth.Depth = None,
+    depth_scale: _depth.DepthScale = None,
+    relative_depth: _depth.RelativeDepth = False,
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
@@ -162,10 +166,10 @@ def map_(
         positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
     )
     _measured.check_measured(measured)
-    check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, *measured.files)
-    check_extension(
-        extend, map_images, {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params}
-    )
+    check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, *measured.files)
+    maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
+    known = {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params, "--depth": depth}
+    check_extension(extend, map_images, known)
 
     if model is not None and camera_params is not None:
         raise InputError("--camera-params is for images without a model. Leave it out.")
@@ -220,7 +224,7 @@ def map_(
             photographs, lambda: [path.relative_to(photographs).as_posix() for path in image_files(photographs)]
         )
     with work_with(threads):
-        result = run_map(console, photographs, work, start, options, matches, survey)
+        result = run_map(console, photographs, work, start, options, matches, survey, maps)
         if extended is not None and survey is None:
             result = in_world_of(result, extended.map)
         found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)

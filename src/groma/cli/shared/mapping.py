@@ -10,6 +10,7 @@ import typer
 
 from groma._counted import counted
 from groma.cli.shared import output as _output
+from groma.cli.shared.depth import say_depth
 from groma.cli.shared.interrupt import PROCESS
 from groma.cli.shared.measurements import say_survey
 from groma.errors import OutputError
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from groma.adjustment.survey.attach import Survey
     from groma.cli.shared.console import Console
     from groma.features.external import ExternalMatches
+    from groma.io.depth_maps import DepthMaps
     from groma.mapping.map import MapOptions
     from groma.mapping.result import MapResult
     from groma.scene import Scene
@@ -31,6 +33,7 @@ def run_map(
     options: MapOptions,
     line_matches: ExternalMatches | None = None,
     survey: Survey | None = None,
+    depth: DepthMaps | None = None,
 ) -> MapResult:
     """Map a folder of photographs; Ctrl-C ends the command and keeps the finished stages in ``work``."""
     from groma.cli.shared.interrupt import interruptible
@@ -43,7 +46,7 @@ def run_map(
         console.say(f"Going on from the finished stages in {work}, as far as they fit.")
     try:
         with interruptible() as interruption, console.stages() as stages:
-            return map_images(images, work, model, options, interruption.checking(stages), line_matches, survey)
+            return map_images(images, work, model, options, interruption.checking(stages), line_matches, survey, depth)
     except KeyboardInterrupt:
         words = f"finished stages are kept in {work}: the same command goes on from there."
         raise typer.Exit(PROCESS.tell(words)) from None
@@ -88,6 +91,7 @@ def say_map(console: Console, result: MapResult, numbers: dict[str, Any], explai
     if explain or console.verbose:
         say_diagnosis(numbers["diagnosis"], console)
     (console.say if explain else console.detail)(result.explanation)
+    say_depth(console, numbers.get("depth") or {})
     say_survey(console, numbers.get("survey") or {})
     for sentence in result.warnings:
         console.warn(sentence)
