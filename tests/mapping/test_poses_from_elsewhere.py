@@ -5,6 +5,7 @@ The truth is that of scenes that were made; the noise found is compared with the
 """
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -119,6 +120,24 @@ def test_poses_that_claim_much_do_not_outvote_motions(world):
     assert np.degrees(np.linalg.norm(quaternion.log(between), axis=1)).max() < 0.5
     centers = average_centers(given.cam_centers_in_world, turned.values, motions, np.arange(COUNT) != 5)
     assert np.linalg.norm(centers.values - scene.cam_centers_in_world, axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_images_that_contradict_each_other_do_not_gather_at_one_place(world, seed):
+    """A group of three images a few noises apart whose motions are wrong: at one place these would all be right."""
+    scene, motions = world
+    rng = np.random.default_rng(seed)
+    group = np.isin(motions.first, [0, 1, 2]) & np.isin(motions.second, [0, 1, 2])
+    alone = group | ((motions.first > 2) & (motions.second > 2))
+    wrong = rng.normal(size=(int(group.sum()), 3))
+    direction = motions.direction.copy()
+    direction[group] = wrong / np.linalg.norm(wrong, axis=1, keepdims=True)
+    fields = {name: value[alone] for name, value in vars(replace(motions, direction=direction)).items()}
+    true = scene.cam_centers_in_world
+    given = true + rng.normal(0.0, 0.7, true.shape)
+    found = average_centers(given, scene.cam_from_world[:, :4], replace(motions, **fields), np.ones(COUNT, bool))
+    apart, before = (np.linalg.norm(some[[0, 1, 2]] - some[[1, 2, 0]], axis=1) for some in (found.values, given))
+    assert apart.sum() > 0.5 * before.sum()
 
 
 def test_noise_is_estimated_and_gross_errors_are_tested_for():

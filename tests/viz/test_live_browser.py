@@ -42,8 +42,9 @@ def test_a_running_track_in_the_browser(tmp_path):
         assert view.shown["points"].value
         page.get_by_role("checkbox", name="Points").click()
         for _ in range(100):
-            if not view.shown["points"].value:
+            if not view._nodes["points"][0].visible:
                 break
             page.wait_for_timeout(50)
-        assert not view.shown["points"].value and not view._nodes["points"][0].visible
+        assert not view.shown["points"].value
+        assert not view._nodes["points"][0].visible
         browser.close()

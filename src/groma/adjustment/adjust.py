@@ -22,6 +22,7 @@ from groma.adjustment.report import AdjustReport, AdjustResult, Progress, not_co
 from groma.adjustment.rescue.clusters import settle_clusters
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
+from groma.adjustment.rig_fit import rig_that_does_not_fit
 from groma.adjustment.stages import (
     METRIC_LOSS,
     METRIC_RELATION_LOSS,
@@ -117,7 +118,8 @@ class AdjustOptions:
     #: Steps of each landmark on its own after every joint step; None: 2 under a robust loss or with lines (1 where
     #: points are tied to lines and there is no loss), else 0.
     landmark_steps: int | None = None
-    #: Look into the residuals of points for lens distortion that the cameras lack; warnings then say so.
+    #: Look for lens distortion that cameras lack, in the residuals of points, and for rigs that do not fit; warnings
+    #: say so.
     check_lens: bool = True
     #: Threads; None takes one for small problems and all cores for large ones.
     threads: int | None = None
@@ -247,8 +249,9 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
     if any(map(len, moved)):
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
     outcome = _outcome(scene, assembly, problem, report, relations, stage_entries(stages, reports))
-    if options.check_lens and (lens := unmodelled_distortion(problem, options.threads)):
-        outcome = replace(outcome, warnings=(*outcome.warnings, lens))
+    if options.check_lens:
+        found = unmodelled_distortion(problem, options.threads), rig_that_does_not_fit(scene, problem, options.threads)
+        outcome = replace(outcome, warnings=(*outcome.warnings, *filter(None, found)))
     return AdjustResult(adjusted, outcome, problem)
 
 

@@ -5,7 +5,8 @@ Every factor of an adjustment, of a map and of a track is made here, by the term
 measurement.
 
 Groups of variables: ``frames`` (rig_from_world), ``sensors`` (cam_from_rig, only in scenes with rigs), one
-``intrinsics/MODEL`` per camera model, ``points``, ``lines``, ``planes``, ``directions``, ``control_points``.
+``intrinsics/MODEL`` per camera model, ``motions`` (only with rolling shutters), ``points``, ``lines``, ``planes``,
+``directions``, ``control_points``.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.terms import (
+    camera_motions,
     camera_positions,
     control_points,
     distances,
@@ -32,6 +34,7 @@ from groma.adjustment.terms import (
     right_columns,
 )
 from groma.adjustment.terms.contract import Draft, Group, Term
+from groma.adjustment.terms.readout import MOTIONS
 from groma.cameras import model as camera_model
 from groma.geometry import quaternion, se3
 from groma.geometry.charts.line_charts import LINE_CHARTS
@@ -55,6 +58,7 @@ TERMS: tuple[Term, ...] = (
     relations.TERM,
     relations_in_pixels.TERM,
     pose_priors.TERM,
+    camera_motions.TERM,
     camera_positions.TERM,
     control_points.MARKS,
     control_points.CONTROL,
@@ -125,7 +129,8 @@ def gauge_of(scene: Scene, options: AssemblyOptions) -> str:
     wireframe = options.points and options.lines and len(scene.relations.point_on_line) > 0
     metric = (wireframe or (options.planes and len(scene.relations) > 0)) and options.structure_form == "metric"
     ends = options.lines and options.planes and len(scene.relations.line_on_plane) > 0
-    return "first_camera" if metric or ends or scene.is_metric else "free"
+    lengths = scene.is_metric or len(scene.camera_motions) > 0
+    return "first_camera" if metric or ends or lengths else "free"
 
 
 def disassemble(scene: Scene, problem: Problem) -> Scene:
@@ -141,6 +146,9 @@ def disassemble(scene: Scene, problem: Problem) -> Scene:
         tables["frames"] = scene.frames.replace(rig_from_world=states["frames"])
     if "sensors" in states:
         tables["sensors"] = scene.sensors.replace(cam_from_rig=states["sensors"])
+    if MOTIONS in states:
+        motion = states[MOTIONS][:-1]
+        tables["camera_motions"] = scene.camera_motions.replace(motion=motion)
     if "points" in states:
         tables["points"] = scene.points.replace(xyz=problem.variables["points"].ambient())
     if "control_points" in states:
@@ -178,6 +186,8 @@ def camera_variables(scene: Scene, options: AssemblyOptions, gauge: BoolArray | 
     if not scene.has_trivial_rigs:
         constant = (scene.sensors.is_reference == 1) | (not options.refine_rigs)
         variables["sensors"] = Variables(chart, scene.sensors.cam_from_rig, constant)
+    if len(scene.camera_motions):
+        variables[MOTIONS] = camera_motions.motion_variables(scene, options.refine_poses)
     for name, members in scene.cameras.by_model().items():
         model = camera_model(name)
         state = scene.cameras.params[members, : model.num_parameters]

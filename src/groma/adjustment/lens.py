@@ -77,11 +77,11 @@ def unmodelled_distortion(problem: Problem, threads: int | None = None, gates: L
     if not any(radial_field(f, problem, gates) for f in seen):
         return None
     options = SolverOptions(max_iterations=gates.max_iterations, threads=threads)
-    begun = _of_points(problem, gates.max_observations)
+    begun = of_points(problem, gates.max_observations)
     if begun.num_residuals < problem.num_residuals:  # a part of the measurements finds another minimum
         begun = solve(begun, options).problem
     freed = solve(_with_free_lens(begun, groups), options).problem
-    before, after = (_median_px([f for f in p.factors if isinstance(f, PointReprojection)], p) for p in (begun, freed))
+    before, after = (median_px([f for f in p.factors if isinstance(f, PointReprojection)], p) for p in (begun, freed))
     if not before > 0.0 or 1.0 - (after / before) ** 2 < gates.share:
         return None
     return _sentence(groups, begun, freed, before, after)
@@ -124,7 +124,7 @@ def _may_lack(group: Variables, model: CameraModel) -> bool:
     return wider is not None and (wider != model.name or (free is not None and not free.any()))
 
 
-def _of_points(problem: Problem, most: int) -> Problem:
+def of_points(problem: Problem, most: int) -> Problem:
     """Return the problem without what refers to lines, planes and directions, and with as many points as are enough."""
     kinds = {name: group.manifold.kind for name, group in problem.variables.items()}
     kept = [
@@ -165,7 +165,7 @@ def _wide(group: str) -> str:
     return f"{group}, free lens"
 
 
-def _median_px(factors: list[PointReprojection], problem: Problem) -> float:
+def median_px(factors: list[PointReprojection], problem: Problem) -> float:
     squares = [np.einsum("ni,ni->n", r, r) for r in (residuals_of(f, problem.variables) for f in factors)]
     return float(np.sqrt(np.median(np.concatenate(squares))))
 

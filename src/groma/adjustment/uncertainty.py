@@ -192,7 +192,13 @@ def _covariances(
     """Return the gauge that was chosen, and the covariances in it."""
     if gauge == "auto":
         metric = options.planes and len(scene.relations) > 0 and options.structure_form == "metric"
-        gauge = "measured" if scene.is_surveyed else "held" if metric or scene.is_metric else "inner"
+        gauge = (
+            "measured"
+            if scene.is_surveyed
+            else "held"
+            if metric or scene.is_metric or len(scene.camera_motions)
+            else "inner"
+        )
     if problem is None:
         held = "first_camera" if gauge == "held" else "free"
         problem = assemble(scene, replace(options, gauge=held)).problem

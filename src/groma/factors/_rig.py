@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""What all factors seen by a camera share: the pose of the camera, alone or in a rig.
+r"""What all factors seen by a camera share: the pose of the camera, alone or in a rig, at once or row by row.
 
 Such a factor has a slot ``pose``. Alone it is ``cam_from_world``, :math:`T_{cw}`. With the optional slot
 ``extrinsics``, which holds ``cam_from_body``, :math:`T_{cb}`, the slot ``pose`` is ``body_from_world``, and
@@ -10,13 +10,14 @@ Such a factor has a slot ``pose``. Alone it is ``cam_from_world``, :math:`T_{cw}
 
 for left increments in the order :math:`(\rho, \omega)`. So the concrete factors know :math:`T_{cw}` only:
 :meth:`CameraFactor.prepare` composes it once per pair of body and sensor that occurs, and
-:meth:`CameraFactor.linearize` applies the chain rule to the finished records.
+:meth:`CameraFactor.linearize` applies the chain rule to the finished records. So it does for cameras that move while
+their images are read (slot ``motion``, :mod:`groma.factors._rolling`): each factor then has poses of its own.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -26,11 +27,15 @@ from groma._numba import kernel, loop
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.factors._record import set_rows
+from groma.factors._rolling import compose_rows, split_rows
 from groma.factors.contract import Factor, Ref, Slot
 from groma.geometry.se3 import compose_kernel
 
 POSE = Slot("pose", "pose")
 EXTRINSICS = Slot("extrinsics", "pose", optional=True, in_world=False)
+#: How the camera moves while an image is read: six numbers, see :mod:`groma.factors._rolling`.
+MOTION = Slot("motion", "vector", optional=True, in_world=False)
+_NOT_MOUNTED, _NOWHERE = np.zeros((0, 12)), np.zeros(0, np.int32)
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -165,12 +170,19 @@ def _split_all(record, begin, extrinsics, extrinsics_index, source, pose_column,
 # ------------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True, kw_only=True)
 class CameraFactor(Factor):
-    """A factor that reads the pose of a camera first; subclasses list :data:`POSE` first, :data:`EXTRINSICS` last."""
+    """A factor that reads the pose of a camera first; subclasses list :data:`POSE` first, :data:`EXTRINSICS` last.
+
+    Those that may be seen by a rolling shutter list :data:`MOTION` behind it.
+    """
 
     #: Poses cam_from_world; body_from_world where ``extrinsics`` are given.
     pose: Ref
     #: Poses cam_from_body of the cameras in their rig, or None.
     extrinsics: Ref | None = None
+    #: Motions of the cameras while their images are read, or None; with ``offsets``.
+    motion: Ref | None = None
+    #: (N, 1) or (N, m) when in the readout, from -1/2 to 1/2, a factor or each row of its residual was seen; or None.
+    offsets: FloatArray | None = None
 
     #: Measured arrays: name of the field and length of a row, 0 for plain numbers. They are checked on construction.
     measured: ClassVar[tuple[tuple[str, int], ...]] = ()
@@ -183,6 +195,8 @@ class CameraFactor(Factor):
                     f"{type(self).__name__}.{slot.name} must have one index per factor, {len(self)} like its "
                     f"{self.slots[0].name}; got {len(ref.index)}."
                 )
+        if self.motion is not None:
+            self._check_offsets()
         for field, size in self.measured:
             set_rows(self, field, *([size] if size else []))
             finite = np.isfinite(getattr(self, field)).reshape(len(self), max(size, 1)).all(axis=1)
@@ -192,6 +206,19 @@ class CameraFactor(Factor):
                     f"{type(self).__name__}.{field} must be finite; row {row} is {getattr(self, field)[row].tolist()} "
                     f"({np.count_nonzero(~finite)} such rows). Leave these observations out."
                 )
+
+    def _check_offsets(self) -> None:
+        offsets = np.ascontiguousarray(self.offsets, dtype=np.float64)
+        if MOTION not in self.slots:
+            raise InputError(f"{type(self).__name__} knows no rolling shutter. Leave its motion out.")
+        if offsets.ndim != 2 or len(offsets) != len(self) or offsets.shape[1] not in (1, self.residual_size):
+            raise ShapeError(
+                f"{type(self).__name__}.offsets must have shape ({len(self)}, 1) or ({len(self)}, "
+                f"{self.residual_size}), one row for each motion; got {offsets.shape}."
+            )
+        object.__setattr__(self, "offsets", offsets)
+        if self.invariance is not None:  # the shift is a length
+            object.__setattr__(self, "invariance", replace(self.invariance, scale=False))
 
     @cached_property
     def _pairs(self) -> tuple[IntArray, IntArray, IntArray]:
@@ -205,6 +232,8 @@ class CameraFactor(Factor):
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:
         """Return (extrinsics or None, cam_from_world (M, 12), its index (N,), the other ambient arrays...)."""
         ambients = tuple(np.ascontiguousarray(ambient, dtype=np.float64) for ambient in ambients)
+        if self.motion is not None:
+            return self._prepare_rows(ambients)
         if self.extrinsics is None:
             return None, ambients[0], self.pose.index, *ambients[1:]
         extrinsics_index, pose_index, index = self._pairs
@@ -212,14 +241,26 @@ class CameraFactor(Factor):
         _compose_all(ambients[-1], ambients[0], extrinsics_index, pose_index, cam_from_world)
         return ambients[-1], cam_from_world, index, *ambients[1:-1]
 
+    def _prepare_rows(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:
+        """Return ((mounted, motions), poses of the rows (K N, 12), the first of each factor (N,), others...)."""
+        assert self.motion is not None and self.offsets is not None
+        mounted = _NOT_MOUNTED if self.extrinsics is None else ambients[-2]
+        index = _NOWHERE if self.extrinsics is None else self.extrinsics.index
+        poses, motions = np.empty((self.offsets.size, 12)), ambients[-1]
+        compose_rows(motions, self.motion.index, self.offsets, mounted, index, ambients[0], self.pose.index, poses)
+        others = ambients[1:-1] if self.extrinsics is None else ambients[1:-2]
+        return (mounted, motions), poses, np.arange(len(self), dtype=np.int32), *others
+
     def residuals(self, inputs: tuple[Any, ...], begin: int, end: int, out: FloatArray) -> int:
         """See :meth:`Factor.residuals`."""
-        return self.evaluate(inputs[1:], begin, end, self._nothing_wanted, out[:, :, None])
+        return self._evaluate_rows(inputs, begin, end, self._nothing_wanted, out[:, :, None])
 
     def linearize(
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
     ) -> int:
         """See :meth:`Factor.linearize`."""
+        if self.motion is not None:
+            return self._linearize_rows(inputs, begin, end, columns, record)
         if self.extrinsics is None:
             return self.evaluate(inputs[1:], begin, end, columns, record)
         pose_column, extrinsics_column = columns[0], columns[-1]
@@ -229,9 +270,38 @@ class CameraFactor(Factor):
             _split_all(record, begin, inputs[0], self.extrinsics.index, source, pose_column, extrinsics_column)
         return degenerate
 
+    def _linearize_rows(
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        """Linearise at the poses of the rows, and apply the chain rule to motion, extrinsics and pose."""
+        assert self.motion is not None and self.offsets is not None
+        alone = self.extrinsics is None
+        pose, mounted, motion = columns[0], -1 if alone else columns[-2], columns[-1]
+        source, middle = max(pose, mounted, motion), columns[1:-1] if alone else columns[1:-2]
+        degenerate = self._evaluate_rows(inputs, begin, end, (source, *middle), record)
+        if source >= 0:
+            index = _NOWHERE if self.extrinsics is None else self.extrinsics.index
+            split_rows(
+                record, begin, source, inputs[0][1], self.motion.index, self.offsets, inputs[0][0], index,
+                pose, mounted, motion,
+            )  # fmt: skip
+        return degenerate
+
+    def _evaluate_rows(
+        self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray
+    ) -> int:
+        """Evaluate once, or once for each row of the residual where rows were seen at different times."""
+        degenerate = self.evaluate(inputs[1:], begin, end, columns, record)
+        times = 1 if self.offsets is None else self.offsets.shape[1]
+        for row in range(1, times):
+            again, later = record.copy(), inputs[2] + np.int32(row * len(self))
+            found = self.evaluate((inputs[1], later, *inputs[3:]), begin, end, columns, again)
+            record[:, row], degenerate = again[:, row], max(degenerate, found)
+        return degenerate
+
     @property
     def _nothing_wanted(self) -> tuple[int, ...]:
-        return (-1,) * sum(slot is not EXTRINSICS for slot in self.slots)
+        return (-1,) * sum(slot not in (EXTRINSICS, MOTION) for slot in self.slots)
 
     @abstractmethod
     def evaluate(
@@ -262,6 +332,7 @@ def normalize_rows(factor: Any, field: str, size: int) -> None:
 
 __all__ = [
     "EXTRINSICS",
+    "MOTION",
     "POSE",
     "CameraFactor",
     "clear_block",

@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from groma._counted import counted
+from groma._names import natural_key
 from groma._typing import FloatArray, IntArray
 from groma.bounded.text import read_lines
 from groma.errors import InputError
@@ -112,7 +113,7 @@ def _of_model(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:
 
 def _of_trajectory(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:
     trajectory = read_trajectory(place)
-    poses, names = trajectory.cam_from_world, sorted(photographs, key=_natural)
+    poses, names = trajectory.cam_from_world, sorted(photographs, key=natural_key)
     count = len(poses)
     times, numbers = _times(names), _numbers(names)
     has_times = bool((np.diff(trajectory.timestamps, prepend=-1.0) != 1.0).any())
@@ -145,7 +146,7 @@ def _of_graph(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:
     graph = read_g2o(place)
     if graph.planar:
         raise InputError(f"{place} holds poses of the plane (SE2); photographs need poses of space (SE3).")
-    poses, names = se3.inverse(graph.poses.world_from_body), sorted(photographs, key=_natural)
+    poses, names = se3.inverse(graph.poses.world_from_body), sorted(photographs, key=natural_key)
     numbers, row_of = _numbers(names), {int(number): row for row, number in enumerate(graph.poses.ids)}
     if numbers is not None and all(int(number) in row_of for number in numbers):
         said = (f"The numbers in the names were taken as ids of {place}.",)
@@ -201,12 +202,6 @@ def _by_name(place: Path, names: Sequence[str], photographs: Sequence[str]) -> t
         f"None of the {counted(len(names), 'names')} in {place} is that of a photograph: there it is for example "
         f"{names[0]!r}, here {photographs[0]!r}. Pass the folder that the file belongs to, or rename."
     )
-
-
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Return a key by which img2 comes before img10."""
-    parts = re.split(r"(\d+)", name)
-    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
 
 
 def _stems(names: Sequence[str]) -> list[str]:

@@ -6,6 +6,7 @@ from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
 from groma.scene.line_intervals import LineIntervals
 from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
+from groma.scene.motions import CameraMotions
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.scene import Scene
 from groma.scene.similarity import Similarity
@@ -13,6 +14,7 @@ from groma.scene.survey import CameraDistances, CameraPositions, ControlPoints, 
 
 __all__ = [
     "CameraDistances",
+    "CameraMotions",
     "CameraPositions",
     "Cameras",
     "ControlPoints",

@@ -37,6 +37,7 @@ def measurements_of(scene: "Scene") -> dict[str, int]:
         "line depths": len(scene.line_depths),
         "plane observations": len(scene.plane_observations),
         "pose priors": len(scene.pose_priors),
+        "camera motions": len(scene.camera_motions),
         "camera positions": len(scene.camera_positions),
         "control points": len(scene.control_points),
         "marks": len(scene.marks),

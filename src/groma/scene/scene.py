@@ -14,6 +14,7 @@ all references are checked when it is made. Every change gives a new scene.
     point_depths       -> images, points          right_columns -> point_observations
     plane_observations -> images, planes          line_depths   -> line_observations
     pose_priors        -> frames                  line_intervals -> lines
+    camera_motions     -> images
     camera_positions   -> images                  marks -> images, control_points
     camera_distances   -> images                  point_distances -> control_points
 
@@ -40,6 +41,7 @@ from groma.scene.image import Frames, Images
 from groma.scene.landmarks import Directions, Lines, Planes, Points
 from groma.scene.line_intervals import LineIntervals
 from groma.scene.measurements import LineDepths, PlaneObservations, PointDepths, PosePriors, RightColumns
+from groma.scene.motions import CameraMotions
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
 from groma.scene.standing_alone import standing_alone
@@ -91,6 +93,8 @@ class Scene:
     plane_observations: PlaneObservations = field(default_factory=PlaneObservations)
     #: Poses known beforehand.
     pose_priors: PosePriors = field(default_factory=PosePriors)
+    #: Images that were read row by row, and how their cameras moved meanwhile.
+    camera_motions: CameraMotions = field(default_factory=CameraMotions)
     #: Measured places of cameras, and distances between them.
     camera_positions: CameraPositions = field(default_factory=CameraPositions)
     camera_distances: CameraDistances = field(default_factory=CameraDistances)

@@ -69,10 +69,12 @@ def write_parts(
     Raises
     ------
     InputError
-        If ``observations`` is not positive.
+        If ``observations`` is not positive, or images were read row by row.
     OutputError
         If an archive exists already, or cannot be written.
     """
+    if len(scene.camera_motions):
+        raise InputError("Scenes with a rolling shutter are not adjusted in parts. Adjust the scene as a whole.")
     folder = Path(folder)
     of_points, of_lines = _parts_of_landmarks(scene, observations)
     folder.mkdir(parents=True, exist_ok=True)

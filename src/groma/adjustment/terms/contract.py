@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -79,7 +80,7 @@ class Draft:
         """Whether images are taken by cameras on rigs."""
         return not self.scene.has_trivial_rigs
 
-    def camera_refs(self, image_idx: IntArray) -> dict[str, Ref]:
+    def camera_refs(self, image_idx: IntArray) -> dict[str, Any]:
         """Return the references to the poses of images that factors of cameras take."""
         images = self.scene.images
         refs = {"pose": Ref("frames", images.frame_idx[image_idx])}

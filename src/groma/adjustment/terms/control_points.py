@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from groma.adjustment.terms.contract import Draft, Group, Term
+from groma.adjustment.terms.readout import point_refs
 from groma.adjustment.terms.survey_loss import root_information, survey_loss
 from groma.factors.contract import Ref
 from groma.factors.observations.point_reprojection import PointReprojection
@@ -18,7 +19,7 @@ from groma.factors.priors.vector_prior import VectorPrior
 
 
 def _marks(draft: Draft) -> Iterator[Group]:
-    table = draft.scene.marks
+    table, xyz = draft.scene.marks, draft.scene.control_points.xyz
     for name, rows, intrinsics in draft.by_model(table.image_idx):
         yield Group(
             PointReprojection(
@@ -30,6 +31,7 @@ def _marks(draft: Draft) -> Iterator[Group]:
                 sqrt_information=1.0 / table.sigma[rows],
                 loss=draft.options.loss,
                 **draft.camera_refs(table.image_idx[rows]),
+                **point_refs(draft, name, table.image_idx[rows], xyz[table.point_idx[rows]], table.pixel[rows]),
             )
         )
 

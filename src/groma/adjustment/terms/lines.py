@@ -30,8 +30,10 @@ import numpy as np
 from groma._counted import counted
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.terms.contract import Draft, Group, Term
+from groma.adjustment.terms.readout import line_refs
 from groma.cameras import model as camera_model
 from groma.cameras.across import pixels_across
+from groma.errors import InputError
 from groma.factors.contract import Ref
 from groma.factors.observations.line_bearing import LineBearing
 from groma.factors.observations.line_normal import LineNormal
@@ -52,17 +54,19 @@ def line_sigma_px(draft: Draft) -> FloatArray:
 
 def _factors(draft: Draft) -> Iterator[Group]:
     table, options = draft.scene.line_observations, draft.options
-    sigma = line_sigma_px(draft)
+    sigma, lines = line_sigma_px(draft), draft.scene.lines.plucker
     for name, rows, intrinsics in draft.by_model(table.image_idx):
         if options.line_residual == "endpoints" and camera_model(name).has_pinhole_parameters:
+            places = _nearer(table.segment[rows, :2], table.segment[rows, 2:], options.reach)
             factor = LineReprojection(
                 camera_model=name,
                 line=Ref("lines", table.line_idx[rows]),
                 intrinsics=intrinsics,
-                segments=np.hstack(_nearer(table.segment[rows, :2], table.segment[rows, 2:], options.reach)),
+                segments=np.hstack(places),
                 sqrt_information=1.0 / sigma[rows],
                 loss=options.loss,
                 **draft.camera_refs(table.image_idx[rows]),
+                **line_refs(draft, name, table.image_idx[rows], lines[table.line_idx[rows]], places),
             )
             yield Group(factor, observes="lines")
             continue
@@ -75,6 +79,8 @@ def _factors(draft: Draft) -> Iterator[Group]:
 class _Rays:
     """The rays (n, 3) of the two places where segments are measured, their rows, and the pixels of a radian across."""
 
+    #: Name of their camera model.
+    model: str
     rows: IntArray
     first: FloatArray
     second: FloatArray
@@ -97,11 +103,11 @@ def _rays(draft: Draft, name: str, rows: IntArray) -> _Rays:
     pixels = model.focal_length(params[good])
     if draft.options.line_residual != "endpoints" or model.sees_behind:
         pixels = pixels_across(model, params[good], first, second)
-    return _Rays(rows[good], first, second, pixels)
+    return _Rays(name, rows[good], first, second, pixels)
 
 
 def _sines(draft: Draft, rays: _Rays, sigma: FloatArray) -> Group:
-    table = draft.scene.line_observations
+    table, lines, places = draft.scene.line_observations, draft.scene.lines.plucker, _places(draft, rays.rows)
     both = rays.pixels.ndim == 2
     pixels = rays.pixels[:, :, None] * np.eye(2) if both else rays.pixels
     factor = LineBearing(
@@ -111,12 +117,21 @@ def _sines(draft: Draft, rays: _Rays, sigma: FloatArray) -> Group:
         sqrt_information=pixels / (sigma[:, None, None] if both else sigma),
         loss=draft.options.loss,
         **draft.camera_refs(table.image_idx[rays.rows]),
+        **line_refs(draft, rays.model, table.image_idx[rays.rows], lines[table.line_idx[rays.rows]], places),
     )
     return Group(factor, observes="lines", pixels_of_residual=pixels)
 
 
+def _places(draft: Draft, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    """The two places (n, 2) in the image at which segments are measured."""
+    segments = draft.scene.line_observations.segment[rows]
+    return _nearer(segments[:, :2], segments[:, 2:], draft.options.reach)
+
+
 def _normals(draft: Draft, rays: _Rays, sigma: FloatArray) -> Group:
     scene, table = draft.scene, draft.scene.line_observations
+    if len(scene.camera_motions):
+        raise InputError("line_residual='normal' knows no rolling shutter. Use endpoints or bearing.")
     first, second = unit(rays.first), unit(rays.second)
     across = np.cross(first, second)
     sine = np.linalg.norm(across, axis=1)

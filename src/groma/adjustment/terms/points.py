@@ -10,6 +10,7 @@ import numpy as np
 from groma._counted import counted
 from groma._typing import BoolArray
 from groma.adjustment.terms.contract import Draft, Group, Term
+from groma.adjustment.terms.readout import point_refs
 from groma.adjustment.terms.right_columns import measured_in_pairs
 from groma.cameras import model as camera_model
 from groma.factors.contract import Ref
@@ -21,6 +22,7 @@ def _factors(draft: Draft) -> Iterator[Group]:
     table, options = draft.scene.point_observations, draft.options
     keep = _in_front(draft) & ~measured_in_pairs(draft)
     table = table.take(np.flatnonzero(keep)) if not keep.all() else table
+    xyz = draft.scene.points.xyz
     for name, rows, intrinsics in draft.by_model(table.image_idx):
         yield Group(
             PointReprojection(
@@ -32,6 +34,7 @@ def _factors(draft: Draft) -> Iterator[Group]:
                 sqrt_information=1.0 / (options.point_sigma_px * table.sigma[rows]),
                 loss=options.loss,
                 **draft.camera_refs(table.image_idx[rows]),
+                **point_refs(draft, name, table.image_idx[rows], xyz[table.point_idx[rows]], table.pixel[rows]),
             ),
             observes="points",
         )

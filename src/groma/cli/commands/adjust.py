@@ -72,6 +72,7 @@ def adjust(
     refine_rigs: Annotated[
         bool, typer.Option("--refine-rigs", help="Estimate where the cameras sit on their rig.")
     ] = False,
+    rolling_shutter: _options.RollingShutter = None,
     points: Annotated[bool, typer.Option("--points/--no-points", help="Use points.")] = True,
     lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Use lines.")] = True,
     planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Use planes.")] = True,
@@ -218,7 +219,7 @@ def adjust(
         refused = {
             "--report": page, "--covariance": covariance, "--contributions": contributions, "--gauge": gauge,
             "--line-chart": line_chart, "--refine-intrinsics": refine_intrinsics, "--refine-rigs": refine_rigs,
-            "--camera-model": camera_model, **measured.given,
+            "--camera-model": camera_model, "--rolling-shutter": rolling_shutter, **measured.given,
         }  # fmt: skip
         graph_options = _chosen(
             loss="none" if loss == "auto" else loss, loss_scale=loss_scale, linear_solver=linear_solver,
@@ -239,7 +240,7 @@ def adjust(
     if in_parts:
         refused = {
             "--report": page, "--covariance": covariance, "--contributions": contributions, "--diagnosis": diagnosis,
-            "--camera-model": camera_model, **measured.given,
+            "--camera-model": camera_model, "--rolling-shutter": rolling_shutter, **measured.given,
         }  # fmt: skip
         adjust_parts_and_write(source, console, options, PartsWanted(output, json_target, force, keep), refused)
         return
@@ -256,6 +257,7 @@ def adjust(
         force,
         measured,
         protocol,
+        rolling_shutter,
     )
     adjust_and_write(console, source, options, wanted)
 

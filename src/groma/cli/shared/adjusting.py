@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from groma.adjustment.adjust import AdjustOptions
     from groma.adjustment.report import AdjustResult, Progress
+    from groma.adjustment.rolling_shutter import Motions
     from groma.cli.shared.console import Console
     from groma.scene import Scene
 
@@ -43,6 +44,8 @@ class Wanted:
     #: Measurements of other instruments, and where their protocol goes.
     measured: Measured = field(default_factory=Measured)
     protocol: Path | None = None
+    #: What images were read along, if not at once.
+    rolling_shutter: str | None = None
 
 
 def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wanted: Wanted) -> None:
@@ -65,7 +68,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     true = None if wanted.truth is None else read_scene(wanted.truth)
     console.expect_compilation("adjust")
     with compilation_time() as compilation, console.progress() as progress:
-        before, result, survey = _adjusted(before, options, wanted, progress)
+        before, result, survey, motions = _adjusted(before, options, wanted, progress)
     entries = ()
     if wanted.contributions:
         from groma.adjustment.contributions import contributions  # with evaluation, half a second to import
@@ -75,6 +78,9 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
     numbers = result.summary(diagnosis, entries)
     numbers["seconds"]["compilation"] = compilation.seconds
     numbers |= {} if survey is None else {"survey": survey}
+    if motions is not None:
+        numbers["rolling_shutter"] = motions.to_dict()
+        numbers["warnings"] += motions.warnings()
 
     if wanted.output is not None:
         write_scene(result.scene, wanted.output, force=wanted.force, like=structures_of(source))
@@ -114,6 +120,8 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
             failure = None if reasons else error  # raised at the end, when all else is written and said
     _say(console, numbers, compilation.compiled)
     say_survey(console, survey or {})
+    for sentence in motions.sentences() if motions else ():
+        console.say(sentence)
     for path in (wanted.output, wanted.page, wanted.protocol, wanted.covariance if "uncertainty" in numbers else None):
         if path is not None:
             console.say(f"Wrote {path}")
@@ -126,20 +134,26 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
 
 def _adjusted(
     before: Scene, options: AdjustOptions, wanted: Wanted, progress: Callable[[Progress], bool | None]
-) -> tuple[Scene, AdjustResult, dict[str, Any] | None]:
-    """Return the scene as it went into the adjustment, the result, and what is told of measurements if there are."""
+) -> tuple[Scene, AdjustResult, dict[str, Any] | None, Motions | None]:
+    """Return the scene as it went into the adjustment, the result, and what is told of measurements and motions."""
     from groma.adjustment.adjust import adjust
+    from groma.adjustment.rolling_shutter import adjust_rolling_shutter, motions_of, with_rolling_shutter
     from groma.mapping.surveyed import adjust_surveyed, has_survey
 
-    if not wanted.measured and not has_survey(before):
-        if wanted.protocol is not None:
-            raise InputError(
-                "--protocol is of measurements; there are none. Add --positions, --control or --distances."
-            )
-        return before, adjust(before, options, progress), None
+    if wanted.rolling_shutter is not None:
+        before = with_rolling_shutter(before, wanted.rolling_shutter)
+    surveyed = bool(wanted.measured) or has_survey(before)
+    if not surveyed and wanted.protocol is not None:
+        raise InputError("--protocol is of measurements; there are none. Add --positions, --control or --distances.")
+    rolled = adjust_rolling_shutter(before, options, progress) if len(before.camera_motions) else None
+    if not surveyed:
+        if rolled is None:
+            return before, adjust(before, options, progress), None, None
+        return before, rolled.result, None, rolled.motions
     survey = wanted.measured.read(None, lambda: before.images.names) if wanted.measured else None
-    found = adjust_surveyed(before, survey, options, progress)
-    return found.surveyed.scene, found.result, found.to_dict()
+    found = adjust_surveyed(before if rolled is None else rolled.result.scene, survey, options, progress)
+    motions = None if rolled is None else motions_of(found.result.scene, found.result.problem)
+    return found.surveyed.scene, found.result, found.to_dict(), motions
 
 
 def why_no_covariances(scene: Scene, path: Path) -> list[str]:

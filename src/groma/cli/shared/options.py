@@ -39,6 +39,15 @@ LineDetector = Annotated[
         "--line-detector", metavar="NAME", help="What finds line segments: lsd, or a detector of an installed package."
     ),
 ]
+RollingShutter = Annotated[
+    str | None,
+    typer.Option(
+        "--rolling-shutter",
+        metavar="rows|columns",
+        help="Images were read row by row (or column by column: photographs turned upright): estimate how the camera "
+        "moved meanwhile.",
+    ),
+]
 Input = Annotated[
     Path,
     typer.Argument(

@@ -32,6 +32,7 @@ from groma._typing import FloatArray
 from groma.factors._examples import indices, make_example, visible_scene
 from groma.factors._rig import (
     EXTRINSICS,
+    MOTION,
     POSE,
     CameraFactor,
     clear_record,
@@ -96,7 +97,7 @@ class LineBearing(CameraFactor):
     #: (N, 3) bearings of the second end points.
     end_bearings: FloatArray
 
-    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), EXTRINSICS)
+    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), EXTRINSICS, MOTION)
     invariance: ClassVar[Invariance] = ANY_SIMILARITY
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("start_bearings", 3), ("end_bearings", 3))
 

@@ -35,7 +35,7 @@ from groma._typing import FloatArray
 from groma.cameras.dispatch import pinhole_parameters, pinhole_parameters_jacobian
 from groma.factors._examples import indices
 from groma.factors._pixels import PixelFactor, load_row, pixel_example
-from groma.factors._rig import EXTRINSICS, POSE, clear_record, put_line, put_line_pose, transform_line
+from groma.factors._rig import EXTRINSICS, MOTION, POSE, clear_record, put_line, put_line_pose, transform_line
 from groma.factors.contract import Example, Ref, Slot, register
 
 
@@ -137,7 +137,13 @@ class LineReprojection(PixelFactor):
     segments: FloatArray
 
     pinhole_only: ClassVar[bool] = True
-    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("line", "line"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
+    slots: ClassVar[tuple[Slot, ...]] = (
+        POSE,
+        Slot("line", "line"),
+        Slot("intrinsics", "intrinsics"),
+        EXTRINSICS,
+        MOTION,
+    )
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("segments", 4),)
     rows: ClassVar[int] = 2
 

@@ -29,7 +29,7 @@ from groma._typing import FloatArray
 from groma.cameras.dispatch import project, project_jacobian, wrap
 from groma.factors._examples import indices
 from groma.factors._pixels import PixelFactor, load_row, pixel_example, put_parameters
-from groma.factors._rig import EXTRINSICS, POSE, clear_record, put_point, put_point_pose, transform_point
+from groma.factors._rig import EXTRINSICS, MOTION, POSE, clear_record, put_point, put_point_pose, transform_point
 from groma.factors.contract import Example, Ref, Slot, register
 
 
@@ -116,7 +116,13 @@ class PointReprojection(PixelFactor):
     #: is the habit of most bundle adjusters. Models that see behind themselves are not concerned.
     require_in_front: bool = True
 
-    slots: ClassVar[tuple[Slot, ...]] = (POSE, Slot("point", "point"), Slot("intrinsics", "intrinsics"), EXTRINSICS)
+    slots: ClassVar[tuple[Slot, ...]] = (
+        POSE,
+        Slot("point", "point"),
+        Slot("intrinsics", "intrinsics"),
+        EXTRINSICS,
+        MOTION,
+    )
     measured: ClassVar[tuple[tuple[str, int], ...]] = (("pixels", 2),)
     rows: ClassVar[int] = 2
 

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from groma._names import natural_key
 from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError, InputError
 from groma.io.endings import IMAGES
@@ -40,7 +41,7 @@ def image_files(folder: Path) -> list[Path]:
         if place.is_dir():
             found = [path for path in place.iterdir() if path.suffix.lower() in IMAGES and path.is_file()]
             if found:
-                return sorted(found, key=lambda path: _natural(path.name))
+                return sorted(found, key=lambda path: natural_key(path.name))
     return []
 
 
@@ -131,12 +132,6 @@ class VideoSequence:
 def _forever() -> Iterator[None]:
     while True:
         yield None
-
-
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Return a key by which img2 comes before img10."""
-    parts = re.split(r"(\d+)", name)
-    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
 
 
 def _times(folder: Path, images: list[Path]) -> list[float]:

@@ -55,6 +55,9 @@ class AveragingGates:
         "to the median disagreement of a place with its neighbours: it starts elsewhere",
         "convention: three",
     )
+    nearest: float = gate(
+        0.5, "share", "of the distance of two images with a parallax, which they keep", "convention: a half"
+    )
     least_redundancy: float = gate(
         0.05, "share", "below which a pose's residual tells nothing about its error", "convention: of geodesy"
     )
@@ -115,18 +118,23 @@ def average_centers(given: FloatArray, rotations: FloatArray, motions: Motions, 
     def averaged(start: FloatArray, loss: _Loss, sigma: float | None) -> Averaged:
         # Lengths stay during a stage: else places far away, where every angle is small, would look right.
         length = np.maximum(np.linalg.norm(start[first] - start[second], axis=1), least)
+        # Images at one place would agree with any motion: no two come nearer than this, if their places are known.
+        nearest = GATES.nearest * (length * (held[first] & held[second]))[:, None]
 
         def residuals(centers: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
             between = centers[first] - centers[second]
             along = np.einsum("ij,ij->i", between, direction)[:, None]
-            return (between - np.maximum(along, 0.0) * direction) / length[:, None], centers - given, length
+            return (between - np.maximum(along, nearest) * direction) / length[:, None], centers - given, length
 
         def solved(centers: FloatArray, weight: FloatArray, prior: FloatArray) -> tuple[FloatArray, SuperLU]:
-            ahead = np.einsum("ij,ij->i", centers[first] - centers[second], direction) > 0.0
+            ahead = np.einsum("ij,ij->i", centers[first] - centers[second], direction) > nearest[:, 0]
             along = np.where(ahead, 1.0, 0.0)[:, None, None] * direction[:, :, None] * direction[:, None, :]
-            blocks = (weight / length**2)[:, None, None] * (np.eye(3) - along)
-            system = splu(_block_laplacian(first, second, blocks, prior))
-            new = system.solve((prior[:, None] * given).ravel()).reshape(-1, 3)
+            weight = weight / length**2
+            system = splu(_block_laplacian(first, second, weight[:, None, None] * (np.eye(3) - along), prior))
+            right, pushed = prior[:, None] * given, (weight * ~ahead)[:, None] * nearest * direction
+            np.add.at(right, first, pushed)
+            np.add.at(right, second, -pushed)
+            new = system.solve(right.ravel()).reshape(-1, 3)
             return _as_large(new, given, prior), system
 
         return _reweighted(start, residuals, solved, motions.direction_sigma, held, loss, sigma)

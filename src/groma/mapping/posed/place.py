@@ -23,7 +23,7 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.adjust import AdjustOptions, adjust
-from groma.errors import InputError
+from groma.errors import InputError, ProblemError
 from groma.gates import gate
 from groma.geometry import quaternion, se3
 from groma.io.colmap.at_poses import MIN_MATCHES, PosedPhotographs
@@ -175,7 +175,10 @@ def _adjusted(scene: Scene, known: GivenPoses, refine_intrinsics: bool, last: bo
     result = adjust(scene.replace(pose_priors=known.priors()), options)
     if result.problem is None:
         return result.scene, known
-    covariance = Covariances(result.problem).of_coordinates("frames")
+    try:
+        covariance = Covariances(result.problem).of_coordinates("frames")
+    except ProblemError:  # groups of images that nothing but wrong matches ties together: what was known stays
+        return result.scene, known
     return result.scene, _compared(result.scene.cam_from_world, covariance, known)
 
 

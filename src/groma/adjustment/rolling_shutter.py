@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Images that were read row by row: the motion of the camera meanwhile is estimated with everything else.
+
+Six numbers more for each image are much, and points alone do not hold them: where all images are read along the same
+direction in the world, motions can flatten or bend the scene without a trace in the residuals. What is known beforehand
+holds them, and how well it is known is estimated: the motions v of all images are draws about what is expected of them,
+e, with one standard deviation for shifts and one for turns. An adjustment under these gives v, and with the share r of
+each number that the images determine (its redundancy as a measurement),
+
+.. math:: \hat\sigma^2 = \frac{\sum (v - e)^2}{\sum r} .
+
+Expected is no motion; or, where the images prove to be a sequence, a share :math:`\lambda` of the motion d from the
+image before to the image after: :math:`e = \lambda d`, if it explains the motions better than chance would. Adjustment
+and estimate take turns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from groma._counted import counted
+from groma._names import natural_key
+from groma._typing import FloatArray, IntArray
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.report import AdjustResult, Progress
+from groma.adjustment.terms.readout import MOTIONS
+from groma.errors import InputError, ProblemError
+from groma.gates import chi_square_gate, gate
+from groma.geometry import quaternion
+from groma.problem.problem import Problem
+from groma.scene import CameraMotions, Scene
+from groma.scene.motions import COLUMNS, ROWS
+from groma.solver.covariance.marginals import Covariances
+
+#: What an image may be read along.
+AXES = {"rows": ROWS, "columns": COLUMNS}
+
+
+@dataclass(frozen=True)
+class RollingShutterGates:
+    """How motions during the readout are held, and when they are told to be uncertain."""
+
+    turn: float = gate(
+        np.radians(3.0), "rad", "standard deviation of a turn at the start", "convention: 100 degrees in a second"
+    )
+    shift: float = gate(
+        0.3, "times", "the distance to the nearest other camera, of a shift at the start", "convention: a third"
+    )
+    smallest: float = gate(
+        1e-3, "times", "the standard deviation at the start, below which none falls", "cost: smaller ones hold as well"
+    )
+    settled: float = gate(
+        1.15, "times", "by which standard deviations change when they have settled", "cost: 15 % of a weight"
+    )
+    max_rounds: int = gate(4, "adjustments", "of a scene", "cost: most need three")
+    max_images: int = gate(300, "images", "for which redundancy is computed; of more it is taken as one", "cost: time")
+    false_alarm: float = gate(
+        1e-3, "probability", "of a sequence where there is none", "convention: three sigma on one side"
+    )
+    parallel: float = gate(
+        np.radians(30.0),
+        "rad",
+        "between the directions of readout of two images, below which all count as parallel",
+        "convention: half of what would decide",
+    )
+    determined: float = gate(
+        0.5, "share", "of a motion that the images determine, below which it is told", "convention: half"
+    )
+
+
+GATES = RollingShutterGates()
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """What an adjustment says of motions during the readout."""
+
+    #: (N, 6) motions, and (N, 6) the share of each that the images determine, from 0 to 1.
+    motion: FloatArray
+    redundancy: FloatArray
+    #: Standard deviations of shifts (scene units) and turns (radians) about what is expected.
+    sigma: tuple[float, float]
+    #: Share of the motion between neighbouring images that is expected; 0 where they are no sequence.
+    share: float
+    #: Largest angle between the directions of readout of two images, radians.
+    spread: float
+
+    def sentences(self) -> tuple[str, ...]:
+        """Say how the cameras moved."""
+        shift, turn = (np.linalg.norm(part, axis=1) for part in (self.motion[:, :3], self.motion[:, 3:]))
+        told = (
+            f"Rolling shutter of {counted(len(shift), 'images')}: while one is read the camera moves by "
+            f"{np.median(shift):.3g} units of length (at most {shift.max():.3g}) and turns by "
+            f"{np.degrees(np.median(turn)):.2g} degrees (at most {np.degrees(turn.max()):.2g})."
+        )
+        if not self.share:
+            return (told,)
+        way = "" if self.share > 0.0 else ", from its last row to its first"
+        return told, f"The images are a sequence: reading one takes {abs(self.share):.2g} of the time to the next{way}."
+
+    def warnings(self, gates: RollingShutterGates = GATES) -> tuple[str, ...]:
+        """Say where motions rest on what was expected of them."""
+        told = []
+        if self.spread < gates.parallel:
+            told.append(
+                f"All images are read along nearly the same direction (within {np.degrees(self.spread):.0f} degrees). "
+                "Motions can then flatten or bend the scene without being noticed, and what holds them is what is "
+                f"expected: {'the path of the camera' if self.share else 'that they are small'}. Turn the camera by 90 "
+                "degrees for some photographs, or measure distances or positions."
+            )
+        for name, part in (("shifts", slice(0, 3)), ("turns", slice(3, 6))):
+            share = float(self.redundancy[:, part].mean())
+            if share < gates.determined:
+                told.append(
+                    f"The {name} of the cameras during the readout rest by {1.0 - share:.0%} on what is expected of "
+                    "them, not on the images."
+                )
+        return tuple(told)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values: the entry ``rolling_shutter`` of a summary."""
+        shift, turn = (np.linalg.norm(part, axis=1) for part in (self.motion[:, :3], self.motion[:, 3:]))
+        return {
+            "num_images": len(shift),
+            "shift": {"median": float(np.median(shift)), "largest": float(shift.max())},
+            "turn_deg": {"median": float(np.degrees(np.median(turn))), "largest": float(np.degrees(turn.max()))},
+            "expected_sigma": {"shift": self.sigma[0], "turn_deg": float(np.degrees(self.sigma[1]))},
+            "share_of_interval": self.share or None,
+            "determined": {
+                "shift": float(self.redundancy[:, :3].mean()),
+                "turn": float(self.redundancy[:, 3:].mean()),
+            },
+            "notes": list(self.sentences()),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class RollingShutterResult:
+    """An adjustment of images that were read row by row."""
+
+    result: AdjustResult
+    motions: Motions
+
+
+def with_rolling_shutter(scene: Scene, along: str = "rows", gates: RollingShutterGates = GATES) -> Scene:
+    """Return a scene all of whose images were read row by row, with motions that begin at zero.
+
+    Parameters
+    ----------
+    scene : Scene
+        With poses; its motions are forgotten.
+    along : "rows" or "columns"
+        Images are read row by row, or, as photographs that were turned to stand upright, column by column.
+    gates : RollingShutterGates
+        What is expected before anything is estimated.
+
+    Raises
+    ------
+    InputError
+        If the size of an image is not known, there are fewer than two, or depths were measured.
+    """
+    if along not in AXES:
+        raise InputError(f"A rolling shutter reads along {' or '.join(AXES)}; got {along!r}.")
+    if scene.num_images < 2:
+        raise InputError(f"A rolling shutter needs at least two images; got {scene.num_images}.")
+    if not (np.minimum(scene.cameras.width, scene.cameras.height)[scene.images.camera_idx] > 0).all():
+        raise InputError(
+            "A rolling shutter needs the size of the images, and a camera has none. Give width and height."
+        )
+    if scene.is_metric:
+        raise InputError(
+            "Depths, stereo pairs and planes measured in the cameras know no rolling shutter. Leave --rolling-shutter "
+            "out, or adjust the scene without them."
+        )
+    count, centers = scene.num_images, scene.cam_centers_in_world
+    nearest = KDTree(centers).query(centers, k=2)[0][:, 1]
+    apart = float(np.median(nearest[nearest > 0.0])) if (nearest > 0.0).any() else 1.0
+    sigma = np.tile(np.repeat([gates.shift * apart, gates.turn], 3), (count, 1))
+    nothing = np.zeros((count, 6))
+    table = CameraMotions(np.arange(count), nothing, nothing, sigma, np.full(count, AXES[along]))
+    return scene.replace(camera_motions=table)
+
+
+def adjust_rolling_shutter(
+    scene: Scene,
+    options: AdjustOptions | None = None,
+    progress: Callable[[Progress], bool | None] | None = None,
+    gates: RollingShutterGates = GATES,
+) -> RollingShutterResult:
+    """Adjust a scene with motions during the readout, and estimate how well these are known beforehand.
+
+    Parameters
+    ----------
+    scene : Scene
+        With ``camera_motions``, as from :func:`with_rolling_shutter` or an earlier adjustment.
+    options, progress
+        As for :func:`groma.adjust`.
+    gates : RollingShutterGates
+        When the estimate has settled.
+    """
+    options = options or AdjustOptions()
+    start = scene.camera_motions.sigma[0, [0, 3]]
+    quick = replace(options, check_lens=False)
+    for _ in range(gates.max_rounds - 1):
+        result = adjust(scene, quick, progress)
+        found = motions_of(result.scene, result.problem, gates)
+        sigma = np.maximum(found.sigma, gates.smallest * start)
+        before, scene = result.scene.camera_motions, _expecting(result.scene, found.share, sigma)
+        ratio = scene.camera_motions.sigma[0] / before.sigma[0]
+        if ratio.max() <= gates.settled and ratio.min() >= 1.0 / gates.settled:
+            break
+    result = adjust(scene, options, progress)
+    return RollingShutterResult(result, motions_of(result.scene, result.problem, gates))
+
+
+def motions_of(scene: Scene, problem: Problem | None, gates: RollingShutterGates = GATES) -> Motions:
+    """Return what an adjusted scene says of motions during the readout, and how well to expect them the next time."""
+    table = scene.camera_motions
+    share_of = _redundancy(problem, table, gates)
+    known = np.maximum(share_of, 0.05)
+    free = table.expected + (table.motion - table.expected) / known  # as if nothing had been expected
+    between = motions_between(scene, table.image_idx)
+    share = _share(free, known, between, table.sigma, gates)
+    left = share_of**2 * (free - share * between) ** 2
+    variance = [left[:, part].sum() / max(share_of[:, part].sum(), 1e-9) for part in (slice(0, 3), slice(3, 6))]
+    return Motions(
+        table.motion,
+        share_of,
+        (float(np.sqrt(variance[0])), float(np.sqrt(variance[1]))),
+        share,
+        _spread(scene, table),
+    )
+
+
+def motions_between(scene: Scene, image_idx: IntArray) -> FloatArray:
+    """Return half of the motions (N, 6) from the image before to the image after, in the order of names.
+
+    In the axes of the camera, as :class:`~groma.scene.motions.CameraMotions` has them; at the ends from one neighbour.
+    """
+    order = sorted(range(len(image_idx)), key=lambda row: natural_key(scene.images.names[image_idx[row]]))
+    poses, centers = scene.cam_from_world[image_idx[order]], scene.cam_centers_in_world[image_idx[order]]
+    number = np.arange(len(order))
+    before, after = np.maximum(number - 1, 0), np.minimum(number + 1, len(order) - 1)
+    steps = (after - before)[:, None]
+    shift = quaternion.rotate(poses[:, :4], centers[after] - centers[before]) / steps
+    turned = quaternion.multiply(poses[after, :4], quaternion.conjugate(poses[before, :4]))
+    out = np.empty((len(order), 6))
+    out[order] = np.hstack([shift, -quaternion.log(turned) / steps])
+    return out
+
+
+# ----------------------------------------------------------------------------------------------------------- helpers
+def _expecting(scene: Scene, share: float, sigma: FloatArray) -> Scene:
+    table = scene.camera_motions
+    expected = share * motions_between(scene, table.image_idx)
+    spread = np.tile(np.repeat(sigma, 3), (len(table), 1))
+    return scene.replace(camera_motions=table.replace(expected=expected, sigma=spread))
+
+
+def _redundancy(problem: Problem | None, table: CameraMotions, gates: RollingShutterGates) -> FloatArray:
+    """Return the share (N, 6) of each number that the images determine; one where that is not known."""
+    if problem is None or MOTIONS not in problem.variables or len(table) > gates.max_images:
+        return np.ones((len(table), 6))
+    try:
+        covariance = Covariances(problem).of_coordinates(MOTIONS)[:-1]
+    except ProblemError:
+        return np.ones((len(table), 6))
+    variance = np.einsum("nii->ni", covariance)
+    return np.clip(1.0 - np.where(np.isfinite(variance), variance, np.inf) / table.sigma**2, 0.0, 1.0)
+
+
+def _share(
+    free: FloatArray, known: FloatArray, between: FloatArray, sigma: FloatArray, gates: RollingShutterGates
+) -> float:
+    """Return the share of the motions between images that explains those during the readout; 0 if chance might."""
+    weight = known / sigma**2
+    square = float((weight * between**2).sum())
+    if not square > 0.0:
+        return 0.0
+    share = float((weight * between * free).sum()) / square
+    gain = 0.0
+    for part in (slice(0, 3), slice(3, 6)):
+        w, v, d = known[:, part], free[:, part], between[:, part]
+        nothing, something = ((w * (v - factor * d) ** 2).sum() for factor in (0.0, share))
+        gain += v.size * float(np.log(max(nothing, 1e-300) / max(something, 1e-300)))
+    return share if gain > chi_square_gate(gates.false_alarm, 1) else 0.0
+
+
+def _spread(scene: Scene, table: CameraMotions) -> float:
+    """Return the largest angle between directions of readout, as lines without a sign."""
+    axes = np.eye(3)[np.where(table.axis == COLUMNS, 0, 1)]
+    turned = quaternion.conjugate(scene.cam_from_world[table.image_idx, :4])
+    ways = quaternion.rotate(turned, axes)
+    return float(np.arccos(np.clip(np.abs(ways @ ways.T).min(), 0.0, 1.0)))
+
+
+__all__ = [
+    "AXES", "GATES", "Motions", "RollingShutterGates", "RollingShutterResult", "adjust_rolling_shutter",
+    "motions_between", "motions_of", "with_rolling_shutter",
+]  # fmt: skip

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: BSD-3-Clause
+# ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
+"""How cameras with a rolling shutter moved while their images were read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.errors import InputError
+from groma.scene.table import Table, check_sigma, check_unique, column
+
+#: What an image is read by: rows of pixels, from the top; or columns, from the left.
+ROWS, COLUMNS = 0, 1
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMotions(Table):
+    """Images that were read row by row, and the motion of the camera meanwhile: uniform, along its own axes.
+
+    The pose of such an image is that of its middle row. Where the last row is read first, all numbers have the other
+    sign; nothing else depends on the direction.
+    """
+
+    noun: ClassVar[str] = "motion"
+    optional: ClassVar[bool] = True
+    #: (N,) the image, each once; those that are not named were taken at once.
+    image_idx: IntArray = column(np.int64, refers="images")
+    #: (N, 6) how far the camera moves while the whole image is read (scene units) and turns (rotation vector, radians),
+    #: both in the axes that it has in the middle: estimated.
+    motion: FloatArray = column(np.float64, 6, length=(1, 1, 1, 0, 0, 0))
+    #: (N, 6) what is known of it beforehand, and its standard deviations.
+    expected: FloatArray = column(np.float64, 6, length=(1, 1, 1, 0, 0, 0))
+    sigma: FloatArray = column(np.float64, 6, length=(1, 1, 1, 0, 0, 0))
+    #: (N,) :data:`ROWS` or :data:`COLUMNS`.
+    axis: IntArray = column(np.int64, fill=ROWS)
+
+    def _check(self) -> None:
+        check_unique("CameraMotions.image_idx", self.image_idx)
+        check_sigma("CameraMotions.sigma", self.sigma)
+        if len(self) and not np.isin(self.axis, (ROWS, COLUMNS)).all():
+            raise InputError(f"CameraMotions.axis must be 0 or 1; got {sorted(set(self.axis.tolist()))}.")
+
+
+__all__ = ["COLUMNS", "ROWS", "CameraMotions"]
