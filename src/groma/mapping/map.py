@@ -44,7 +44,6 @@ from groma.io.depth_maps import DepthMaps
 from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, SCENE, SEGMENTS
 from groma.mapping.checkpoints import Stages, digest, digest_files, stage
 from groma.mapping.depth.segments import with_line_depths
-from groma.mapping.depth.stages import find_segment_depths, with_depths
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
 from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider
@@ -66,6 +65,7 @@ from groma.mapping.start import start_of
 from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.surveyed import adjust_with_survey, tied
+from groma.mapping.with_depths import find_segment_depths, with_depths
 from groma.scene import Scene
 from groma.scene.local_frame import usual_frame
 from groma.solver.linear.blas import one_blas_thread
