@@ -43,6 +43,34 @@ def _track(folder: Path) -> None:
         step()
 
 
+def _localize(folder: Path) -> None:
+    from groma.evaluation import cabinet
+    from groma.io import read_scene
+    from groma.localization.localizer import Localizer
+
+    call = [sys.executable, "-W", "ignore", "-m", "groma.cli.main", "demo", "-o", str(folder / "demo"), "--quiet"]
+    subprocess.run(call, check=True)  # elsewhere: what it calls is not what localising calls
+    scene, images = read_scene(folder / "demo" / "scene.npz"), cabinet.folder() / "images"
+    Localizer(scene.subset(range(16)), images).localize(images / scene.images.names[20])
+
+
+def _pose_graph(folder: Path) -> None:
+    import numpy as np
+
+    from groma.adjustment.pose_graph import PoseGraphOptions, adjust_pose_graph
+    from groma.io.g2o import read_g2o
+
+    rows, diagonal = [], " ".join("1" if i == j else "0" for i in range(6) for j in range(i, 6))
+    for k in range(12):
+        angle = 2 * np.pi * k / 12
+        rows.append(f"VERTEX_SE3:QUAT {k} {np.cos(angle):.3f} {np.sin(angle) + 0.02 * k:.3f} 0 0 0 0 1")
+    for k in range(12):
+        rows.append(f"EDGE_SE3:QUAT {k} {(k + 1) % 12} 0.5 0.1 0 0 0 0 1 {diagonal}")
+    (folder / "graph.g2o").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    for solver in ("auto", "sparse"):  # the latter is what large graphs get
+        adjust_pose_graph(read_g2o(folder / "graph.g2o"), PoseGraphOptions(linear_solver=solver))
+
+
 def _selfcheck(folder: Path) -> None:
 
     run(["selfcheck", "--quiet"])
@@ -54,6 +82,8 @@ WORK: dict[str, Callable[[Path], None]] = {
     "map": _map,
     "track": _track,
     "selfcheck": _selfcheck,
+    "localize": _localize,
+    "pose graph": _pose_graph,
 }
 
 

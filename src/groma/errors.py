@@ -14,6 +14,9 @@ Every message has three parts: what was expected, what came, what to do next. Fa
 an error: see :class:`groma.solver.termination.Termination`.
 """
 
+import difflib
+from collections.abc import Iterable
+
 
 class GromaError(Exception):
     """Root of all errors that groma raises on purpose."""
@@ -39,4 +42,11 @@ class OutputError(GromaError, OSError):
     """A result could not be written."""
 
 
-__all__ = ["FileFormatError", "GromaError", "InputError", "OutputError", "ProblemError", "ShapeError"]
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the end of a message about a name that is not known: `` Did you mean 'huber'?``; empty if none is near."""
+    by_key = {other.lower().replace("-", "_"): other for other in known}
+    close = difflib.get_close_matches(name.lower().replace("-", "_"), by_key, n=1)
+    return f" Did you mean {by_key[close[0]]!r}?" if close else ""
+
+
+__all__ = ["FileFormatError", "GromaError", "InputError", "OutputError", "ProblemError", "ShapeError", "did_you_mean"]

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Every command on tiny data: what it writes, what it says, what it refuses, and that nothing is left behind."""
 
+import base64
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +49,7 @@ def here(tmp_path, monkeypatch):
 def test_adjust(scenes, here, capsys):
     assert run(["adjust", str(scenes / "points.npz"), "-o", "out.npz", "--json", "r.json", "--report", "p.html"]) == 0
     said = capsys.readouterr()
-    assert "points error" in said.out and "Wrote out.npz" in said.out
+    assert "rms of inliers" in said.out and "Wrote out.npz" in said.out
     assert "\r" not in said.err  # progress is for terminals
     report = json.loads((here / "r.json").read_text())
     start = read_scene(scenes / "points.npz")
@@ -203,6 +205,25 @@ def test_covariances_in_a_file(scenes, here, capsys, gauge):
     np.testing.assert_allclose(arrays["centers"], expected.centers, rtol=1e-6, atol=1e-15)
     assert (np.abs(arrays["poses"][0]).max() == 0) == (gauge == "held")
     assert json.loads((here / "r.json").read_text())["uncertainty"]["gauge"] == gauge
+
+
+def test_the_page_of_an_adjustment_knows_its_covariances(scenes, here):
+    """As groma report --covariance puts them on a page; without --covariance there are none."""
+    adjust = ["adjust", str(scenes / "points.npz"), "--quiet", "--max-iterations", "3"]
+    assert run([*adjust, "-o", "out.npz", "--covariance", "c.npz", "--report", "with.html"]) == 0
+    assert run([*adjust, "--report", "without.html"]) == 0
+    assert run(["report", "out.npz", "--covariance", "c.npz", "-o", "later.html", "--quiet"]) == 0
+    ours, none, later = (_data_of_page(here / f"{name}.html") for name in ("with", "without", "later"))
+    assert none["covariances"] is None and ours["covariances"]["gauge"] == "inner"
+    for kind in ("points", "centers"):
+        values, expected = (np.frombuffer(base64.b64decode(one["covariances"][kind]), "<f4") for one in (ours, later))
+        assert values.size and values.max() > 0
+        np.testing.assert_allclose(values, expected, rtol=1e-5)
+
+
+def _data_of_page(path):
+    text = path.read_text(encoding="utf-8")
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[1])
 
 
 def test_covariances_that_are_impossible_do_not_cost_the_result(scenes, here, capsys, monkeypatch):

@@ -1,13 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Progress: a line that rewrites itself on a terminal, a line now and then in a pipe, nothing with --quiet."""
+"""What commands show: counted stages, bars that fit, a line now and then in a pipe, tables, colours where wanted."""
 
 import os
+import re
 import sys
 
 import pytest
 
-from groma.cli.shared import console as _console
-from groma.cli.shared.console import Console, say_seconds, stage_line
+from groma.cli.shared import progress as _progress
+from groma.cli.shared import style
+from groma.cli.shared.console import Console
+from groma.cli.shared.progress import Plan, parts_done, say_seconds, screen_line
+
+
+def be_terminal(monkeypatch):
+    """A terminal of 80 columns, without colours."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(style.shutil, "get_terminal_size", lambda: os.terminal_size((80, 24)))
+    monkeypatch.setenv("NO_COLOR", "1")
 
 
 @pytest.mark.parametrize(
@@ -18,41 +29,129 @@ def test_lengths_of_time(seconds, words):
     assert say_seconds(seconds) == words
 
 
-def test_a_stage_with_parts_has_a_bar_and_the_time_left():
-    assert stage_line(3, "finding lines", 0, 1, 5.0) == " 3. finding lines"
-    assert (
-        stage_line(3, "finding lines", 25, 100, 10.0) == " 3. finding lines  [#####...............] 25/100, 30 s left"
-    )
-    assert stage_line(3, "finding lines", 100, 100, 10.0).endswith("[####################] 100/100")
-    assert "left" not in stage_line(3, "finding lines", 0, 100, 10.0)
+def test_parts_and_the_time_left():
+    assert parts_done("finding lines", 0, 1, 5.0) == ""
+    assert parts_done("finding lines", 25, 100, 10.0) == "25/100, 30 s left"
+    assert parts_done("finding lines", 25, 100, 0.5) == "25/100"
+    assert parts_done("finding lines", 100, 100, 10.0) == "100/100"
+    assert parts_done("tracking frame", 1234, 0, 10.0) == "1,234"  # how many there are is not known
+    assert parts_done("adjusting points", 7, 50, 10.0) == "step 7 of at most 50"  # it ends when it has converged
+
+
+@pytest.mark.parametrize("width", [30, 60, 80, 120])
+@pytest.mark.parametrize("name", ["finding lines", "looking for photographs of the second map in the first"])
+def test_the_line_fits_whatever_the_width(width, name, monkeypatch):
+    monkeypatch.setenv("NO_COLOR", "1")
+    line = screen_line(f"stage 10 of 17: {name}", "25/100, 30 s left", 0.25, width)
+    assert len(line) < width
+    bar = re.search(r"\[(#*)(\.*)\]", line)
+    assert (bar is not None) == (width >= len(f"  stage 10 of 17: {name}  []  25/100, 30 s left") + 7)
+    assert bar is None or len(bar[1]) == (len(bar[1]) + len(bar[2])) // 4
+
+
+def test_stages_are_counted_by_what_was_announced():
+    plan = Plan(["checking", "lines", "joint", "lines", "writing"])
+    assert plan.label("checking") == "stage 1 of 5: checking"
+    assert plan.label("lines") == "stage 2 of 5: lines"
+    assert plan.label("joint") == "stage 3 of 5: joint"
+    assert plan.label("lines") == "stage 4 of 5: lines"
+    assert plan.label("joint") == "stage 3 of 5, round 2: joint"
+    assert plan.label("lines") == "stage 4 of 5, round 2: lines"
+    assert plan.label("something else") == "something else"
+    assert plan.label("writing") == "stage 5 of 5: writing"
+
+
+def test_a_stage_that_was_kept_is_passed_over():
+    plan = Plan(["checking", "lines", "joint", "lines", "writing"])
+    assert plan.label("joint") == "stage 3 of 5: joint"
+    assert plan.label("lines") == "stage 4 of 5: lines"
 
 
 def test_on_a_terminal_the_line_is_as_wide_as_it_and_vanishes(monkeypatch, capsys):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(_console.shutil, "get_terminal_size", lambda: os.terminal_size((30, 24)))
-    with Console(False, False, None).stages() as stages:
-        stages("a stage with a name that is too long for this terminal", 1, 2)
+    be_terminal(monkeypatch)
+    console = Console(False, False, None)
+    console.expect_stages("first", "a stage with a name")
+    with console.stages() as stages:
+        stages("a stage with a name", 1, 2)
     said = capsys.readouterr().err
-    shown = said.split("\x1b[K")
-    assert shown[0] == "\r" and len(shown[1].rstrip("\r")) <= 30
-    assert said.endswith("\r\x1b[K")
+    assert said == "\r\x1b[K  stage 2 of 2: a stage with a name  [##########..........]  1/2\r\x1b[K"
+
+
+def test_verbose_leaves_a_line_for_every_stage_with_its_time(capsys):
+    with Console(False, True, None).stages() as stages:
+        stages("first", 0, 1)
+        stages("second", 0, 1)
+    assert [line.split(":")[0].strip() for line in capsys.readouterr().out.splitlines()] == ["first", "second"]
 
 
 def test_in_a_pipe_a_line_comes_every_ten_seconds(monkeypatch, capsys):
     now = [100.0]
-    monkeypatch.setattr(_console.time, "monotonic", lambda: now[0])
-    with Console(False, False, None).stages() as stages:
+    monkeypatch.setattr(_progress.time, "monotonic", lambda: now[0])
+    console = Console(False, False, None)
+    console.expect_stages("finding lines", "others")
+    with console.stages() as stages:
         for step in range(26):
             now[0] = 100.0 + step
             stages("finding lines", step, 50)
     said = capsys.readouterr().err
-    assert [line.split()[-1] for line in said.splitlines()] == ["10/50", "20/50"]
+    assert said.splitlines() == [f"  stage 1 of 2: finding lines  {done}/50" for done in (10, 20)]
     assert "\r" not in said and "\x1b" not in said
 
 
 def test_quiet_shows_nothing(monkeypatch, capsys):
-    monkeypatch.setattr(_console, "PAUSE", 0.0)
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with Console(True, False, None).stages() as stages:
+    be_terminal(monkeypatch)
+    monkeypatch.setattr(_progress, "PAUSE", 0.0)
+    console = Console(True, False, None)
+    with console.stages() as stages:
         stages("finding lines", 1, 2)
-    assert capsys.readouterr().err == ""
+    console.say("a sentence")
+    console.table(("", "number"), [["points", "3"]])
+    console.warn("odd")
+    console.wrote("out")
+    said = capsys.readouterr()
+    assert said.out == said.err == ""
+
+
+def test_tables_are_aligned_and_leave_out_what_nothing_has(capsys):
+    rows = [["points", "1,200", "", "0.5 px"], ["lines", "42", "", ""]]
+    Console(False, False, None).table(("", "number", "nothing", "error"), rows)
+    assert capsys.readouterr().out.splitlines() == [
+        "          number   error",
+        "  points   1,200  0.5 px",
+        "  lines       42",
+    ]
+
+
+def test_sentences_are_broken_between_words_on_a_terminal_only(monkeypatch, capsys):
+    be_terminal(monkeypatch)
+    sentence = "  some words, " * 12
+    console = Console(False, False, None)
+    console.say(sentence)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) > 1 and max(map(len, lines)) <= 80
+    assert " ".join(" ".join(lines).split()) == " ".join(sentence.split())
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: False, raising=False)
+    console.say(sentence)
+    assert capsys.readouterr().out == sentence + "\n"
+
+
+@pytest.mark.parametrize(
+    ("environment", "is_terminal", "coloured"),
+    [({}, True, True), ({"NO_COLOR": "1"}, True, False), ({"TERM": "dumb"}, True, False), ({}, False, False)],
+    ids=["terminal", "NO_COLOR", "dumb", "pipe"],
+)
+def test_colours_are_for_terminals_where_nobody_asked_for_none(environment, is_terminal, coloured, monkeypatch, capsys):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    for stream in (sys.stdout, sys.stderr):
+        monkeypatch.setattr(stream, "isatty", lambda: is_terminal, raising=False)
+    console = Console(False, False, None)
+    console.table(("", "number"), [["points", "3"]])
+    console.warn("odd")
+    console.wrote("out")
+    said = capsys.readouterr()
+    assert ("\x1b[" in said.out) == ("\x1b[" in said.err) == coloured
+    plain = re.sub(r"\x1b\[\d+m", "", said.out + said.err)
+    assert plain == "          number\n  points       3\nWrote out\nwarning: odd\n"

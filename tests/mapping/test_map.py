@@ -246,4 +246,4 @@ def test_a_map_that_did_not_converge_says_so_and_given_cameras_change(tmp_path, 
     assert not numbers["converged"] and any(text.startswith("Not converged") for text in numbers["warnings"])
     assert set(read_scene("map/scene.npz").cameras.models) == {"OPENCV"} != set(model.cameras.models)
     with_params = [*command, "--camera-params", "1,2,3", "--force"]
-    assert run(with_params) == 1 and "--camera-params is for images without a model" in capsys.readouterr().err
+    assert run(with_params) == 1 and "--camera-params acts only on images without a model" in capsys.readouterr().err

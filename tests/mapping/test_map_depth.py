@@ -19,6 +19,7 @@ from groma.mapping.depth.noise import cells_of, fitted_noise, shared_errors
 from groma.mapping.depth.points import measure_depths
 from groma.mapping.depth.unit import own_units
 from groma.mapping.map import MapOptions, map_images
+from groma.mapping.plan import planned_stages
 from groma.scene import Similarity
 
 SIGMA = 0.01  # units of the world, of a depth map
@@ -48,8 +49,10 @@ def small(corner):
 def mapped(corner, small, tmp_path_factory):
     place = tmp_path_factory.mktemp("depth")
     maps = DepthMaps(write_depths(place / "depth", corner[1]))
-    options = MapOptions(min_confidence=0.0)
-    return map_images(corner[0], place / "work", small, options, depth=maps)
+    options, named = MapOptions(min_confidence=0.0), set()
+    result = map_images(corner[0], place / "work", small, options, lambda name, done, all_: named.add(name), depth=maps)
+    assert set(planned_stages(options, "model", depth=True)) == named
+    return result
 
 
 def test_the_map_has_the_unit_of_the_depths(corner, mapped):
@@ -194,7 +197,7 @@ def test_the_command_says_the_unit(corner, small, tmp_path, capsys):
         cv2.imwrite(str(folder / f"{stem}.png"), np.round(5000 * depth).astype(np.uint16))
     common = ["map", str(corner[0]), "--model", str(tmp_path / "model.npz"), "-o", str(tmp_path / "out")]
     assert run([*common, "--depth-scale", "5000"]) == 1
-    assert "Add --depth FOLDER" in capsys.readouterr().err
+    assert "--depth-scale acts only with --depth" in capsys.readouterr().err
     assert run([*common, "--depth", str(folder), "--depth-scale", "5000", "--min-confidence", "0"]) == 0
     told = " ".join(capsys.readouterr().out.split())
     assert "The map has their unit of length (1 unit of the model was 2.99" in told

@@ -48,11 +48,15 @@ def _run(*arguments):
     return CliRunner().invoke(app, ["track", *map(str, arguments)])
 
 
+#: The same as COLMAP counts them, from the corner of the first one.
+AS_COLMAP = ("SIMPLE_PINHOLE", f"{_room.FOCAL},{_room.WIDTH / 2},{_room.HEIGHT / 2}")
+
+
 def test_what_it_writes(sequence, tmp_path):
     out = tmp_path / "out"
     result = _run(sequence, "-o", out, "--camera", CAMERA, "--json", tmp_path / "numbers.json")
     assert result.exit_code == 0, result.output
-    assert "16 tracked" in result.output
+    assert "frames tracked      16" in result.output
     trajectory = read_tum(out / "trajectory.txt")
     assert len(trajectory) == 16
     assert _room.position_error(trajectory, _room.poses(16)) < 0.01
@@ -193,3 +197,15 @@ def test_a_track_killed_in_the_middle_leaves_what_is_finished(sequence, tmp_path
     assert result.exit_code == 0, result.output
     assert len(read_tum(out / "trajectory.txt")) == 16
     assert not work.exists()
+
+
+def test_the_camera_as_all_commands_take_it(sequence, tmp_path):
+    """--camera-model and --camera-params, as of groma map, are the same camera as the numbers of OpenCV."""
+    few = ["--max-frames", 4, "--no-lines", "--no-planes"]
+    model, params = AS_COLMAP
+    for name, camera in (("a", ["--camera", CAMERA]), ("b", ["--camera-model", model, "--camera-params", params])):
+        assert _run(sequence, "-o", tmp_path / name, *camera, *few).exit_code == 0
+    ours, theirs = (read_tum(tmp_path / name / "trajectory.txt") for name in "ab")
+    np.testing.assert_allclose(ours.world_from_cam, theirs.world_from_cam, atol=1e-9)
+    wrong = _run(sequence, "-o", tmp_path / "c", "--camera-model", "PINHOLE", "--camera-params", "1,2,3", *few)
+    assert wrong.exit_code == 1

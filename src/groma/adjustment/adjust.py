@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from groma._counted import counted
+from groma._log import log_warnings, logger_of
 from groma._typing import FloatArray
 from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, disassemble
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
@@ -225,6 +226,7 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
 
         def tell(record, spent=spent, patient=patient, stopped=stopped) -> bool:
             event = Progress(spent + record.iteration, options.max_iterations, record.cost)
+            logger_of("adjustment").debug("step %d of at most %d, cost %.6g", *astuple(event))
             if progress is not None and progress(event) is False:
                 stopped.append(event)
             return not stopped and (record.accepted or patient)
@@ -252,7 +254,16 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
     if options.check_lens:
         found = unmodelled_distortion(problem, options.threads), rig_that_does_not_fit(scene, problem, options.threads)
         outcome = replace(outcome, warnings=(*outcome.warnings, *filter(None, found)))
+    _log(outcome)
     return AdjustResult(adjusted, outcome, problem)
+
+
+def _log(outcome: AdjustReport) -> None:
+    cost = f"cost {outcome.solve.initial_cost:.5g} -> {outcome.solve.final_cost:.5g}"
+    steps = counted(outcome.solve.iterations, "steps")
+    images, observations = counted(outcome.num_images, "images"), counted(outcome.num_observations, "observations")
+    logger_of("adjustment").info("%s, %s: %s, %s", images, observations, cost, steps)
+    log_warnings("adjustment", outcome.warnings)
 
 
 def _outcome(

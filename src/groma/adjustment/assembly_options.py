@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, field
 
 from groma._typing import BoolArray, FloatArray
-from groma.errors import InputError
+from groma.errors import InputError, did_you_mean
 from groma.factors.losses import Loss, Trivial
 from groma.geometry.charts.line_charts import LINE_CHARTS
 from groma.geometry.charts.plane_charts import PLANE_CHARTS
@@ -115,7 +115,10 @@ class AssemblyOptions:
             ("gauge", ("auto", "first_camera", "free")),
         ):
             if getattr(self, name) not in known:
-                raise InputError(f"{name} must be one of {', '.join(sorted(known))}; got {getattr(self, name)!r}.")
+                given = getattr(self, name)
+                raise InputError(
+                    f"{name} must be one of {', '.join(sorted(known))}; got {given!r}.{did_you_mean(given, known)}"
+                )
         if not abs(self.line_end_correlation) < 1.0:
             raise InputError(f"line_end_correlation must be between -1 and 1; got {self.line_end_correlation}.")
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from groma.cameras.contract import CameraModel
 from groma.cameras.dispatch import kernel_module, set_kernels
-from groma.errors import InputError
+from groma.errors import InputError, did_you_mean
 
 _MODELS: dict[str, CameraModel] = {}
 #: One for every registration of this process.
@@ -64,9 +64,10 @@ def register_camera(
 def model(name: str) -> CameraModel:
     """Return the camera model of the given name, for example ``"PINHOLE"``; InputError lists the names if unknown."""
     if name not in _MODELS:
+        known = ", ".join(other.name for other in models())
         raise InputError(
-            f"Camera model must be one of {', '.join(other.name for other in models())}; got {name!r}. "
-            f"Convert the images to one of these models first, or register it with groma.cameras.register_camera."
+            f"Camera model must be one of {known}; got {name!r}.{did_you_mean(name, _MODELS)} "
+            "Convert the images to one of these models first, or register it with groma.cameras.register_camera."
         )
     return _MODELS[name]
 

@@ -23,16 +23,16 @@ from groma.cli.commands import (
     view,
     warmup,
 )
+from groma.cli.shared.command import Command, NoColor, forbid_colours, with_common_options
 from groma.cli.shared.guard import guard
 
 app = typer.Typer(
     name="groma",
     help="Reconstruct and adjust scenes made of points, lines and planes.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
 )
 #: Name, function, and a few words for the list of ``groma --help``; the command's own help says the rest.
 _Commands = tuple[tuple[str, Callable[..., None], str], ...]
@@ -61,7 +61,7 @@ _COMPARISONS: _Commands = (
 
 def _add(group: typer.Typer, commands: _Commands) -> None:
     for name, command, words in commands:
-        group.command(name, short_help=words)(guard(command))
+        group.command(name, cls=Command, short_help=words)(with_common_options(guard(command)))
 
 
 _evaluate = typer.Typer(help="Compare a result with a reference.", no_args_is_help=True, rich_markup_mode=None)
@@ -81,5 +81,7 @@ def _options(
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and leave.")
     ] = False,
+    no_color: NoColor = False,
 ) -> None:
     """Reconstruct and adjust scenes made of points, lines and planes."""
+    forbid_colours(no_color)

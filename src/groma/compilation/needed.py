@@ -24,6 +24,8 @@ IMPORTS = {
     "map": "groma.mapping.map",
     "track": "groma.tracking",
     "selfcheck": "groma.factors",
+    "localize": "groma.localization.run",
+    "pose graph": "groma.adjustment.pose_graph",
 }
 #: Module, name, argument types.
 Entry = tuple[str, str, tuple[Any, ...]]

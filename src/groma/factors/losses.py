@@ -46,7 +46,7 @@ from numba.extending import overload
 from groma._numba import exact_kernel, kernel, loop
 from groma._numba_digest import ByLength
 from groma._typing import FloatArray
-from groma.errors import InputError
+from groma.errors import InputError, did_you_mean
 
 _SMALL = 1e-8  # below this, Barron's alpha or 2 - alpha counts as zero
 
@@ -343,7 +343,9 @@ def loss(name: str, scale: float = 1.0, *, alpha: float | None = None) -> Loss:
     key = "trivial" if key == "none" else key
     if key not in LOSSES:
         known = ["none", *sorted(set(LOSSES) - {"trivial"})]
-        raise InputError(f"There is no loss named {name!r}; choose one of {', '.join(known)}.")
+        raise InputError(
+            f"There is no loss named {name!r}; choose one of {', '.join(known)}.{did_you_mean(name, known)}"
+        )
     given: dict[str, Any] = {"scale": float(scale)}
     names = {field.name for field in fields(LOSSES[key])}
     if alpha is not None:

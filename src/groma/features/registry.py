@@ -21,7 +21,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
 
-from groma.errors import InputError
+from groma.errors import InputError, did_you_mean
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 
 _T = TypeVar("_T")
@@ -78,7 +78,10 @@ class Table(Generic[_T]):
     def _make(self, name: str, settings: dict[str, Any]) -> Any:
         factory = self._factories.get(name) or self._installed().get(name)
         if factory is None:
-            raise InputError(f"There is no {self.noun} named {name!r}; choose one of {', '.join(self.names())}.")
+            raise InputError(
+                f"There is no {self.noun} named {name!r}; choose one of {', '.join(self.names())}."
+                + did_you_mean(name, self.names())
+            )
         if isinstance(factory, str):
             module, _, attribute = factory.partition(":")
             return getattr(import_module(module), attribute)(**settings)

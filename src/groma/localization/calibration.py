@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from groma.errors import InputError
+from groma.errors import InputError, did_you_mean
 from groma.gates import gate
 from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.quiet import quiet
@@ -55,7 +55,10 @@ class CalibrationChoice:
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:
-            raise InputError(f"--calibration must be one of {', '.join(SOURCES)}; got {self.source!r}.")
+            raise InputError(
+                f"--calibration must be one of {', '.join(SOURCES)}; got {self.source!r}."
+                + did_you_mean(self.source, SOURCES)
+            )
         if (self.model is None) != (self.params is None):
             raise InputError("--camera-model and --camera-params belong together. Pass both, or none.")
         if self.model is not None and self.params is not None:
@@ -105,14 +108,4 @@ def _focal_length(path: Path) -> float | None:
     return float(focal) if focal and np.isfinite(focal) and focal > 0 else None
 
 
-def parameters(text: str | None) -> tuple[float, ...] | None:
-    """Camera parameters from numbers with commas between them."""
-    if text is None:
-        return None
-    try:
-        return tuple(float(number) for number in text.split(","))
-    except ValueError:
-        raise InputError(f"--camera-params must be numbers with commas between them; got {text!r}.") from None
-
-
-__all__ = ["SOURCES", "Calibration", "CalibrationChoice", "calibration_of", "parameters"]
+__all__ = ["SOURCES", "Calibration", "CalibrationChoice", "calibration_of"]

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from groma._log import log_warnings, logged_stages
 from groma._typing import IntArray
 from groma.errors import InputError
 from groma.features.images import GrayImage, to_gray
@@ -97,7 +98,7 @@ class Localizer:
         options: LocalizeOptions | None = None,
         progress: Callable[[str, int, int], None] | None = None,
     ) -> None:
-        say = progress or (lambda stage, done, total: None)
+        say = logged_stages("localization", progress)
         self.options = options or LocalizeOptions()
         self.scene = map_ if isinstance(map_, Scene) else read_scene(map_)
         check_map(self.scene)
@@ -108,6 +109,8 @@ class Localizer:
         self.files = image_paths(self.scene, _folder(map_, images, path))
         #: The descriptions; and what could not be done as wanted, in words.
         self.index, self.warning = kept_index(self.scene, self.files, path, say)
+        if self.warning:
+            log_warnings("localization", [self.warning])
         self._retrieval = VladRetrieval(self.index.vocabulary)
 
     def camera_of_map(self, width: int, height: int) -> QueryCamera | None:

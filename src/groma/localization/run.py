@@ -7,6 +7,7 @@ import hashlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from groma._log import logged_stages, logger_of
 from groma.errors import GromaError, InputError
 from groma.io.endings import IMAGES
 from groma.localization.calibration import CalibrationChoice, calibration_of
@@ -60,7 +61,7 @@ def localize_images(
     progress
         Called with the name of a stage, what is done and what there is to do.
     """
-    say, choice = progress or (lambda stage, done, total: None), choice or CalibrationChoice()
+    say, choice = logged_stages("localization", progress), choice or CalibrationChoice()
     told = f"{digest_of(localizer.scene, localizer.files)} {localizer.options} {choice}"
     found = []
     with lock_folder(work):
@@ -73,6 +74,7 @@ def localize_images(
                 one = _localize(localizer, name, path, choice)
                 one.write(file, digest)
             found.append(one)
+            logger_of("localization").info("%s: %s. %s", name, one.status, one.sentence)
     return found
 
 

@@ -26,6 +26,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from groma._log import log_warnings, logged_stages
 from groma._typing import FloatArray
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
@@ -194,7 +195,7 @@ def map_images(
         If another run works in ``work``, or it cannot be written.
     """
     options = with_parts(options or MapOptions())
-    say = progress or (lambda doing, done, total: None)
+    say = logged_stages("mapping", progress)
     folder = Path(images)
     files = image_files(folder)
     names = [path.relative_to(folder).as_posix() for path in files]
@@ -227,7 +228,6 @@ def map_images(
         if depths is not None and depth is not None:
             beside = stages.run(find_segment_depths, points, segments, depth, depths.measured)
         result = map_segments(points, segments, matches, stages, neighbors_for(options, folder), beside)
-    say("done", 1, 1)
     left_out = images_left_out(names, (model or start).images.names, model is not None)
     result = dataclasses.replace(
         result,
@@ -238,6 +238,7 @@ def map_images(
         surveyed=None if in_place is None else in_place.surveyed,
         depths=None if depths is None else depths.measured,
     )
+    log_warnings("mapping", [sentence for sentence in result.warnings if sentence not in result.report.warnings])
     if near is None:
         return result
     scene, start, before = (part.transformed(near.inverse()) for part in (result.scene, result.start, result.before))

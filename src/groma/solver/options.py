@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import InitVar, dataclass
 
-from groma.errors import InputError
+from groma.errors import InputError, did_you_mean
 from groma.problem.variables import Variables
 from groma.solver.linear.choice import linear_solver_names
 
@@ -62,7 +62,10 @@ class SolverOptions:
         choices = {"method": METHODS, "linear_solver": linear_solver_names(), "shared_system": SHARED_SYSTEMS}
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
-                raise InputError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
+                given = getattr(self, name)
+                raise InputError(
+                    f"{name} must be one of {', '.join(allowed)}; got {given!r}.{did_you_mean(given, allowed)}"
+                )
         if self.shared_system == "products" and self.linear_solver not in ("auto", "pcg"):
             raise InputError(
                 f"shared_system='products' is for conjugate gradients; got linear_solver={self.linear_solver!r}. Leave "

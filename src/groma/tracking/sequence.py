@@ -15,6 +15,7 @@ import numpy as np
 
 from groma._counted import counted
 from groma._json import json_text
+from groma._log import log_warnings, logged_stages, logger_of
 from groma.errors import GromaError, InputError
 from groma.evaluation.trajectory import TrajectoryScores, score_trajectory
 from groma.io import atomic_output, write_scene
@@ -48,6 +49,9 @@ class TrackProgress:
     #: What became of the frame, and its name in the sequence; None at the end.
     frame: TrackedFrame | None = None
     name: str = ""
+
+
+_Told = Callable[[TrackProgress], bool | None]
 
 
 @dataclass(frozen=True)
@@ -168,13 +172,13 @@ def track(
         name = name or os.fspath(sequence)
         source = source or FrameSource.of(sequence)
         sequence = open_sequence(sequence)
+    progress = _logged(progress)
     earlier = None if map_ is None else read_saved_map(map_)
     tracker = Tracker(sequence.camera, options, saved=_loaded(earlier, sequence, options, progress))
     frames: list[TrackedFrame] = []
     journal = None if work is None else Journal(Path(work))
     tracker, completed = _follow(tracker, sequence, frames, progress, journal)
-    if progress is not None:
-        progress(TrackProgress("adjusting all keyframes", 0, 1))
+    progress(TrackProgress("adjusting all keyframes", 0, 1))
     result = tracker.finish()
     warnings = [*sequence.warnings, *result.warnings, *_without_pose(frames)]
     if not len(result.trajectory):
@@ -191,6 +195,7 @@ def track(
         warnings.append(
             f"The sequence was not found in the map {earlier.path}: its trajectory is in a world of its own."
         )
+    log_warnings("tracking", warnings)
     scores, not_compared = _compared(result, sequence)
     tracked: dict[str, Any] = {item.name: getattr(result, item.name) for item in fields(result)}
     tracked["warnings"] = tuple(warnings)
@@ -209,19 +214,31 @@ def track(
     )  # fmt: skip
 
 
+def _logged(progress: _Told | None) -> _Told:
+    """Return a progress callback that logs stages and frames, and passes them on."""
+    stages = logged_stages("tracking", None)
+
+    def told(event: TrackProgress) -> bool | None:
+        stages(event.stage, event.done, event.total)
+        if event.frame is not None:
+            logger_of("tracking").debug("frame %s: %s", event.name or event.done, event.frame.status)
+        return None if progress is None else progress(event)
+
+    return told
+
+
 def _loaded(
     earlier: SavedMap | None,
     sequence: Sequence,
     options: TrackOptions | None,
-    progress: Callable[[TrackProgress], bool | None] | None,
+    progress: _Told,
 ) -> TrackMap | None:
     """Return the map of an earlier track, ready to be tracked in."""
     if earlier is None:
         return None
 
     def say(done: int, total: int) -> None:
-        if progress is not None:
-            progress(TrackProgress("reading the map", done, total))
+        progress(TrackProgress("reading the map", done, total))
 
     camera = TrackCamera.of(sequence.camera)
     return earlier.track_map(camera, sequence.kind != "mono", options or TrackOptions(), say)
@@ -231,7 +248,7 @@ def _follow(
     tracker: Tracker,
     sequence: Sequence,
     frames: list[TrackedFrame],
-    progress: Callable[[TrackProgress], bool | None] | None,
+    progress: _Told,
     journal: Journal | None,
 ) -> tuple[Tracker, bool]:
     """Track all frames, noting in ``frames`` what became of each; return the tracker and whether none was left out.
@@ -246,7 +263,7 @@ def _follow(
             if journal is not None:
                 journal.frame(tracked, frame, tracker)
             event = TrackProgress("tracking frame", len(frames), total, tracked, frame.name)
-            go_on = progress is None or progress(event) is not False
+            go_on = progress(event) is not False
             if journal is not None and tracked.keyframe:
                 journal.keyframe(tracker, tracked)
             if not go_on:

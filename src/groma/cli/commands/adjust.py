@@ -6,9 +6,10 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from groma.cli.shared import command as _complete
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
-from groma.errors import InputError
+from groma.errors import InputError, did_you_mean
 
 LineResidual = Literal["endpoints", "bearing", "normal"]
 PlaneResidual = Literal["normal_offset", "quaternion"]
@@ -22,7 +23,8 @@ def _check_linear_solver(name: str) -> None:
 
     if name not in linear_solver_names():
         known = ", ".join(linear_solver_names())
-        raise typer.BadParameter(f"{name!r} is not one of {known}.", param_hint="'--linear-solver'")
+        suggestion = did_you_mean(name, linear_solver_names())
+        raise typer.BadParameter(f"{name!r} is not one of {known}.{suggestion}", param_hint="'--linear-solver'")
 
 
 def adjust(
@@ -40,6 +42,7 @@ def adjust(
     loss: Annotated[
         str,
         typer.Option(
+            autocompletion=_complete.one_of(*_complete.LOSSES),
             metavar="NAME",
             help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron, truncated, or one of an installed "
             "package. auto: robust "
@@ -54,6 +57,7 @@ def adjust(
         str | None,
         typer.Option(
             "--camera-model",
+            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
             metavar="NAME",
             help="Change the lens model of all cameras first (PINHOLE to OPENCV, ...); what it adds starts at 0 and is "
             "estimated.",
@@ -82,6 +86,7 @@ def adjust(
     linear_solver: Annotated[
         str,
         typer.Option(
+            autocompletion=_complete.one_of(*_complete.LINEAR_SOLVERS),
             metavar="NAME",
             help="How each step is solved: auto, dense, sparse, pcg, or a solver of an installed package.",
         ),
@@ -89,6 +94,7 @@ def adjust(
     line_chart: Annotated[
         str | None,
         typer.Option(
+            autocompletion=_complete.one_of(*_complete.LINE_CHARTS),
             metavar="NAME",
             help="Line parametrisation: cartesian (default), orthonormal_left, orthonormal_right, free_left, "
             "free_right, or one of an installed package.",
@@ -108,6 +114,7 @@ def adjust(
     gauge: Annotated[
         str | None,
         typer.Option(
+            autocompletion=_complete.one_of(*_complete.GAUGES),
             metavar="NAME",
             help="free; first_camera, to hold the first camera and the scale; or auto (default): free, unless distances"
             " between landmarks are in scene units.",
@@ -177,7 +184,7 @@ def adjust(
     truth: _options.Truth = None,
     force: _options.Force = False,
     threads: _options.Threads = None,
-    seed: _options.Seed = 0,
+    seed: _options.NoSeed = 0,
     json_target: _options.Json = None,
     quiet: _options.Quiet = False,
     verbose: _options.Verbose = False,
@@ -188,12 +195,11 @@ def adjust(
     is never changed. LIMAP's structures beside a COLMAP model are read and written too, with what they hold besides.
     What the data do not determine is said in words at the end. A pose graph (.g2o, .g2o.gz) is adjusted, too, and so is
     a folder of parts (groma convert --parts), by one process or by all that mpiexec starts.
-    The result is deterministic; --seed is accepted so that scripts can pass it to every command.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.adjusting import Wanted, adjust_and_write
     from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.input import check_inputs, refuse_idle
     from groma.cli.shared.parts import PartsWanted, adjust_parts_and_write, has_company, is_parts
     from groma.cli.shared.pose_graph import adjust_graph_and_write, is_pose_graph
 
@@ -213,6 +219,11 @@ def adjust(
         raise InputError(f"--sigma0 must be positive; got {sigma0}.")
     if truth is not None and not contributions:
         raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
+    refuse_idle(
+        ("--covariance-gauge", covariance_gauge != "auto" and covariance is None, "with --covariance"),
+        ("--sigma0", sigma0 != 1.0 and covariance is None, "with --covariance"),
+        ("--keep", keep != "auto" and not in_parts, "on a folder of parts"),
+    )
     if not in_parts:
         check_inputs(source, truth, *measured.files)
     if is_pose_graph(source) and not in_parts:

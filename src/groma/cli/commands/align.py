@@ -32,7 +32,7 @@ def align(
     crs: _measured.Crs = None,
     force: _options.Force = False,
     threads: _options.Threads = None,
-    seed: _options.Seed = 0,
+    seed: _options.NoSeed = 0,
     json_target: _options.Json = None,
     quiet: _options.Quiet = False,
     verbose: _options.Verbose = False,
@@ -40,16 +40,16 @@ def align(
     """Bring a scene into the frame of a reference by a similarity, which ignores gross errors.
 
     The reference is another scene, measured camera positions or control points. Nothing is adjusted: for measurements
-    that take part in an adjustment, pass them to groma adjust or groma map. --threads and --seed are accepted so that
-    scripts can pass them to every command.
+    that take part in an adjustment, pass them to groma adjust or groma map.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.input import check_inputs, refuse_idle
 
     measured = _measured.Measured(positions=positions, position_sigma="1", control=control, control_sigma="1", crs=crs)
     if (reference is None) == (not measured):
         raise InputError("Pass either a REFERENCE scene, or --positions or --control.")
+    refuse_idle(("--crs", crs is not None and not measured, "with --positions or --control"))
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
     check_inputs(source, reference, *measured.files)
@@ -65,7 +65,10 @@ def align(
     if output is not None:
         write_scene(found.scene, output, force=force, like=structures_of(source))
     _say(console, found)
-    console.say(f"Wrote {output}" if output is not None else "No -o given: the moved scene was not written.")
+    if output is not None:
+        console.wrote(output)
+    else:
+        console.say("No -o given: the moved scene was not written.")
     _output.write_json(json_target, found.to_dict(), force)
 
 

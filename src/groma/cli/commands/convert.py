@@ -68,7 +68,7 @@ def _convert(source: Path, target: Path, console: Console, force: bool) -> dict[
         scene = convert_scene(source, target, force)
     if target.suffix.lower() == ".json":  # cameras, poses and points
         scene = scene.points_only().keep(point_observations=[])
-    console.say(f"Wrote {target}: {sentence_of(scene, geometry=target.suffix.lower() in ('.ply', '.obj', '.dxf'))}")
+    console.wrote(f"{target}: {sentence_of(scene, geometry=target.suffix.lower() in ('.ply', '.obj', '.dxf'))}")
     return counts_of(scene)
 
 
@@ -82,7 +82,7 @@ def _cut(source: Path, target: Path, console: Console, force: bool, part_size: i
         raise InputError(f"{source} is a folder of parts already. Leave --parts out to join them.")
     scene, part_size = read_scene(source), part_size or PART_SIZE
     paths = write_parts(scene, target, part_size, force)
-    console.say(f"Wrote {target}: {counted(len(paths), 'parts')}, {counted(scene.num_observations, 'observations')}")
+    console.wrote(f"{target}: {counted(len(paths), 'parts')}, {counted(scene.num_observations, 'observations')}")
     if cut := num_ties_cut(scene, part_size):
         console.warn(
             f"{cut:,} of {counted(len(scene.relations.point_on_line), 'points on lines')} are left out: the line is in "

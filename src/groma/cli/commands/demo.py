@@ -48,7 +48,7 @@ def demo(
     found = try_diagnosis(result.diagnose, result.scene.num_images, console)
     numbers = result.summary(found) | cabinet.evaluate_cabinet(result.start, result.scene, reference)
     title = "A filing cabinet in 58 photographs"
-    write_map(result, output, work, replace, images=images, title=title, summary=numbers)
+    write_map(console, result, output, work, replace, images=images, title=title, summary=numbers)
     say_map(console, result, numbers, explain=False)
     for sentence in cabinet.sentences(numbers):
         console.say(sentence)

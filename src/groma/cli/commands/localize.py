@@ -2,11 +2,22 @@
 """``groma localize``: where photographs were taken, in a map that is there already."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from groma._counted import counted
+from groma.cli.shared import command as _complete
 from groma.cli.shared import options as _options
+
+if TYPE_CHECKING:
+    from groma.cli.shared.console import Console
+    from groma.localization.placed import PlacedImage
+    from groma.localization.result import LocalizeResult
+
+#: Localised photographs in the table; those that are not are always told.
+_SHOWN = 12
+_MIN_LENGTH = 15.0
 
 
 def localize(
@@ -28,19 +39,26 @@ def localize(
         str,
         typer.Option(
             "--calibration",
+            autocompletion=_complete.one_of(*_complete.CALIBRATIONS),
             metavar="SOURCE",
             help="Of the queries: map, exif, unknown; or auto, the first of these that fits.",
         ),
     ] = "auto",
     camera_model: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Lens model of the queries, by COLMAP's name; with its parameters."),
+        typer.Option(
+            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
+            metavar="NAME",
+            help="Lens model of the queries, by COLMAP's name; with its parameters.",
+        ),
     ] = None,
     camera_params: Annotated[
         str | None, typer.Option(metavar="F,CX,CY,...", help="The parameters, if they are known; they are then kept.")
     ] = None,
     lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Use lines besides points.")] = True,
-    min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 15.0,
+    min_length: Annotated[
+        float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")
+    ] = _MIN_LENGTH,
     force: _options.Force = False,
     threads: _options.Threads = None,
     seed: _options.Seed = 0,
@@ -57,26 +75,29 @@ def localize(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.input import camera_parameters, check_inputs, refuse_idle
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
     check_inputs(map_, *queries, images)
+    refuse_idle(("--min-length", min_length != _MIN_LENGTH and not lines, "with lines"))
 
     import shutil
 
-    from groma._counted import counted
+    from groma.cli.shared.extending import DESCRIBING, LOCALIZING
     from groma.cli.shared.interrupt import PROCESS, interruptible
-    from groma.localization.calibration import CalibrationChoice, parameters
+    from groma.cli.shared.mapping import WRITING
+    from groma.localization.calibration import CalibrationChoice
     from groma.localization.localizer import LocalizeOptions, Localizer
     from groma.localization.pose.absolute_pose import PoseOptions
     from groma.localization.result import LocalizeResult
     from groma.localization.run import localize_images, query_files
 
-    choice = CalibrationChoice(calibration, camera_model, parameters(camera_params))
+    choice = CalibrationChoice(calibration, camera_model, camera_parameters(camera_params))
     files = query_files(queries)
     options = LocalizeOptions(lines=lines, min_segment_length=min_length, pose=PoseOptions(seed=seed))
     console.expect_compilation("localize")
+    console.expect_stages(*DESCRIBING, LOCALIZING, WRITING)
     work = output.with_name(output.name + ".work")
     try:
         with interruptible() as interruption, console.stages() as stages:
@@ -90,11 +111,36 @@ def localize(
         console.warn(localizer.warning)
     result = LocalizeResult(localizer.scene, localizer.index, tuple(found))
     _output.check_output(output, force)
-    result.write(output, files, f"Photographs in {map_.absolute().name}", force=force)
+    with console.stages() as say:
+        say(WRITING, 0, 1)
+        result.write(output, files, f"Photographs in {map_.absolute().name}", force=force)
     shutil.rmtree(work, ignore_errors=True)
+    _say(console, result)
+    console.wrote_page(output)
+    _output.write_json(json_target, result.to_dict(), force)
+
+
+def _say(console: "Console", result: "LocalizeResult") -> None:
+    """A row for every photograph, at most a dozen of those that are localised; why the others are not; a count."""
+    found = result.queries
+    localized = [one for one in found if one.status == "localized"]
+    hidden = 0 if console.verbose else max(len(localized) - _SHOWN, 0)
+    left_out = {one.name for one in localized[len(localized) - hidden :]}
+    console.table(
+        ("photograph", "status", "points", "lines", "centre known to", "rotation"),
+        [_row(one) for one in found if one.name not in left_out],
+    )
+    if hidden:
+        console.say(f"  and {hidden:,} more that are localised; --verbose shows them.")
     for one in found:
-        (console.detail if one.status == "localized" else console.say)(f"{one.name}: {one.status}. {one.sentence}")
+        (console.detail if one.status == "localized" else console.say)(f"{one.name}: {one.sentence}")
     numbers = ", ".join(f"{result.count(status)} {status}" for status in ("localized", "uncertain", "failed"))
     console.say(f"{counted(len(found), 'photographs')}: {numbers}.")
-    console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
-    _output.write_json(json_target, result.to_dict(), force)
+
+
+def _row(one: "PlacedImage") -> tuple[str, ...]:
+    numbers = one.to_dict()
+    sigma, turn = numbers["center_sigma"], numbers["rotation_sigma_deg"]
+    center = "" if sigma is None else f"{sum(value * value for value in sigma) ** 0.5:.2g}"
+    seen = (f"{numbers['num_point_inliers']:,}", f"{numbers['num_line_inliers']:,}")
+    return one.name, one.status, *seen, center, "" if turn is None else f"{turn:.2g}°"

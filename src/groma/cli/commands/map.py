@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from groma.cli.shared import command as _complete
 from groma.cli.shared import depth as _depth
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
@@ -62,6 +63,7 @@ def map_(
     camera_model: Annotated[
         str | None,
         typer.Option(
+            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
             metavar="NAME",
             help="Lens model, by COLMAP's name. Without --model the one to estimate (SIMPLE_RADIAL); with it the one "
             "that its cameras are changed to, and what it adds is estimated.",
@@ -73,7 +75,11 @@ def map_(
     ] = None,
     mapper: Annotated[
         str,
-        typer.Option(metavar="NAME", help="Without --model and --poses: place cameras incremental(ly) or global(ly)."),
+        typer.Option(
+            autocompletion=_complete.one_of(*_complete.MAPPERS),
+            metavar="NAME",
+            help="Without --model and --poses: place cameras incremental(ly) or global(ly).",
+        ),
     ] = "incremental",
     rig: Annotated[
         Path | None,
@@ -98,6 +104,7 @@ def map_(
         str | None,
         typer.Option(
             "--line-matcher",
+            autocompletion=_complete.one_of(*_complete.MATCHERS),
             metavar="NAME",
             help="Match segments by wide_baseline, flow, or a matcher of an installed package. Default: poses alone.",
         ),
@@ -158,7 +165,7 @@ def map_(
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
     from groma.cli.shared.extending import check_extension
-    from groma.cli.shared.input import check_inputs
+    from groma.cli.shared.input import camera_parameters, check_inputs, refuse_idle
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
@@ -171,20 +178,22 @@ def map_(
     known = {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params, "--depth": depth}
     check_extension(extend, map_images, known)
 
-    if model is not None and camera_params is not None:
-        raise InputError("--camera-params is for images without a model. Leave it out.")
-
     _check_start(model, poses, rig)
-
-    if line_matches is not None and line_matcher is not None:
-        raise InputError("--line-matches and --line-matcher exclude each other. Leave one of them out.")
-
-    if truth is not None and not contributions:
-        raise InputError("--truth is what --contributions compares with. Add --contributions, or leave it out.")
+    placed = model is not None or poses is not None or extend is not None
+    refuse_idle(
+        ("--mapper", mapper != "incremental" and placed, "without --model, --poses and --extend: it places cameras"),
+        ("--refine-rig", refine_rig and poses is not None, "on rigs, and --poses takes every image for itself"),
+        ("--line-matcher", line_matcher is not None and line_matches is not None, "without --line-matches"),
+        ("--line-detector", line_detector != "lsd" and line_matches is not None, "without --line-matches"),
+        ("--camera-params", model is not None and camera_params is not None, "on images without a model"),
+        ("--depth-scale", depth_scale is not None and depth is None, "with --depth"),
+        ("--relative-depth", relative_depth and depth is None, "with --depth"),
+        ("--truth", truth is not None and not contributions, "with --contributions, which compares with it"),
+    )
 
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.extending import end_queries, extend_map
-    from groma.cli.shared.mapping import run_map, say_map, write_map
+    from groma.cli.shared.mapping import run_map, say_map, stages_of_map, write_map
     from groma.execution import work_with
     from groma.features.external import read_matches
     from groma.io import read_scene
@@ -203,7 +212,7 @@ def map_(
         refine_intrinsics=refine_intrinsics,
         max_iterations=max_iterations,
         camera_model=camera_model,
-        camera_params=_parameters(camera_params),
+        camera_params=camera_parameters(camera_params),
         mapper=mapper,
         rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
@@ -216,7 +225,8 @@ def map_(
     work = output.with_name(output.name + ".work")
     photographs, extended = images, None
     if extend is not None:
-        extended = extend_map(console, extend, images, map_images, output, force)
+        stages = stages_of_map(options, "model", bool(measured), matches is not None)
+        extended = extend_map(console, extend, images, map_images, output, force, stages)
         photographs, start = extended.folder, extended.scene
     survey = None
     if measured:
@@ -230,10 +240,10 @@ def map_(
         found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
         numbers = result.summary(found, result.contributions(true) if contributions else ())
         title = f"Map of {images.absolute().name}"
-        write_map(result, output, work, force, images=photographs, title=title, summary=numbers)
+        write_map(console, result, output, work, force, images=photographs, title=title, summary=numbers)
     end_queries(output)
     say_map(console, result, numbers)
-    console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
+    console.wrote_page(output)
     _output.write_json(json_target, numbers, force)
 
 
@@ -267,6 +277,8 @@ def _start(
     from groma.io import read_scene
     from groma.mapping.posed.given import scene_at_poses
 
+    if model is None:
+        options.point_model()  # refuses a wrong name now
     if poses is None:
         return (None if model is None else read_scene(model)), options
     given = scene_at_poses(images, poses, options.point_model())
@@ -275,13 +287,3 @@ def _start(
     if given.calibrated:  # a model that came with parameters is the one of the scene
         return given.scene, options if options.camera_params is None else replace(options, camera_model=None)
     return given.scene, replace(options, camera_model=None, refine_intrinsics=options.refine_intrinsics is not False)
-
-
-def _parameters(text: str | None) -> tuple[float, ...] | None:
-    """Camera parameters from numbers with commas between them."""
-    if text is None:
-        return None
-    try:
-        return tuple(float(number) for number in text.split(","))
-    except ValueError:
-        raise InputError(f"--camera-params must be numbers with commas between them; got {text!r}.") from None

@@ -46,17 +46,19 @@ def merge(
     check_inputs(first, second, first_images, second_images)
 
     from groma.cli.shared.extending import merge_maps
-    from groma.cli.shared.mapping import run_map, say_map, write_map
+    from groma.cli.shared.mapping import run_map, say_map, stages_of_map, write_map
     from groma.localization.extension import in_world_of
     from groma.mapping.map import MapOptions
 
-    merged = merge_maps(console, (first, second), (first_images, second_images), scale, output, force)
+    options = MapOptions(threads=threads, seed=seed)
+    stages = stages_of_map(options)
+    merged = merge_maps(console, (first, second), (first_images, second_images), scale, output, force, stages)
     work = output.with_name(output.name + ".work")
-    result = run_map(console, merged.folder, work, merged.scene, MapOptions(threads=threads, seed=seed))
+    result = run_map(console, merged.folder, work, merged.scene, options)
     result = in_world_of(result, merged.map)
     numbers = {**result.summary(), "merged": merged.sentence()}
     title = f"Map of {first.absolute().name} and {second.absolute().name}"
-    write_map(result, output, work, force, images=merged.folder, title=title, summary=numbers)
+    write_map(console, result, output, work, force, images=merged.folder, title=title, summary=numbers)
     say_map(console, result, numbers, explain=False)
-    console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
+    console.wrote_page(output)
     _output.write_json(json_target, numbers, force)

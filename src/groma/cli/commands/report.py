@@ -68,5 +68,5 @@ def report(
         told = {} if saved is None else {"outcomes": saved.outcomes, "explanation": saved.explanation}
         contents = PageContents(**told, covariances=found)
         write_report(draft, earlier, scene, saved, images, source.absolute().name, contents)
-    console.say(f"Wrote {output}")
+    console.wrote(output)
     _output.write_json(json_target, {"output": str(output), **counts_of(scene)}, force)

@@ -13,6 +13,8 @@ from groma.errors import InputError
 if TYPE_CHECKING:
     from groma.cli.shared.console import Console
 
+_RUNS = 100
+
 
 def selfcheck(
     golden: Annotated[
@@ -25,7 +27,7 @@ def selfcheck(
     ] = False,
     runs: Annotated[
         int, typer.Option(min=2, metavar="N", help="Scenes simulated with --nees, for either gauge.")
-    ] = 100,
+    ] = _RUNS,
     seed: _options.Seed = 0,
     force: _options.Force = False,
     threads: _options.Threads = None,
@@ -41,9 +43,14 @@ def selfcheck(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
+    from groma.cli.shared.input import refuse_idle
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
+    refuse_idle(
+        ("--runs", runs != _RUNS and not nees, "with --nees"),
+        ("--golden", golden is not None and nees, "without --nees"),
+    )
     if golden is not None and not golden.is_dir():
         raise InputError(f"--golden must be a folder of reference values; there is none at {golden}. Check the path.")
     console.expect_compilation("selfcheck")

@@ -52,7 +52,7 @@ def synth(
         draft.mkdir()
         write_scene(made.truth, draft / "truth.npz")
         write_scene(made.start, draft / "start.npz")
-    console.say(f"Wrote {output / 'truth.npz'} and {output / 'start.npz'}: {sentence_of(made.truth)}")
+    console.wrote(f"{output / 'truth.npz'} and {output / 'start.npz'}: {sentence_of(made.truth)}")
     _output.write_json(
         json_target, {"kind": kind, "seed": seed, "noise_px": made.noise_px, **counts_of(made.truth)}, force
     )

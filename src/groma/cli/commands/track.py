@@ -6,11 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
-from groma._counted import counted
+from groma.cli.shared import command as _complete
 from groma.cli.shared import options as _options
 
 if TYPE_CHECKING:
     from groma.cli.shared.console import Console
+
+#: As :func:`groma.tracking.track` names them.
+_STAGES = ("tracking frame", "adjusting all keyframes")
 
 
 def track(
@@ -32,11 +35,31 @@ def track(
         typer.Option(
             "--camera",
             metavar="CAMERA",
-            help="File or numbers: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: what the sequence says.",
+            help="Calibration file, or its numbers as OpenCV has them: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: what "
+            "the sequence says.",
         ),
     ] = None,
+    camera_model: Annotated[
+        str | None,
+        typer.Option(
+            "--camera-model",
+            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
+            metavar="NAME",
+            help="Lens model, by COLMAP's name; with its parameters, in place of --camera.",
+        ),
+    ] = None,
+    camera_params: Annotated[
+        str | None,
+        typer.Option("--camera-params", metavar="F,CX,CY,...", help="The parameters, pixels counted as COLMAP does."),
+    ] = None,
     kind: Annotated[
-        str | None, typer.Option("--kind", metavar="KIND", help="rgbd, stereo or mono; told by the files otherwise.")
+        str | None,
+        typer.Option(
+            "--kind",
+            autocompletion=_complete.one_of(*_complete.SEQUENCES),
+            metavar="KIND",
+            help="rgbd, stereo or mono; told by the files otherwise.",
+        ),
     ] = None,
     points: Annotated[bool, typer.Option("--points/--no-points", help="Follow points.")] = True,
     lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Follow line segments.")] = True,
@@ -75,15 +98,22 @@ def track(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.errors import InputError
+    from groma.cli.shared.input import camera_line, refuse_idle
+    from groma.errors import InputError, did_you_mean
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
-    if kind not in (None, "rgbd", "stereo", "mono"):
-        raise InputError(f"--kind must be rgbd, stereo or mono; got {kind!r}.")
+    if kind not in (None, *_complete.SEQUENCES):
+        raise InputError(f"--kind must be rgbd, stereo or mono; got {kind!r}.{did_you_mean(kind, _complete.SEQUENCES)}")
+    line = camera_line(camera_model, camera_params)
+    if camera is not None and line is not None:
+        raise InputError("--camera and --camera-model exclude each other. Leave one of them out.")
+    camera = camera or line
+    refuse_idle(("--line-detector", line_detector != "lsd" and not lines, "with lines"))
 
     import shutil
 
+    from groma.cli.shared.mapping import WRITING
     from groma.io.sequences import open_sequence
     from groma.tracking.options import TrackOptions
     from groma.tracking.saved import FrameSource
@@ -101,6 +131,7 @@ def track(
     options.make_detector()  # refuses a wrong name now
     console.expect_compilation("track")
     work = output.with_name(output.name + ".work")
+    console.expect_stages(*(() if map_ is None else ("reading the map",)), *_STAGES, WRITING)
     with console.stages() as stages:
 
         def show(event: TrackProgress) -> None:
@@ -114,19 +145,22 @@ def track(
     if result.interrupted:
         console.warn("interrupted; what was tracked so far is written.")
     _output.check_output(output, force)
-    for sentence in result.write(output, f"Track of {sequence.absolute().name}", force):
+    with console.stages() as say:
+        say(WRITING, 0, 1)
+        unwritten = result.write(output, f"Track of {sequence.absolute().name}", force)
+    for sentence in unwritten:
         console.warn(sentence)
     shutil.rmtree(work, ignore_errors=True)
     numbers = result.summary()
     _say(console, numbers)
-    console.say(f"Wrote {output}. Open {(output / 'report.html').absolute()} in a browser.")
+    console.wrote_page(output)
     _output.write_json(json_target, numbers, force)
 
 
 def _say(console: "Console", numbers: dict[str, Any]) -> None:
-    statuses = ", ".join(f"{count:,} {status}" for status, count in sorted(numbers["frames"].items()))
+    statuses = [[f"frames {status}", f"{count:,}"] for status, count in sorted(numbers["frames"].items())]
     kinds = ("keyframes", "points", "lines", "planes", "loops")
-    console.say(f"Frames: {statuses}; {', '.join(counted(numbers[kind], kind) for kind in kinds)}")
+    console.table(("", "number"), [*statuses, *([kind, f"{numbers[kind]:,}"] for kind in kinds)])
     total = numbers["milliseconds"].get("total")
     if total:
         console.say(f"Time per frame: median {total['median']:.1f} ms, 95 % below {total['p95']:.1f} ms")

@@ -42,11 +42,12 @@ def view(
 
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs, whole_scene
+    from groma.cli.shared.input import check_inputs, refuse_idle, whole_scene
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_json(json_target, force)
 
+    refuse_idle(("--images", images is not None and live, "without --live"))
     if live:
         _follow(source, port, browser, console, json_target, force)
         return

@@ -6,13 +6,18 @@ from typing import Annotated, Any
 import typer
 
 from groma._counted import counted
+from groma.cli.shared import command as _complete
 from groma.cli.shared import options as _options
 
 
 def warmup(
     parts: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[adjust|map|track]...", help="What to compile for; everything if left out."),
+        typer.Argument(
+            autocompletion=_complete.one_of(*_complete.COMPILED),
+            metavar="[adjust|map|track]...",
+            help="What to compile for; everything if left out.",
+        ),
     ] = None,
     again: Annotated[bool, typer.Option("--again", help="Run even if everything is there.")] = False,
     force: _options.Force = False,

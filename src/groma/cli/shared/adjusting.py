@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from groma.adjustment.adjust import AdjustOptions
     from groma.adjustment.report import AdjustResult, Progress
     from groma.adjustment.rolling_shutter import Motions
+    from groma.adjustment.uncertainty import SceneUncertainty
     from groma.cli.shared.console import Console
+    from groma.compilation.time import Compilation
     from groma.scene import Scene
 
 
@@ -89,25 +91,7 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
 
         with _output.atomic_output(wanted.protocol, wanted.force) as draft:
             draft.write_text(protocol(numbers), encoding="utf-8")
-    if wanted.page is not None:
-        from groma.viz.report.page import PageContents, write_report
-        from groma.viz.report.survey import survey_card
-        from groma.viz.report.tables import contributions_card
-
-        with _output.atomic_output(wanted.page, wanted.force) as draft:
-            write_report(
-                draft,
-                before,
-                result.scene,
-                result.report,
-                title=f"Adjustment of {source.absolute().name}",
-                contents=PageContents(
-                    warnings=numbers["warnings"],
-                    diagnosis=numbers["diagnosis"],
-                    cards=contributions_card(numbers.get("contributions")) + survey_card(survey),
-                ),
-            )
-    failure = None
+    found, failure = None, None
     if wanted.covariance is not None:
         try:
             found = result.uncertainty(wanted.gauge, wanted.sigma0)
@@ -118,18 +102,46 @@ def adjust_and_write(console: Console, source: Path, options: AdjustOptions, wan
             reasons = why_no_covariances(result.scene, wanted.covariance)
             numbers["warnings"] += reasons
             failure = None if reasons else error  # raised at the end, when all else is written and said
-    _say(console, numbers, compilation.compiled)
+    if wanted.page is not None:
+        _write_page(wanted.page, wanted.force, source, before, result, numbers, found)
+    _say(console, numbers, compilation)
     say_survey(console, survey or {})
     for sentence in motions.sentences() if motions else ():
         console.say(sentence)
     for path in (wanted.output, wanted.page, wanted.protocol, wanted.covariance if "uncertainty" in numbers else None):
         if path is not None:
-            console.say(f"Wrote {path}")
+            console.wrote(path)
     if all(place is None for place in (wanted.output, wanted.page, wanted.covariance, wanted.json_target)):
         console.say("No -o given: the adjusted scene was not written.")
     _output.write_json(wanted.json_target, numbers, wanted.force)
     if failure is not None:
         raise failure
+
+
+def _write_page(
+    path: Path,
+    force: bool,
+    source: Path,
+    before: Scene,
+    result: AdjustResult,
+    numbers: dict[str, Any],
+    found: SceneUncertainty | None,
+) -> None:
+    """Write the page, before and after; with standard deviations of what is measured on it if there are covariances."""
+    from groma.viz.report.covariances import covariances_of
+    from groma.viz.report.page import PageContents, write_report
+    from groma.viz.report.survey import survey_card
+    from groma.viz.report.tables import contributions_card
+
+    contents = PageContents(
+        warnings=numbers["warnings"],
+        diagnosis=numbers["diagnosis"],
+        cards=contributions_card(numbers.get("contributions")) + survey_card(numbers.get("survey")),
+        covariances=None if found is None else covariances_of(result.scene, found),
+    )
+    title = f"Adjustment of {source.absolute().name}"
+    with _output.atomic_output(path, force) as draft:
+        write_report(draft, before, result.scene, result.report, title=title, contents=contents)
 
 
 def _adjusted(
@@ -176,16 +188,15 @@ def why_no_covariances(scene: Scene, path: Path) -> list[str]:
     ]
 
 
-def _say(console: Console, numbers: dict[str, Any], compiled: bool) -> None:
+def _say(console: Console, numbers: dict[str, Any], compilation: Compilation) -> None:
     """Say the main numbers, what the data do not determine, and the warnings."""
     from groma.cli.shared.diagnosis import say_diagnosis
-    from groma.cli.shared.sentences import describe, describe_contributions, describe_uncertainty
+    from groma.cli.shared.sentences import describe_uncertainty, say_adjustment, say_contributions
 
-    lines = describe(numbers, numbers["termination_sentence"], verbose=console.verbose, compiled=compiled)
-    lines += describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else []
-    lines += describe_contributions(numbers.get("contributions", []))
-    for line in lines:
+    say_adjustment(console, numbers, numbers["termination_sentence"], compilation)
+    for line in describe_uncertainty(numbers["uncertainty"]) if "uncertainty" in numbers else ():
         console.say(line)
+    say_contributions(console, numbers.get("contributions", []))
     say_diagnosis(numbers["diagnosis"], console)
     for sentence in numbers["warnings"]:
         console.warn(sentence)

@@ -50,9 +50,6 @@ def depth_maps(folder: Path | None, scale: float | None, relative: bool, images:
     from groma.io.depth_maps import DepthMaps
 
     if folder is None:
-        if scale is not None or relative:
-            option = "--relative-depth" if relative else "--depth-scale"
-            raise InputError(f"{option} says what depth maps mean. Add --depth FOLDER, or leave it out.")
         return None
     if images.absolute() in (folder.absolute(), *folder.absolute().parents):
         raise InputError(f"{folder} lies in {images}: its files would be taken for photographs. Move it elsewhere.")

@@ -10,6 +10,9 @@ if TYPE_CHECKING:
     from groma.cli.shared.console import Console
     from groma.solver.observability.diagnosis import Diagnosis
 
+#: The stage as it is said.
+DIAGNOSING = "finding what the data determine"
+
 
 def try_diagnosis(
     make: Callable[[], Diagnosis], num_images: int, console: Console, wanted: bool | None = None
@@ -35,7 +38,9 @@ def try_diagnosis(
     if wanted is False:
         return None
     try:
-        return make()
+        with console.stages() as say:
+            say(DIAGNOSING, 0, 1)
+            return make()
     except Exception as error:  # whatever it is, the result of the command is worth more
         console.warn(f"What the data determine could not be found out: {error}")
         return None

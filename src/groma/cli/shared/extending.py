@@ -19,12 +19,17 @@ if TYPE_CHECKING:
     from groma.localization.merging import MergedModel
 
 _Made = TypeVar("_Made")
+Names = tuple[str, ...]
+#: Stages as they are said: of a map that is described, of photographs, of two maps.
+DESCRIBING: Names = ("describing the images of the map", "placing the points of the map")
+LOCALIZING, COMPARING = "localising photographs", "looking for photographs of the second map in the first"
+_WITH_POINTS: Names = ("finding points in images", "placing points")
 
 
 def extend_map(
-    console: Console, map_: Path, new: Path, map_images: Path | None, output: Path, force: bool
+    console: Console, map_: Path, new: Path, map_images: Path | None, output: Path, force: bool, following: Names
 ) -> ExtendedModel:
-    """Localise photographs in a map; return the model of all of them."""
+    """Localise photographs in a map; return the model of all of them. ``following`` are the stages after that."""
     from groma.localization.calibration import CalibrationChoice
     from groma.localization.extension import extended_model
     from groma.localization.localizer import Localizer
@@ -36,6 +41,7 @@ def extend_map(
     def made(say: Callable[[str, int, int], None]) -> ExtendedModel:
         return extended_model(Localizer(map_, map_images, progress=say), files, work, folder, CalibrationChoice(), say)
 
+    console.expect_stages(*DESCRIBING, LOCALIZING, *_WITH_POINTS, *following)
     extended = _with_progress(console, made, f"finished photographs are kept in {work}")
     for sentence in extended.warnings():
         console.warn(sentence)
@@ -49,8 +55,9 @@ def merge_maps(
     scale: bool,
     output: Path,
     force: bool,
+    following: Names,
 ) -> MergedModel:
-    """Find how two maps lie to each other; return the model of the photographs of both."""
+    """Find how two maps lie to each other; return the model of both. ``following`` are the stages after that."""
     from groma.localization.localizer import Localizer, photographs_of
     from groma.localization.merging import merged_model
 
@@ -62,6 +69,7 @@ def merge_maps(
         first, second = (Localizer(one, where, progress=say) for one, where in zip(maps, images, strict=True))
         return merged_model(first, second, folder, "similarity" if scale else "rigid", say)
 
+    console.expect_stages(*DESCRIBING, *DESCRIBING, COMPARING, *_WITH_POINTS, *following)
     merged = _with_progress(console, made, "the descriptions of the maps are kept beside them")
     console.say(merged.sentence())
     return merged
@@ -102,4 +110,12 @@ def _with_progress(console: Console, made: Callable[[Callable[[str, int, int], N
         raise typer.Exit(PROCESS.tell(f"{kept}: the same command goes on from there.")) from None
 
 
-__all__ = ["check_extension", "end_queries", "extend_map", "merge_maps", "photograph_folder"]
+__all__ = [
+    "DESCRIBING",
+    "LOCALIZING",
+    "check_extension",
+    "end_queries",
+    "extend_map",
+    "merge_maps",
+    "photograph_folder",
+]

@@ -9,7 +9,9 @@ from typing import ParamSpec
 
 import typer
 
+from groma.cli.shared.console import warn
 from groma.cli.shared.interrupt import PROCESS
+from groma.cli.shared.style import paint
 from groma.errors import GromaError
 from groma.plugins import load_plugins
 
@@ -66,12 +68,12 @@ def _explain(error: Exception) -> None:
 def _show(message: Warning | str, category: type[Warning], *_where: object) -> None:
     """Print a warning for the user as one line; others are for developers and stay silent."""
     if category is UserWarning:
-        print(f"warning: {message}", file=sys.stderr, flush=True)
+        warn(str(message))
 
 
 def _fail(message: str, code: int) -> None:
     from groma.solver.reduce.mpi import started_as
 
     if started_as()[0] == 0:  # of processes that mpiexec started together, the first speaks
-        print(f"groma: {' '.join(message.split())}", file=sys.stderr, flush=True)
+        print(f"{paint('groma:', 'red', sys.stderr)} {' '.join(message.split())}", file=sys.stderr, flush=True)
     raise typer.Exit(code) from None

@@ -12,6 +12,31 @@ def whole_scene(source: Path) -> Path:
     return archive if archive.is_file() and (source / "summary.json").is_file() else source
 
 
+def refuse_idle(*options: tuple[str, bool, str]) -> None:
+    """Refuse options that would do nothing: each with whether it was given in vain, and what it acts with."""
+    for option, in_vain, others in options:
+        if in_vain:
+            raise InputError(f"{option} acts only {others}. Leave it out.")
+
+
+def camera_parameters(text: str | None) -> tuple[float, ...] | None:
+    """Return the numbers of --camera-params, which have commas between them."""
+    if text is None:
+        return None
+    try:
+        return tuple(float(number) for number in text.split(","))
+    except ValueError:
+        raise InputError(f"--camera-params must be numbers with commas between them; got {text!r}.") from None
+
+
+def camera_line(model: str | None, params: str | None) -> str | None:
+    """Return a camera as one line, model and parameters; None if neither is given, which belong together."""
+    numbers = camera_parameters(params)
+    if (model is None) != (numbers is None):
+        raise InputError("--camera-model and --camera-params belong together. Pass both, or none.")
+    return None if model is None or numbers is None else " ".join([model, *map(repr, numbers)])
+
+
 def check_inputs(*paths: Path | None) -> None:
     """Refuse places where there is nothing; None stands for an input that was not given."""
     for path in paths:

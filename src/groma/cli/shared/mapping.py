@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from groma._counted import counted
 from groma.cli.shared import output as _output
 from groma.cli.shared.depth import say_depth
+from groma.cli.shared.diagnosis import DIAGNOSING
 from groma.cli.shared.interrupt import PROCESS
 from groma.cli.shared.measurements import say_survey
 from groma.errors import OutputError
@@ -21,8 +21,12 @@ if TYPE_CHECKING:
     from groma.features.external import ExternalMatches
     from groma.io.depth_maps import DepthMaps
     from groma.mapping.map import MapOptions
+    from groma.mapping.plan import Start
     from groma.mapping.result import MapResult
     from groma.scene import Scene
+
+#: The last stage as it is said.
+WRITING = "writing the results"
 
 
 def run_map(
@@ -42,6 +46,10 @@ def run_map(
 
     check_free(work)
     console.expect_compilation("map")
+    start: Start = "photographs" if model is None else "model" if model.num_point_observations else "poses"
+    console.expect_stages(
+        *stages_of_map(options, start, survey is not None, line_matches is not None, depth is not None)
+    )
     if has_stages(work):
         console.say(f"Going on from the finished stages in {work}, as far as they fit.")
     try:
@@ -52,13 +60,28 @@ def run_map(
         raise typer.Exit(PROCESS.tell(words)) from None
 
 
-def write_map(result: MapResult, output: Path, work: Path, force: bool, **how: Any) -> None:
+def stages_of_map(
+    options: MapOptions,
+    start: Start = "model",
+    surveyed: bool = False,
+    given_segments: bool = False,
+    depth: bool = False,
+) -> tuple[str, ...]:
+    """Return the names of the stages of a map, with those that the command adds."""
+    from groma.mapping.plan import planned_stages
+
+    return (*planned_stages(options, start, surveyed, given_segments, depth), DIAGNOSING, WRITING)
+
+
+def write_map(console: Console, result: MapResult, output: Path, work: Path, force: bool, **how: Any) -> None:
     """Write the folder of results and remove the finished stages; ``how`` goes to :meth:`MapResult.write`."""
     from groma.mapping.checkpoints import remove_stages, system_reason
 
     try:
         _output.check_output(output, force)
-        result.write(output, force=force, work=work, **how)
+        with console.stages() as say:
+            say(WRITING, 0, 1)
+            result.write(output, force=force, work=work, **how)
     except OutputError as error:
         raise OutputError(
             f"Cannot write {output}: {system_reason(error)}. Finished stages are kept in {work}: the same command goes "
@@ -74,20 +97,20 @@ def say_map(console: Console, result: MapResult, numbers: dict[str, Any], explai
     """
     from groma.cli.shared.diagnosis import say_diagnosis
     from groma.cli.shared.sentences import (
-        describe_contributions,
-        describe_inliers,
+        KINDS,
         describe_pose_uncertainty,
         describe_relations,
+        fit_table,
+        say_contributions,
     )
 
-    kinds = ("images", "points", "lines", "planes", "directions")
-    console.say(", ".join(counted(getattr(result.scene, f"num_{kind}"), kind) for kind in kinds))
-    for line in (*describe_inliers(result.report.inliers), *describe_pose_uncertainty(numbers.get("pose_uncertainty"))):
+    counts = {kind: getattr(result.scene, f"num_{kind}") for kind in KINDS}
+    console.table(*fit_table(counts, result.report.inliers))
+    for line in describe_pose_uncertainty(numbers.get("pose_uncertainty")):
         console.say(line)
     for line in describe_relations(result.report.relations):
         console.detail(line)
-    for line in describe_contributions(numbers.get("contributions", [])):
-        console.say(line)
+    say_contributions(console, numbers.get("contributions", []))
     if explain or console.verbose:
         say_diagnosis(numbers["diagnosis"], console)
     (console.say if explain else console.detail)(result.explanation)

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from groma.cli.shared import command as _complete
+
 Json = Annotated[
     str | None,
     typer.Option("--json", metavar="FILE", help="Write a machine-readable report to FILE; '-' is standard output."),
@@ -19,6 +21,8 @@ Threads = Annotated[
     ),
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Seed of the random numbers.")]
+#: Of commands that draw no random numbers: accepted, so that a script can pass it to every command, and not shown.
+NoSeed = Annotated[int, typer.Option("--seed", min=0, hidden=True)]
 Force = Annotated[bool, typer.Option("--force", "-f", help="Replace what is there.")]
 Contributions = Annotated[
     bool,
@@ -36,7 +40,10 @@ Truth = Annotated[
 LineDetector = Annotated[
     str,
     typer.Option(
-        "--line-detector", metavar="NAME", help="What finds line segments: lsd, or a detector of an installed package."
+        "--line-detector",
+        autocompletion=_complete.one_of(*_complete.DETECTORS),
+        metavar="NAME",
+        help="What finds line segments: lsd, or a detector of an installed package.",
     ),
 ]
 RollingShutter = Annotated[

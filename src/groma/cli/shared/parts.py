@@ -85,7 +85,7 @@ def _adjust(
     from groma.adjustment.parts.settings import settings_of
     from groma.adjustment.parts.together import agreed
     from groma.adjustment.report import Progress
-    from groma.cli.shared.sentences import describe
+    from groma.cli.shared.sentences import say_adjustment
     from groma.compilation.time import compilation_time
 
     speaks = reducer.rank == 0
@@ -113,13 +113,12 @@ def _adjust(
     numbers |= {"parts": len(paths), "bytes_per_step": getattr(reducer, "bytes_per_sum", 0)}
     numbers["seconds"] |= {"compilation": compilation.seconds, "total": time.perf_counter() - began}
     sentence = result.report.termination.sentence
-    for text in describe(numbers, sentence, verbose=console.verbose, compiled=compilation.compiled):
-        console.say(text)
+    say_adjustment(console, numbers, sentence, compilation)
     for kind, rmse in numbers["rmse_px"].items() if not console.verbose else ():
         console.say(f"  rms of all {kind}, outliers included: {rmse['before']:.3f} px -> {rmse['after']:.3f} px")
     for text in result.warnings:
         console.warn(text)
-    console.say(f"Wrote {output}")
+    console.wrote(output)
     return numbers
 
 

@@ -51,15 +51,20 @@ def adjust_graph_and_write(
         write_g2o(result.graph, output, force)
     numbers = result.summary()
     numbers["seconds"]["compilation"] = compilation.seconds
-    console.say(f"{counted(numbers['num_poses'], 'poses')}, {counted(numbers['num_motions'], 'motions')} between them")
-    console.say(f"  {'cost':<16}{numbers['initial_cost']:>10.5g}     ->{numbers['final_cost']:>9.5g}")
-    time = spent(numbers["seconds"]["total"], compilation.seconds, compilation.compiled)
-    console.say(f"  {counted(numbers['iterations'], 'steps')} in {time}. {result.report.termination.sentence}")
+    rows = [[kind, f"{numbers[f'num_{kind}']:,}"] for kind in ("poses", "motions")]
     if len(result.outliers):
-        console.say(f"  {counted(len(result.outliers), 'motions')} beyond the scale of the loss")
+        rows.append(["beyond the scale of the loss", f"{len(result.outliers):,}"])
+    console.table(("", "number"), rows)
+    time = spent(numbers["seconds"]["total"], compilation.seconds, compilation.compiled)
+    costs = f"Cost {numbers['initial_cost']:.5g} -> {numbers['final_cost']:.5g}"
+    steps = counted(numbers["iterations"], "steps")
+    console.say(f"{costs}, {steps} in {time}. {result.report.termination.sentence}")
     for sentence in result.warnings:
         console.warn(sentence)
-    console.say(f"Wrote {output}" if output is not None else "No -o given: the adjusted graph was not written.")
+    if output is not None:
+        console.wrote(output)
+    else:
+        console.say("No -o given: the adjusted graph was not written.")
     return numbers
 
 

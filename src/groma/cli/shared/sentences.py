@@ -1,10 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Numbers as lines of text: of an adjustment, its uncertainties, its contributions, and what a scene determines."""
+"""Numbers as tables and sentences: of an adjustment, its uncertainties, and what each kind of landmark contributes."""
+
+from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from groma._counted import counted
+
+if TYPE_CHECKING:
+    from groma.cli.shared.console import Console
+    from groma.compilation.time import Compilation
+
+#: What a scene holds, in the order in which it is said.
+KINDS = ("images", "points", "lines", "planes", "directions")
+#: Header and rows.
+Table = tuple[tuple[str, ...], list[list[str]]]
 
 _SIGMAS = (
     ("centres", "center", ""),
@@ -23,47 +34,63 @@ _GAUGES = {
 _NO_STAGES = ("total", "compilation")
 
 
-def describe(numbers: Mapping[str, Any], sentence: str, verbose: bool = False, compiled: bool = False) -> list[str]:
-    """Return what a reader wants to know after an adjustment, most important first.
+def say_adjustment(
+    console: Console, numbers: Mapping[str, Any], sentence: str, compilation: Compilation | None = None
+) -> None:
+    """Say what a reader wants to know after an adjustment, most important first.
 
     Parameters
     ----------
+    console : Console
+        Where; with --verbose also the relations between landmarks and the seconds per stage.
     numbers : mapping
         The report as a dictionary (the content of ``--json``).
     sentence : str
         Why the solver stopped.
-    verbose : bool
-        Add the relations between landmarks and the seconds per stage.
-    compiled : bool
-        Whether code was compiled, and not only loaded.
+    compilation : Compilation, optional
+        Whether code was compiled, and not only loaded, and how long that took.
     """
-    kinds = ("images", "points", "lines", "planes", "observations")
-    lines = [", ".join(counted(numbers[f"num_{kind}"], kind) for kind in kinds if numbers.get(f"num_{kind}"))]
-    if others := numbers.get("num_measurements"):
-        lines.append("  also measured: " + ", ".join(f"{count:,} {name}" for name, count in others.items()))
-    lines += describe_inliers(numbers.get("inliers") or {})
-    lines.append(f"  {'cost':<16}{numbers['initial_cost']:>10.5g}     -> {numbers['final_cost']:>9.5g}")
-    lines += describe_pose_uncertainty(numbers.get("pose_uncertainty"))
+    kinds = (*KINDS[:4], "observations")
+    counts = {kind: numbers[f"num_{kind}"] for kind in kinds if numbers.get(f"num_{kind}")}
+    console.table(*fit_table(counts | (numbers.get("num_measurements") or {}), numbers.get("inliers") or {}))
     seconds = numbers["seconds"]
-    time = spent(seconds["total"], seconds.get("compilation", 0.0), compiled)
-    lines.append(f"  {counted(numbers['iterations'], 'steps')} in {time}. {sentence}")
-    if verbose:
-        lines += describe_relations(numbers.get("relations") or {})
-        for kind, rmse in numbers.get("rmse_px", {}).items():
-            lines.append(f"  rms of all {kind}, outliers included: {rmse['before']:.3f} px -> {rmse['after']:.3f} px")
-        stages = ", ".join(f"{name} {value:.3f} s" for name, value in seconds.items() if name not in _NO_STAGES)
-        lines.append(f"  stages: {stages} (compiled code included)")
-    return lines
+    time = spent(seconds["total"], seconds.get("compilation", 0.0), compilation is not None and compilation.compiled)
+    steps = counted(numbers["iterations"], "steps")
+    console.say(f"Cost {numbers['initial_cost']:.5g} -> {numbers['final_cost']:.5g}, {steps} in {time}. {sentence}")
+    for line in describe_pose_uncertainty(numbers.get("pose_uncertainty")):
+        console.say(line)
+    if not console.verbose:
+        return
+    for line in describe_relations(numbers.get("relations") or {}):
+        console.say(line)
+    for kind, rmse in numbers.get("rmse_px", {}).items():
+        console.say(f"  rms of all {kind}, outliers included: {rmse['before']:.3f} px -> {rmse['after']:.3f} px")
+    stages = ", ".join(f"{name} {value:.3f} s" for name, value in seconds.items() if name not in _NO_STAGES)
+    console.say(f"  stages: {stages} (compiled code included)")
 
 
-def describe_inliers(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return a line for each kind of landmark, such as ``points  5.201 px -> 0.331 px, rms of 97.4 % inliers ...``."""
-    return [
-        f"  {kind + ' error':<16}{numbers['rmse_px']['before']:>10.3f} px  -> {numbers['rmse_px']['after']:>9.3f} px   "
-        f"(rms of the inliers: {100 * numbers['share']['after']:.1f} % within {numbers['limit_px']:.2g} px, before "
-        f"{100 * numbers['share']['before']:.1f} %)"
-        for kind, numbers in found.items()
-    ]
+def fit_table(counts: Mapping[str, int], found: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return header and rows: of everything how much there is, and of landmarks how well they fit, before and after.
+
+    Parameters
+    ----------
+    counts : mapping
+        Number of each kind.
+    found : mapping
+        Of landmarks: ``limit_px`` within which one is an inlier, and ``share`` and ``rmse_px`` of inliers before and
+        after.
+    """
+    rows = []
+    for kind in dict.fromkeys((*counts, *found)):
+        row = [kind, f"{counts[kind]:,}" if kind in counts else ""]
+        if (fit := found.get(kind)) is None:
+            rows.append([*row, "", "", ""])
+            continue
+        error, share = fit["rmse_px"], fit["share"]
+        row.append(f"{error['before']:.3f} -> {error['after']:>5.3f} px")
+        row.append(f"{100 * share['before']:.1f} -> {100 * share['after']:>4.1f} %")
+        rows.append([*row, f"{fit['limit_px']:.2g} px"])
+    return ("", "number", "rms of inliers", "inliers", "within"), rows
 
 
 def describe_pose_uncertainty(numbers: Mapping[str, Any] | None) -> list[str]:
@@ -72,7 +99,7 @@ def describe_pose_uncertainty(numbers: Mapping[str, Any] | None) -> list[str]:
         return []
     center, turn = numbers["center"], numbers["rotation_deg"]
     return [
-        f"  cameras: centres known to {center['median']:.2g} (largest {center['largest']:.2g}), rotations to "
+        f"Cameras: centres known to {center['median']:.2g} (largest {center['largest']:.2g}), rotations to "
         f"{turn['median']:.2g}° (largest {turn['largest']:.2g}°): standard deviations relative to "
         f"{_GAUGES[numbers['gauge']]}"
     ]
@@ -94,31 +121,38 @@ def describe_uncertainty(numbers: Mapping[str, Any]) -> list[str]:
         for words, key, unit in _SIGMAS
         if numbers[key]["median"] is not None
     ]
-    lines = [f"  Standard deviations (medians, at sigma0 {numbers['sigma0']:.3g}, relative to {gauge}):"]
-    lines += [f"    {', '.join(parts)}" if parts else "    nothing has any"]
+    lines = [f"Standard deviations (medians, at sigma0 {numbers['sigma0']:.3g}, relative to {gauge}):"]
+    lines += [f"  {', '.join(parts)}" if parts else "  nothing has any"]
     left = sum(numbers[key]["undetermined"] for key in ("point", "segment_end", "plane_normal_deg"))
     if left:
-        lines.append(f"    {left:,} points, segment ends and planes are not determined and have none")
+        lines.append(f"  {left:,} points, segment ends and planes are not determined and have none")
     return lines
 
 
-def describe_contributions(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return one line for each adjustment, points alone first; the entries are those of ``--json``."""
-    lines = ["With and without:"] if entries else []
+def say_contributions(console: Console, entries: Sequence[Mapping[str, Any]]) -> None:
+    """Say what each kind of landmark changes, points alone first; the entries are those of ``--json``."""
+    if not entries:
+        return
+    kinds = list(dict.fromkeys(kind for entry in entries for kind in entry["rmse_px"]))
+    header = ["with", *(f"rms {kind}" for kind in kinds), "moved", "known to", "off"]
+    console.say("By kind of landmark: how far camera centres moved, how well they are known, how far they are off.")
+    rows = []
     for number, entry in enumerate(entries):
-        parts = [f"{name} {value:.3f} px" for name, value in entry["rmse_px"].items()]
-        if number:
-            parts.append(f"cameras moved {entry['moved']:.3g}")
-        if entry["center_sigma"] is not None:
-            parts.append(f"centres known to {entry['center_sigma']:.3g}")
-        elif number == 0 or not entries[number - 1]["center_sigma_missing"]:
-            parts.append(f"centres not predicted: {entry['center_sigma_missing'].rstrip('.')}")
-        if entry["center_error"] is not None:
-            parts.append(f"error {entry['center_error']:.4g}, {entry['rotation_error_deg']:.4f}°")
+        known, off = entry["center_sigma"], entry["center_error"]
+        rows.append([
+            ("and " if number else "") + entry["added"],
+            *(f"{entry['rmse_px'][kind]:.3f} px" if kind in entry["rmse_px"] else "" for kind in kinds),
+            f"{entry['moved']:.3g}" if number else "",
+            "" if known is None else f"{known:.3g}",
+            "" if off is None else f"{off:.4g}, {entry['rotation_error_deg']:.4f}°",
+        ])  # fmt: skip
+    console.table(header, rows)
+    for number, entry in enumerate(entries):
+        if entry["center_sigma"] is None and (number == 0 or not entries[number - 1]["center_sigma_missing"]):
+            console.say(f"Centres not predicted with {entry['added']}: {entry['center_sigma_missing'].rstrip('.')}.")
         if entry["num_relations"]:
-            parts.append(f"{entry['num_dropped']:,} of {entry['num_relations']:,} relations given up")
-        lines.append(f"  {('and ' if number else '') + entry['added']:<26}{', '.join(parts)}")
-    return lines
+            given_up = f"{entry['num_dropped']:,} of {entry['num_relations']:,} relations given up"
+            console.say(f"With {entry['added']}: {given_up}.")
 
 
 def spent(total: float, compilation: float, compiled: bool) -> str:

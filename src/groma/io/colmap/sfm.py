@@ -23,7 +23,7 @@ from typing import Any
 
 from groma import cameras as camera_models
 from groma._counted import counted
-from groma.errors import GromaError, InputError, OutputError
+from groma.errors import GromaError, InputError, OutputError, did_you_mean
 from groma.io.colmap.load import load_pycolmap
 from groma.io.colmap.mappers import MAPPERS, Task
 from groma.io.colmap.model import from_pycolmap
@@ -62,11 +62,17 @@ class PointModelOptions:
 
     def __post_init__(self) -> None:
         if self.mapper not in MAPPERS:
-            raise InputError(f"The mapper must be one of {', '.join(MAPPERS)}; got {self.mapper!r}.")
+            raise InputError(
+                f"The mapper must be one of {', '.join(MAPPERS)}; got {self.mapper!r}."
+                + did_you_mean(self.mapper, MAPPERS)
+            )
         known = {model.name: model for model in camera_models.models() if model.colmap_name is not None}
         model = known.get(self.camera_model)
         if model is None:
-            raise InputError(f"The camera model must be one of {', '.join(known)}; got {self.camera_model!r}.")
+            raise InputError(
+                f"The camera model must be one of {', '.join(known)}; got {self.camera_model!r}."
+                + did_you_mean(self.camera_model, known)
+            )
         given = self.camera_params
         if given is not None and len(given) != model.num_parameters:
             raise InputError(

@@ -159,6 +159,8 @@ def _from_text(text: str, source: str) -> Calibration:
         if len(words) > 3 and words[0][:1].isalpha():
             if len(lines) > 1:
                 raise FileFormatError(f"{source} holds {len(lines)} cameras; expected one. Remove the others.")
+            if len(words) == 1 + cameras.model(words[0]).num_parameters:
+                return _checked(words[0], np.array(finite(words[1:], wrong)), None, source)
             size = whole(words[1], wrong, "the width"), whole(words[2], wrong, "the height")
             return _checked(words[0], np.array(finite(words[3:], wrong)), size, source)
     numbers = np.array(finite((word for words in lines for word in words), wrong, _HELP.removeprefix("expected ")))

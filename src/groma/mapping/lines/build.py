@@ -119,8 +119,9 @@ def map_lines(
             ratios = depth_ratios(scene, segments, views)
         else:
             ratios = np.zeros((len(views.image_idx), 2))
-        places = find_places(scene, views, ratios, compared, matches, options, partial(report, "proposals"), known)
-        unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, partial(report, "tracks"))
+        proposing, linking = partial(report, "proposing lines"), partial(report, "linking segments")
+        places = find_places(scene, views, ratios, compared, matches, options, proposing, known)
+        unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, linking)
         evidence = Evidence(
             options=options,
             neighbors=compared,

@@ -13,7 +13,7 @@ Others are added with :func:`groma.solver.linear.contract.register_linear_solver
 
 from __future__ import annotations
 
-from groma.errors import InputError
+from groma.errors import InputError, did_you_mean
 from groma.problem.layout import Layout
 from groma.solver.linear import dense, pcg, sparse  # noqa: F401  they register themselves
 from groma.solver.linear.contract import LinearSolver, registered_linear_solvers
@@ -30,7 +30,10 @@ def linear_solver(layout: Layout, name: str) -> LinearSolver:
     if name == "auto":
         return min((make(layout) for make in known.values()), key=lambda solver: solver.expected_seconds())
     if name not in known:
-        raise InputError(f"linear_solver must be one of {', '.join(linear_solver_names())}; got {name!r}.")
+        raise InputError(
+            f"linear_solver must be one of {', '.join(linear_solver_names())}; got {name!r}."
+            + did_you_mean(name, linear_solver_names())
+        )
     return known[name](layout)
 
 

@@ -22,11 +22,30 @@ if TYPE_CHECKING:
 class Uncertainty(Protocol):
     """What the page reads of the uncertainty of a scene, such as :func:`groma.uncertainty` returns it."""
 
-    gauge: str
-    points: FloatArray
-    lines: FloatArray
-    planes: FloatArray
-    centers: FloatArray
+    @property
+    def gauge(self) -> str:
+        """What they refer to."""
+        ...
+
+    @property
+    def points(self) -> FloatArray:
+        """(P, 3, 3)"""
+        ...
+
+    @property
+    def lines(self) -> FloatArray:
+        """(L, 6, 6)"""
+        ...
+
+    @property
+    def planes(self) -> FloatArray:
+        """(K, 4, 4)"""
+        ...
+
+    @property
+    def centers(self) -> FloatArray:
+        """(N, 3, 3)"""
+        ...
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What every command gets on top of its own options: --no-color, completion of names and files, "did you mean"."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import os
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_type_hints
+
+import typer
+from typer.core import TyperCommand
+
+from groma.errors import did_you_mean
+
+NoColor = Annotated[bool, typer.Option("--no-color", help="Use no colours; so does the environment variable NO_COLOR.")]
+
+
+class Command(TyperCommand):
+    """A command that suggests what may have been meant where a value is not one of its choices."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse as usual."""
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            value, *choices = re.findall(r"'([^']*)'", error.message) or [""]
+            error.message = error.message.removeprefix("Value error, ")
+            if "is not one of" in error.message:
+                error.message += did_you_mean(value, choices)
+            raise
+
+
+def with_common_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command --no-color, and let the shell complete the files that it takes."""
+    signature = inspect.signature(command)
+    hints = get_type_hints(command, include_extras=True)
+    for name in signature.parameters:
+        kind, *infos = get_args(hints[name]) or (hints[name],)
+        if Path in (kind, *get_args(kind)) and infos and infos[0].autocompletion is None:
+            infos[0].autocompletion = left_to_shell
+
+    @functools.wraps(command)
+    def prepared(*args: Any, no_color: bool = False, **kwargs: Any) -> None:
+        forbid_colours(no_color)
+        command(*args, **kwargs)
+
+    own = inspect.Parameter("no_color", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=NoColor)
+    parameters = [*(parameter.replace(annotation=hints[parameter.name]) for parameter in signature.parameters.values())]
+    prepared.__signature__ = signature.replace(parameters=[*parameters, own])  # type: ignore[attr-defined]
+    prepared.__annotations__ = {**hints, "no_color": NoColor}
+    return prepared
+
+
+def forbid_colours(wanted: bool) -> None:
+    """Show no colours from now on, in processes that are started either; nothing if not wanted."""
+    if wanted:
+        os.environ["NO_COLOR"] = "1"
+
+
+def left_to_shell(incomplete: str) -> list[str]:
+    """Complete nothing: shells complete files themselves then."""
+    return []
+
+
+def one_of(*names: str) -> Callable[[str], Sequence[str]]:
+    """Return a completion by names; parts of installed packages are not among them."""
+    return lambda incomplete: [name for name in names if name.lower().startswith(incomplete.lower())]
+
+
+#: What options may be given, as far as groma itself has it; tests compare them with the registries, which take a second
+#: to import.
+LOSSES = "auto none huber soft_l1 cauchy tukey geman_mcclure barron truncated".split()
+LINEAR_SOLVERS = "auto dense sparse pcg".split()
+LINE_CHARTS = "cartesian orthonormal_left orthonormal_right free_left free_right".split()
+GAUGES = "auto free first_camera".split()
+CAMERA_MODELS = (
+    "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV FULL_OPENCV OPENCV_FISHEYE SIMPLE_RADIAL_FISHEYE "
+    "RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE FOV SIMPLE_FISHEYE FISHEYE SIMPLE_DIVISION DIVISION "
+    "EUCM EQUIRECTANGULAR"
+).split()
+DETECTORS, MATCHERS = ["lsd"], ["wide_baseline", "flow"]
+MAPPERS, CALIBRATIONS = ["incremental", "global"], ["auto", "map", "exif", "unknown"]
+SEQUENCES, COMPILED = ["rgbd", "stereo", "mono"], ["adjust", "map", "track"]
+
+__all__ = ["Command", "NoColor", "forbid_colours", "left_to_shell", "one_of", "with_common_options"]

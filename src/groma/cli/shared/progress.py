@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What goes on, on standard error: one line that rewrites itself on a terminal, one now and then in a pipe."""
+
+import sys
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+from groma.cli.shared.style import has_colours, is_terminal, paint, terminal_width
+
+#: Seconds between two lines where progress cannot rewrite itself, and characters of a full bar and of a short one.
+PAUSE, BAR, SHORT_BAR = 10.0, 20, 6
+#: Seconds of a stage before it is told how long it still takes.
+_EARLY = 1.0
+_ERASE = "\r\x1b[K"
+
+
+class Line:
+    """One line on a terminal, which vanishes at the end; in a pipe or a file, a line every ten seconds."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._is_terminal = not quiet and is_terminal(sys.stderr)
+        self._is_heard = not quiet
+        self._last = time.monotonic()
+
+    def _show(self, head: str, parts: str = "", share: float | None = None) -> None:
+        if self._is_terminal:
+            sys.stderr.write(f"{_ERASE}{screen_line(head, parts, share, terminal_width())}")
+            sys.stderr.flush()
+        elif self._is_heard and time.monotonic() - self._last >= PAUSE:
+            self._last = time.monotonic()
+            print(f"  {head}  {parts}".rstrip(), file=sys.stderr, flush=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._wipe()
+
+    def _wipe(self) -> None:
+        if self._is_terminal:
+            sys.stderr.write(_ERASE)
+            sys.stderr.flush()
+
+
+class Progress(Line):
+    """Call it with the progress events of an adjustment."""
+
+    def __call__(self, event: Any) -> None:
+        """Show one event: iteration, limit and cost."""
+        self._show("adjusting", f"step {event.iteration} of at most {event.max_iterations}, cost {event.cost:.6g}")
+
+
+class Plan:
+    """The stages that are to come, by name; a name may come twice, and stages may be gone through again."""
+
+    def __init__(self, names: Sequence[str] = ()) -> None:
+        self.names = tuple(names)
+        self._at = self._furthest = -1
+        self._round = 1
+
+    def label(self, name: str) -> str:
+        """Return for example ``stage 3 of 12: finding segments`` for the stage that begins; its name if not planned."""
+        later = [place for place, other in enumerate(self.names) if other == name]
+        if not later:
+            return name
+        place = next((place for place in later if place > self._at), later[-1])
+        if place < self._at:
+            self._round += 1
+        if place > self._furthest:
+            self._furthest, self._round = place, 1
+        self._at = place
+        again = f", round {self._round}" if self._round > 1 else ""
+        return f"stage {place + 1} of {len(self.names)}{again}: {name}"
+
+
+class Stages(Line):
+    """Call it with the name of a stage, what is done and what there is to do."""
+
+    def __init__(self, quiet: bool, plan: Plan, finished: Callable[[str], None] | None = None) -> None:
+        super().__init__(quiet)
+        self._plan = plan
+        self._finished = finished
+        self._stage = self._label = ""
+        self._since = time.perf_counter()
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Show a stage."""
+        if stage != self._stage:
+            self._leave()
+            self._stage, self._label = stage, self._plan.label(stage)
+        parts = parts_done(stage, done, total, time.perf_counter() - self._since)
+        share = done / total if total > 1 and not _has_steps(stage) else None
+        self._show(self._label, parts, share)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the last stage."""
+        if error is None:
+            self._leave()
+        super().__exit__(kind, error, trace)
+
+    def _leave(self) -> None:
+        now = time.perf_counter()
+        if self._stage and self._finished is not None:
+            self._wipe()
+            self._finished(f"  {self._stage}: {now - self._since:.1f} s")
+        self._since = now
+
+
+def parts_done(stage: str, done: int, total: int, seconds: float) -> str:
+    """Return how far a stage is, in words; nothing if it has no parts.
+
+    An adjustment ends when it has converged, so its steps tell nothing about the time that is left.
+    """
+    if _has_steps(stage):
+        return f"step {done} of at most {total}" if done else ""
+    if total <= 1:
+        return f"{done:,}" if total == 0 and done else ""
+    told = 0 < done < total and seconds > _EARLY
+    return f"{done:,}/{total:,}" + (f", {say_seconds(seconds * (total - done) / done)} left" if told else "")
+
+
+def _has_steps(stage: str) -> bool:
+    return stage.startswith("adjusting")
+
+
+def screen_line(head: str, parts: str, share: float | None, width: int) -> str:
+    """Return a line that fits the terminal: what goes on, a bar where there is room, and how far it is."""
+    room = width - 1
+    bar = min(BAR, room - len(f"  {head}  []  {parts}")) if share is not None else 0
+    if bar < SHORT_BAR or share is None:
+        return f"  {head}  {parts}".rstrip()[:room]
+    filled = int(bar * min(max(share, 0.0), 1.0))
+    full, empty = ("━", "━") if has_colours(sys.stderr) and _can_say("━") else ("#", ".")
+    drawn = paint(full * filled, "green", sys.stderr) + paint(empty * (bar - filled), "dim", sys.stderr)
+    return f"  {head}  [{drawn}]  {parts}".rstrip()
+
+
+def _can_say(text: str) -> bool:
+    try:
+        text.encode(sys.stderr.encoding or "ascii")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def say_seconds(seconds: float) -> str:
+    """Return a length of time in two units at most: ``40 s``, ``2 min 5 s``, ``3 h 10 min``."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+__all__ = ["Line", "Plan", "Progress", "Stages", "parts_done", "say_seconds", "screen_line"]
