@@ -177,7 +177,6 @@ def map_(
     maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
     known = {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params, "--depth": depth}
     check_extension(extend, map_images, known)
-
     _check_start(model, poses, rig)
     placed = model is not None or poses is not None or extend is not None
     refuse_idle(
@@ -186,8 +185,6 @@ def map_(
         ("--line-matcher", line_matcher is not None and line_matches is not None, "without --line-matches"),
         ("--line-detector", line_detector != "lsd" and line_matches is not None, "without --line-matches"),
         ("--camera-params", model is not None and camera_params is not None, "on images without a model"),
-        ("--depth-scale", depth_scale is not None and depth is None, "with --depth"),
-        ("--relative-depth", relative_depth and depth is None, "with --depth"),
         ("--truth", truth is not None and not contributions, "with --contributions, which compares with it"),
     )
 
@@ -239,8 +236,8 @@ def map_(
             result = in_world_of(result, extended.map)
         found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
         numbers = result.summary(found, result.contributions(true) if contributions else ())
-        title = f"Map of {images.absolute().name}"
-        write_map(console, result, output, work, force, images=photographs, title=title, summary=numbers)
+        page = {"images": photographs, "title": f"Map of {images.absolute().name}", "summary": numbers}
+        write_map(console, result, output, work, force, **page)
     end_queries(output)
     say_map(console, result, numbers)
     console.wrote_page(output)

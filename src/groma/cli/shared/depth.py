@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from groma._counted import counted
+from groma.cli.shared.input import refuse_idle
 from groma.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,6 +50,10 @@ def depth_maps(folder: Path | None, scale: float | None, relative: bool, images:
     """Return what the options mean; None without a folder."""
     from groma.io.depth_maps import DepthMaps
 
+    refuse_idle(
+        ("--depth-scale", scale is not None and folder is None, "with --depth"),
+        ("--relative-depth", relative and folder is None, "with --depth"),
+    )
     if folder is None:
         return None
     if images.absolute() in (folder.absolute(), *folder.absolute().parents):
