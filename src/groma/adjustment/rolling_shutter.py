@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from groma._counted import counted
-from groma._names import natural_key
+from groma._counted import counted, natural_key
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress

@@ -45,6 +45,7 @@ from groma.factors.priors.point_distance import PointDistance
 from groma.factors.priors.pose_between import PoseBetween
 from groma.factors.priors.pose_prior import PosePrior
 from groma.factors.priors.position_prior import PositionPrior
+from groma.factors.priors.similarity_between import SimilarityBetween
 from groma.factors.priors.vector_prior import VectorPrior
 from groma.factors.relations.line_direction import LineDirection
 from groma.factors.relations.line_on_plane import LineOnPlane, SegmentOnPlane
@@ -118,6 +119,7 @@ __all__ = [
     "SegmentOnPlanePixels",
     "SelfCheckReport",
     "SelfCheckRow",
+    "SimilarityBetween",
     "Slot",
     "SoftL1",
     "StereoLine",

@@ -26,8 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from groma._counted import counted
-from groma._names import natural_key
+from groma._counted import counted, natural_key
 from groma._typing import FloatArray, IntArray
 from groma.bounded.text import read_lines
 from groma.errors import InputError

@@ -239,7 +239,7 @@ class _Search:
         return Found(estimate, self.known, agree, lines.take(estimate.lines), score, share)
 
 
-class _Places:
+class Places:
     """Just the places of points, where an estimate wants a table of them."""
 
     def __init__(self, xyz: FloatArray) -> None:
@@ -254,7 +254,7 @@ def _temporary_points(known: KnownFeatures, pairs: IntArray, data: FrameFeatures
     depth_sigma = data.depth_sigma(depth)
     unknown = np.full((count, 2), np.nan)
     table = PointMeasurements(np.arange(count), data.features.pixel[rows], sigma, depth, depth_sigma, unknown)
-    return _Places(known.places[pairs[:, 0]]), table
+    return Places(known.places[pairs[:, 0]]), table
 
 
 def promote(track_map: TrackMap, found: Found, data: FrameFeatures) -> PointTracks:
@@ -316,8 +316,10 @@ def match_planes(
 __all__ = [
     "Found",
     "KnownFeatures",
+    "Places",
     "feature_places",
     "find_pose",
+    "known_features",
     "match_lines",
     "match_near",
     "match_planes",
