@@ -31,7 +31,7 @@ from groma._typing import FloatArray
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
-from groma.adjustment.survey.attach import Survey
+from groma.adjustment.survey.given import Survey
 from groma.execution import work_with
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches
@@ -53,13 +53,8 @@ from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.in_views import map_lines_in_views
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
-from groma.mapping.photographs import (
-    check_images,
-    check_number,
-    image_files,
-    image_reader,
-    images_left_out,
-)
+from groma.mapping.photographs import check_images, check_number, image_files, image_reader, images_left_out
+from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
 from groma.mapping.refine_points import PointRefinementOptions, refine_points
 from groma.mapping.result import MapResult, result_of
 from groma.mapping.start import start_of
@@ -143,6 +138,8 @@ class MapOptions:
     rigs: tuple[RigDescription, ...] = ()
     #: Estimate where cameras sit on their rig.
     refine_rigs: bool = False
+    #: What photographs were read along, ``rows`` or ``columns``; None: taken at once, unless a given model says how.
+    rolling_shutter: str | None = None
 
     def point_model(self, threads: bool = True) -> PointModelOptions:
         """How points are reconstructed, with or without the number of threads, on which no result depends."""
@@ -212,7 +209,7 @@ def map_images(
     with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
         placed = start_of(folder, names, model, stages)
         start = placed.scene
-        points = stages.run(adjust_points, start)
+        points = stages.run(adjust_read_rows if read_by_rows(start, options) else adjust_points, start)
         if options.refine_points:
             points = stages.run(measure_points, folder, points)
         in_place = tied(start, points, survey) if survey else None
@@ -227,7 +224,9 @@ def map_images(
         beside = None
         if depths is not None and depth is not None:
             beside = stages.run(find_segment_depths, points, segments, depth, depths.measured)
-        result = map_segments(points, segments, matches, stages, neighbors_for(options, folder), beside)
+        seen = taken_at_once(points, segments)
+        result = map_segments(seen.scene, seen.segments, matches, stages, neighbors_for(options, folder), beside)
+        result = mapped_as_measured(result, seen, stages)
     left_out = images_left_out(names, (model or start).images.names, model is not None)
     result = dataclasses.replace(
         result,

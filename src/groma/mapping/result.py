@@ -19,6 +19,7 @@ from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.contributions import Contribution, contributions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.report import AdjustReport, AdjustResult
+from groma.adjustment.rolling_shutter import motions_of
 from groma.adjustment.stages import with_loss
 from groma.adjustment.survey.attach import Surveyed
 from groma.adjustment.survey.protocol import protocol
@@ -30,7 +31,7 @@ from groma.mapping.depth.points import MeasuredDepths
 from groma.mapping.lines.confidence import left_out, with_confidence
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.lines.line_map import LineMap, explain
-from groma.mapping.surveyed import has_survey, reliability_of, survey_numbers
+from groma.mapping.surveyed import reliability_of, survey_numbers
 from groma.mapping.unused import without_unused
 from groma.problem.problem import Problem
 from groma.scene import Scene
@@ -112,7 +113,10 @@ class MapResult:
             numbers["contributions"] = [entry.to_dict() for entry in contributions]
         if self.depths is not None:
             numbers["depth"] = self.depths.to_dict()
-        if has_survey(self.scene):
+        if len(self.scene.camera_motions):
+            problem = _problem_of(self.scene, self.adjusted_with)
+            numbers["rolling_shutter"] = motions_of(self.scene, problem).to_dict()
+        if self.scene.has_survey:
             found = reliability_of(self.scene, _problem_of(self.scene, self.adjusted_with))
             numbers["survey"] = survey_numbers(self.surveyed, found)
         return numbers

@@ -121,8 +121,8 @@ def read_saved_map(folder: str | os.PathLike[str]) -> SavedMap:
         raise InputError(f"{missing} where the frames of its keyframes are. {remedy}") from error
     if of_photographs:
         raise InputError(
-            f"{path} is a map of photographs, made by groma map: tracking goes on in maps of groma track, whose keyframes "
-            f"are of the camera of the sequence. Place frames in it with: groma localize {path} FRAMES -o OUT."
+            f"{path} is a map of photographs, made by groma map: tracking goes on in maps of groma track, whose "
+            f"keyframes are of the camera of the sequence. Place frames in it: groma localize {path} FRAMES -o OUT."
         )
     scene = read_scene(path / "scene.npz")
     known = {name for source in sources for name in source.images}

@@ -43,7 +43,7 @@ def map_(
             "--poses",
             metavar="FILE",
             help="Poses from elsewhere, without points: a model, transforms.json, reconstruction.json, a trajectory "
-            "(TUM, KITTI), a g2o graph. Points are found, poses improved, wrong ones named.",
+            "(TUM, KITTI), a g2o graph, or name x y z qx qy qz qw. Points are found, poses improved, wrong ones named.",
         ),
     ] = None,
     extend: Annotated[
@@ -93,6 +93,7 @@ def map_(
     refine_rig: Annotated[
         bool, typer.Option("--refine-rig/--fix-rig", help="Estimate where the cameras sit on their rig.")
     ] = False,
+    rolling_shutter: _options.RollingShutter = None,
     line_matches: Annotated[
         Path | None,
         typer.Option(
@@ -143,6 +144,12 @@ def map_(
     check: _measured.Check = None,
     distances: _measured.Distances = None,
     distance_sigma: _measured.DistanceSigma = None,
+    directions: _measured.Directions = None,
+    direction_sigma: _measured.DirectionSigma = None,
+    known_planes: _measured.KnownPlanes = None,
+    plane_sigma: _measured.PlaneSigma = None,
+    pose_sigma: _measured.PoseSigma = None,
+    hold: _measured.Hold = None,
     crs: _measured.Crs = None,
     depth: _depth.Depth = None,
     depth_scale: _depth.DepthScale = None,
@@ -169,10 +176,7 @@ def map_(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
-    measured = _measured.Measured(
-        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
-    )
-    _measured.check_measured(measured)
+    measured = _measured.given(locals() | {"poses": poses if _has_noise(poses, pose_sigma) else None})
     check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, *measured.files)
     maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
     known = {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params, "--depth": depth}
@@ -187,7 +191,6 @@ def map_(
         ("--camera-params", model is not None and camera_params is not None, "on images without a model"),
         ("--truth", truth is not None and not contributions, "with --contributions, which compares with it"),
     )
-
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.extending import end_queries, extend_map
     from groma.cli.shared.mapping import run_map, say_map, stages_of_map, write_map
@@ -213,6 +216,7 @@ def map_(
         mapper=mapper,
         rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
+        rolling_shutter=rolling_shutter,
         threads=threads,
         seed=seed,
     )
@@ -242,6 +246,13 @@ def map_(
     say_map(console, result, numbers)
     console.wrote_page(output)
     _output.write_json(json_target, numbers, force)
+
+
+def _has_noise(poses: Path | None, stated: str | None) -> bool:
+    """Whether it is known how exact given poses are; else that is estimated."""
+    from groma.io.measured_poses import holds_covariances
+
+    return poses is not None and (stated is not None or holds_covariances(poses))
 
 
 def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> None:
