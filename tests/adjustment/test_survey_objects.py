@@ -292,3 +292,10 @@ def test_gravity_keeps_the_size_of_a_scene():
     assert size[0] == pytest.approx(size[1], rel=0.03) and result.report.solve.iterations < 20
     spread = result.uncertainty()
     assert spread.gauge == "inner" and position_sigma(spread.centers).max() < 0.03
+
+
+def test_poses_whose_noise_is_known_replace_estimated_ones(truth):
+    priors = PosePriors(np.arange(8), truth.frames.rig_from_world, np.full((8, 6), 0.05))
+    given = Survey(poses=measured_poses(truth, np.random.default_rng(3)))
+    found = with_survey(truth.replace(pose_priors=priors), given).scene
+    assert len(found.pose_priors) == 0 and len(found.camera_poses) == 8
