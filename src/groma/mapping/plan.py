@@ -40,10 +40,11 @@ def planned_stages(
     given_segments : bool
         Segments come from elsewhere.
     """
+    rolling = options.rolling_shutter is not None
     return (
         "checking images",
         *_STARTS[start],
-        "adjusting points",
+        "adjusting points and motions" if rolling else "adjusting points",
         *(("measuring points", "adjusting points again") if options.refine_points else ()),
         *(("adjusting with measurements",) if surveyed else ()),
         "reading segments" if given_segments else "finding segments",
@@ -51,6 +52,7 @@ def planned_stages(
         *(("adjusting points and lines", *_LINES) if options.refine_poses else ()),
         *(_STRUCTURE if options.find_planes else ()),
         "adjusting everything",
+        *(("adjusting with motions",) if rolling else ()),
     )
 
 

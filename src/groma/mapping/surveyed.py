@@ -15,7 +15,7 @@ from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
 from groma.adjustment.survey.attach import Survey, Surveyed, with_survey
 from groma.adjustment.survey.records import Reliability
-from groma.adjustment.survey.reliability import has_survey, reliability
+from groma.adjustment.survey.reliability import reliability
 from groma.errors import ProblemError
 from groma.gates import gate
 from groma.io.survey import WorldFrame
@@ -159,6 +159,6 @@ def weighted(scene: Scene, options: AdjustOptions) -> AdjustOptions:
 
 
 __all__ = [
-    "SurveyedResult", "Tied", "adjust_surveyed", "adjust_with_survey", "has_survey", "reliability_of",
+    "SurveyedResult", "Tied", "adjust_surveyed", "adjust_with_survey", "reliability_of",
     "survey_numbers", "tied", "weighted",
 ]  # fmt: skip

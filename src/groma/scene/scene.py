@@ -205,6 +205,12 @@ class Scene:
         return any(map(len, (self.point_depths, self.right_columns, self.line_depths, self.plane_observations)))
 
     @property
+    def has_survey(self) -> bool:
+        """Whether there are measurements of other instruments than the cameras, or something is held."""
+        places = self.camera_positions, self.camera_poses, self.control_points, self.distances
+        return any(map(len, (*places, self.known_planes, self.known_directions, self.held)))
+
+    @property
     def is_surveyed(self) -> bool:
         """Whether places of cameras or control points were measured that tell where the scene is, and its scale."""
         return len(self.camera_positions) + len(self.camera_poses) + int(self.control_points.is_control.sum()) > 1

@@ -58,12 +58,6 @@ _ANGLES = {"camera pose": (False,) * 3 + (True,) * 3, "known direction": (True, 
 _UNCHECKED = 1e-6
 
 
-def has_survey(scene: Scene) -> bool:
-    """Tell whether a scene holds measurements of other instruments than the cameras, or something is held."""
-    tables = (scene.camera_positions, scene.camera_poses, scene.control_points, scene.distances, scene.known_planes)
-    return any(map(len, (*tables, scene.known_directions, scene.held)))
-
-
 def reliability(
     scene: Scene, problem: Problem | None = None, level: float = GATES.level, power: float = GATES.power
 ) -> Reliability | None:
@@ -88,7 +82,7 @@ def reliability(
     ProblemError
         If the poses are not determined.
     """
-    if not has_survey(scene):
+    if not scene.has_survey:
         return None
     near = local_frame(scene)
     scene = scene if near is None else scene.transformed(near)
@@ -322,4 +316,4 @@ def _checked(frame: _Frame, scene: Scene) -> tuple[CheckPoint, ...]:
     return tuple(found)
 
 
-__all__ = ["CheckPoint", "Measurement", "Reliability", "has_survey", "noncentrality", "reliability"]
+__all__ = ["CheckPoint", "Measurement", "Reliability", "noncentrality", "reliability"]

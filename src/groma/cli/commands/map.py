@@ -187,7 +187,6 @@ def map_(
         ("--camera-params", model is not None and camera_params is not None, "on images without a model"),
         ("--truth", truth is not None and not contributions, "with --contributions, which compares with it"),
     )
-
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.extending import end_queries, extend_map
     from groma.cli.shared.mapping import run_map, say_map, stages_of_map, write_map
