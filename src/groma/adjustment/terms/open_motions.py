@@ -9,6 +9,8 @@ columns are held, those in which G is largest and independent (QR with pivots), 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.linalg import qr
 
@@ -45,8 +47,8 @@ def coordinates_to_hold(scene: Scene, usable: BoolArray) -> BoolArray:
         moved = gauge_directions(POSE_CHARTS["left"], frames, middle, length).transpose(1, 2, 0) @ motions
         moved[:, :3] /= length
         moved[~usable] = 0.0
-        chosen = qr(moved.reshape(-1, motions.shape[1]).T, mode="r", pivoting=True)[1][: motions.shape[1]]
-        held.reshape(-1)[chosen] = True
+        found: Any = qr(moved.reshape(-1, motions.shape[1]).T, mode="r", pivoting=True)
+        held.reshape(-1)[found[-1][: motions.shape[1]]] = True
     return held
 
 
