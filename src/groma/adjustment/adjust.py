@@ -35,6 +35,7 @@ from groma.adjustment.stages import (
 )
 from groma.adjustment.survey.place import settled
 from groma.adjustment.terms.contract import Term
+from groma.adjustment.terms.objects import with_held_states
 from groma.errors import InputError
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
@@ -173,7 +174,7 @@ def adjust(
 
 def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
     """Adjust a scene that begins and ends where measurements of other instruments fit best."""
-    if not (scene.is_surveyed and options.refine_poses):
+    if not (scene.is_tied and options.refine_poses):
         return _adjusted(scene, options, progress)
     result = _adjusted(settled(scene), options, progress)
     after = settled(result.scene)
@@ -239,10 +240,10 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         if stopped:
             break
         for renew in () if last else (renew_lines, settle_clusters):
-            problem, renewed = renew(scene, problem, options.threads)
+            problem, renewed = with_held_states(problem, *renew(scene, problem, options.threads))
             moved.append(renewed)
         if not isinstance(loss, Trivial) and solution.report.iterations:
-            problem, renewed = without_slips(problem, options.threads)
+            problem, renewed = with_held_states(problem, *without_slips(problem, options.threads))
             moved.append(renewed)
             if last and problem is not solution.problem:
                 reports[-1] = with_costs_at(reports[-1], problem)

@@ -29,7 +29,7 @@ from groma._log import log_warnings, logged_stages
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
-from groma.adjustment.survey.attach import Survey
+from groma.adjustment.survey.given import Survey
 from groma.execution import work_with
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches

@@ -27,7 +27,7 @@ from groma.adjustment.uncertainty import pose_uncertainty
 from groma.execution import beside
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
-from groma.mapping.surveyed import has_survey, reliability_of, survey_numbers
+from groma.mapping.surveyed import reliability_of, survey_numbers
 from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.solver.observability.diagnosis import Diagnosis, Finding
@@ -107,7 +107,7 @@ class MapResult:
         if len(self.scene.camera_motions):
             problem = _problem_of(self.scene, self.adjusted_with)
             numbers["rolling_shutter"] = motions_of(self.scene, problem).to_dict()
-        if has_survey(self.scene):
+        if self.scene.has_survey:
             found = reliability_of(self.scene, _problem_of(self.scene, self.adjusted_with))
             numbers["survey"] = survey_numbers(self.surveyed, found)
         return numbers

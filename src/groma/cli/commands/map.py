@@ -42,7 +42,7 @@ def map_(
             "--poses",
             metavar="FILE",
             help="Poses from elsewhere, without points: a model, transforms.json, reconstruction.json, a trajectory "
-            "(TUM, KITTI), a g2o graph. Points are found, poses improved, wrong ones named.",
+            "(TUM, KITTI), a g2o graph, or name x y z qx qy qz qw. Points are found, poses improved, wrong ones named.",
         ),
     ] = None,
     extend: Annotated[
@@ -143,6 +143,12 @@ def map_(
     check: _measured.Check = None,
     distances: _measured.Distances = None,
     distance_sigma: _measured.DistanceSigma = None,
+    directions: _measured.Directions = None,
+    direction_sigma: _measured.DirectionSigma = None,
+    known_planes: _measured.KnownPlanes = None,
+    plane_sigma: _measured.PlaneSigma = None,
+    pose_sigma: _measured.PoseSigma = None,
+    hold: _measured.Hold = None,
     crs: _measured.Crs = None,
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
@@ -166,10 +172,7 @@ def map_(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
-    measured = _measured.Measured(
-        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
-    )
-    _measured.check_measured(measured)
+    measured = _measured.given(locals() | {"poses": poses if _has_noise(poses, pose_sigma) else None})
     check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, *measured.files)
     check_extension(
         extend, map_images, {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params}
@@ -239,6 +242,13 @@ def map_(
     say_map(console, result, numbers)
     console.wrote_page(output)
     _output.write_json(json_target, numbers, force)
+
+
+def _has_noise(poses: Path | None, stated: str | None) -> bool:
+    """Whether it is known how exact given poses are; else that is estimated."""
+    from groma.io.measured_poses import holds_covariances
+
+    return poses is not None and (stated is not None or holds_covariances(poses))
 
 
 def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> None:

@@ -15,7 +15,7 @@ from groma.cli.shared.measurements import say_survey
 from groma.errors import OutputError
 
 if TYPE_CHECKING:
-    from groma.adjustment.survey.attach import Survey
+    from groma.adjustment.survey.given import Survey
     from groma.cli.shared.console import Console
     from groma.features.external import ExternalMatches
     from groma.mapping.map import MapOptions
