@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from groma.cli.shared import command as _complete
+from groma.cli.shared import depth as _depth
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
 from groma.cli.shared.ranks import led_by_first_rank
@@ -150,6 +151,9 @@ def map_(
     pose_sigma: _measured.PoseSigma = None,
     hold: _measured.Hold = None,
     crs: _measured.Crs = None,
+    depth: _depth.Depth = None,
+    depth_scale: _depth.DepthScale = None,
+    relative_depth: _depth.RelativeDepth = False,
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
@@ -173,10 +177,10 @@ def map_(
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
     measured = _measured.given(locals() | {"poses": poses if _has_noise(poses, pose_sigma) else None})
-    check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, *measured.files)
-    check_extension(
-        extend, map_images, {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params}
-    )
+    check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, *measured.files)
+    maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
+    known = {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params, "--depth": depth}
+    check_extension(extend, map_images, known)
     _check_start(model, poses, rig)
     placed = model is not None or poses is not None or extend is not None
     refuse_idle(
@@ -231,13 +235,13 @@ def map_(
             photographs, lambda: [path.relative_to(photographs).as_posix() for path in image_files(photographs)]
         )
     with work_with(threads):
-        result = run_map(console, photographs, work, start, options, matches, survey)
+        result = run_map(console, photographs, work, start, options, matches, survey, maps)
         if extended is not None and survey is None:
             result = in_world_of(result, extended.map)
         found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
         numbers = result.summary(found, result.contributions(true) if contributions else ())
-        title = f"Map of {images.absolute().name}"
-        write_map(console, result, output, work, force, images=photographs, title=title, summary=numbers)
+        page = {"images": photographs, "title": f"Map of {images.absolute().name}", "summary": numbers}
+        write_map(console, result, output, work, force, **page)
     end_queries(output)
     say_map(console, result, numbers)
     console.wrote_page(output)
