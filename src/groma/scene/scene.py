@@ -14,9 +14,8 @@ all references are checked when it is made. Every change gives a new scene.
     point_depths       -> images, points          right_columns -> point_observations
     plane_observations -> images, planes          line_depths   -> line_observations
     pose_priors        -> frames                  line_intervals -> lines
-    camera_motions     -> images
-    camera_positions   -> images                  marks -> images, control_points
-    camera_poses       -> images                  distances, known_planes, known_directions, held -> any objects
+    camera_motions, camera_positions, camera_poses -> images      marks -> images, control_points
+    distances, known_planes, known_directions, held -> any objects
 
 Each column declares in its table what it refers to and how it changes when the world moves (see
 :func:`groma.scene.table.column`); checks, selections and transforms here go by that.
@@ -69,9 +68,8 @@ class Scene:
     images: Images = field(default_factory=Images)
     #: 3D points.
     points: Points = field(default_factory=Points)
-    #: Points seen in images.
+    #: Points seen in images; 2D points without a 3D point.
     point_observations: PointObservations = field(default_factory=PointObservations)
-    #: 2D points without a 3D point.
     keypoints: Keypoints = field(default_factory=Keypoints)
     #: 3D lines.
     lines: Lines = field(default_factory=Lines)
@@ -85,17 +83,14 @@ class Scene:
     directions: Directions = field(default_factory=Directions)
     #: Which landmarks belong together.
     relations: Relations = field(default_factory=Relations)
-    #: Depths of points.
+    #: Depths of points; observed points in the right images of stereo pairs.
     point_depths: PointDepths = field(default_factory=PointDepths)
-    #: Observed points in the right images of stereo pairs.
     right_columns: RightColumns = field(default_factory=RightColumns)
-    #: Inverse depths of the ends of observed segments.
+    #: Inverse depths of the ends of observed segments; planes measured in the cameras.
     line_depths: LineDepths = field(default_factory=LineDepths)
-    #: Planes measured in the cameras.
     plane_observations: PlaneObservations = field(default_factory=PlaneObservations)
-    #: Poses known beforehand.
+    #: Poses known beforehand; images that were read row by row, and how their cameras moved meanwhile.
     pose_priors: PosePriors = field(default_factory=PosePriors)
-    #: Images that were read row by row, and how their cameras moved meanwhile.
     camera_motions: CameraMotions = field(default_factory=CameraMotions)
     #: Measured places and poses of cameras.
     camera_positions: CameraPositions = field(default_factory=CameraPositions)
