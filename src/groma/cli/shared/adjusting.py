@@ -152,7 +152,9 @@ def _adjusted(
 
     surveyed = bool(wanted.measured) or before.has_survey
     if not surveyed and wanted.protocol is not None:
-        raise InputError("--protocol is of measurements; there are none. Add --positions, --control or --distances.")
+        raise InputError(
+            "--protocol is of measurements; there are none. Add --positions, --control, --distances or others."
+        )
     if not surveyed and wanted.rolling_shutter is None and not len(before.camera_motions):
         return before, adjust(before, options, progress), None, None
     from groma.adjustment.rolling_shutter import adjust_rolling_shutter, motions_of, with_rolling_shutter

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.special import polygamma
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.assemble import LINE_FACTORS, AssemblyOptions, assemble
+from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.gates import gate
 from groma.mapping.noise.landmarks import GATES as LANDMARK_GATES
@@ -88,14 +88,14 @@ def line_end_correlation(scene: Scene) -> float:
 
     Segments of lines that few images see follow their line and are left out; where no others are, it is zero.
     """
-    problem = assemble(scene, AssemblyOptions(points=False, planes=False)).problem
+    assembly = assemble(scene, AssemblyOptions(points=False, planes=False))
     images = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
     ends = [np.zeros((0, 2))]
-    for factor in problem.factors:
-        if factor.type_name not in LINE_FACTORS:
+    for group, factor in zip(assembly.groups, assembly.problem.factors, strict=True):
+        if group.observes != "lines":
             continue  # measurements of other instruments
         told = images[factor.line.index] >= GATES.min_views  # type: ignore[attr-defined]
-        residual, unit = residuals_of(factor, problem.variables), np.asarray(factor.sqrt_information)
+        residual, unit = residuals_of(factor, assembly.problem.variables), np.asarray(factor.sqrt_information)
         # Where a camera sees behind itself, each end has a weight of its own.
         weighted = residual * unit[:, None] if unit.ndim == 1 else np.einsum("nij,nj->ni", unit, residual)
         ends.append(weighted[told])
