@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from groma.adjustment.parts import adjust_parts, write_parts
     from groma.adjustment.report import AdjustResult
     from groma.adjustment.survey.align import Alignment, align
-    from groma.adjustment.survey.attach import Survey
+    from groma.adjustment.survey.given import Survey
     from groma.adjustment.survey.records import Reliability
     from groma.adjustment.survey.reliability import reliability
     from groma.adjustment.uncertainty import uncertainty
@@ -123,7 +123,7 @@ _HOME = {
     "Solution": "groma.solver.solve",
     "SolveReport": "groma.solver.report",
     "SolverOptions": "groma.solver.options",
-    "Survey": "groma.adjustment.survey.attach",
+    "Survey": "groma.adjustment.survey.given",
     "SurveyedResult": "groma.mapping.surveyed",
     "Termination": "groma.solver.termination",
     "TrackOptions": "groma.tracking",
