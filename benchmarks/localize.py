@@ -29,6 +29,8 @@ from groma.mapping.photographs import image_files, read_gray
 
 #: Shares of queries within these distances (metres) and angles (degrees) are told.
 LIMITS = ((0.01, 1.0), (0.02, 2.0), (0.05, 5.0))
+#: Orders of its blocks that each image is cut into.
+SHUFFLES = 4
 
 
 def main() -> None:
@@ -45,7 +47,7 @@ def main() -> None:
     held_of.add_argument("--align", action="store_true")
     held_of.add_argument("--every", type=int, default=1, help="take every N-th query")
     wrong_of.add_argument("others", type=Path, nargs="*")
-    wrong_of.add_argument("--limit", type=int, default=1000)
+    wrong_of.add_argument("--limit", type=int, default=1000, help="photographs of a folder at most")
     given = parser.parse_args()
     if given.command == "stairs":
         told = stairs(given.data)
@@ -205,11 +207,11 @@ def wrong(map_: Path, images: Path, others: list[Path], limit: int) -> dict[str,
     localizer = Localizer(map_, images)
     rng = np.random.default_rng(0)
     told: dict[str, object] = {}
-    own = [read_gray(path) for path in localizer.files[: max(limit // 4, 1)]]
+    own = [read_gray(path) for path in image_files(images)[:limit]]
     kinds = {
         "mirrored": [np.ascontiguousarray(image[:, ::-1]) for image in own],
         "upside down and mirrored": [np.ascontiguousarray(image[::-1]) for image in own],
-        "blocks in another order": [_shuffled(image, rng) for image in own],
+        "blocks in another order": [_shuffled(image, rng) for image in own for _ in range(SHUFFLES)],
         "noise": [rng.integers(0, 256, own[0].shape, dtype=np.uint8) for _ in range(3)],
         "blank": [np.full_like(own[0], level) for level in (0, 128, 255)],
     }

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Counts as a person reads them, for every sentence, table and message."""
+"""Numbers as a person reads them: counts in every sentence, table and message, and numbers in names."""
+
+from __future__ import annotations
+
+import re
 
 
 def counted(count: int, plural: str) -> str:
@@ -7,4 +11,10 @@ def counted(count: int, plural: str) -> str:
     return f"{count:,} {plural.removesuffix('s') if count == 1 else plural}"
 
 
-__all__ = ["counted"]
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Return a key by which img2 comes before img10."""
+    parts = re.split(r"(\d+)", name)
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
+
+
+__all__ = ["counted", "natural_key"]

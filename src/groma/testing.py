@@ -19,7 +19,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.errors import InputError
-from groma.geometry import se3
+from groma.geometry import se3, sim3
 from groma.geometry.manifold import AMBIENT_SIZE, FACTOR_COLUMNS, Manifold
 
 if TYPE_CHECKING:
@@ -185,8 +185,10 @@ def _check_round_trips(
 
 
 def _factor_coordinates(manifold: Manifold, state: FloatArray, moved: FloatArray) -> FloatArray:
-    """What factors differentiate by, up to a constant: the left twist for poses, the ambient numbers otherwise."""
+    """What factors differentiate by: left tangents of poses and similarities, else ambient numbers up to a constant."""
     ambient = manifold.ambient(moved)
+    if manifold.kind == "similarity":
+        return sim3.log(sim3.compose(ambient, sim3.inverse(manifold.ambient(state))))
     if manifold.kind != "pose":
         return ambient
     here, there = (se3.from_matrix(a.reshape(-1, 3, 4)) for a in (manifold.ambient(state), ambient))

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 import groma
-from groma.adjustment.lens import LensGates, radial_field, unmodelled_distortion
+from groma.adjustment.misfit.lens import LensGates, radial_field, unmodelled_distortion
 from groma.cameras import in_model, model
 from groma.cli.app import app
 from groma.errors import InputError

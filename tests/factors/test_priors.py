@@ -16,8 +16,9 @@ from groma.factors.contract import Ref
 from groma.factors.priors.pose_between import PoseBetween
 from groma.factors.priors.pose_prior import PosePrior
 from groma.factors.priors.position_prior import PositionPrior
+from groma.factors.priors.similarity_between import SimilarityBetween
 from groma.factors.priors.vector_prior import VectorPrior
-from groma.geometry import se3
+from groma.geometry import se3, sim3
 
 pytestmark = pytest.mark.kernels
 N = 6
@@ -142,3 +143,30 @@ def test_wrong_shapes_are_refused(rng):
         VectorPrior(variable=EACH, measured=np.zeros((N + 1, 3)))
     with pytest.raises(ShapeError, match="has 2 columns, but the variables of group 'poses' have 3 numbers"):
         _residuals(VectorPrior(variable=EACH, measured=np.zeros((N, 2))), (np.zeros((N, 3)),))
+
+
+def test_similarity_between_is_the_error_in_the_unit_of_the_second_camera(rng):
+    """Residuals of an error that is applied on the right of the measured similarity, against products of matrices."""
+
+    def some(count):
+        return np.hstack([random_poses(rng, count, rotation=2.0), rng.uniform(0.4, 2.5, (count, 1))])
+
+    first, second, error = some(N), some(N), 0.3 * rng.normal(size=(N, 7))
+    S1, S2 = sim3.to_matrix(first), sim3.to_matrix(second)
+    E = np.array([expm(sim3.hat(x)) for x in error])
+    measured = sim3.from_matrix(S1 @ np.linalg.inv(S2) @ np.linalg.inv(E))
+    factor = SimilarityBetween(first=EACH, second=Ref("others", np.arange(N)), first_from_second=measured)
+    expected = np.hstack([E[:, :3, 3], error[:, 3:]])
+    np.testing.assert_allclose(_residuals(factor, (first, second)), expected, atol=1e-12)
+
+
+def test_similarity_between_of_poses_is_that_of_poses_to_first_order(rng):
+    first, second = random_poses(rng, N, rotation=1.0), random_poses(rng, N, rotation=1.0)
+    measured = se3.compose(se3.compose(first, se3.inverse(second)), se3.exp(1e-6 * rng.normal(size=(N, 6))))
+    others = Ref("others", np.arange(N))
+    poses = PoseBetween(first=EACH, second=others, first_from_second=measured)
+    one = np.ones((N, 1))
+    scaled = SimilarityBetween(first=EACH, second=others, first_from_second=np.hstack([measured, one]))
+    r = _residuals(scaled, (np.hstack([first, one]), np.hstack([second, one])))
+    expected = _residuals(poses, (poses_from_states(first), poses_from_states(second)))
+    np.testing.assert_allclose(r, np.hstack([expected, 0 * one]), atol=1e-11)

@@ -10,6 +10,7 @@ from groma.geometry.charts.line_charts import LINE_CHARTS, CartesianLine
 from groma.geometry.charts.plane_charts import PLANE_CHARTS, NormalOffsetPlane
 from groma.geometry.charts.point3 import POINT_CHARTS, from_homogeneous, to_homogeneous
 from groma.geometry.charts.pose_charts import POSE_CHARTS, PoseBody, PoseLeft, PoseRight
+from groma.geometry.charts.similarity import SIMILARITY_CHARTS
 from groma.geometry.charts.unit3 import DIRECTION_CHARTS, Unit3
 from groma.geometry.manifold import Euclidean
 from groma.testing import check_manifold
@@ -18,6 +19,7 @@ pytestmark = pytest.mark.kernels
 
 TABLES = {
     "pose": POSE_CHARTS,
+    "similarity": SIMILARITY_CHARTS,
     "line": LINE_CHARTS,
     "plane": PLANE_CHARTS,
     "direction": DIRECTION_CHARTS,

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 from worlds import CAMERA, make_world, project
 
 import groma
@@ -10,6 +11,10 @@ from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3, so3
 from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
 from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.pieces import cells_elsewhere
+from groma.localization.pose.refinement import fitted
+from groma.localization.pose.verdict import votes_of_a_rival
 
 #: What wrong matches may still do: the loss leaves them a small weight. A pixel is 0.007 here.
 OUTLIERS = 5e-4
@@ -152,6 +157,46 @@ def test_two_places_that_fit_equally_well_are_told_as_two():
     # Where the second place has few of them, there is no doubt.
     kept = np.concatenate([np.arange(60), 60 + rng.permutation(60)[:10]])
     assert estimate_absolute_pose(CAMERA, pixels[kept], both[kept]).status == "localized"
+
+
+def _in_pieces(world, rng, moved):
+    """A world whose right half is seen ``moved`` pixels from where it is; with wrong matches."""
+    half = world.points2d[:, 0] > CAMERA.width / 2
+    points2d = np.where(half[:, None], world.points2d + moved, world.points2d)
+    wrong = rng.permutation(len(half))[: len(half) // 4]
+    points2d[wrong] = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (len(wrong), 2))
+    return points2d
+
+
+def test_what_is_put_together_of_pieces_is_not_believed():
+    rng, believed = np.random.default_rng(12), []
+    for _ in range(5):
+        world = make_world(rng, points=300)
+        pieces = estimate_absolute_pose(CAMERA, _in_pieces(world, rng, [0.0, 150.0]), world.points3d)
+        assert pieces.status == "uncertain", pieces.sentence
+        whole = estimate_absolute_pose(CAMERA, _in_pieces(world, rng, [0.0, 0.0]), world.points3d)
+        believed.append(whole.status)
+    assert believed == ["localized"] * 5
+
+
+def test_cells_that_are_off_like_their_neighbours_are_counted():
+    rng = np.random.default_rng(13)
+    world = make_world(rng, points=300, lines=0)
+    pose = np.array(world.pose)
+    for moved, wrong, low, high in (([0.0, 150.0], 0, 100, 160), ([0.0, 0.0], 0, 0, 0), ([0.0, 0.0], 150, 0, 20)):
+        pixels = world.points2d + np.where(world.points2d[:, :1] > CAMERA.width / 2, moved, 0.0)
+        rows = rng.permutation(300)[:wrong]
+        pixels[rows] = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (wrong, 2))
+        matches = Matches(pixels, world.points3d)
+        found = fitted(CAMERA, matches, pose, (7.0, 7.0))
+        assert low <= cells_elsewhere(found, matches, 34.0) <= high
+
+
+def test_a_rival_needs_so_many_votes():
+    for agree in (5, 40, 400):
+        votes = votes_of_a_rival(agree)
+        assert 2.0 * binom.cdf(votes, agree + votes, 0.5) > 1e-3
+        assert votes == 0 or 2.0 * binom.cdf(votes - 1, agree + votes - 1, 0.5) <= 1e-3
 
 
 def test_points_on_a_line_do_not_determine_a_pose():

@@ -91,6 +91,21 @@ def test_what_is_not_in_the_map_is_not_found(place, localizer):
         assert localizer.localize(picture).pose.status != "localized", name
 
 
+def test_mirrored_photographs_of_the_place_are_not_localized(place, localizer):
+    for name in QUERIES[::2]:
+        image = cv2.imread(str(place / "queries" / name), cv2.IMREAD_GRAYSCALE)
+        assert localizer.localize(np.ascontiguousarray(image[:, ::-1])).pose.status != "localized", name
+
+
+def test_photographs_in_shuffled_pieces_are_not_localized(place, localizer):
+    rng = np.random.default_rng(1)
+    for name in QUERIES[1::2]:
+        image = cv2.imread(str(place / "queries" / name), cv2.IMREAD_GRAYSCALE)
+        blocks = rng.permutation(image.reshape(3, 160, 4, 160).swapaxes(1, 2).reshape(-1, 160, 160))
+        shuffled = np.ascontiguousarray(blocks.reshape(3, 4, 160, 160).swapaxes(1, 2).reshape(image.shape))
+        assert localizer.localize(shuffled).pose.status != "localized", name
+
+
 def test_the_mirror_image_of_descriptors_is_that_of_the_image(place):
     image = cv2.imread(str(place / "queries" / QUERIES[3]), cv2.IMREAD_GRAYSCALE)
     flipped = np.ascontiguousarray(image[:, ::-1])
@@ -104,12 +119,12 @@ def test_the_mirror_image_of_descriptors_is_that_of_the_image(place):
 
 def test_photographs_whose_mirror_image_fits_far_better_are_doubted():
     right = Verdict("localized", 1.0, "all agree.")
-    many, few = Evidence(300, 400, -500.0), Evidence(110, 400, -50.0)
-    assert doubted_if_mirrored(right, 100, many).status == "uncertain"
-    assert "mirror" in doubted_if_mirrored(right, 100, many).sentence
+    own, many, few = Evidence(100, 400, -100.0), Evidence(300, 400, -500.0), Evidence(110, 400, -104.0)
+    assert doubted_if_mirrored(right, own, many).status == "uncertain"
+    assert "mirror" in doubted_if_mirrored(right, own, many).sentence
     # What is symmetric fits both ways, and most photographs are not mirrored.
-    assert doubted_if_mirrored(right, 100, few) is right
-    assert doubted_if_mirrored(right, 300, few) is right
+    assert doubted_if_mirrored(right, own, few) is right
+    assert doubted_if_mirrored(right, many, own) is right
 
 
 def test_the_index_is_kept_and_made_anew_for_another_map(place, localizer):

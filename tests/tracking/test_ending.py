@@ -59,7 +59,7 @@ def _state(track_map: TrackMap) -> list[np.ndarray]:
 def test_joining_maps_changes_neither_of_them_and_shifts_shared_features_once():
     one, two = _map(0.0), _map(3.0)
     before = [*_state(one), *_state(two)]
-    there = np.array([0, 0, 0, 1, -3.0, 0, 0])
+    there = np.array([0, 0, 0, 1, -3.0, 0, 0, 1])
     for _ in range(2):
         joined = joined_map(one, two, there)
         np.testing.assert_allclose(joined.points.xyz[6:], one.points.xyz, atol=1e-12)
@@ -75,7 +75,7 @@ def test_joining_maps_changes_neither_of_them_and_shifts_shared_features_once():
 
 def _joint(older: int, newer: int) -> Joint:
     same = np.arange(6)
-    return Joint(older, 0, newer, 0, np.array([0, 0, 0, 1, 0, 0, 0.0]), same, same)
+    return Joint(older, 0, newer, 0, np.array([0, 0, 0, 1, 0, 0, 0.0, 1]), same, same)
 
 
 @pytest.mark.parametrize("order", [[(0, 1), (0, 2)], [(1, 2), (0, 2)], [(0, 2), (1, 2)], [(0, 1), (1, 2), (0, 2)]])

@@ -15,7 +15,8 @@ from groma._typing import FloatArray
 from groma.adjustment.assemble import Assembly, AssemblyOptions, assemble, disassemble
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.fit import inliers, noise_of
-from groma.adjustment.lens import unmodelled_distortion
+from groma.adjustment.misfit.lens import unmodelled_distortion
+from groma.adjustment.misfit.rig import rig_that_does_not_fit
 from groma.adjustment.pixel_residuals import redundancy_of, squared_residuals_px
 from groma.adjustment.places import at_places_of
 from groma.adjustment.relation_outcome import drop_failed_relations
@@ -23,7 +24,6 @@ from groma.adjustment.report import AdjustReport, AdjustResult, Progress, not_co
 from groma.adjustment.rescue.clusters import settle_clusters
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
-from groma.adjustment.rig_fit import rig_that_does_not_fit
 from groma.adjustment.stages import (
     METRIC_LOSS,
     METRIC_RELATION_LOSS,
@@ -35,6 +35,7 @@ from groma.adjustment.stages import (
 )
 from groma.adjustment.survey.place import settled
 from groma.adjustment.terms.contract import Term
+from groma.adjustment.terms.objects import with_held_states
 from groma.errors import InputError
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
@@ -175,7 +176,7 @@ def adjust(
 
 def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
     """Adjust a scene that begins and ends where measurements of other instruments fit best."""
-    if not (scene.is_surveyed and options.refine_poses):
+    if not (scene.is_tied and options.refine_poses):
         return _adjusted(scene, options, progress)
     result = _adjusted(settled(scene), options, progress)
     after = settled(result.scene)
@@ -241,10 +242,10 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         if stopped:
             break
         for renew in () if last else (renew_lines, settle_clusters):
-            problem, renewed = renew(scene, problem, options.threads)
+            problem, renewed = with_held_states(problem, *renew(scene, problem, options.threads))
             moved.append(renewed)
         if not isinstance(loss, Trivial) and solution.report.iterations:
-            problem, renewed = without_slips(problem, options.threads)
+            problem, renewed = with_held_states(problem, *without_slips(problem, options.threads))
             moved.append(renewed)
             if last and problem is not solution.problem:
                 reports[-1] = with_costs_at(reports[-1], problem)

@@ -40,11 +40,13 @@ from groma.factors.observations.point_depth import PointDepth
 from groma.factors.observations.point_reprojection import PointReprojection
 from groma.factors.observations.stereo_line import StereoLine
 from groma.factors.observations.stereo_point import StereoPoint
-from groma.factors.priors.camera_distance import CameraDistance
-from groma.factors.priors.point_distance import PointDistance
+from groma.factors.priors.distance import Distance
+from groma.factors.priors.known_direction import CameraDirection, KnownDirection
+from groma.factors.priors.on_known_plane import OnKnownPlane
 from groma.factors.priors.pose_between import PoseBetween
 from groma.factors.priors.pose_prior import PosePrior
 from groma.factors.priors.position_prior import PositionPrior
+from groma.factors.priors.similarity_between import SimilarityBetween
 from groma.factors.priors.vector_prior import VectorPrior
 from groma.factors.relations.line_direction import LineDirection
 from groma.factors.relations.line_on_plane import LineOnPlane, SegmentOnPlane
@@ -76,14 +78,16 @@ __all__ = [
     "LOSSES",
     "WORLD_FIXED",
     "Barron",
-    "CameraDistance",
+    "CameraDirection",
     "Cauchy",
+    "Distance",
     "Example",
     "Factor",
     "FactorCheck",
     "GemanMcClure",
     "Huber",
     "Invariance",
+    "KnownDirection",
     "LineBearing",
     "LineDirection",
     "LineNormal",
@@ -95,6 +99,7 @@ __all__ = [
     "LineToPixel",
     "LinesMeeting",
     "Loss",
+    "OnKnownPlane",
     "OrthogonalDirections",
     "OrthogonalLines",
     "OrthogonalPlanes",
@@ -106,7 +111,6 @@ __all__ = [
     "PlanePerpendicularToDirection",
     "PlaneQuaternion",
     "PointDepth",
-    "PointDistance",
     "PointOnLine",
     "PointOnPlane",
     "PointOnPlanePixels",
@@ -120,6 +124,7 @@ __all__ = [
     "SegmentOnPlanePixels",
     "SelfCheckReport",
     "SelfCheckRow",
+    "SimilarityBetween",
     "Slot",
     "SoftL1",
     "StereoLine",

@@ -68,6 +68,8 @@ from groma.geometry.manifold import AMBIENT_SIZE, Euclidean
 
 #: Kinds whose size is not fixed; their slot is (name, kind, size).
 FREE_KINDS = ("intrinsics", "vector")
+#: Kinds of variables that a function may take.
+KINDS = (*(kind for kind in AMBIENT_SIZE if kind != "similarity"), *FREE_KINDS)
 
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
@@ -142,10 +144,10 @@ def _read_slots(name: str, slots: Sequence[tuple]) -> tuple[tuple[Slot, ...], tu
     read, sizes = [], []
     reserved = {field.name for field in dataclasses.fields(UserFactor)} | set(dir(UserFactor))
     for slot in slots:
-        if not 2 <= len(slot) <= 3 or slot[1] not in (*AMBIENT_SIZE, *FREE_KINDS):
+        if not 2 <= len(slot) <= 3 or slot[1] not in KINDS:
             raise InputError(
                 f"A slot of factor {name!r} must be (name, kind), or (name, kind, size) for the kinds "
-                f"{', '.join(FREE_KINDS)}; got {slot!r}. Kinds: {', '.join((*AMBIENT_SIZE, *FREE_KINDS))}."
+                f"{', '.join(FREE_KINDS)}; got {slot!r}. Kinds: {', '.join(KINDS)}."
             )
         if (len(slot) == 3) != (slot[1] in FREE_KINDS):
             raise InputError(

@@ -11,7 +11,7 @@ A *manifold* describes one kind of variable. Three sizes belong to it:
     numbers of a minimal increment :math:`\delta` (a pose: 6; a line: 4; a plane: 3).
 
 Factors differentiate with respect to the *factor coordinates* of a kind, never with respect to a chart: the ambient
-numbers themselves, except for poses, where it is the left twist :math:`\xi` of
+numbers themselves, except for poses and similarities, where it is the left twist :math:`\xi` of
 :math:`T_{cw} \leftarrow \mathrm{Exp}(\xi)\,T_{cw}`. A chart supplies the matrix :meth:`Manifold.basis`
 :math:`B = \partial(\text{factor coordinates})/\partial\delta` at :math:`\delta = 0`; the chain
 :math:`\partial r/\partial\delta = \partial r/\partial(\text{factor coordinates})\; B` joins any residual to any chart.
@@ -29,8 +29,8 @@ import numpy as np
 from groma._typing import FloatArray
 
 #: Numbers read by factors, and columns of a factor's Jacobian, per kind. ``intrinsics`` and ``vector`` have any size.
-AMBIENT_SIZE = {"pose": 12, "point": 3, "line": 6, "plane": 4, "direction": 3}
-FACTOR_COLUMNS = {"pose": 6, "point": 3, "line": 6, "plane": 4, "direction": 3}
+AMBIENT_SIZE = {"pose": 12, "point": 3, "line": 6, "plane": 4, "direction": 3, "similarity": 8}
+FACTOR_COLUMNS = {"pose": 6, "point": 3, "line": 6, "plane": 4, "direction": 3, "similarity": 7}
 
 
 class Manifold(ABC):
@@ -38,7 +38,7 @@ class Manifold(ABC):
 
     #: Name of the chart, as options and files spell it, for example ``"cartesian"``.
     name: ClassVar[str]
-    #: ``pose``, ``point``, ``line``, ``plane``, ``direction``, ``intrinsics`` or ``vector``.
+    #: ``pose``, ``point``, ``line``, ``plane``, ``direction``, ``similarity``, ``intrinsics`` or ``vector``.
     kind: ClassVar[str]
     state_size: int
     ambient_size: int

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from groma._typing import FloatArray, IntArray
 from groma.features.matching.wide_baseline import match_wide_baseline
@@ -14,7 +13,7 @@ from groma.features.segments import Segments
 from groma.localization.features import DescribedImage, unit
 from groma.localization.line_matching import SeenLines, lines_near
 from groma.localization.map_index import MapIndex
-from groma.localization.matching import MATCHES, match_descriptors
+from groma.localization.matching import match_descriptors, pairs_near
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.matches import Matches
 from groma.scene import Scene
@@ -46,28 +45,21 @@ class Candidates:
 
 def described_alike(
     query: DescribedImage, scene: Scene, index: MapIndex, images: IntArray, lines: bool = True
-) -> tuple[Candidates, IntArray]:
-    """Match a query with some images of a map, one after the other.
-
-    Returns
-    -------
-    Candidates, (k,) int
-        What matches, and the number of matching points of each image.
-    """
+) -> Candidates:
+    """Match a query with some images of a map, one after the other."""
     vectors = unit(query.points.descriptors)
     points: list[IntArray] = [np.zeros((0, 2), np.int64)]
-    segments, count = points.copy(), []
+    segments = points.copy()
     determined = np.isfinite(index.line_covariance[:, 0, 0])
     for image in images.tolist():
         own = slice(index.begin[image], index.begin[image + 1])
         pairs = match_descriptors(vectors, unit(index.descriptor[own]))
         points.append(np.column_stack([pairs[:, 0], index.point[own][pairs[:, 1]]]))
-        count.append(len(pairs))
         if lines:
             places = np.hstack([query.points.pixels[pairs[:, 0]], index.pixel[own][pairs[:, 1]]])
             segments.append(_alike_lines(query, scene, index, image, places))
     found = np.unique(np.concatenate(segments), axis=0)
-    return Candidates(np.unique(np.concatenate(points), axis=0), found[determined[found[:, 1]]]), np.array(count)
+    return Candidates(np.unique(np.concatenate(points), axis=0), found[determined[found[:, 1]]])
 
 
 def _alike_lines(query: DescribedImage, scene: Scene, index: MapIndex, image: int, places: FloatArray) -> IntArray:
@@ -113,20 +105,20 @@ def found_near(
 def _points_near(
     query: DescribedImage, index: MapIndex, images: IntArray, camera: QueryCamera, pose: FloatArray, reach: float
 ) -> IntArray:
-    none = np.zeros((0, 2), np.int64)
     rows = np.concatenate([np.arange(int(index.begin[i]), int(index.begin[i + 1])) for i in images])
-    expected = camera.project(pose, index.xyz[index.point[rows]])
-    inside = camera.inside(expected, reach)
-    rows, expected = rows[inside], expected[inside]
+    seen = np.zeros(len(index.xyz), bool)
+    seen[index.point[rows]] = True
+    point = np.flatnonzero(seen)
+    expected = np.full((len(index.xyz), 2), np.nan)
+    expected[point] = camera.project(pose, index.xyz[point])
+    rows = rows[camera.inside(expected[index.point[rows]], reach)]
     if not len(rows) or not len(query.points):
-        return none
-    near = KDTree(expected).sparse_distance_matrix(KDTree(query.points.pixels), reach, output_type="ndarray")
-    first, second = near["i"], near["j"]
-    one, other = unit(index.descriptor[rows]), unit(query.points.descriptors)
-    far = np.sqrt(np.maximum(2.0 - 2.0 * np.einsum("nk,nk->n", one[first], other[second]), 0.0))
-    alike = np.flatnonzero(far <= MATCHES.distance)
-    alike = alike[np.argsort(far[alike], kind="stable")]
-    pairs = np.column_stack([second[alike], index.point[rows[first[alike]]]])
+        return np.zeros((0, 2), np.int64)
+    first, second, far = pairs_near(
+        expected[index.point[rows]], index.descriptor[rows], query.points.pixels, query.points.descriptors, reach
+    )
+    order = np.argsort(far, kind="stable")
+    pairs = np.column_stack([second[order], index.point[rows[first[order]]]])
     # The nearest in description for the point of the query, and for that of the map.
     best = [np.isin(np.arange(len(pairs)), np.unique(pairs[:, side], return_index=True)[1]) for side in (0, 1)]
     return pairs[best[0] & best[1]]

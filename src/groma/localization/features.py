@@ -7,7 +7,7 @@ things everyone should know to improve object retrieval*, 2012), in bytes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -62,6 +62,10 @@ class DescribedPoints:
     def __len__(self) -> int:
         return len(self.pixels)
 
+    def take(self, rows: IntArray) -> DescribedPoints:
+        """The chosen points."""
+        return DescribedPoints(self.pixels[rows], self.sigma[rows], self.descriptors[rows], self.upright[rows])
+
     def joined(self, other: DescribedPoints) -> DescribedPoints:
         """These points and others."""
         return DescribedPoints(
@@ -85,6 +89,10 @@ class DescribedImage:
     segments: Segments
     #: (m, 72) of the segments.
     segment_descriptors: Descriptors
+
+    def with_points(self, points: DescribedPoints) -> DescribedImage:
+        """The same segments, and other points."""
+        return replace(self, points=points)
 
 
 def find_points(image: GrayImage, gates: FeatureGates = FEATURES) -> DescribedPoints:

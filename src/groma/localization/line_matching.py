@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.matching.descriptor import Descriptors
 from groma.features.segments import Segments
@@ -31,6 +32,55 @@ class GuidedLineGates:
 GATES = GuidedLineGates()
 
 
+# ---------------------------------------------------------------------------------------------------------- Kernels
+@loop
+def _near(lines, segments, reach, angle, overlap, rows, columns):
+    """Pairs of images of lines and segments that are near, of about one direction, and side by side.
+
+    The number of them that is returned may be more than the arrays hold.
+    """
+    count = 0
+    for i in range(lines.shape[0]):
+        u, v = lines[i, 0, 0], lines[i, 0, 1]
+        du, dv = lines[i, 1, 0] - u, lines[i, 1, 1] - v
+        length = max(np.sqrt(du * du + dv * dv), 1e-9)
+        du, dv = du / length, dv / length
+        for k in range(segments.shape[0]):
+            x, y = segments[k, 0, 0] - u, segments[k, 0, 1] - v
+            across = y * du - x * dv
+            if not (-reach <= across <= reach):
+                continue
+            x2, y2 = segments[k, 1, 0] - u, segments[k, 1, 1] - v
+            other = y2 * du - x2 * dv
+            if not (-reach <= other <= reach):
+                continue
+            first, second = x * du + y * dv, x2 * du + y2 * dv
+            own = max(np.sqrt((other - across) ** 2 + (second - first) ** 2), 1e-9)
+            if abs(other - across) > angle * own:
+                continue
+            common = min(max(first, second), length) - max(min(first, second), 0.0)
+            if common < overlap * own:
+                continue
+            if count < len(rows):
+                rows[count], columns[count] = i, k
+            count += 1
+    return count
+
+
+@loop
+def _most_alike(rows, columns, begin, of_lines, of_segments, out):
+    """Largest product of a descriptor of a line with that of a segment, for each pair."""
+    for n in range(rows.shape[0]):
+        best = np.float32(-1.0)
+        for k in range(begin[rows[n]], begin[rows[n] + 1]):
+            product = np.float32(0.0)
+            for j in range(of_lines.shape[1]):
+                product += of_lines[k, j] * of_segments[columns[n], j]
+            best = max(best, product)
+        out[n] = best
+
+
+# ----------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True, eq=False)
 class SeenLines:
     """Lines of a map, each with descriptors from some of its images."""
@@ -69,14 +119,32 @@ def lines_near(
     if not len(segments) or not len(seen.ends) or not len(seen.owner):
         return np.zeros((0, 2), np.int64)
     straight = camera.straight(segments.ends.reshape(-1, 2)).reshape(-1, 2, 2)
-    projected, visible = _projected(camera, pose, seen.ends)
-    near = _near(projected, straight, reach, gates) & visible[:, None]
-    rows, columns = np.nonzero(near)
-    if not len(rows):
+    if np.isnan(straight).all():
         return np.zeros((0, 2), np.int64)
-    far = _descriptor_distance(seen, descriptors)[rows, columns]
-    alike = far <= gates.descriptor
-    return np.column_stack([rows[alike], columns[alike]])
+    projected, visible = _projected(camera, pose, seen.ends)
+    low, high = np.nanmin(straight, axis=(0, 1)) - reach, np.nanmax(straight, axis=(0, 1)) + reach
+    touches = (projected.max(axis=1) >= low) & (projected.min(axis=1) <= high)
+    chosen = np.flatnonzero(visible & touches.all(axis=1))
+    rows, columns = _pairs_near(np.ascontiguousarray(projected[chosen]), straight, reach, gates)
+    order = np.argsort(seen.owner, kind="stable")
+    begin = np.searchsorted(seen.owner[order], np.arange(len(seen.ends) + 1))
+    product = np.empty(len(rows), np.float32)
+    of_lines, of_segments = (np.ascontiguousarray(x, np.float32) for x in (seen.descriptors[order], descriptors))
+    _most_alike(chosen[rows], columns, begin, of_lines, of_segments, product)
+    alike = np.sqrt(np.maximum(2.0 - 2.0 * product.astype(np.float64), 0.0)) <= gates.descriptor
+    return np.column_stack([chosen[rows[alike]], columns[alike]])
+
+
+def _pairs_near(
+    lines: FloatArray, segments: FloatArray, reach: float, gates: GuidedLineGates
+) -> tuple[IntArray, IntArray]:
+    count = 4 * len(segments)
+    while True:
+        rows, columns = np.empty((2, count), np.int64)
+        found = _near(lines, segments, reach, gates.angle, gates.overlap, rows, columns)
+        if found <= count:
+            return rows[:found], columns[:found]
+        count = found
 
 
 def _projected(camera: QueryCamera, pose: FloatArray, ends: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -93,31 +161,6 @@ def _projected(camera: QueryCamera, pose: FloatArray, ends: FloatArray) -> tuple
     cut[~visible] = 1.0
     K = camera.matrix
     return cut[..., :2] / cut[..., 2:] * K[[0, 1], [0, 1]] + K[:2, 2], visible
-
-
-def _near(lines: FloatArray, segments: FloatArray, reach: float, gates: GuidedLineGates) -> BoolArray:
-    """Which of (L, M) images of lines and segments are near, of about the same direction, and side by side."""
-    way = lines[:, 1] - lines[:, 0]
-    length = np.maximum(np.linalg.norm(way, axis=1), 1e-9)
-    along = way / length[:, None]
-    normal = np.column_stack([-along[:, 1], along[:, 0]])
-    offset = segments[None] - lines[:, None, None, 0]
-    across = np.abs(np.einsum("lmek,lk->lme", offset, normal)).max(axis=2)
-    place = np.einsum("lmek,lk->lme", offset, along)
-    own = segments[:, 1] - segments[:, 0]
-    own_length = np.maximum(np.linalg.norm(own, axis=1), 1e-9)
-    turn = np.abs(np.einsum("mk,lk->lm", own / own_length[:, None], normal))
-    common = np.minimum(place.max(axis=2), length[:, None]) - np.maximum(place.min(axis=2), 0.0)
-    with np.errstate(invalid="ignore"):
-        return (across <= reach) & (turn <= gates.angle) & (common >= gates.overlap * own_length)
-
-
-def _descriptor_distance(seen: SeenLines, descriptors: Descriptors) -> FloatArray:
-    """Least distance (L, M) of the descriptors of each line from those of segments."""
-    product = seen.descriptors @ descriptors.T
-    best = np.full((len(seen.ends), len(descriptors)), -1.0, np.float32)
-    np.maximum.at(best, seen.owner, product)
-    return np.sqrt(np.maximum(2.0 - 2.0 * best.astype(np.float64), 0.0))
 
 
 __all__ = ["GATES", "GuidedLineGates", "SeenLines", "lines_near"]

@@ -16,11 +16,11 @@ from groma._log import log_warnings, logged_stages
 from groma._typing import IntArray
 from groma.errors import InputError
 from groma.features.images import GrayImage, to_gray
-from groma.features.segments import Segments
 from groma.gates import gate
 from groma.io import read_scene
-from groma.localization.candidates import described_alike, found_near
-from groma.localization.features import DescribedImage, find_features, mirrored
+from groma.localization.candidates import Candidates, described_alike, found_near
+from groma.localization.features import DescribedImage, DescribedPoints, find_features, mirrored
+from groma.localization.landmarks import DescribedLandmarks, coarsest, counted_in, seen_in
 from groma.localization.map_images import image_paths, images_in_summary
 from groma.localization.map_index import images_told, kept_index
 from groma.localization.pose.absolute_pose import UNKNOWN_LENS, AbsolutePose, PoseOptions, pose_from_matches
@@ -38,6 +38,10 @@ class LocalizerGates:
     """How much of a map a query is compared with."""
 
     images: int = gate(8, "images", "of the map, the most alike, matched with a query", "cost: of matching")
+    plain: int = gate(
+        50, "cells", "that agree with a pose from coarse points; where fewer do, everything is matched",
+        "convention: a vote of 50 is good to a seventh",
+    )  # fmt: skip
     near: int = gate(5, "images", "of those, whose points and lines are looked for near a pose", "cost: of matching")
 
 
@@ -69,6 +73,9 @@ class LocalizedImage:
     #: Seconds that it took: finding features, and the rest.
     feature_seconds: float
     seconds: float
+
+
+_Found = tuple[AbsolutePose, Candidates]
 
 
 class Localizer:
@@ -112,6 +119,8 @@ class Localizer:
         if self.warning:
             log_warnings("localization", [self.warning])
         self._retrieval = VladRetrieval(self.index.vocabulary)
+        upright = np.arange(len(self.index.xyz)) >= len(self.index.xyz) - self.scene.num_points
+        self._landmarks = DescribedLandmarks.of(self.index, upright)
 
     def camera_of_map(self, width: int, height: int) -> QueryCamera | None:
         """The camera of the map for images of this size; None where there is none, or more than one."""
@@ -158,8 +167,43 @@ class Localizer:
         start = time.perf_counter()
         query = find_features(gray, camera, self.options.lines, self.options.min_segment_length)
         described = time.perf_counter()
-        images = self._alike(query)
-        found, count = described_alike(query, self.scene, self.index, images, self.options.lines)
+        images = self._alike(query.points)
+        pose, last = self._coarsely(query, camera, options, images)
+        if pose.status != "localized" or pose.votes < self.options.gates.plain:
+            pose, last = self._fully(query, camera, options, images)
+        done = time.perf_counter()
+        return LocalizedImage(pose, last.points[:, 1], last.lines[:, 1], described - start, done - described)
+
+    def _coarsely(self, query: DescribedImage, camera: QueryCamera, options: PoseOptions, images: IntArray) -> _Found:
+        """Look for the coarsest points among all that the images see: enough where the place is plain."""
+        few = query.with_points(query.points.take(coarsest(query.points)))
+
+        def matched(points: DescribedPoints, images: IntArray) -> Candidates:
+            return Candidates(self._landmarks.match(points, seen_in(self.index, images)), np.zeros((0, 2), np.int64))
+
+        return self._pose(query, few, camera, options, images, matched(few.points, images), matched)
+
+    def _fully(self, query: DescribedImage, camera: QueryCamera, options: PoseOptions, images: IntArray) -> _Found:
+        """Match everything, lines too, with one image after the other."""
+
+        def matched(points: DescribedPoints, images: IntArray) -> Candidates:
+            return described_alike(query.with_points(points), self.scene, self.index, images, lines=False)
+
+        found = described_alike(query, self.scene, self.index, images, self.options.lines)
+        return self._pose(query, query, camera, options, images, found, matched)
+
+    def _pose(
+        self,
+        query: DescribedImage,
+        part: DescribedImage,
+        camera: QueryCamera,
+        options: PoseOptions,
+        images: IntArray,
+        found: Candidates,
+        matched: Callable[[DescribedPoints, IntArray], Candidates],
+    ) -> _Found:
+        """The pose from matches of a part of a query, those that it guides to, and what mirrored points match."""
+        count = counted_in(self.index, images, found.points[:, 1])
         near = images[np.argsort(-count, kind="stable")[: self.options.gates.near]]
         last = [found]
 
@@ -172,22 +216,19 @@ class Localizer:
             return last[0].matches(query, self.scene, self.index)
 
         def mirror() -> Matches:
-            other = replace(query, points=mirrored(query.points, camera.width), segments=Segments.empty())
-            alike, _ = described_alike(other, self.scene, self.index, images, lines=False)
-            return alike.matches(other, self.scene, self.index)
+            points = mirrored(part.points, camera.width)
+            return matched(points, self._alike(points)).matches(part.with_points(points), self.scene, self.index)
 
-        pose = pose_from_matches(
-            camera, found.matches(query, self.scene, self.index), options, max(len(images), 1), guided, mirror
-        )
-        done = time.perf_counter()
-        return LocalizedImage(pose, last[0].points[:, 1], last[0].lines[:, 1], described - start, done - described)
+        matches = found.matches(part, self.scene, self.index)
+        pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, mirror)
+        return pose, last[0]
 
-    def _alike(self, query: DescribedImage) -> IntArray:
+    def _alike(self, points: DescribedPoints) -> IntArray:
         """The images of the map to match with, the most alike first."""
         wanted = self.options.gates.images
         if len(self.index.image) <= wanted:
             return np.arange(len(self.index.image))
-        described = self._retrieval.gather(query.points.descriptors)
+        described = self._retrieval.gather(points.descriptors)
         return np.argsort(-self._retrieval.similarity(described, self.index.image), kind="stable")[:wanted]  # type: ignore[arg-type]
 
 

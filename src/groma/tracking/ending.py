@@ -95,7 +95,7 @@ class Ending:
         places = Places.apart(mapper.maps)
         for joint in mapper.joints.values():
             places = self._joined(places, joint)
-        if mapper.metric and mapper.options.close_loops:
+        if mapper.options.close_loops:
             for one, two in combinations(range(len(mapper.maps)), 2):
                 if places.where[one][0] != places.where[two][0]:
                     places = self._searched(places, one, two)
@@ -108,7 +108,7 @@ class Ending:
         mapper = self._mapper
         joint = self.attempt(
             f"the search for places common to maps {one + 1} and {two + 1}",
-            lambda: best_joint(mapper.maps, mapper.camera, one, two, mapper.options.gates),
+            lambda: best_joint(mapper.maps, mapper.camera, one, two, mapper.options),
             None,
             changes=(),
         )
@@ -121,6 +121,8 @@ class Ending:
     def adjust(self, number: int) -> Adjusted:
         """Adjust all keyframes of a map together, and with planes that are found in its points and lines."""
         mapper, turn = self._mapper, self._mapper.right.turn
+        if mapper.options.close_loops and not mapper.metric:
+            self.attempt("the loops of one camera", lambda: mapper.close_scaled_loops(number), None, changes=(number,))
         report, turn = self.attempt(
             "the adjustment of all keyframes", lambda: mapper.adjust_at_end(number), (None, turn), changes=(number,)
         )

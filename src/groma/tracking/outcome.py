@@ -13,7 +13,7 @@ from groma.geometry import se3
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
 from groma.tracking.backend.submaps import Submap
-from groma.tracking.map.track_map import TrackMap
+from groma.tracking.map.track_map import TrackMap, in_unit
 
 #: What a frame can be.
 TRACKED, FOUND, WEAK, LOST, SKIPPED, STARTING = "tracked", "found", "weak", "lost", "skipped", "starting"
@@ -66,6 +66,7 @@ class Entry:
 
     timestamp: float
     keyframe: int
+    #: (7,) in the unit of the keyframe.
     cam_from_keyframe: FloatArray
     #: The map of the keyframe.
     submap: int = 0
@@ -89,7 +90,7 @@ class History:
         """Keep a pose in terms of the keyframe that is followed."""
         keyframe = track_map.near
         relative = se3.compose(pose[None], se3.inverse(keyframe.pose[None]))[0]
-        self.entries.append(Entry(timestamp, keyframe.index, relative, submap))
+        self.entries.append(Entry(timestamp, keyframe.index, in_unit(relative, 1.0 / keyframe.unit), submap))
 
     def joined(self, where: Sequence[tuple[int, int]]) -> None:
         """Take note of maps that were put into others."""
@@ -106,7 +107,8 @@ class History:
         times = np.array([entry.timestamp for entry in entries])
         near = np.array([entry.keyframe for entry in entries])
         poses = np.array([track_map.pose_of(entry.keyframe) for entry in entries])
-        poses = se3.compose(np.array([entry.cam_from_keyframe for entry in entries]), poses)
+        moved = [in_unit(entry.cam_from_keyframe, track_map.unit_of(entry.keyframe)) for entry in entries]
+        poses = se3.compose(np.array(moved), poses)
         number = {keyframe.timestamp: keyframe.index for keyframe in track_map.keyframes}
         own = np.array([number.get(time, -1) for time in times.tolist()])
         rows = np.flatnonzero(own >= 0)

@@ -115,9 +115,15 @@ def read_saved_map(folder: str | os.PathLike[str]) -> SavedMap:
     missing = f"{path} is no map to track in: its summary.json does not tell"
     try:
         told = json.loads((path / "summary.json").read_text(encoding="utf-8"))
-        sources = tuple(_source(one) for one in told["sources"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        of_photographs = "sources" not in told and isinstance(told.get("images"), str)
+        sources = () if of_photographs else tuple(_source(one) for one in told["sources"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{missing} where the frames of its keyframes are. {remedy}") from error
+    if of_photographs:
+        raise InputError(
+            f"{path} is a map of photographs, made by groma map: tracking goes on in maps of groma track, whose "
+            f"keyframes are of the camera of the sequence. Place frames in it: groma localize {path} FRAMES -o OUT."
+        )
     scene = read_scene(path / "scene.npz")
     known = {name for source in sources for name in source.images}
     unknown = [name for name in scene.images.names if name not in known]

@@ -10,7 +10,7 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.factors.contract import Invariance, Slot
-from groma.geometry import so3
+from groma.geometry import quaternion, sim3, so3
 from groma.geometry.manifold import AMBIENT_SIZE
 
 Ambients = tuple[FloatArray, ...]
@@ -54,6 +54,9 @@ def _moved(slot: Slot, ambient: FloatArray, motion: WorldMotion) -> FloatArray:
             pose[:, :, :3] = pose[:, :, :3] @ R.T
             pose[:, :, 3] -= pose[:, :, :3] @ t
         return pose.reshape(-1, 12)
+    if slot.kind == "similarity":
+        back = sim3.inverse(np.concatenate([quaternion.from_matrix(R), t, [s]]))
+        return sim3.compose(ambient, back) if slot.in_world else ambient
     if slot.kind not in AMBIENT_SIZE or not slot.in_world:
         return ambient
     first = ambient[:, :3] @ R.T
@@ -92,7 +95,7 @@ def check_invariance(
     """
     if not lives_in_the_world(slots):
         return
-    in_camera = any(slot.kind == "pose" for slot in slots)
+    in_camera = any(slot.kind in ("pose", "similarity") for slot in slots)
     before = residuals(ambients)
     for motion in motions_of(invariance, rng):
         after = residuals(moved_world(slots, ambients, motion))

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from groma._names import natural_key
+from groma._counted import natural_key
 from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError, InputError
 from groma.io.endings import IMAGES

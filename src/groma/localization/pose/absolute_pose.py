@@ -19,16 +19,20 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
 from groma.localization.pose.matches import Matches
+from groma.localization.pose.pieces import cells_elsewhere
 from groma.localization.pose.refinement import Refined, fitted, refine
 from groma.localization.pose.verdict import (
     Evidence,
     Status,
     Verdict,
+    doubted_if_in_pieces,
     doubted_if_mirrored,
     evidence_of,
     judge,
     median_distance,
+    most_votes,
     moved,
+    votes_of_a_rival,
 )
 
 
@@ -79,6 +83,8 @@ class AbsolutePose:
     sigma0: float = 1.0
     #: Another pose that fits about as well, where there is one.
     rival: FloatArray | None = None
+    #: Cells of the image, and lines, that agreed before more matches were looked for where the pose says.
+    votes: int = 0
 
     @property
     def center(self) -> FloatArray | None:
@@ -186,16 +192,21 @@ def pose_from_matches(
     if best is None:
         return _failed(camera, matches)
     first = evidence_of(best, matches, places)
-    other = _rival(matches, best, options, places) if options.look_for_rival and first.significant else None
+    own = best
+    other = _rival(matches, best, options, places, first) if options.look_for_rival and first.significant else None
     used = matches
     if guided is not None and first.significant:
         used = guided(best)
         errors = _errors(used, options)
         best = refine(best.camera, used, best.pose, errors, options.refine_lens)
-        first = evidence_of(fitted(best.camera, matches, best.pose, errors, options.refine_lens), matches, places)
+        own = fitted(best.camera, matches, best.pose, errors, options.refine_lens)
+        first = evidence_of(own, matches, places)
     covariance = best.covariance(used)
     distance = median_distance(best.pose, _seen(used, best))
     verdict = judge(best, covariance, distance, first, None if other is None else other[1])
+    if verdict.status == "localized":
+        beyond = VERDICT.distinct * max_errors(matches)[0]
+        verdict = doubted_if_in_pieces(verdict, first.agree, cells_elsewhere(own, matches, beyond))
     if mirror is not None and verdict.status == "localized":
         verdict = _unless_mirrored(verdict, best, mirror(), matches, options)
     failed = verdict.status == "failed"
@@ -211,6 +222,7 @@ def pose_from_matches(
         used,
         best.sigma0,
         None if other is None or verdict.status != "uncertain" else other[0].pose,
+        first.agree,
     )
 
 
@@ -219,24 +231,33 @@ def _unless_mirrored(
 ) -> Verdict:
     """Return a verdict, or another one where the mirror image of a photograph fits clearly better."""
     points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
-    other = _best(best.camera, mirror, replace(options, refine_lens=False, focal_factors=(1.0,)))
-    if other is None:
-        return verdict
-    own = 0
-    if points.num_points:
-        own = evidence_of(fitted(best.camera, points, best.pose, _errors(points, options)), points).agree
-    return doubted_if_mirrored(verdict, own, evidence_of(other, mirror))
+    own = evidence_of(fitted(best.camera, points, best.pose, _errors(points, options)), points)
+    # Of what agrees as well, half as many must.
+    other = _best_of_others(best.camera, mirror, options, own.agree // 2)
+    return verdict if other is None else doubted_if_mirrored(verdict, own, evidence_of(other, mirror))
 
 
 def _errors(matches: Matches, options: PoseOptions) -> tuple[float, float]:
     return max_errors(matches) if options.max_error is None else (options.max_error, options.max_error)
 
 
-def _best(camera: QueryCamera, matches: Matches, options: PoseOptions) -> Refined | None:
-    """The pose that most agrees with, refined; None where there is none. Of several focal lengths the best."""
+def _best_of_others(camera: QueryCamera, matches: Matches, options: PoseOptions, votes: int) -> Refined | None:
+    """The best pose of matches, if it may get so many votes; it is not looked for longer than those would take."""
+    possible = most_votes(matches, camera)
+    if possible < max(votes, 1):
+        return None
+    only_this = replace(options, refine_lens=False, focal_factors=(1.0,))
+    return _best(camera, matches, only_this, votes / possible)
+
+
+def _best(camera: QueryCamera, matches: Matches, options: PoseOptions, share: float = 0.0) -> Refined | None:
+    """The pose that most agrees with, refined; None where there is none. Of several focal lengths the best.
+
+    ``share`` is the least share of the matches that such a pose is of interest with.
+    """
     errors = _errors(matches, options)
     starts = [_with_focal_length(camera, factor) for factor in options.focal_factors]
-    found = [(propose(straightened(one, matches), errors, options.seed), one) for one in starts]
+    found = [(propose(straightened(one, matches), errors, options.seed, share), one) for one in starts]
     refined = [refine(one, matches, pose, errors, options.refine_lens) for pose, one in found if pose is not None]
     return max(refined, key=lambda one: int(one.point_inliers.sum() + one.line_inliers.sum()), default=None)
 
@@ -249,12 +270,14 @@ def _with_focal_length(camera: QueryCamera, factor: float) -> QueryCamera:
     return QueryCamera(camera.model, params, camera.width, camera.height)
 
 
-def _rival(matches: Matches, best: Refined, options: PoseOptions, places: int) -> tuple[Refined, Evidence] | None:
+def _rival(
+    matches: Matches, best: Refined, options: PoseOptions, places: int, first: Evidence
+) -> tuple[Refined, Evidence] | None:
     """The best pose of what disagrees with the first, if it is another one."""
     squares = [np.where(np.isfinite(one.square), one.square, np.inf) for one in (best.points, best.lines)]
     left = [square > 4.0 * best.limit for square in squares]
     rest = matches.take(left[0], left[1])
-    other = _best(best.camera, rest, replace(options, refine_lens=False, focal_factors=(1.0,)))
+    other = _best_of_others(best.camera, rest, options, votes_of_a_rival(first.agree))
     if other is None:
         return None
     found = evidence_of(other, rest, places)

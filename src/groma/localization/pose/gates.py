@@ -17,6 +17,7 @@ class HypothesisGates:
         2.0, "1", "of that residual for poses from few matches", "derived from noise: such poses are noisier themselves"
     )
     confidence: float = gate(0.9999, "probability", "that one sample held no outlier", "convention: PoseLib's default")
+    min_trials: int = gate(1000, "samples", "drawn at least", "convention: PoseLib's default")
     max_trials: int = gate(20_000, "samples", "drawn at most", "cost: half a second")
     min_matches: int = gate(4, "matches", "a pose is not looked for in fewer", "derived from P3P: three and one more")
 
@@ -59,6 +60,11 @@ class VerdictGates:
     distinct: float = gate(
         5.0, "thresholds", "by which another pose moves what is seen, in the median", "derived from noise: well beyond"
     )
+    beside: float = gate(0.125, "share", "of the longer side: cells as near are neighbours", "convention: an eighth")
+    bend: float = gate(
+        0.15, "share", "of their distance, by which neighbours may be off differently",
+        "derived from perspective: as between views 10 degrees apart",
+    )  # fmt: skip
 
 
 #: The numbers in use.

@@ -60,7 +60,11 @@ def max_errors(matches: Matches, gates: HypothesisGates = HYPOTHESES) -> tuple[f
 
 
 def propose(
-    straight: Straight, errors: tuple[float, float], seed: int, gates: HypothesisGates = HYPOTHESES
+    straight: Straight,
+    errors: tuple[float, float],
+    seed: int,
+    share: float = 0.0,
+    gates: HypothesisGates = HYPOTHESES,
 ) -> FloatArray | None:
     """Return the pose (7,) cam_from_world that most matches agree with; None without one.
 
@@ -72,6 +76,8 @@ def propose(
         Of :func:`max_errors`, pixels.
     seed
         Of the samples.
+    share
+        A pose that a smaller share of the matches agrees with is of no interest, and need not be found.
     gates
         Numbers of the search.
     """
@@ -82,7 +88,7 @@ def propose(
         return None
     settings = {
         "max_reproj_error": errors[0], "max_epipolar_error": errors[1], "seed": seed,
-        "success_prob": gates.confidence, "max_iterations": gates.max_trials,
+        "success_prob": gates.confidence, "min_iterations": gates.min_trials, "max_iterations": _trials(share, gates),
     }  # fmt: skip
     ends, lines = matches.segments2d, matches.segments3d
     if matches.num_lines:
@@ -100,6 +106,16 @@ def propose(
     rotation = quaternion.from_matrix(np.asarray(found.R, np.float64)[None])[0].astype(np.float32).astype(np.float64)
     shift = np.asarray(found.t, np.float64).astype(np.float32).astype(np.float64)
     return np.concatenate([rotation / np.linalg.norm(rotation), shift])
+
+
+def _trials(share: float, gates: HypothesisGates) -> int:
+    """How many samples of three hold one without outliers, if so many matches are none; three times as many, since
+    noise spoils some.
+    """
+    if share <= 0.0:
+        return gates.max_trials
+    wanted = 3.0 * np.log1p(-gates.confidence) / np.log1p(-(min(share, 0.99) ** 3))
+    return int(np.clip(wanted, gates.min_trials, gates.max_trials))
 
 
 __all__ = ["Straight", "max_errors", "propose", "straightened"]

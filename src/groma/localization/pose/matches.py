@@ -97,7 +97,11 @@ _OF_LINES = ("segments2d", "segments3d", "segment_sigma", "line_covariance")
 def _groups(rows: npt.NDArray[np.float64]) -> IntArray:
     if not len(rows):
         return np.zeros(0, np.int64)
-    return np.unique(rows, axis=0, return_inverse=True)[1].ravel().astype(np.int64)
+    order = np.lexsort(rows.T)
+    changes = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    group = np.zeros(len(rows), np.int64)
+    group[order[1:]] = np.cumsum(changes)
+    return group
 
 
 def nearest_claims(claim: IntArray, distance: FloatArray, agrees: BoolArray) -> BoolArray:

@@ -26,6 +26,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
@@ -55,6 +56,32 @@ _SINGULAR = 1e-10
 _LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
 
 
+# ---------------------------------------------------------------------------------------------------------- Kernels
+@loop
+def _widen(image, derivative, covariance, rows, out):
+    """Inverse roots of the noise of the image and of the landmarks together."""
+    size = covariance.shape[1]
+    for n in range(image.shape[0]):
+        determinant = image[n, 0, 0] * image[n, 1, 1] - image[n, 0, 1] * image[n, 1, 0]
+        a, b, c, d = image[n, 1, 1], -image[n, 0, 1], -image[n, 1, 0], image[n, 0, 0]
+        uu, uv = (a * a + b * b) / determinant**2, (a * c + b * d) / determinant**2
+        vv = (c * c + d * d) / determinant**2
+        for i in range(size):
+            first, second = 0.0, 0.0
+            for j in range(size):
+                value = covariance[rows[n], i, j]
+                first += value * derivative[n, 0, j]
+                second += value * derivative[n, 1, j]
+            uu += derivative[n, 0, i] * first
+            uv += derivative[n, 0, i] * second
+            vv += derivative[n, 1, i] * second
+        root = np.sqrt(uu)
+        rest = np.sqrt(vv - uv * uv / uu)
+        out[n, 0, 0], out[n, 0, 1] = 1.0 / root, 0.0
+        out[n, 1, 0], out[n, 1, 1] = -uv / (uu * rest), 1.0 / rest
+
+
+# ----------------------------------------------------------------------------------------------------------- Public
 @dataclass(frozen=True, eq=False)
 class Residuals:
     """What a pose leaves of the matches, in standard deviations, and what it says about the pose."""
@@ -151,7 +178,9 @@ def cells_of(pixels: FloatArray, camera: QueryCamera, cells: int) -> IntArray:
     """Number pixels (N, 2) by the cell of the image that they lie in, cells without any left out."""
     side = max(camera.width, camera.height) / cells
     place = np.floor(pixels / side).astype(np.int64)
-    return np.unique(place, axis=0, return_inverse=True)[1].ravel().astype(np.int64)
+    place -= place.min(axis=0, initial=0)
+    number = place[:, 0] * (place[:, 1].max(initial=0) + 1) + place[:, 1]
+    return np.unique(number, return_inverse=True)[1].ravel().astype(np.int64)
 
 
 def refine(
@@ -177,21 +206,24 @@ def refine(
     gates
         Numbers of the fit.
     """
-    pose, agree = start, 0
+    pose, agree, problem = start, 0, _problem(camera, matches, start, refine_lens)
     for stage in ("wide", "last"):
-        problem = _problem(camera, matches, pose, refine_lens)
         loss = Cauchy(gates.wide_loss) if stage == "wide" else GemanMcClure(last_scale(agree, gates))
-        problem = solve(with_loss(problem, loss), _LENS if refine_lens else _POSE).problem
-        estimated = _camera_of(problem, camera) if refine_lens else camera
+        weighted = with_loss(_with_landmarks(problem, matches), loss)
+        solved = solve(weighted, _LENS if refine_lens else _POSE).problem
+        estimated = _camera_of(solved, camera) if refine_lens else camera
         if estimated is None:
             break
-        pose, camera = problem.variables["frames"].state[0], estimated
+        pose, camera = solved.variables["frames"].state[0], estimated
+        problem = problem.with_states({name: group.state for name, group in solved.variables.items()})
         squares = [
-            residual_squares(problem, name, len(rows))
+            residual_squares(solved, name, len(rows))
             for name, rows in (("points", matches.points2d), ("lines", matches.segments2d))
         ]
         agree = int((np.concatenate(squares) <= chi_square_gate(gates.outlier, 2)).sum())
-    return fitted(camera, matches, pose, max_error, refine_lens, gates)
+    if refine_lens:
+        problem = _problem(camera, matches, pose, False)
+    return _fitted(_with_landmarks(problem, matches), camera, matches, max_error, refine_lens, gates)
 
 
 def last_scale(agree: int, gates: RefinementGates = REFINEMENT) -> float:
@@ -211,11 +243,23 @@ def fitted(
     gates: RefinementGates = REFINEMENT,
 ) -> Refined:
     """Say which matches agree with a pose as it is; parameters as of :func:`refine`."""
-    problem = _problem(camera, matches, pose, False)
-    sigma0 = _noise(problem, matches, max_error, gates)
+    problem = _with_landmarks(_problem(camera, matches, pose, False), matches)
+    return _fitted(problem, camera, matches, max_error, refine_lens, gates)
+
+
+def _fitted(
+    problem: Problem,
+    camera: QueryCamera,
+    matches: Matches,
+    max_error: tuple[float, float],
+    refine_lens: bool,
+    gates: RefinementGates,
+) -> Refined:
+    pose = problem.variables["frames"].state[0]
     lens = _lens_columns(camera) if refine_lens else []
     points = residuals(problem, "points", matches.num_points, lens)
     lines = residuals(problem, "lines", matches.num_lines, lens)
+    sigma0 = _noise((points, lines), matches, max_error, gates)
     limit = chi_square_gate(gates.outlier, 2) * sigma0**2
     near = (points.square <= limit, (lines.square <= limit) & _in_front(camera, matches, pose))
     agree = [
@@ -262,7 +306,7 @@ def residuals(problem: Problem, landmarks: str, count: int, lens: Sequence[int] 
         seen = (record != 0.0).any(axis=(1, 2))  # what cannot be evaluated is zero
         value[rows[seen]] = white[seen, :, -1]
         by_pose[rows[seen], :, : len(kept)] = white[seen][:, :, kept]
-        spread[rows] = 1.0 / np.abs(np.linalg.det(weight))
+        spread[rows] = 1.0 / np.abs(weight[:, 0, 0] * weight[:, 1, 1] - weight[:, 0, 1] * weight[:, 1, 0])
     return Residuals(value, by_pose, spread)
 
 
@@ -271,7 +315,7 @@ def _lens_columns(camera: QueryCamera) -> list[int]:
 
 
 def _problem(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool) -> Problem:
-    """The problem of one pose; what is not known of the landmarks is added to the noise of the image."""
+    """The problem of one pose, with the noise of the image alone."""
     image = np.zeros(matches.num_points, np.int64), np.zeros(matches.num_lines, np.int64)
     scene = Scene.from_images(
         camera.table(), ["query"], [0], pose[None],
@@ -284,34 +328,40 @@ def _problem(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_len
             image[1], np.arange(matches.num_lines), matches.segments2d.reshape(-1, 4), matches.segment_sigma
         ),
     )  # fmt: skip
-    problem = assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem
+    return assemble(scene, replace(_ASSEMBLY, refine_intrinsics=refine_lens)).problem
+
+
+def _with_landmarks(problem: Problem, matches: Matches) -> Problem:
+    """Return a problem whose noise holds that of its landmarks, too, as they are seen from where its pose is."""
     covariances = {"points": matches.point_covariance, "lines": matches.line_covariance}
-    return Problem(problem.variables, [_with_landmarks(problem, factor, covariances) for factor in problem.factors])
+    return Problem(problem.variables, [_widened(problem, factor, covariances) for factor in problem.factors])
 
 
-def _with_landmarks(problem: Problem, factor: Factor, covariances: dict[str, FloatArray]) -> Factor:
-    """Return a factor whose noise holds that of its landmarks, too."""
+def _widened(problem: Problem, factor: Factor, covariances: dict[str, FloatArray]) -> Factor:
     for name, covariance in covariances.items():
         rows = landmark_rows(factor, name)
         if rows is None or not covariance.any():
             continue
-        size = covariance.shape[1]
-        J = records(problem, factor, {name[:-1]: size})[..., :size]
-        image = np.linalg.inv(times(factor.sqrt_information, np.eye(2)[None]))
-        noise = image @ np.swapaxes(image, 1, 2) + J @ covariance[rows] @ np.swapaxes(J, 1, 2)
-        return replace(factor, sqrt_information=np.linalg.inv(np.linalg.cholesky(noise)))
+        J = records(problem, factor, {name[:-1]: covariance.shape[1]})
+        image = np.broadcast_to(times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))
+        sqrt_information = np.empty((len(factor), 2, 2))
+        _widen(image, J, covariance, rows, sqrt_information)
+        return replace(factor, sqrt_information=sqrt_information)
     return factor
 
 
-def _noise(problem: Problem, matches: Matches, max_error: tuple[float, float], gates: RefinementGates) -> float:
+def _noise(
+    found: tuple[Residuals, Residuals], matches: Matches, max_error: tuple[float, float], gates: RefinementGates
+) -> float:
     """Noise that the residuals show beside what was stated, from those that are no outliers for sure.
 
     The median of what lies below a limit is too small where noise reaches the limit; the limit is wide.
     """
-    squares, sigmas = [], (matches.point_sigma, matches.segment_sigma)
-    for name, sigma, limit in zip(("points", "lines"), sigmas, max_error, strict=True):
-        found = residuals(problem, name, len(sigma))
-        squares.append(found.square[found.square <= (limit / sigma) ** 2])
+    sigmas = (matches.point_sigma, matches.segment_sigma)
+    squares = [
+        one.square[one.square <= (limit / sigma) ** 2]
+        for one, sigma, limit in zip(found, sigmas, max_error, strict=True)
+    ]
     together = np.concatenate(squares)
     if not len(together):
         return 1.0

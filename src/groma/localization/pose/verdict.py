@@ -133,17 +133,42 @@ def judge(
     return Verdict("localized", probability, f"{agree} agree.")
 
 
-def doubted_if_mirrored(verdict: Verdict, own: int, mirror: Evidence, gates: VerdictGates = VERDICT) -> Verdict:
-    """Return a verdict, or ``uncertain`` where more cells speak for the mirror image than for the photograph (own).
+def doubted_if_mirrored(verdict: Verdict, own: Evidence, mirror: Evidence, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where the mirror image fits far better than the photograph (own).
 
-    Mirrored photographs are rare, and what is symmetric fits both ways: the sign test must exclude that both are alike.
+    Mirrored photographs are as rare as wrong poses may be: by so much less likely by chance must be what agrees with
+    the mirror image.
     """
-    from scipy.special import bdtr
-
-    if not mirror.significant or mirror.agree <= own or bdtr(own, own + mirror.agree, 0.5) > 1.0 - gates.right:
+    if not mirror.significant or mirror.log_alarms > own.log_alarms + math.log(1.0 - gates.right):
         return verdict
-    words = f"{mirror.agree} measurements speak for its mirror image, {own} for the photograph: it may be mirrored."
+    words = (
+        f"{mirror.agree} measurements speak for its mirror image, {own.agree} for the photograph: it may be mirrored."
+    )
     return Verdict("uncertain", 1.0 - gates.right, words)
+
+
+def doubted_if_in_pieces(verdict: Verdict, agree: int, elsewhere: int, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where about as much of the photograph shows the map elsewhere."""
+    if not elsewhere or _tail(elsewhere, agree) <= 1.0 - gates.right:
+        return verdict
+    words = (
+        f"{agree} measurements speak for this place, and {elsewhere} cells of the image show the map where this place "
+        "does not have it: it may repeat itself, or be put together of pieces."
+    )
+    return Verdict("uncertain", 1.0 - gates.right, words)
+
+
+def votes_of_a_rival(agree: int, gates: VerdictGates = VERDICT) -> int:
+    """How many cells must agree with another place for it to make one with so many doubtful."""
+    votes = np.arange(agree + 1)
+    return int(np.argmax(_tail(votes, agree) > 1.0 - gates.right))
+
+
+def most_votes(matches: Matches, camera: QueryCamera, gates: VerdictGates = VERDICT) -> int:
+    """How many cells and segments could agree with a pose at most: those that have matches."""
+    cells = cells_of(matches.points2d, camera, gates.cells)
+    lines = np.unique(matches.segments3d.reshape(-1, 6), axis=0) if matches.num_lines else ()
+    return int(cells.max(initial=-1)) + 1 + len(lines)
 
 
 def moved(camera: QueryCamera, first: FloatArray, second: FloatArray, places: FloatArray) -> float:
@@ -187,9 +212,14 @@ def _as_good(first: Evidence, second: Evidence | None) -> float:
     """Probability that a second pose gets so few votes of both if both are equally good."""
     if second is None or not second.significant:
         return 0.0
+    return float(_tail(np.array(second.agree), first.agree))
+
+
+def _tail(fewer, more):
+    """Probability that of two alike one gets so few votes or fewer."""
     from scipy.special import bdtr
 
-    return min(1.0, 2.0 * float(bdtr(second.agree, first.agree + second.agree, 0.5)))
+    return np.minimum(1.0, 2.0 * bdtr(fewer, fewer + more, 0.5))
 
 
 def _log_choose(n: int, k: int) -> float:
@@ -203,4 +233,15 @@ def _open(sigma: FloatArray) -> str:
     return f"its standard deviation is {shift:.3g} scene units and {turn:.2g} degrees"
 
 
-__all__ = ["Evidence", "Status", "Verdict", "doubted_if_mirrored", "evidence_of", "judge", "median_distance", "moved"]
+__all__ = [
+    "Evidence",
+    "Status",
+    "Verdict",
+    "doubted_if_mirrored",
+    "evidence_of",
+    "judge",
+    "median_distance",
+    "most_votes",
+    "moved",
+    "votes_of_a_rival",
+]

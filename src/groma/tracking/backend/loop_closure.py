@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.pose_graph import motion_problem
+from groma.adjustment.graphs.pose_graph import motion_problem
 from groma.factors.losses import Huber
 from groma.geometry import se3
 from groma.scene.landmarks import Lines
@@ -23,7 +23,7 @@ from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, back, into, planes_back, planes_into
 from groma.tracking.gates import LoopGates, TrackingGates
 from groma.tracking.map.feature_points import match_features
-from groma.tracking.map.landmarks import DEAD
+from groma.tracking.map.landmarks import ALIVE, DEAD
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.depth_check import depth_agreement
 from groma.tracking.pose.relocalise import feature_places, pose_from_matches
@@ -51,11 +51,10 @@ class LoopSearch:
         return out
 
 
-def search_for_loop(track_map: TrackMap, metric: bool, gates: TrackingGates) -> LoopSearch | None:
-    """Return the search that the newest keyframe is worth, or None if it sees what older ones see anyway."""
-    newest = track_map.last
+def search_for_loop(track_map: TrackMap, newest: Keyframe, gates: TrackingGates) -> LoopSearch | None:
+    """Return the search that a keyframe is worth, or None if it sees what older ones see anyway."""
     living = [k for k in track_map.living() if k.index < newest.index - gates.loops.gap]
-    if not living or not metric:
+    if not living:
         return None
     shared = track_map.shared(newest, living)
     if shared.max(initial=0) >= gates.loops.shared:
@@ -78,27 +77,39 @@ def close_loop(
             continue
         found = agreeing_pose(track_map, camera, keyframe, newest, first, second, gates)
         better = found is not None and (best is None or len(found[1]) > len(best[2]))
-        if found is not None and better and _can_be(track_map, keyframe, newest, found[0], gates.loops):
+        if found is not None and better and can_be(track_map, keyframe, newest, found[0], gates.loops):
             best = (keyframe, *found)
     if best is None:
         return False
     keyframe, pose, first, second = best
     measured = se3.compose(keyframe.pose[None], se3.inverse(pose[None]))[0]
-    track_map.loops.append((keyframe.index, newest.index, measured))
+    track_map.loops.append((keyframe.index, newest.index, np.append(measured, 1.0)))
     _spread_error(track_map, gates.loops)
     join_points(track_map, keyframe, newest, first, second)
     return True
 
 
-def _can_be(track_map: TrackMap, keyframe: Keyframe, newest: Keyframe, pose: FloatArray, gates: LoopGates) -> bool:
-    """Whether errors that add up at random between two keyframes explain how far the newest is from a pose (7,)."""
+def can_be(
+    track_map: TrackMap,
+    keyframe: Keyframe,
+    newest: Keyframe,
+    pose: FloatArray,
+    gates: LoopGates,
+    log_scale: float = 0.0,
+) -> bool:
+    """Whether errors that add up at random between two keyframes explain how far the newest is from a pose (7,).
+
+    With one camera the scale is among them: ``log_scale`` is the logarithm of how much it has changed.
+    """
     way = [one for one in track_map.living() if keyframe.index <= one.index <= newest.index]
     centers = se3.inverse(np.array([one.pose for one in way]))[:, 4:]
     lever = float(np.linalg.norm(centers - centers[-1], axis=1).max())
     away = se3.log(se3.compose(pose[None], se3.inverse(newest.pose[None])))[0]
     many = gates.jump * math.sqrt(newest.index - keyframe.index)
-    went = np.linalg.norm(away[:3]) < many * (gates.shift_sigma * newest.depth + gates.turn_sigma * lever)
-    return bool(went and np.linalg.norm(away[3:]) < many * gates.turn_sigma)
+    turned = gates.turn_sigma if log_scale == 0.0 else math.hypot(gates.turn_sigma, gates.scale_sigma)
+    went = np.linalg.norm(away[:3]) < many * (gates.shift_sigma * newest.depth + turned * lever)
+    grew = abs(log_scale) < many * gates.scale_sigma
+    return bool(went and grew and np.linalg.norm(away[3:]) < many * gates.turn_sigma)
 
 
 def agreeing_pose(
@@ -128,11 +139,25 @@ def agreeing_pose(
 def _spread_error(track_map: TrackMap, gates: LoopGates) -> None:
     """Solve the pose graph and move keyframes with what they first saw."""
     living = track_map.living()
-    place = {keyframe.index: k for k, keyframe in enumerate(living)}
     poses = np.array([keyframe.pose for keyframe in living])
+    first, second = neighbours(track_map, living, gates)
+    relative = [se3.compose(poses[first], se3.inverse(poses[second]))]
+    ends, measured = known_loops(track_map, living)
+    first, second = np.concatenate([first, ends[:, 0]]), np.concatenate([second, ends[:, 1]])
+    relative.append(measured[:, :7])
+    held = np.zeros(len(living), dtype=bool)
+    held[0] = True
+    sigma = np.array([gates.shift_sigma] * 3 + [gates.turn_sigma] * 3)
+    weights = np.tile(np.diag((1.0 / sigma) ** 2), (len(first), 1, 1))
+    motions = Motions(first, second, np.concatenate(relative), weights)
+    problem = motion_problem(poses, held, motions, [(np.arange(len(motions)), Huber(gates.loss))])
+    solved = solve(problem, SolverOptions(max_iterations=gates.max_iterations, threads=1))["poses"]
+    move(track_map, living, np.column_stack([solved, np.ones(len(solved))]))
+
+
+def neighbours(track_map: TrackMap, living: list[Keyframe], gates: LoopGates) -> tuple[IntArray, IntArray]:
+    """Return which of the living keyframes hold each other: those that follow each other, or see much the same."""
     first, second = [np.arange(len(living) - 1)], [np.arange(1, len(living))]
-    relative = [se3.compose(poses[:-1], se3.inverse(poses[1:]))]
-    # Keyframes that see the same hold each other too.
     for k, keyframe in enumerate(living):
         begin = max(0, k - gates.held_by)
         earlier = living[begin : max(0, k - 1)]
@@ -140,42 +165,51 @@ def _spread_error(track_map: TrackMap, gates: LoopGates) -> None:
             index = np.flatnonzero(track_map.shared(keyframe, earlier) > 2 * gates.shared) + begin
             first.append(index)
             second.append(np.full(len(index), k))
-            relative.append(se3.compose(poses[index], se3.inverse(np.tile(poses[k], (len(index), 1)))))
-    for one, two, measured in track_map.loops:
-        if one in place and two in place:
-            first.append(np.array([place[one]]))
-            second.append(np.array([place[two]]))
-            relative.append(measured[None])
-    held = np.zeros(len(living), dtype=bool)
-    held[0] = True
-    sigma = np.array([gates.shift_sigma] * 3 + [gates.turn_sigma] * 3)
-    motions = Motions(
-        np.concatenate(first),
-        np.concatenate(second),
-        np.concatenate(relative),
-        np.tile(np.diag((1.0 / sigma) ** 2), (sum(map(len, first)), 1, 1)),
-    )
-    problem = motion_problem(poses, held, motions, [(np.arange(len(motions)), Huber(gates.loss))])
-    solved = solve(problem, SolverOptions(max_iterations=gates.max_iterations, threads=1))["poses"]
-    _move(track_map, living, solved)
+    return np.concatenate(first), np.concatenate(second)
 
 
-def _move(track_map: TrackMap, living: list[Keyframe], poses: FloatArray) -> None:
+def known_loops(track_map: TrackMap, living: list[Keyframe]) -> tuple[IntArray, FloatArray]:
+    """Return the loops of the map: positions (n, 2) among the living keyframes, and similarities (n, 8)."""
+    place = {keyframe.index: k for k, keyframe in enumerate(living)}
+    known = [loop for loop in track_map.loops if loop[0] in place and loop[1] in place]
+    ends = np.array([(place[one], place[two]) for one, two, _ in known], dtype=np.int64).reshape(-1, 2)
+    return ends, np.array([measured for *_, measured in known]).reshape(-1, 8)
+
+
+def move(track_map: TrackMap, living: list[Keyframe], similarities: FloatArray) -> None:
+    """Move keyframes, and what they first saw, to where similarities (n, 8), cam_from_world, say.
+
+    Their scales go into the lengths: what a keyframe saw grows by the inverse of its scale.
+    """
     points, lines, planes = track_map.points, track_map.lines, track_map.planes
     of_plane = np.full(len(planes), -1)
-    for keyframe, new in zip(living, poses, strict=True):
+    grown = {}
+    for keyframe, similarity in zip(living, similarities, strict=True):
+        scale = similarity[7]
+        new = np.concatenate([similarity[:4], similarity[4:7] / scale])
         rows = np.flatnonzero(points.first_keyframe == keyframe.index)
-        points.xyz[rows] = back(new, into(keyframe.pose, points.xyz[rows]))
+        points.xyz[rows] = back(new, into(keyframe.pose, points.xyz[rows]) / scale)
         rows = np.flatnonzero((lines.first_keyframe == keyframe.index) & lines.alive)
         if len(rows):
-            table = Lines.through(back(new, into(keyframe.pose, lines.segment[rows])))
+            table = Lines.through(back(new, into(keyframe.pose, lines.segment[rows]) / scale))
             lines.segment[rows], lines.plucker[rows] = table.segments, table.plucker
         rows = keyframe.measured.planes.index
         rows = np.unique(rows[of_plane[rows] < 0])
         of_plane[rows] = keyframe.index
-        planes.hesse[rows] = planes_back(new, planes_into(keyframe.pose, planes.hesse[rows]))
-        planes.samples[rows] = back(new, into(keyframe.pose, planes.samples[rows]))
-        keyframe.pose = new.copy()
+        planes.hesse[rows] = planes_back(new, planes_into(keyframe.pose, planes.hesse[rows]) / [1.0, 1.0, 1.0, scale])
+        planes.samples[rows] = back(new, into(keyframe.pose, planes.samples[rows]) / scale)
+        keyframe.pose, keyframe.unit, keyframe.depth = new, keyframe.unit / scale, keyframe.depth / scale
+        grown[keyframe.index] = 1.0 / scale
+    track_map.loops = [
+        (one, two, _regrown(measured, grown.get(one, 1.0), grown.get(two, 1.0)))
+        for one, two, measured in track_map.loops
+    ]
+
+
+def _regrown(first_from_second: FloatArray, first: float, second: float) -> FloatArray:
+    """Return a similarity (8,) between cameras whose units are so much longer now."""
+    turn, shift, scale = first_from_second[:4], first_from_second[4:7], first_from_second[7]
+    return np.concatenate([turn, first * shift, [scale * first / second]])
 
 
 def join_points(track_map: TrackMap, old: Keyframe, new: Keyframe, first: IntArray, second: IntArray) -> None:
@@ -200,4 +234,32 @@ def join_points(track_map: TrackMap, old: Keyframe, new: Keyframe, first: IntArr
     track_map.points.state[drop] = DEAD
 
 
-__all__ = ["LoopSearch", "agreeing_pose", "close_loop", "join_points", "search_for_loop"]
+def join_lines(track_map: TrackMap, pairs: IntArray) -> None:
+    """Lines (n, 2) that are the same become one: the first of each pair stays."""
+    state = track_map.lines.state
+    renamed = np.arange(len(track_map.lines))
+    for keep, drop in pairs.tolist():
+        # A pair found before may have joined one of them already.
+        if state[keep] == ALIVE and state[drop] == ALIVE and keep != drop:
+            renamed[renamed == drop] = keep
+            state[drop] = DEAD
+    for keyframe in track_map.living():
+        table = keyframe.measured.lines
+        index = renamed[table.index]
+        if (index != table.index).any():
+            unique = np.unique(index, return_index=True)[1]
+            keyframe.measured = replace(keyframe.measured, lines=replace(table, index=index).take(unique))
+
+
+__all__ = [
+    "LoopSearch",
+    "agreeing_pose",
+    "can_be",
+    "close_loop",
+    "join_lines",
+    "join_points",
+    "known_loops",
+    "move",
+    "neighbours",
+    "search_for_loop",
+]

@@ -17,6 +17,7 @@ from groma.solver.report import SolveReport
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
 from groma.tracking.backend.loop_closure import LoopSearch, close_loop, search_for_loop
 from groma.tracking.backend.plane_outcome import PlaneOutcome, drop_what_failed
+from groma.tracking.backend.scaled_loops import close_scaled_loops
 from groma.tracking.backend.stereo_calibration import correct_map, estimate_turn, shift_between, tells_yaw
 from groma.tracking.backend.submaps import Joint, find_joint, search_older_maps
 from groma.tracking.frame.camera import TrackCamera
@@ -242,15 +243,16 @@ class Mapper:
     def _what_to_search(self) -> LoopSearch | None:
         """Search the older maps until this one is joined to one of them, then this map for loops."""
         newest = len(self.maps) - 1
-        if 0 < newest == self.current and newest not in self.joints and self.metric:
+        if 0 < newest == self.current and newest not in self.joints:
             return search_older_maps(self.maps, self.map.last, self.options.gates)
-        return search_for_loop(self.map, self.metric, self.options.gates)
+        # Those of a single camera are closed at the end: its scale changes then.
+        return search_for_loop(self.map, self.map.last, self.options.gates) if self.metric else None
 
     def _close_loop(self, present: Present, search: LoopSearch, pairs: list) -> None:
         if search.newest is not self.map.keyframes[search.newest.index]:
             return
         if pairs and not any(pair[0] in self.map.living() for pair in pairs):
-            joint = find_joint(self.maps, self.camera, self.current, search.newest, pairs, self.options.gates)
+            joint = find_joint(self.maps, self.camera, self.current, search.newest, pairs, self.options)
             if joint is not None:
                 self.joints[self.current] = joint
                 self.map.pinned.add(joint.newest)
@@ -320,6 +322,10 @@ class Mapper:
         for pool in pools:
             if pool is not None:
                 pool.shutdown(wait=True, cancel_futures=True)
+
+    def close_scaled_loops(self, number: int) -> None:
+        """Close the loops of a map of a single camera."""
+        self.loops += close_scaled_loops(self.maps[number], self.camera, self.options)
 
     def adjust_at_end(self, number: int) -> tuple[SolveReport | None, RightTurn]:
         """Adjust all keyframes of a map together; return the report and how the right camera is turned."""

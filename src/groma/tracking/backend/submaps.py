@@ -10,7 +10,7 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import FloatArray, IntArray
-from groma.geometry import se3
+from groma.geometry import se3, sim3
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
 from groma.scene.landmarks import Lines
@@ -19,9 +19,11 @@ from groma.tracking.backend.loop_closure import (
     agreeing_pose,
     join_points,
 )
+from groma.tracking.backend.place_again import KnownMap, measure_place
 from groma.tracking.frame.camera import TrackCamera, into, planes_into
 from groma.tracking.gates import TrackingGates
-from groma.tracking.map.track_map import Keyframe, TrackMap
+from groma.tracking.map.track_map import Keyframe, TrackMap, in_unit
+from groma.tracking.options import TrackOptions
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Joint:
     keyframe: int
     newer: int
     newest: int
-    #: (7,) pose of the newer camera in terms of the older one.
+    #: (8,) similarity of the newer camera in terms of the older one; its scale is not 1 for maps of a single camera.
     keyframe_from_newest: FloatArray
     #: Matched features that agree.
     first: IntArray
@@ -69,13 +71,13 @@ class Places:
         first, second = joint.first, joint.second
         if other < root:
             root, other, old, new, first, second = other, root, new, old, second, first
-            relative = se3.inverse(relative[None])[0]
+            relative = sim3.inverse(relative)
         if root == other:
             joined, where = self.maps[root].copy(), self.where
         else:
             here, there = self.maps[root].keyframes[old], self.maps[other].keyframes[new]
-            moved = se3.compose(se3.inverse(here.pose[None]), relative[None])
-            joined = joined_map(self.maps[root], self.maps[other], se3.compose(moved, there.pose[None])[0])
+            moved = sim3.compose(sim3.inverse(np.append(here.pose, 1.0)), relative)
+            joined = joined_map(self.maps[root], self.maps[other], sim3.compose(moved, np.append(there.pose, 1.0)))
             shift = len(self.maps[root].keyframes)
             where = tuple((root, number + shift) if held == other else (held, number) for held, number in self.where)
             new += shift
@@ -96,28 +98,43 @@ def find_joint(
     newer: int,
     newest: Keyframe,
     pairs: list[tuple[Keyframe, IntArray, IntArray]],
-    gates: TrackingGates,
+    options: TrackOptions,
 ) -> Joint | None:
-    """Return how a keyframe of a map joins it to another, if what a search found agrees on one pose."""
+    """Return how a keyframe of a map joins it to another, if what a search found agrees on one pose.
+
+    Where a map has no metric scale, enough depths must agree on how its unit compares with that of the other.
+    """
     best: Joint | None = None
     for keyframe, first, second in pairs:
         older = next((k for k, submap in enumerate(maps) if keyframe in submap.living()), newer)
         if older == newer:
             continue
-        found = agreeing_pose(maps[older], camera, keyframe, newest, first, second, gates)
-        if found is not None and (best is None or len(found[1]) > len(best.first)):
-            pose, first, second = found
-            relative = se3.compose(keyframe.pose[None], se3.inverse(pose[None]))[0]
-            best = Joint(older, keyframe.index, newer, newest.index, relative, first, second)
+        joint = None
+        if all(maps[k].is_metric for k in (older, newer)):
+            found = agreeing_pose(maps[older], camera, keyframe, newest, first, second, options.gates)
+            if found is not None:
+                relative = np.append(se3.compose(keyframe.pose[None], se3.inverse(found[0][None]))[0], 1.0)
+                joint = Joint(older, keyframe.index, newer, newest.index, relative, *found[1:])
+        else:
+            known = [KnownMap(maps[k], camera) for k in (older, newer)]
+            place = measure_place(known[0], known[1], keyframe, newest, (first, second), options)
+            if place is not None:
+                relative, matches = place.keyframe_from_newest, place.matches(0)
+                joint = Joint(older, keyframe.index, newer, newest.index, relative, *matches)
+        if joint is not None and (best is None or len(joint.first) > len(best.first)):
+            best = joint
     return best
 
 
-def best_joint(maps: Sequence[TrackMap], camera: TrackCamera, one: int, two: int, gates: TrackingGates) -> Joint | None:
+def best_joint(
+    maps: Sequence[TrackMap], camera: TrackCamera, one: int, two: int, options: TrackOptions
+) -> Joint | None:
     """Return the joint of two maps that most agrees with, over an even choice of the keyframes of both."""
+    gates = options.gates
     older, newer = (_evenly(maps[k].living(), 2 * gates.loops.compared) for k in (one, two))
     best = None
     for newest in newer:
-        joint = find_joint(maps, camera, two, newest, LoopSearch(newest, older, gates).run(), gates)
+        joint = find_joint(maps, camera, two, newest, LoopSearch(newest, older, gates).run(), options)
         if joint is not None and (best is None or len(joint.first) > len(best.first)):
             best = joint
     return best
@@ -129,8 +146,9 @@ def _evenly(keyframes: list[Keyframe], count: int) -> list[Keyframe]:
 
 
 def joined_map(track_map: TrackMap, other: TrackMap, here_from_there: FloatArray) -> TrackMap:
-    """Return a map of all that two maps hold; the other is moved by a pose (7,), and its keyframes come last."""
+    """Return a map of all that two maps hold; the other is moved by a similarity (8,), and its keyframes come last."""
     out, shift = track_map.copy(), len(track_map.keyframes)
+    pose, scale = here_from_there[:7], here_from_there[7]
     start = {}
     for kind in ("points", "lines", "planes"):
         mine, theirs = getattr(out, kind), getattr(other, kind)
@@ -142,34 +160,39 @@ def joined_map(track_map: TrackMap, other: TrackMap, here_from_there: FloatArray
             if name in theirs._columns:
                 getattr(mine, name)[rows] = _shifted(getattr(theirs, name), shift)
     points, lines, planes = (slice(start[kind], None) for kind in ("points", "lines", "planes"))
-    out.points.xyz[points] = into(here_from_there, other.points.xyz)
+    out.points.xyz[points] = into(pose, scale * other.points.xyz)
     alive = np.flatnonzero(other.lines.alive)
     if len(alive):
-        moved = Lines.through(into(here_from_there, other.lines.segment[alive]))
+        moved = Lines.through(into(pose, scale * other.lines.segment[alive]))
         rows = alive + start["lines"]
         out.lines.segment[rows], out.lines.plucker[rows] = moved.segments, moved.plucker
     out.points.plane[points] = _shifted(other.points.plane, start["planes"])
     out.lines.plane[lines] = _shifted(other.lines.plane, start["planes"])
-    out.planes.hesse[planes] = planes_into(here_from_there, other.planes.hesse)
-    out.planes.samples[planes] = into(here_from_there, other.planes.samples)
+    out.points.plane_sigma[points] *= scale
+    out.lines.plane_sigma[lines] *= scale
+    out.planes.hesse[planes] = planes_into(pose, other.planes.hesse * [1.0, 1.0, 1.0, scale])
+    out.planes.samples[planes] = into(pose, scale * other.planes.samples)
     out.planes.merged_into[planes] = _shifted(other.planes.merged_into, start["planes"])
-    there_from_here = se3.inverse(here_from_there[None])
-    out.keyframes += [_moved(keyframe, there_from_here, shift, start) for keyframe in other.keyframes]
-    out.loops += [(one + shift, two + shift, pose) for one, two, pose in other.loops]
+    out.keyframes += [_moved(keyframe, here_from_there, shift, start) for keyframe in other.keyframes]
+    regrown = [np.concatenate([loop[:4], scale * loop[4:7], loop[7:]]) for *_, loop in other.loops]
+    out.loops += [(one + shift, two + shift, loop) for (one, two, _), loop in zip(other.loops, regrown, strict=True)]
     out.pinned |= {index + shift for index in other.pinned}
     return out
 
 
-def _moved(keyframe: Keyframe, there_from_here: FloatArray, shift: int, start: dict[str, int]) -> Keyframe:
+def _moved(keyframe: Keyframe, here_from_there: FloatArray, shift: int, start: dict[str, int]) -> Keyframe:
     """Return a keyframe in the world of another map, under its numbers there."""
     tables = {kind: getattr(keyframe.measured, kind) for kind in start}
     measured = {kind: replace(table, index=table.index + start[kind]) for kind, table in tables.items()}
-    features = keyframe.features
+    features, scale = keyframe.features, here_from_there[7]
+    there_from_here = se3.inverse(here_from_there[None, :7])
     return replace(
         keyframe,
         index=keyframe.index + shift,
         parent=keyframe.parent + shift if keyframe.parent >= 0 else -1,
-        pose=se3.compose(keyframe.pose[None], there_from_here)[0],
+        pose=se3.compose(in_unit(keyframe.pose, scale)[None], there_from_here)[0],
+        unit=scale * keyframe.unit,
+        depth=scale * keyframe.depth,
         measured=replace(keyframe.measured, **measured),
         features=replace(features, point=_shifted(features.point, start["points"])),
     )

@@ -16,6 +16,7 @@ from groma.cameras import model as camera_model
 from groma.errors import InputError
 from groma.geometry import quaternion
 from groma.io.sequences.frame import SequenceCamera
+from groma.localization.pose.camera import QueryCamera
 
 #: Nothing nearer than this share of the focal plane's unit depth is projected, scene units.
 NEAR = 1e-3
@@ -62,6 +63,11 @@ class TrackCamera:
     def matrix_opencv(self) -> FloatArray:
         """(3, 3) calibration matrix in OpenCV's pixels."""
         return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
+
+    @property
+    def query(self) -> QueryCamera:
+        """The same camera, for :func:`groma.estimate_absolute_pose`."""
+        return QueryCamera(PINHOLE, self.params, self.width, self.height)
 
     def bearings(self, pixels: FloatArray) -> FloatArray:
         """(N, 3) rays with z = 1 through pixels."""

@@ -131,6 +131,12 @@ class LoopGates:
     shared: int = gate(30, "points", "a keyframe that shares so much with the new one is no loop", SEQUENCES)
     shift_sigma: float = gate(0.02, "share", "noise of a relative position, of the median depth", SEQUENCES)
     turn_sigma: float = gate(0.01, "rad", "noise of a relative rotation", SEQUENCES)
+    min_scales: int = gate(
+        10, "points", "ratios of depths that agree on a scale", "convention: that of poses found by features"
+    )
+    scale_sigma: float = gate(
+        0.02, "1", "noise of the logarithm of a relative scale, of one camera", "derived from that of positions"
+    )
     jump: float = gate(6.0, "sigma", "a loop moves the newest keyframe by less: places are alike", SEQUENCES)
     held_by: int = gate(
         8, "keyframes", "earlier keyframes that hold each one in the pose graph", "cost: time of a loop"

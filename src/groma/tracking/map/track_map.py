@@ -15,6 +15,11 @@ from groma.tracking.frame.measurements import Measurements
 from groma.tracking.map.landmarks import ALIVE, DEAD, LineTable, MapView, PlaneTable, PointTable
 
 
+def in_unit(motion: FloatArray, unit: float) -> FloatArray:
+    """Return a motion (7,) whose translation was in another unit of length, in that of the world."""
+    return np.concatenate([motion[:4], unit * motion[4:]])
+
+
 @dataclass(eq=False)
 class Keyframe:
     """A frame that stays: its image for patches, what it measures, and its described features."""
@@ -35,6 +40,9 @@ class Keyframe:
     alive: bool = True
     parent: int = -1
     from_parent: FloatArray | None = None
+    #: Length, in the world as it is now, of the unit in which the camera moved when the keyframe was made: loops and
+    #: joints of maps of a single camera change it.
+    unit: float = 1.0
 
     def forget(self) -> None:
         """Let go of everything but the pose."""
@@ -52,7 +60,7 @@ class TrackMap:
     lines: LineTable = field(default_factory=LineTable)
     planes: PlaneTable = field(default_factory=PlaneTable)
     keyframes: list[Keyframe] = field(default_factory=list)
-    #: Pairs of keyframes joined by loop closures, with the measured first_from_second.
+    #: Pairs of keyframes joined by loop closures, with the measured first_from_second (8,): a similarity.
     loops: list[tuple[int, int, FloatArray]] = field(default_factory=list)
     #: The keyframe whose patches are followed: the newest, or an older one that was visited again.
     reference: int = -1
@@ -105,7 +113,14 @@ class TrackMap:
         keyframe = self.keyframes[index]
         if keyframe.from_parent is None:
             return keyframe.pose
-        return se3.compose(keyframe.from_parent[None], self.pose_of(keyframe.parent)[None])[0]
+        return se3.compose(
+            in_unit(keyframe.from_parent, self.unit_of(index))[None], self.pose_of(keyframe.parent)[None]
+        )[0]
+
+    def unit_of(self, index: int) -> float:
+        """Unit of a keyframe, also of one that was dropped: that of the keyframe which tells its pose."""
+        keyframe = self.keyframes[index]
+        return keyframe.unit if keyframe.from_parent is None else self.unit_of(keyframe.parent)
 
     def shared(self, keyframe: Keyframe, others: list[Keyframe]) -> IntArray:
         """How much each of the others sees of what a keyframe sees: points, and lines counted thrice."""
@@ -147,4 +162,4 @@ class TrackMap:
         )
 
 
-__all__ = ["Keyframe", "TrackMap"]
+__all__ = ["Keyframe", "TrackMap", "in_unit"]

@@ -3,7 +3,7 @@
 
 Used when following fails between two frames, and to find the place again after the track was lost. Where a guess of
 the pose exists, features are matched near where it says they are; otherwise each keyframe proposes a pose from all
-matches (perspective from points, with RANSAC). Guesses and proposals are judged by the features and planes that agree
+matches, as a photograph is localised. Guesses and proposals are judged by the features and planes that agree
 with them, and the best are estimated from all that agrees: points, lines and planes.
 """
 
@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads
-from groma.geometry import quaternion, se3
+from groma.geometry import se3
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.features import Descriptors, Features, FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
@@ -93,23 +93,14 @@ def pose_from_matches(
     min_inliers: int = DEFAULT.finding.min_inliers,
     max_error: float = DEFAULT.finding.max_error,
 ) -> tuple[FloatArray, BoolArray] | None:
-    """Pose (7,) from places in the world and their pixels, by P3P with RANSAC, and which agree; None without one."""
-    if len(places) < max(min_inliers, 6):
+    """Pose (7,) from places in the world and their pixels, and which agree; None where chance explains them as well."""
+    options, sigma = PoseOptions(max_error=max_error, look_for_rival=False), 0.5 * max_error
+    pose = estimate_absolute_pose(camera.query, pixel, places, sigma=(sigma, sigma), options=options).cam_from_world
+    if pose is None:
         return None
-    try:
-        found, turn, shift, inliers = cv2.solvePnPRansac(
-            np.ascontiguousarray(places), np.ascontiguousarray(pixel - 0.5), camera.matrix_opencv, np.zeros(0),
-            iterationsCount=500, reprojectionError=max_error, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
-        )  # fmt: skip
-    except cv2.error:  # its last step asserts that the inliers, not known before, are spread well
-        return None
-    if not found or inliers is None or len(inliers) < min_inliers or not np.isfinite(shift).all():
-        return None
-    turned = quaternion.from_matrix(np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64))
-    pose = np.concatenate([turned, np.asarray(shift, dtype=np.float64).ravel()])
-    agree = np.zeros(len(places), dtype=bool)
-    agree[np.asarray(inliers, dtype=np.int64).ravel()] = True
-    return pose, agree
+    away = np.linalg.norm(camera.project(into(pose, places)) - pixel, axis=1)
+    agree: BoolArray = away <= max_error  # what is behind the camera is NaN, and does not
+    return (pose, agree) if agree.sum() >= min_inliers else None
 
 
 @dataclass(frozen=True)
@@ -239,7 +230,7 @@ class _Search:
         return Found(estimate, self.known, agree, lines.take(estimate.lines), score, share)
 
 
-class _Places:
+class Places:
     """Just the places of points, where an estimate wants a table of them."""
 
     def __init__(self, xyz: FloatArray) -> None:
@@ -254,7 +245,7 @@ def _temporary_points(known: KnownFeatures, pairs: IntArray, data: FrameFeatures
     depth_sigma = data.depth_sigma(depth)
     unknown = np.full((count, 2), np.nan)
     table = PointMeasurements(np.arange(count), data.features.pixel[rows], sigma, depth, depth_sigma, unknown)
-    return _Places(known.places[pairs[:, 0]]), table
+    return Places(known.places[pairs[:, 0]]), table
 
 
 def promote(track_map: TrackMap, found: Found, data: FrameFeatures) -> PointTracks:
@@ -316,8 +307,10 @@ def match_planes(
 __all__ = [
     "Found",
     "KnownFeatures",
+    "Places",
     "feature_places",
     "find_pose",
+    "known_features",
     "match_lines",
     "match_near",
     "match_planes",

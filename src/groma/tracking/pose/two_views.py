@@ -30,6 +30,7 @@ from groma._typing import BoolArray, FloatArray
 from groma.adjustment.assemble import assemble
 from groma.factors.losses import Cauchy
 from groma.geometry import quaternion, se3
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
 from groma.scene import Cameras, PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -152,16 +153,11 @@ def continued(
     near = candidate.agrees & (candidate.places[:, 2] < gates.max_depth)
     poses = [candidate.poses[-1]]
     if near.sum() >= 4:
-        places, seen, flags = candidate.places[near], pixels[near] - 0.5, cv2.SOLVEPNP_SQPNP
-        found, turn, shift, _ = cv2.solvePnPRansac(
-            places, seen, camera.matrix_opencv, np.zeros(0), reprojectionError=max_error, flags=flags
-        )
-        pose = (
-            np.concatenate([quaternion.exp(np.asarray(turn, np.float64).ravel()), np.ravel(shift)])
-            if found
-            else poses[0]
-        )
-        poses += [pose] if np.isfinite(pose).all() else []
+        options = PoseOptions(max_error=max_error, look_for_rival=False)
+        found = estimate_absolute_pose(
+            camera.query, pixels[near], candidate.places[near], sigma=(sigma, sigma), options=options
+        ).cam_from_world
+        poses += [] if found is None else [found]
     costs = [np.minimum(_squared(camera, pose, candidate.places, pixels), max_error**2).sum() for pose in poses]
     return replace(candidate, poses=np.concatenate([candidate.poses, poses[int(np.argmin(costs))][None]]))
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.adjustment.lens import median_px, of_points
+from groma.adjustment.misfit.lens import median_px, of_points
 from groma.adjustment.stages import with_loss
 from groma.factors.contract import Factor, Ref
 from groma.factors.losses import Cauchy

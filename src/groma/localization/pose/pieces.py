@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Pieces of a photograph that show the map, but not where a pose says: matches that disagree with it all alike.
+
+Wrong matches disagree at random. Where neighbouring ones are off by the same way in the image, what they show is there,
+in another place than the pose puts it: the photograph repeats the scene, or is put together of pieces.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from groma._typing import FloatArray
+from groma.localization.pose.gates import VERDICT, VerdictGates
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.refinement import Refined, cells_of
+
+
+def cells_elsewhere(refined: Refined, matches: Matches, beyond: float, gates: VerdictGates = VERDICT) -> int:
+    """Return how many cells of an image show the map elsewhere than a pose says, each like a cell beside it.
+
+    Parameters
+    ----------
+    refined, matches
+        The pose, and all that may be seen.
+    beyond
+        Matches that are off by less, pixels, do not disagree for sure.
+    gates
+        Size of the cells; how far neighbours reach, and how much they may differ.
+    """
+    camera = refined.camera
+    cell = cells_of(matches.points2d, camera, gates.cells)
+    expected = camera.project(refined.pose, matches.points3d)
+    off = matches.points2d - expected
+    agreeing = np.unique(cell[refined.point_inliers])
+    with np.errstate(invalid="ignore"):
+        rows = np.flatnonzero((np.linalg.norm(off, axis=1) > beyond) & ~np.isin(cell, agreeing))
+    if len(rows) < 2:
+        return 0
+    side = max(camera.width, camera.height)
+    pixels, cell, off = matches.points2d[rows], cell[rows], off[rows]
+    first, second = KDTree(pixels).query_pairs(gates.beside * side, output_type="ndarray").T
+    alike = (cell[first] != cell[second]) & (
+        _length(off[first] - off[second]) <= gates.bend * _length(pixels[first] - pixels[second])
+    )
+    return len(np.unique(cell[np.concatenate([first[alike], second[alike]])]))
+
+
+def _length(vectors: FloatArray) -> FloatArray:
+    return np.linalg.norm(vectors, axis=1)
+
+
+__all__ = ["cells_elsewhere"]
