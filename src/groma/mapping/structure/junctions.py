@@ -59,7 +59,7 @@ def meetings(marks: Landmarks, level: float, least: float, gates: JunctionGates 
     # Shares of the segments at which the lines come nearest to each other.
     scale = np.maximum(sine, 1e-12) ** 2
     share = tuple(
-        dot(np.cross(between, unit(other)), crossed) / (scale * norm(own))
+        dot(np.asarray(np.cross(between, unit(other)), np.float64), crossed) / (scale * norm(own))
         for own, other in ((along[0], along[1]), (along[1], along[0]))
     )
     pixel = 0.5 * (marks.line_pixel[first] + marks.line_pixel[second])
