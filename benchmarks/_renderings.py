@@ -24,6 +24,8 @@ FLOOR = 3.0
 #: Straight pieces of a rim.
 RIM = 64
 BACKGROUND = 30.0
+#: Which of the six sides of a box is its bottom.
+BOTTOM = 4
 #: Rays per pixel, in either direction.
 SAMPLES = 3
 
@@ -50,6 +52,10 @@ class BoxSettings:
     blur: float = 0.6
     #: "ring": on a wavy ring around the boxes; "random": anywhere above, from near and far, tilted.
     cameras: str = "ring"
+    #: Rectangles on a facade behind the boxes, and how far they lie off its plane, scene units: most are upright and
+    #: nearly in its plane, some turned by a few degrees, some well in front.
+    num_panels: int = 0
+    rough: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +66,11 @@ class RenderedScene:
     images: list[np.ndarray]
     #: (E, 2, 3) visible pieces of edges.
     edges: np.ndarray
+    #: Corners of the faces, the face that each point lies on (-1: a round body), and the plane that each face is meant
+    #: to lie in.
+    faces: list[np.ndarray]
+    face_of_point: np.ndarray
+    plane_of_face: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,23 +83,28 @@ class _Round:
     shade: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _World:
     polygons: list[np.ndarray]
     shades: list[float]
     edges: np.ndarray
     rounds: list[_Round]
+    #: Numbers of planes, one for each polygon; faces of one plane have the same.
+    planes: list[int]
 
 
 def render_boxes(settings: BoxSettings) -> RenderedScene:
     """Make the world of a seed, its images and its visible edges."""
     rng = np.random.default_rng(settings.seed)
     world = _boxes(settings, rng)
-    poses = _scattered(settings, rng) if settings.cameras == "random" else _ring(settings, rng)
+    if settings.num_panels:
+        _add_facade(world, settings, rng)
+    places = {"random": _scattered, "ring": _ring, "front": _front}[settings.cameras]
+    poses = places(settings, rng)
     camera = np.array([settings.focal, settings.focal, settings.width / 2, settings.height / 2])
     blotches = [_blotches(rng, settings.blotches) for _ in world.polygons] if settings.texture else None
     images = [_picture(world, pose, camera, settings, blotches, rng) for pose in poses]
-    points, observations = _points(world, poses, camera, settings, rng)
+    points, observations, face_of_point = _points(world, poses, camera, settings, rng)
     scene = Scene.from_images(
         Cameras(np.array([1]), ("PINHOLE",), camera[None], np.array([settings.width]), np.array([settings.height])),
         [f"{i:03d}.png" for i in range(len(poses))],
@@ -97,7 +113,8 @@ def render_boxes(settings: BoxSettings) -> RenderedScene:
         points=points,
         point_observations=observations,
     )
-    return RenderedScene(scene, images, _visible(world, poses, camera, settings))
+    edges = _visible(world, poses, camera, settings)
+    return RenderedScene(scene, images, edges, world.polygons, face_of_point, np.array(world.planes))
 
 
 # -------------------------------------------------------------------------------------------------------------- world
@@ -138,7 +155,47 @@ def _boxes(settings: BoxSettings, rng: np.random.Generator) -> _World:
             body.world_from_body[2, 3] = height / 2
         rounds.append(body)
         edges += _rims(body)
-    return _World(polygons, shades, np.array(edges), rounds)
+    # Boxes stand on the floor: their first side, at the bottom, is in its plane.
+    planes = [0, *(0 if k % 6 == BOTTOM else k + 1 for k in range(len(polygons) - 1))]
+    return _World(polygons, shades, np.array(edges), rounds, planes)
+
+
+def _add_facade(world: _World, settings: BoxSettings, rng: np.random.Generator) -> None:
+    """A wall at the end of the floor with rectangles: joints, panels, boards; some askew."""
+    wall, first = len(world.polygons), len(world.polygons)
+    world.polygons.append(FLOOR * np.array([[-1.0, 1, 0], [1, 1, 0], [1, 1, 1], [-1, 1, 1]]))
+    world.shades.append(140.0)
+    world.planes.append(wall)
+    edges, taken = [world.polygons[-1][[k, (k + 1) % 4]] for k in range(4)], []
+    while len(world.polygons) - first <= settings.num_panels:
+        half = rng.uniform(0.08, 0.45, 2)
+        center = np.array([rng.uniform(-2.5, 2.5), rng.uniform(0.5, 2.5)])
+        if any((np.abs(center - other) < 1.3 * (half + far)).all() for other, far in taken):
+            if len(taken) > 20 and rng.uniform() < 0.01:
+                break
+            continue
+        taken.append((center, half))
+        kind = rng.choice(["upright", "turned", "in front"], p=[0.7, 0.15, 0.15])
+        angle = rng.uniform(0.02, 0.15) * rng.choice([-1, 1]) if kind == "turned" else 0.0
+        across = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        corners = center + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ across.T
+        away = rng.uniform(0.03, 0.15) if kind == "in front" else 2e-4 + abs(rng.normal(0.0, settings.rough))
+        panel = np.column_stack([corners[:, 0], np.full(4, FLOOR - away), corners[:, 1]])
+        world.planes.append(len(world.polygons) if kind == "in front" else wall)
+        world.polygons.append(panel)
+        world.shades.append(float(rng.choice([40.0, 70, 100, 190, 220])))
+        edges += [panel[[k, (k + 1) % 4]] for k in range(4)]
+    world.edges = np.concatenate([world.edges, edges])
+
+
+def _front(settings: BoxSettings, rng: np.random.Generator) -> np.ndarray:
+    """Poses (C, 7) on an arc before the facade."""
+    poses = []
+    for k in range(settings.num_images):
+        a = np.pi * (0.15 + 0.7 * k / max(settings.num_images - 1, 1))
+        center = np.array([3.5 * np.cos(a), 3.0 - 5.0 * np.sin(a), 1.4]) + rng.normal(0, 0.15, 3)
+        poses.append(_looking(center, np.array([0.6 * np.cos(a), FLOOR, 1.2]) + rng.normal(0, 0.1, 3)))
+    return np.array(poses)
 
 
 def _rims(body: _Round) -> list[np.ndarray]:
@@ -322,8 +379,8 @@ def _visible(world: _World, poses: np.ndarray, camera: np.ndarray, settings: Box
     return np.array(pieces)
 
 
-def _points(world, poses, camera, settings, rng) -> tuple[Points, PointObservations]:
-    """Points on all surfaces, observed with 0.3 pixels of noise."""
+def _points(world, poses, camera, settings, rng) -> tuple[Points, PointObservations, np.ndarray]:
+    """Points on all surfaces, observed with 0.3 pixels of noise, and the face of each."""
     xyz = []
     for k, polygon in enumerate(world.polygons):
         s, t = rng.uniform(0.08, 0.92, (2, 300 if k == 0 else 25, 1))
@@ -336,11 +393,12 @@ def _points(world, poses, camera, settings, rng) -> tuple[Points, PointObservati
             around, z = rng.uniform(0, 2 * np.pi, 40), rng.uniform(0.05, 0.95, 40)
             unit = np.column_stack([*((1.0 - body.taper * z) * [np.cos(around), np.sin(around)]), z])
         xyz.append(unit @ body.world_from_body[:, :3].T + body.world_from_body[:, 3])
-    xyz = np.concatenate(xyz)
+    groups, xyz = xyz, np.concatenate(xyz)
     table = []
     for i, pose in enumerate(poses):
         pixel, seen = _seen(world, xyz, pose, camera, settings)
         rows = np.flatnonzero(seen)
         table.append((np.full(len(rows), i), rows, pixel[rows] + rng.normal(0, 0.3, (len(rows), 2))))
     image, point, pixel = (np.concatenate(column) for column in zip(*table, strict=True))
-    return Points.at(xyz), PointObservations(image, point, pixel, np.arange(len(image)))
+    faces = [np.full(len(rows), k if k < len(world.polygons) else -1) for k, rows in enumerate(groups)]
+    return Points.at(xyz), PointObservations(image, point, pixel, np.arange(len(image))), np.concatenate(faces)

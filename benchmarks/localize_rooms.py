@@ -3,9 +3,9 @@
 
     python benchmarks/localize_rooms.py OUT [--seeds 0 1] [--every 2]
 
-A depth camera swings around a room whose walls, boards and boxes have one shade each (:mod:`_turning_worlds`). Every fourth frame
-goes into a map of ``groma track``; the other frames are queries, without depth. The world of the map is aligned to the
-truth by the poses of its own images. OUT keeps sequences and maps.
+A depth camera swings around a room whose walls, boards and boxes have one shade each (:mod:`_turning_worlds`). Every
+fourth frame goes into a map of ``groma track``; the other frames are queries, without depth. The world of the map is
+aligned to the truth by the poses of its own images. OUT keeps sequences and maps.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.stats import norm
 
 import groma
-from groma.adjustment.survey.attach import Survey
+from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.records import GATES
 from groma.adjustment.survey.reliability import reliability
 from groma.geometry import quaternion
@@ -36,14 +36,14 @@ from groma.scene import (
     CameraPositions,
     Cameras,
     ControlPoints,
+    Distances,
     Marks,
-    PointDistances,
     PointObservations,
     Points,
     Scene,
     Similarity,
 )
-from groma.scene.survey import CHECK, CONTROL, UNKNOWN, diagonal_covariance
+from groma.scene.survey import CHECK, CONTROL, UNKNOWN, Kind, diagonal_covariance
 from groma.scene.synthetic import holistic
 from groma.scene.synthetic.noise import project_pinhole
 from groma.solver.covariance.marginals import Covariances
@@ -141,7 +141,7 @@ def with_bar(scene: Scene, rng: np.random.Generator, chosen: np.ndarray) -> Scen
     """Return the scene with one measured distance between two marked points."""
     marked = with_control(scene, rng, chosen[:2], [UNKNOWN] * 2, POSITION)
     length = np.linalg.norm(np.subtract(*scene.points.xyz[chosen[:2]])) + rng.normal() * BAR
-    return marked.replace(point_distances=PointDistances([0], [1], np.array([length]), np.array([BAR])))
+    return marked.replace(distances=Distances.between(Kind.CONTROL_POINT, [0], [1], [length], [BAR]))
 
 
 def normalized_distance(result: groma.AdjustResult, truth: Scene) -> float:

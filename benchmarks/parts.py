@@ -21,7 +21,9 @@ walk round a corridor in place of the block: points, lines, planes, and what lie
 With ``--plain-sums`` one process adjusts in turn with sums of twice the digits, as always, and with plain ones.
 
 With ``--states`` a corridor of so many images with known poses is solved at once and in parts by so many ranks, without
-damping, until nothing changes; reported are the largest differences of states, metres and radians.
+damping, until the cost falls no more; reported are the largest differences of states, metres and radians. The cost is
+known to its rounding, eps, and grows by half a square of the distance to the minimum in standard deviations. So no cost
+tells apart what lies within sqrt(2 eps cost) standard deviations of it, which is what lines are compared with.
 """
 
 import argparse
@@ -227,6 +229,7 @@ def compare_states(images: int, ranks: list[int], work: Path) -> None:
     """Print the largest differences between the states of a solve at once and of parts."""
     from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble
     from groma.adjustment.parts import join_parts, parts_of, write_parts
+    from groma.adjustment.uncertainty import position_sigma, uncertainty
     from groma.geometry import line3
     from groma.scene import PosePriors, synthetic
     from groma.solver.solve import solve
@@ -238,7 +241,10 @@ def compare_states(images: int, ranks: list[int], work: Path) -> None:
     whole = join_parts(paths)
     print(f"{whole}, {len(paths)} parts\n")
     problem = assemble(whole, AssemblyOptions()).problem
-    solved = disassemble(whole, solve(solve(problem, states_options()).problem, states_options("gauss_newton")).problem)
+    solution = solve(solve(problem, states_options()).problem, states_options("gauss_newton"))
+    solved = disassemble(whole, solution.problem)
+    ends = uncertainty(solved, problem=solution.problem).segment_ends
+    sigma = position_sigma(ends.reshape(-1, 3, 3)).reshape(-1, 2)
     print("| ranks | poses | points | lines | planes | same files as of the first |\n|--:|--:|--:|--:|--:|---|")
     launcher, files = shutil.which("mpiexec", path=sysconfig.get_path("scripts")) or "mpiexec", []
     for number in ranks:
@@ -251,10 +257,15 @@ def compare_states(images: int, ranks: list[int], work: Path) -> None:
             np.abs(getattr(getattr(found, table), column) - getattr(getattr(solved, table), column)).max()
             for table, column in (("frames", "rig_from_world"), ("points", "xyz"), ("planes", "hesse"))
         ]
-        off.insert(2, line3.distance_to_point(found.lines.plucker[:, None], solved.lines.segments).max())
+        distance = line3.distance_to_point(found.lines.plucker[:, None], solved.lines.segments)
+        off.insert(2, distance.max())
         print(
             f"| {number} | {' | '.join(f'{value:.1e}' for value in off)} | {'yes' if files[-1] == files[0] else 'no'} |"
         )
+    least = np.sqrt(2.0 * np.finfo(float).eps * solution.report.final_cost)
+    largest = np.sort(distance.max(axis=1))[-2:]
+    print(f"\nlines differ by at most {(distance / sigma).max():.1e} standard deviations; the cost tells {least:.1e}")
+    print(f"one line differs by {largest[1]:.1e}, all others by at most {largest[0]:.1e}")
 
 
 def states_options(method: str = "levenberg_marquardt"):

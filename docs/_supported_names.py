@@ -94,7 +94,7 @@ ROOMS: Rooms = (
             "groma.adjustment.uncertainty": ("SceneUncertainty", "uncertainty"),
             "groma.adjustment.covariance_files": None,
             "groma.adjustment.consistency": None,
-            "groma.adjustment.similarity_graph": None,
+            "groma.adjustment.graphs.similarity_graph": None,
             "groma.adjustment.parts": ("PartsResult", "adjust_parts", "join_parts", "write_parts"),
         },
     ),

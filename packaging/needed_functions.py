@@ -57,7 +57,7 @@ def _localize(folder: Path) -> None:
 def _pose_graph(folder: Path) -> None:
     import numpy as np
 
-    from groma.adjustment.pose_graph import PoseGraphOptions, adjust_pose_graph
+    from groma.adjustment.graphs.pose_graph import PoseGraphOptions, adjust_pose_graph
     from groma.io.g2o import read_g2o
 
     rows, diagonal = [], " ".join("1" if i == j else "0" for i in range(6) for j in range(i, 6))

@@ -123,3 +123,36 @@ def test_a_check_can_fail(right, wrong):
     namespace["check"]("a row", 1.0, 1.0, 2.0)
     with pytest.raises(AssertionError, match="a row"):
         namespace["check"]("a row", 1.0, right, wrong)
+
+
+def _links(page):
+    """The pages that a page leads to, by links and by its table of contents, from the folder of the pages."""
+    text = page.read_text(encoding="utf-8")
+    named = re.findall(r"\]\(([^)#:]+)[^)]*\)", text)
+    for block in re.findall(r"```\{toctree\}\n(.*?)```", text, re.DOTALL):
+        named += [line.strip() for line in block.splitlines() if line.strip() and not line.startswith(":")]
+    found = set()
+    for name in named:
+        place = page.parent / name
+        endings = [place.with_name(place.name + ending) for ending in ("", ".md", ".rst")]
+        found |= {other.resolve() for other in endings if other.is_file()}
+    return found
+
+
+def test_ten_tasks_are_three_clicks_away():
+    rows = re.findall(r"^\| ([^|]+) \| (.*\[.*) \|$", (DOCS / "tasks.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert len(rows) == 10
+    for task, clicks in rows:
+        path = [(DOCS / name).resolve() for name in re.findall(r"\]\(([^)]+)\)", clicks)]
+        assert 1 <= len(path) <= 3, task
+        for page, target in zip([DOCS / "index.md", *path], path, strict=False):
+            assert target in _links(page), f"{task}: {page.name} does not lead to {target.name}"
+
+
+def test_pictures_are_there_and_small():
+    for page in [ROOT / "README.md", *DOCS.rglob("*.md")]:
+        text = page.read_text(encoding="utf-8")
+        for name in re.findall(r"!\[[^\]]*\]\(([^)]+)\)|\{image\} (\S+)", text):
+            picture = page.parent / (name[0] or name[1])
+            assert picture.is_file(), f"{page.name}: {picture.name}"
+            assert picture.stat().st_size < 260_000, picture.name

@@ -3,6 +3,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -42,3 +43,15 @@ def test_the_viewer_is_loaded_only_when_asked_for():
 @pytest.mark.parametrize("module", ["groma.adjustment.adjust", "groma.mapping.map"])
 def test_statistics_are_not_loaded_for_a_quantile(module):
     assert "scipy.stats" not in _loaded_after(f"import {module}")
+
+
+def test_a_plain_adjustment_loads_the_solver_alone(tmp_path):
+    """No photographs are looked at, no COLMAP model is read, and of SciPy nothing but LAPACK is needed."""
+    source = Path(__file__).parent / "data" / "bal" / "dubrovnik-3-7-18-pre.txt"
+    code = (
+        "from groma.cli.main import run\n"
+        f"assert run(['adjust', {str(source)!r}, '-o', {str(tmp_path / 'out.npz')!r}]) == 0"
+    )
+    loaded = _loaded_after(code)
+    assert not loaded & {"scipy.linalg", "scipy.sparse", "scipy.spatial", "scipy.stats", "cv2", "pycolmap"}
+    assert (tmp_path / "out.npz").exists()

@@ -12,7 +12,7 @@ import numpy as np
 from _common import TOLERANCE, Clock, report
 
 import groma
-from groma.adjustment.pose_graph import PoseGraphOptions, pose_graph_problem
+from groma.adjustment.graphs.pose_graph import PoseGraphOptions, pose_graph_problem
 from groma.io.g2o import read_g2o, write_g2o
 from groma.scene.pose_graph import PoseGraph
 from groma.solver.options import SolverOptions

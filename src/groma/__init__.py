@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from groma.adjustment.contributions import contributions
     from groma.adjustment.covariance_files import write_covariances
     from groma.adjustment.diagnosis import diagnose_scene as diagnose
+    from groma.adjustment.graphs.pose_graph import PoseGraphOptions, PoseGraphResult, adjust_pose_graph
     from groma.adjustment.parts import adjust_parts, write_parts
-    from groma.adjustment.pose_graph import PoseGraphOptions, PoseGraphResult, adjust_pose_graph
     from groma.adjustment.report import AdjustResult
     from groma.adjustment.survey.align import Alignment, align
-    from groma.adjustment.survey.attach import Survey
+    from groma.adjustment.survey.given import Survey
     from groma.adjustment.survey.records import Reliability
     from groma.adjustment.survey.reliability import reliability
     from groma.adjustment.uncertainty import uncertainty
@@ -108,8 +108,8 @@ _HOME = {
     "PlaneObservation": "groma.factors.observations.plane_observation",
     "PointOnPlane": "groma.factors.relations.point_on_plane",
     "PointReprojection": "groma.factors.observations.point_reprojection",
-    "PoseGraphOptions": "groma.adjustment.pose_graph",
-    "PoseGraphResult": "groma.adjustment.pose_graph",
+    "PoseGraphOptions": "groma.adjustment.graphs.pose_graph",
+    "PoseGraphResult": "groma.adjustment.graphs.pose_graph",
     "PoseOptions": "groma.localization.pose.absolute_pose",
     "PosePrior": "groma.factors.priors.pose_prior",
     "Problem": "groma.problem.problem",
@@ -123,7 +123,7 @@ _HOME = {
     "Solution": "groma.solver.solve",
     "SolveReport": "groma.solver.report",
     "SolverOptions": "groma.solver.options",
-    "Survey": "groma.adjustment.survey.attach",
+    "Survey": "groma.adjustment.survey.given",
     "SurveyedResult": "groma.mapping.surveyed",
     "Termination": "groma.solver.termination",
     "TrackOptions": "groma.tracking",
@@ -132,7 +132,7 @@ _HOME = {
     "Variables": "groma.problem.variables",
     "adjust": "groma.adjustment.adjust",
     "adjust_parts": "groma.adjustment.parts",
-    "adjust_pose_graph": "groma.adjustment.pose_graph",
+    "adjust_pose_graph": "groma.adjustment.graphs.pose_graph",
     "adjust_surveyed": "groma.mapping.surveyed",
     "align": "groma.adjustment.survey.align",
     "contributions": "groma.adjustment.contributions",

@@ -12,7 +12,8 @@ import pytest
 import groma
 from groma.adjustment.contributions import KINDS, contributions
 from groma.cli.main import run
-from groma.cli.shared.sentences import describe_contributions
+from groma.cli.shared.console import Console
+from groma.cli.shared.sentences import say_contributions
 from groma.scene import Planes, Relations, Similarity, synthetic
 from groma.viz.report.charts import spreads
 from groma.viz.report.tables import contributions_card
@@ -121,11 +122,12 @@ def test_open_landmarks_are_counted_and_do_no_harm(scenes, found):
         assert entry.center_sigma == pytest.approx(before.center_sigma, rel=0.02)
 
 
-def test_what_is_not_predicted_is_explained(scenes):
+def test_what_is_not_predicted_is_explained(scenes, capsys):
     (entry,) = contributions(scenes.start.points_only(), replace(OPTIONS, refine_poses=False))
     assert entry.center_sigma is None and "held" in entry.center_sigma_missing
     assert "Not predicted: " in contributions_card([entry.to_dict()])
-    assert f"centres not predicted: {entry.center_sigma_missing}" in describe_contributions([entry.to_dict()])[1]
+    say_contributions(Console(False, False, None), [entry.to_dict()])
+    assert f"Centres not predicted with points: {entry.center_sigma_missing}" in capsys.readouterr().out
 
 
 def test_card_leaves_out_what_is_not_known():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from groma.adjustment.pose_graph import PoseGraphOptions, adjust_pose_graph
+from groma.adjustment.graphs.pose_graph import PoseGraphOptions, adjust_pose_graph
 from groma.errors import InputError
 from groma.geometry import quaternion, se3
 from groma.scene.pose_graph import GraphPoses, Motions, PoseGraph

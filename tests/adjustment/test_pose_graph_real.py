@@ -2,7 +2,7 @@
 
 import pytest
 
-from groma.adjustment.pose_graph import PoseGraphOptions, adjust_pose_graph
+from groma.adjustment.graphs.pose_graph import PoseGraphOptions, adjust_pose_graph
 from groma.io.g2o import read_g2o
 
 

@@ -47,6 +47,7 @@ def test_photographs_read_row_by_row(along):
     assert found.motions.sigma[0] == pytest.approx(0.03, rel=0.4)
     assert np.degrees(found.motions.sigma[1]) == pytest.approx(1.0, rel=0.3)
     assert found.motions.share == 0.0 and found.motions.warnings() == ()
+    assert found.motions.explained is not None and found.motions.explained > 0.8
     assert found.result.report.sigma0 == pytest.approx(1.0, rel=0.1)
 
 
@@ -96,7 +97,9 @@ def test_images_at_once_have_no_motions():
     found = adjust_rolling_shutter(with_rolling_shutter(rolling_scene(poses, 0.0 * motions)), NOISE)
     assert np.abs(found.result.scene.camera_motions.motion[:, :3]).max() < 0.01
     assert np.degrees(np.abs(found.result.scene.camera_motions.motion[:, 3:])).max() < 0.1
-    assert any("rest by" in sentence for sentence in found.motions.warnings())
+    words = " ".join(found.motions.warnings())
+    assert "rest by" in words and "The images show next to no rolling shutter" in words
+    assert found.motions.explained is not None and found.motions.explained < 0.05
 
 
 def test_motions_are_kept_moved_and_cut(tmp_path):

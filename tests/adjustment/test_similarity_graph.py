@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from groma.adjustment.similarity_graph import SimilarityMotions, adjust_similarity_graph
+from groma.adjustment.graphs.similarity_graph import SimilarityMotions, adjust_similarity_graph
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3, sim3, so3
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _measured import with_measurements
-from _survey import Exact, with_everything
+from _survey import Exact, with_everything, with_objects
 
 import groma
 from groma.adjustment.assemble import TERMS, AssemblyOptions, assemble
@@ -52,7 +52,7 @@ def related(scene):
 @pytest.fixture(scope="module")
 def exact():
     measured = with_measurements(holistic(20, noise_px=0.0, seed=3).truth, depth_sigma=0.0, pixel_sigma=0.0)
-    return related(with_everything(measured, Exact()))
+    return related(with_objects(with_everything(measured, Exact()), Exact()))
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,12 @@ import json
 import numpy as np
 import pytest
 
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.assemble import AssemblyOptions
 from groma.adjustment.diagnosis import diagnose_scene
-from groma.adjustment.uncertainty import uncertainty
+from groma.adjustment.uncertainty import position_sigma, uncertainty
 from groma.errors import InputError
+from groma.evaluation.alignment import align_points
 from groma.scene.observations import Relations
 from groma.scene.synthetic.scenes import holistic
 from groma.solver.covariance import quantities
@@ -77,3 +80,31 @@ def test_diagnosis_uses_the_names_of_the_scene():
     )
     diagnosis = diagnose_scene(scene)
     assert any("00005.png" in sentence for sentence in diagnosis.sentences), diagnosis.sentences
+
+
+def test_relations_do_not_tell_the_scale():
+    """Points on lines and planes miss these by little, and by less in a smaller scene: the scale is free all the same.
+
+    With inner constraints the ellipses are those of the errors that occur, and no larger than without relations.
+    """
+    truth = holistic(6, noise_px=0.0, seed=2).truth
+    options = AssemblyOptions(point_sigma_px=0.5, line_sigma_px=0.5)
+    found, alone = (uncertainty(scene, options, gauge="inner") for scene in (truth, truth.points_only()))
+    assert found.covariances.motions.count == 7
+    sizes = [position_sigma(one.centers) for one in (found, alone)]
+    assert (sizes[0] < 1.02 * sizes[1]).all() and sizes[0].min() > 0.3 * sizes[1].min()
+    rng, squares = np.random.default_rng(0), []
+    seen, segments = truth.point_observations, truth.line_observations
+    for _ in range(12):
+        drawn = truth.replace(
+            point_observations=seen.replace(pixel=seen.pixel + rng.normal(size=seen.pixel.shape) * 0.5),
+            line_observations=segments.replace(
+                segment=segments.segment + rng.normal(size=segments.segment.shape) * 0.5
+            ),
+        )
+        told = AdjustOptions(loss="none", point_sigma_px=0.5, line_sigma_px=0.5, check_lens=False)
+        centers = adjust(drawn, told).scene.cam_centers_in_world
+        true = truth.cam_centers_in_world
+        squares.append(np.sum((align_points(centers, true).points(centers) - true) ** 2, axis=1))
+    # 12 draws of 6 cameras, 11 independent coordinates each
+    assert np.sqrt(np.mean(squares) / np.mean(sizes[0] ** 2)) == pytest.approx(1.0, abs=0.25)

@@ -15,8 +15,12 @@ BOARD = (480, 360)  # pixels of a wall's texture
 WALLS = np.array([[[-4, -1.5, 0], [1, 0, 0.15], [0, 1, 0]], [[0, -1.5, 0.6], [1, 0, -0.25], [0, 1, 0]]], float)
 
 
-def facade(folder, num_images=5, seed=0, model="SIMPLE_PINHOLE", extra=(), num_points=120):
-    """Write photographs into a new folder; return the scene of their cameras and of points on the walls."""
+def facade(folder, num_images=5, seed=0, model="SIMPLE_PINHOLE", extra=(), num_points=120, motions=None):
+    """Write photographs into a new folder; return the scene of their cameras and of points on the walls.
+
+    With motions (N, 6) each is read row by row, while the camera moves and turns so far in its own axes.
+    """
+    motions = np.zeros((num_images, 6)) if motions is None else motions
     folder.mkdir(parents=True)
     rng = np.random.default_rng(seed)
     textures = []
@@ -36,7 +40,7 @@ def facade(folder, num_images=5, seed=0, model="SIMPLE_PINHOLE", extra=(), num_p
         image = np.full(len(rays), 90.0)
         depth = np.full(len(rays), np.inf)
         for wall, texture in zip(WALLS, textures, strict=True):
-            s, t, z = meet(wall, place, rays @ R)
+            s, t, z = meet(wall, *read_row_by_row(R, place, motions[i], rays, v.ravel()))
             level = cv2.remap(
                 texture.astype(np.float32),
                 (s * BOARD[0] - 0.5).astype(np.float32).reshape(u.shape),
@@ -47,7 +51,10 @@ def facade(folder, num_images=5, seed=0, model="SIMPLE_PINHOLE", extra=(), num_p
             image[front], depth[front] = level[front], z[front]
         image = image.reshape(HEIGHT, 2, WIDTH, 2).mean(axis=(1, 3)) + rng.normal(0, 1.0, (HEIGHT, WIDTH))
         cv2.imwrite(str(folder / f"{i:04d}.png"), np.clip(np.round(image), 0, 255).astype(np.uint8))
-        seen = camera.project(params, (xyz - place) @ R.T)
+        seen = np.full((len(xyz), 2), HEIGHT / 2)
+        for _ in range(30 if motions[i].any() else 1):
+            centers, turns = cameras_of_rows(R, place, motions[i], seen[:, 1])
+            seen = camera.project(params, np.einsum("nij,nj->ni", turns, xyz - centers))
         inside = ((seen > 2) & (seen < [WIDTH - 2, HEIGHT - 2])).all(1)
         image_idx.append(np.full(inside.sum(), i))
         point_idx.append(np.flatnonzero(inside))
@@ -72,6 +79,21 @@ def facade(folder, num_images=5, seed=0, model="SIMPLE_PINHOLE", extra=(), num_p
             np.concatenate(image_idx), np.concatenate(point_idx), np.concatenate(pixels), number(image_idx)
         ),
     )
+
+
+def cameras_of_rows(R, place, motion, rows):
+    """Centres (n, 3) and rotations from the world (n, 3, 3) of the cameras that see rows of an image."""
+    rows, of = np.unique(rows, return_inverse=True)
+    s = np.clip(rows, -HEIGHT, 2 * HEIGHT)[:, None] / HEIGHT - 0.5
+    return (place + s * (motion[:3] @ R))[of], (quaternion.to_matrix(quaternion.exp(-s * motion[3:])) @ R)[of]
+
+
+def read_row_by_row(R, place, motion, rays, rows):
+    """Centres and directions in the world of rays in the camera."""
+    if not motion.any():
+        return place, rays @ R
+    centers, turns = cameras_of_rows(R, place, motion, rows)
+    return centers, np.einsum("nji,nj->ni", turns, rays)
 
 
 def number(image_idx):

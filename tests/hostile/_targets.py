@@ -31,12 +31,21 @@ from _models import rig_scene
 from _mutations import gzip_stored
 from _views import views
 
-from groma.adjustment.survey.attach import Survey, with_survey
+from groma.adjustment.survey.attach import with_survey
+from groma.adjustment.survey.given import Survey
 from groma.features.external import read_matches
 from groma.io import read_g2o, read_scene, read_trajectory, structures_of, write_archive, write_colmap, write_scene
 from groma.io.reference import holds_scene, read_line3dpp, read_reference
 from groma.io.sequences import open_sequence
-from groma.io.survey import read_control, read_distances, read_exif_positions, read_positions
+from groma.io.survey import (
+    read_control,
+    read_directions,
+    read_distances,
+    read_exif_positions,
+    read_known_planes,
+    read_measured_poses,
+    read_positions,
+)  # fmt: skip
 from groma.mapping.checkpoint_files import LINE_MAP, SEGMENTS
 from groma.mapping.photographs import read_gray
 from groma.scene import Scene, synthetic
@@ -367,7 +376,14 @@ def _surveys() -> Iterator[_Made]:
     def attached(**files: str) -> Callable[[Path], object]:
         def read(folder: Path) -> object:
             given = {kind: _SURVEYS[kind](folder / name) for kind, name in files.items()}
-            survey = Survey(**given, position_sigma=(1.0,), control_sigma=(1.0,), distance_sigma=1.0)
+            survey = Survey(
+                **given,
+                position_sigma=(1.0,),
+                control_sigma=(1.0,),
+                distance_sigma=1.0,
+                plane_sigma=0.1,
+                direction_sigma_deg=1.0,
+            )
             return with_survey(scene, survey).scene
 
         return read
@@ -378,11 +394,22 @@ def _surveys() -> Iterator[_Made]:
     bars = b"p0 p1 1.5 0.01\n" + f"{scene.images.names[0]},{scene.images.names[1]},2.0".encode()
     yield "control", {"gcp_list.txt": gcp, "bars.csv": bars}, attached(control="gcp_list.txt", distances="bars.csv")
     yield "ground control", {"gcp.json": json.dumps({"points": points}).encode()}, attached(control="gcp.json")
+    names, down = scene.images.names, b"0.02 0.9 0.4"
+    known = {
+        "down.txt": b"\n".join(name.encode() + b" " + down for name in names),
+        "levels.txt": b"p0 z 1.5\n" + f"{names[0]} 0 0 1 -2 0.1".encode(),
+        "poses.txt": "\n".join(f"{name} {k} {k % 2} 0 0 0 0 1 0.1 1" for k, name in enumerate(names)).encode(),
+    }
+    for kind, (file, text) in zip(("directions", "planes", "poses"), known.items(), strict=True):
+        yield kind, {"gcp_list.txt": gcp, file: text}, attached(control="gcp_list.txt", **{kind: file})
     photo = test_survey_files.jpeg_with_position("<", 52.5, 13.4, 99.0)
     yield "exif", {"a.jpg": photo}, lambda folder: read_exif_positions(folder, ["a.jpg"])
 
 
-_SURVEYS = {"positions": read_positions, "control": read_control, "distances": read_distances}
+_SURVEYS = {
+    "positions": read_positions, "control": read_control, "distances": read_distances, "directions": read_directions,
+    "planes": read_known_planes, "poses": read_measured_poses,
+}  # fmt: skip
 
 
 def _transforms(folder: Path) -> Scene:

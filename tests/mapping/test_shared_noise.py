@@ -6,7 +6,7 @@ import pytest
 
 import groma
 from groma.evaluation import evaluate_poses
-from groma.mapping.noise.landmarks import project_points
+from groma.mapping.noise.landmarks import pixels_of, project_points
 from groma.mapping.noise.shared import with_shared_noise
 from groma.scene import PointObservations, Points, Relations, Scene, synthetic
 
@@ -28,7 +28,7 @@ def crowded(seed: int, shared_px: float, count: int = 800) -> tuple[Scene, Scene
         point_observations=PointObservations.numbered(image_idx, point_idx, np.zeros((len(image_idx), 2))),
         relations=Relations(),
     )
-    pixel, _ = project_points(everything, image_idx, xyz[point_idx])
+    pixel = pixels_of(everything, image_idx, xyz[point_idx])
     camera = made.cameras
     inside = (pixel > 0).all(axis=1) & (pixel < [camera.width[0], camera.height[0]]).all(axis=1)
     exact, image, point = pixel[inside], image_idx[inside], point_idx[inside]
@@ -82,3 +82,22 @@ def test_a_spot_that_is_found_twice_shares_the_weight_of_one():
 def test_scenes_that_tell_nothing_are_returned():
     small = synthetic.holistic(4, noise_px=1.0, seed=0).truth
     assert with_shared_noise(small, 1.0, 1.0) is small
+
+
+def test_derivatives_of_pixels_are_those_of_differences():
+    """Also behind cameras: nothing is known there, in pixels nor in derivatives."""
+    scene = synthetic.holistic(NUM_IMAGES, noise_px=0.0, seed=3).truth
+    image_idx = np.repeat(np.arange(NUM_IMAGES), 40)
+    places = np.random.default_rng(1).uniform(-8.0, 8.0, (len(image_idx), 3))
+    pixels, by_world = project_points(scene, image_idx, places)
+    np.testing.assert_array_equal(pixels_of(scene, image_idx, places), pixels)
+    seen = np.isfinite(pixels).all(axis=1)
+    assert seen.any() and not seen.all() and np.isnan(by_world[~seen]).all()
+    for axis in range(3):
+        step = 1e-6 * np.eye(3)[axis]
+        difference = pixels_of(scene, image_idx, places + step) - pixels_of(scene, image_idx, places - step)
+        scale = np.abs(by_world[seen]).max(axis=(1, 2))[:, None]
+        near = np.isfinite(difference[seen]).all(axis=1)
+        np.testing.assert_allclose(
+            (difference[seen] / 2e-6 / scale)[near], (by_world[seen, :, axis] / scale)[near], atol=1e-4
+        )

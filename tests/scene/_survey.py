@@ -1,11 +1,23 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A made scene with measurements of other instruments, whose truth and noise are known."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from groma.geometry import se3
-from groma.scene import CameraDistances, CameraPositions, ControlPoints, Marks, PointDistances, Similarity
-from groma.scene.survey import CHECK, CONTROL, diagonal_covariance
+from groma.geometry import quaternion, se3
+from groma.io.survey import ControlFile, CoordinateSystem, Places
+from groma.scene import (
+    CameraPoses,
+    CameraPositions,
+    ControlPoints,
+    Distances,
+    KnownDirections,
+    KnownPlanes,
+    Marks,
+    Similarity,
+)  # fmt: skip
+from groma.scene.survey import CHECK, CONTROL, Kind, diagonal_covariance
 from groma.scene.synthetic.noise import project_pinhole
 from groma.scene.synthetic.scenes import holistic
 
@@ -58,20 +70,40 @@ def distances(truth, xyz, rng, sigma=SIGMA_DISTANCE):
     between = np.linalg.norm(xyz[1] - xyz[0]) + rng.normal() * sigma
     centers = truth.cam_centers_in_world
     apart = np.linalg.norm(centers[1] - centers[0]) + rng.normal() * sigma
-    one, two, noise = np.array([0]), np.array([1]), np.array([sigma])
-    return PointDistances(one, two, np.array([between]), noise), CameraDistances(one, two, np.array([apart]), noise)
+    kinds, numbers = np.array([Kind.CONTROL_POINT, Kind.IMAGE]), np.array([between, apart])
+    zero, one = np.zeros(2, int), np.ones(2, int)
+    return Distances(kinds, zero, kinds, one, np.zeros((2, 3)), numbers, np.full(2, sigma))
+
+
+def with_objects(truth, rng):
+    """The scene with poses, gravity, heights, and what is known of its first line and plane if it has some."""
+    count, down = truth.num_images, np.array([0.0, 0.0, -1.0])
+    noise = rng.normal(size=(count, 6)) * np.repeat([SIGMA, 0.005], 3)
+    poses = se3.compose(se3.inverse(se3.exp(noise)), truth.cam_from_world)
+    covariance = np.diag(np.repeat([SIGMA, 0.005], 3) ** 2)
+    seen = quaternion.rotate(truth.cam_from_world[:, :4], np.tile(down, (count, 1)))
+    seen = quaternion.rotate(quaternion.exp(rng.normal(size=(count, 3)) * 0.01), seen)
+    kinds, rows = [Kind.IMAGE] * count, list(range(count))
+    vectors, places = np.tile(down, (count, 1)), truth.cam_centers_in_world
+    hesse = np.column_stack([np.tile([0, 0, 1.0], (count, 1)), rng.normal(size=count) * SIGMA - places[:, 2]])
+    planes = KnownPlanes(kinds, rows, places, hesse, np.full(count, SIGMA))
+    if truth.num_lines and truth.num_planes:
+        kinds, rows = [*kinds, Kind.LINE, Kind.PLANE], [*rows, 0, 0]
+        known = np.stack([truth.lines.plucker[0, 3:], truth.planes.hesse[0, :3]])
+        vectors, seen = np.concatenate([vectors, known]), np.concatenate([seen, known])
+    gravity = KnownDirections(kinds, rows, vectors, seen, np.full(len(rows), 0.01))
+    table = CameraPoses(np.arange(count), poses, np.tile(covariance, (count, 1, 1)))
+    return truth.replace(camera_poses=table, known_directions=gravity, known_planes=planes)
 
 
 def with_everything(truth, rng):
-    """The scene with every table of measurements."""
+    """The scene with positions, control points and distances."""
     points, marks, xyz = control(truth, rng)
-    between, apart = distances(truth, xyz, rng)
     return truth.replace(
         camera_positions=positions(truth, rng),
         control_points=points,
         marks=marks,
-        point_distances=between,
-        camera_distances=apart,
+        distances=distances(truth, xyz, rng),
     )
 
 
@@ -93,3 +125,25 @@ def on_rigs(scene):
         cameras=scene.cameras, rigs=Rigs(np.array([1])), sensors=sensors,
         frames=Frames(np.arange(frames) + 1, np.zeros(frames, int), first), images=images, points=scene.points,
     )  # fmt: skip
+
+
+def places_of(names, xyz, sigma=SIGMA, system=""):
+    """Places as a file has them."""
+    return Places(tuple(names), xyz, np.full(xyz.shape, sigma), CoordinateSystem(system), "positions.csv")
+
+
+def measured_positions(truth, rng, shift=0.0):
+    """Measured positions of all cameras as a file has them."""
+    return places_of(truth.images.names, positions(truth, rng).xyz + shift)
+
+
+def control_file(truth, rng, normalized=False):
+    """Control points as a file has them, and where they truly are."""
+    points, marks, xyz = control(truth, rng)
+    names = tuple(truth.images.names[row] for row in marks.image_idx)
+    given = places_of(points.names, points.measured, np.nan)
+    found = ControlFile(given, points.role == CHECK, names, marks.point_idx, marks.pixel, False)
+    if normalized:
+        size = np.array([truth.cameras.width[0], truth.cameras.height[0]], float)
+        found = replace(found, pixels=(marks.pixel - size / 2) / size.max(), normalized=True)
+    return found, xyz

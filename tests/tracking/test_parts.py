@@ -9,11 +9,12 @@ import pytest
 
 from groma.factors.contract import Ref
 from groma.factors.observations.plane_observation import PlaneObservation
+from groma.features.depth.points import depth_at
 from groma.features.point_tracks import corners, follow, spread
 from groma.geometry import se3
 from groma.scene.landmarks import Lines
 from groma.tracking.frame.camera import TrackCamera, back, into, planes_back, planes_into
-from groma.tracking.frame.depth import depth_at, segment_inverse_depths
+from groma.tracking.frame.depth import segment_inverse_depths
 from groma.tracking.frame.features import segment_noise
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.frame.planes import frame_planes

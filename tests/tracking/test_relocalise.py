@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 
+from groma.features.depth.points import depth_at
 from groma.geometry import se3
 from groma.tracking.frame.camera import TrackCamera, into
-from groma.tracking.frame.depth import depth_at
 from groma.tracking.gates import DEFAULT
 from groma.tracking.pose.near_matches import pair_near
 from groma.tracking.pose.relocalise import pose_from_matches

@@ -166,5 +166,5 @@ def test_a_map_that_tells_no_frames_is_refused(tmp_path):
 
 def test_a_map_of_photographs_is_refused_in_words_of_its_own(tmp_path):
     (tmp_path / "summary.json").write_text('{"num_images": 2, "images": "/photographs"}')
-    with pytest.raises(InputError, match=r"made by groma map.* Place frames in it with: groma loc"):
+    with pytest.raises(InputError, match=r"a map of photographs, made by groma map.* Place frames in it: groma loc"):
         read_saved_map(tmp_path)

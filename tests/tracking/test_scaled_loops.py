@@ -90,5 +90,17 @@ def test_maps_of_one_camera_are_joined_with_their_scale(ring):
     assert result.submaps == ()
     assert result.statistics["maps_joined"] == 1
     # The first frame of each map is placed when the second keyframe is.
+    _no_segment_tells_two_lines(tracker)
     assert len(result.trajectory) == sum(row.pose is not None for row in rows) + 2
     assert _room.position_error(result.trajectory, _poses(), scale=True) < 0.02
+
+
+def _no_segment_tells_two_lines(tracker: Tracker) -> None:
+    """Lines that were joined are measured once in each keyframe, and the oldest keyframes' lines are seen again."""
+    ages = {}
+    for keyframe in tracker.map.living():
+        index = tracker.map.living_measurements(keyframe).lines.index
+        assert len(np.unique(index)) == len(index)
+        for line in index.tolist():
+            ages.setdefault(line, []).append(keyframe.index)
+    assert max(max(seen) - min(seen) for seen in ages.values()) > 15

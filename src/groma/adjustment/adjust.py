@@ -35,6 +35,7 @@ from groma.adjustment.stages import (
 )
 from groma.adjustment.survey.place import settled
 from groma.adjustment.terms.contract import Term
+from groma.adjustment.terms.objects import with_held_states
 from groma.errors import InputError
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.factors.losses import loss as make_loss
@@ -102,6 +103,8 @@ class AdjustOptions:
     #: :class:`groma.adjustment.assemble.AssemblyOptions`.
     structure_form: str = "metric"
     structure_sigma_px: float = SURFACE_SIGMA_PX
+    #: Hold lines together that meet: see :class:`groma.adjustment.assemble.AssemblyOptions`.
+    meeting_lines: bool = False
     #: Most steps tried.
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in a step.
@@ -173,7 +176,7 @@ def adjust(
 
 def _settled(scene: Scene, options: AdjustOptions, progress: Callable[[Progress], bool | None] | None) -> AdjustResult:
     """Adjust a scene that begins and ends where measurements of other instruments fit best."""
-    if not (scene.is_surveyed and options.refine_poses):
+    if not (scene.is_tied and options.refine_poses):
         return _adjusted(scene, options, progress)
     result = _adjusted(settled(scene), options, progress)
     after = settled(result.scene)
@@ -239,10 +242,10 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         if stopped:
             break
         for renew in () if last else (renew_lines, settle_clusters):
-            problem, renewed = renew(scene, problem, options.threads)
+            problem, renewed = with_held_states(problem, *renew(scene, problem, options.threads))
             moved.append(renewed)
         if not isinstance(loss, Trivial) and solution.report.iterations:
-            problem, renewed = without_slips(problem, options.threads)
+            problem, renewed = with_held_states(problem, *without_slips(problem, options.threads))
             moved.append(renewed)
             if last and problem is not solution.problem:
                 reports[-1] = with_costs_at(reports[-1], problem)
@@ -357,7 +360,7 @@ def _is_coupled(problem: Problem) -> bool:
     """Whether points are tied to lines. Lines are then not eliminated, and long steps tear points off their lines and
     planes by the product of two displacements, which is much where ties are tight: points take the steps of their own.
     """
-    return any(factor.type_name == "point_on_line" for factor in problem.factors)
+    return any(factor.type_name in ("point_on_line", "lines_meeting") for factor in problem.factors)
 
 
 def assembly_options_of(

@@ -20,9 +20,10 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.terms import (
     camera_motions,
-    camera_positions,
+    camera_poses,
     control_points,
     distances,
+    known_geometry,
     line_depths,
     lines,
     plane_observations,
@@ -34,6 +35,7 @@ from groma.adjustment.terms import (
     right_columns,
 )
 from groma.adjustment.terms.contract import Draft, Group, Term
+from groma.adjustment.terms.objects import with_held
 from groma.adjustment.terms.readout import MOTIONS
 from groma.cameras import model as camera_model
 from groma.geometry import quaternion, se3
@@ -59,11 +61,13 @@ TERMS: tuple[Term, ...] = (
     relations_in_pixels.TERM,
     pose_priors.TERM,
     camera_motions.TERM,
-    camera_positions.TERM,
+    camera_poses.POSITIONS,
+    camera_poses.POSES,
     control_points.MARKS,
     control_points.CONTROL,
-    distances.BETWEEN_CAMERAS,
-    distances.BETWEEN_POINTS,
+    distances.TERM,
+    known_geometry.PLANES,
+    known_geometry.DIRECTIONS,
 )
 #: Types of factors that are observations of points and of lines in images.
 POINT_FACTORS = ("point_reprojection", "stereo_point")
@@ -113,7 +117,8 @@ def assemble(scene: Scene, options: AssemblyOptions, more: Sequence[Term] = ()) 
     if options.gauge == "auto":
         options = replace(options, gauge=gauge_of(scene, options))
     variables = {**camera_variables(scene, options), **_landmark_variables(scene, options)}
-    draft = Draft(scene, options, {**variables, **structure_variables(scene, options)}, notes)
+    variables = with_held({**variables, **structure_variables(scene, options)}, scene)
+    draft = Draft(scene, options, variables, notes)
     made = [(term.name, group) for term in (*TERMS, *more) if term.applies(draft) for group in term.factors(draft)]
     factors = [group.factor for _, group in made]
     used = {ref.group for factor in factors for _, ref in factor.references()}
@@ -124,7 +129,7 @@ def assemble(scene: Scene, options: AssemblyOptions, more: Sequence[Term] = ()) 
 
 def gauge_of(scene: Scene, options: AssemblyOptions) -> str:
     """Whether the first frame must be held; see :attr:`AssemblyOptions.gauge`."""
-    if len(scene.pose_priors) or scene.is_surveyed:
+    if len(scene.pose_priors) or scene.is_tied:
         return "free"
     wireframe = options.points and options.lines and len(scene.relations.point_on_line) > 0
     metric = (wireframe or (options.planes and len(scene.relations) > 0)) and options.structure_form == "metric"

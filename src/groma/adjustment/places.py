@@ -10,6 +10,8 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.adjustment.assemble import point_variables
 from groma.factors.contract import Factor
+from groma.factors.priors.distance import Distance
+from groma.factors.priors.on_known_plane import OnKnownPlane
 from groma.factors.priors.pose_prior import PosePrior
 from groma.factors.priors.position_prior import PositionPrior
 from groma.factors.priors.vector_prior import VectorPrior
@@ -44,7 +46,7 @@ def at_places_of(problem: Problem, scene: Scene, shifted: bool = True) -> Proble
     return Problem(variables, [_shifted(factor, shift) for factor in problem.factors])
 
 
-_IN_WORLD = (PositionPrior, PosePrior, VectorPrior)
+_IN_WORLD = (PositionPrior, PosePrior, VectorPrior, Distance, OnKnownPlane)
 
 
 def _shifted(factor: Factor, shift: FloatArray) -> Factor:
@@ -57,6 +59,12 @@ def _shifted(factor: Factor, shift: FloatArray) -> Factor:
         poses = factor.cam_from_world.copy()
         poses[:, 4:] -= quaternion.rotate(poses[:, :4], np.tile(shift, (len(poses), 1)))
         return replace(factor, cam_from_world=poses)
+    if isinstance(factor, Distance) and factor.first_camera is None:
+        return replace(factor, first_arm=factor.first_arm + shift)
+    if isinstance(factor, OnKnownPlane):
+        known = factor.known.copy()
+        known[:, 3] -= known[:, :3] @ shift
+        return replace(factor, known=known, arm=factor.arm if factor.camera is not None else factor.arm + shift)
     return factor
 
 

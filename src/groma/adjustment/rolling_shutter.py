@@ -67,6 +67,9 @@ class RollingShutterGates:
         "between the directions of readout of two images, below which all count as parallel",
         "convention: half of what would decide",
     )
+    explained: float = gate(
+        0.1, "share", "of the residuals' variance that motions explain, below which it is told", "convention: a tenth"
+    )
     determined: float = gate(
         0.5, "share", "of a motion that the images determine, below which it is told", "convention: half"
     )
@@ -88,6 +91,8 @@ class Motions:
     share: float
     #: Largest angle between the directions of readout of two images, radians.
     spread: float
+    #: Share of the residuals' variance that they explain, against images that were taken at once; None: not asked.
+    explained: float | None = None
 
     def sentences(self) -> tuple[str, ...]:
         """Say how the cameras moved."""
@@ -105,6 +110,12 @@ class Motions:
     def warnings(self, gates: RollingShutterGates = GATES) -> tuple[str, ...]:
         """Say where motions rest on what was expected of them."""
         told = []
+        if self.explained is not None and self.explained < gates.explained:
+            told.append(
+                f"The images show next to no rolling shutter: motions explain {max(self.explained, 0.0):.1%} of the "
+                "variance of the residuals. They may stand for errors of the calibration. Repeat without "
+                "--rolling-shutter."
+            )
         if self.spread < gates.parallel:
             told.append(
                 f"All images are read along nearly the same direction (within {np.degrees(self.spread):.0f} degrees). "
@@ -130,6 +141,7 @@ class Motions:
             "turn_deg": {"median": float(np.degrees(np.median(turn))), "largest": float(np.degrees(turn.max()))},
             "expected_sigma": {"shift": self.sigma[0], "turn_deg": float(np.degrees(self.sigma[1]))},
             "share_of_interval": self.share or None,
+            "explained": self.explained,
             "determined": {
                 "shift": float(self.redundancy[:, :3].mean()),
                 "turn": float(self.redundancy[:, 3:].mean()),
@@ -203,6 +215,7 @@ def adjust_rolling_shutter(
         When the estimate has settled.
     """
     options = options or AdjustOptions()
+    still = noise_at_once(scene, options)
     start = scene.camera_motions.sigma[0, [0, 3]]
     quick = replace(options, check_lens=False)
     for _ in range(gates.max_rounds - 1):
@@ -214,7 +227,16 @@ def adjust_rolling_shutter(
         if ratio.max() <= gates.settled and ratio.min() >= 1.0 / gates.settled:
             break
     result = adjust(scene, options, progress)
-    return RollingShutterResult(result, motions_of(result.scene, result.problem, gates))
+    found = motions_of(result.scene, result.problem, gates)
+    if still is not None and result.report.sigma0 is not None:
+        found = replace(found, explained=1.0 - (result.report.sigma0 / still) ** 2)
+    return RollingShutterResult(result, found)
+
+
+def noise_at_once(scene: Scene, options: AdjustOptions) -> float | None:
+    """Return the noise that the observations of a scene show if it is adjusted without motions; None if they do not."""
+    told = replace(options, check_lens=False)
+    return adjust(scene.replace(camera_motions=CameraMotions()), told).report.sigma0
 
 
 def motions_of(scene: Scene, problem: Problem | None, gates: RollingShutterGates = GATES) -> Motions:
@@ -300,5 +322,5 @@ def _spread(scene: Scene, table: CameraMotions) -> float:
 
 __all__ = [
     "AXES", "GATES", "Motions", "RollingShutterGates", "RollingShutterResult", "adjust_rolling_shutter",
-    "motions_between", "motions_of", "with_rolling_shutter",
+    "motions_between", "motions_of", "noise_at_once", "with_rolling_shutter",
 ]  # fmt: skip

@@ -26,7 +26,9 @@ METRIC_START_TOLERANCE = 1e-3
 
 
 #: Factors that keep the loss they were made with: what is measured by other instruments than the cameras.
-OWN_LOSS = ("pose_prior", "position_prior", "vector_prior", "point_distance", "camera_distance")
+OWN_LOSS = (
+    "pose_prior", "position_prior", "vector_prior", "distance", "on_known_plane", "camera_direction", "known_direction",
+)  # fmt: skip
 
 
 def with_loss(problem: Problem, loss: Loss, relation_loss: Loss | None = None) -> Problem:

@@ -12,6 +12,7 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble, first_camera_gauge
 from groma.adjustment.places import at_places_of
+from groma.adjustment.terms.objects import with_held
 from groma.errors import InputError, ProblemError
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
@@ -88,7 +89,8 @@ def uncertainty(
     gauge : str
         ``inner``: a free network; the camera centres vary least together. ``held``: the first camera and the scale are
         certain. ``auto``: inner, or held where lengths in the cameras or between landmarks tie the scale; where
-        positions or control points hold the scene, ``measured``: nothing is held, and covariances are of their frame.
+        other instruments say where the scene is, ``measured``: covariances are of their frame, and of what they leave
+        open inner.
     sigma0 : float
         Covariances are multiplied by its square; pass the root of the report's ``reduced_chi_square`` where the stated
         noise is not to be believed.
@@ -194,7 +196,7 @@ def _covariances(
         metric = options.planes and len(scene.relations) > 0 and options.structure_form == "metric"
         gauge = (
             "measured"
-            if scene.is_surveyed
+            if scene.is_tied
             else "held"
             if metric or scene.is_metric or len(scene.camera_motions)
             else "inner"
@@ -241,7 +243,7 @@ def _in_gauge(problem: Problem, scene: Scene, gauge: str) -> Problem:
         return problem
     constant = first_camera_gauge(scene) if gauge == "held" else False
     variables = {**problem.variables, "frames": Variables(frames.manifold, frames.state, constant)}
-    return Problem(variables, problem.factors)
+    return Problem(with_held(variables, scene), problem.factors)
 
 
 def _free_cameras(problem: Problem) -> int:

@@ -120,8 +120,8 @@ def opened_arrays(path: str | os.PathLike[str]) -> Iterator[ArrayMembers]:
         yield ArrayMembers(file, path, os.stat(path).st_size)
 
 
-def read_array(path: str | os.PathLike[str]) -> Array:
-    """Read an ``.npy`` file of numbers.
+def read_array(path: str | os.PathLike[str], check: Check | None = None) -> Array:
+    """Read an ``.npy`` file of numbers, after ``check`` has seen its header.
 
     Raises
     ------
@@ -130,6 +130,8 @@ def read_array(path: str | os.PathLike[str]) -> Array:
     """
     with open(path, "rb") as stream:
         header = _header(stream, str(path))
+        if check is not None:
+            check(header)
         return _content(stream, header, os.fstat(stream.fileno()).st_size - stream.tell(), str(path))
 
 

@@ -4,11 +4,15 @@
 Exit codes: 0 success, 1 a known error (one line on standard error), 2 wrong usage, 130 interrupted.
 """
 
+import gc
 import os
 import sys
 from io import TextIOWrapper
 
 from groma.cli.shared.interrupt import INTERRUPTED, PROCESS, answer_signals, ignore_signals
+
+#: New objects after which garbage is looked for; Python's own number is 700. Modules are a hundred thousand that stay.
+_COLLECT_AFTER = 10_000
 
 
 def run(arguments: list[str] | None = None) -> int:
@@ -32,6 +36,7 @@ def run(arguments: list[str] | None = None) -> int:
 
 def main() -> None:
     """Run as a process."""
+    gc.set_threshold(_COLLECT_AFTER)
     try:
         answer_signals()
         for stream in (sys.stdout, sys.stderr):
@@ -46,6 +51,7 @@ def main() -> None:
         # Worker threads may still be inside a compiled kernel; the normal exit would wait for them.
         sys.stderr.flush()
         os._exit(INTERRUPTED)
+    gc.freeze()  # memory goes back as a whole: no search for garbage in it
     sys.exit(code)
 
 

@@ -25,7 +25,7 @@ IMPORTS = {
     "track": "groma.tracking",
     "selfcheck": "groma.factors",
     "localize": "groma.localization.run",
-    "pose graph": "groma.adjustment.pose_graph",
+    "pose graph": "groma.adjustment.graphs.pose_graph",
 }
 #: Module, name, argument types.
 Entry = tuple[str, str, tuple[Any, ...]]

@@ -93,4 +93,18 @@ def inlier_probability(
     return probability, share
 
 
-__all__ = ["inlier_probability"]
+def maximise_shares(
+    density: FloatArray, clutter: FloatArray, owner: IntArray, num: int, pooled: float, rounds: int
+) -> FloatArray:
+    """Shares (K,) of members by expectation maximisation, from the densities (N,) of members and of clutter.
+
+    The share of all structures together counts ``pooled`` features in that of each.
+    """
+    together, probability = np.full(1, 0.5), np.zeros(len(density))
+    _maximise(density, clutter, np.zeros_like(owner), np.array([len(owner)]), 1.0, 0.5, rounds, together, probability)
+    share, count = np.full(num, float(together[0])), np.bincount(owner, minlength=num)
+    _maximise(density, clutter, owner, count, pooled, float(together[0]), rounds, share, probability)
+    return share
+
+
+__all__ = ["inlier_probability", "maximise_shares"]

@@ -40,8 +40,9 @@ from groma.factors.observations.point_depth import PointDepth
 from groma.factors.observations.point_reprojection import PointReprojection
 from groma.factors.observations.stereo_line import StereoLine
 from groma.factors.observations.stereo_point import StereoPoint
-from groma.factors.priors.camera_distance import CameraDistance
-from groma.factors.priors.point_distance import PointDistance
+from groma.factors.priors.distance import Distance
+from groma.factors.priors.known_direction import CameraDirection, KnownDirection
+from groma.factors.priors.on_known_plane import OnKnownPlane
 from groma.factors.priors.pose_between import PoseBetween
 from groma.factors.priors.pose_prior import PosePrior
 from groma.factors.priors.position_prior import PositionPrior
@@ -50,6 +51,7 @@ from groma.factors.priors.vector_prior import VectorPrior
 from groma.factors.relations.line_direction import LineDirection
 from groma.factors.relations.line_on_plane import LineOnPlane, SegmentOnPlane
 from groma.factors.relations.line_to_pixel import LineToPixel
+from groma.factors.relations.lines_meeting import LinesMeeting
 from groma.factors.relations.on_plane_pixels import PointOnPlanePixels, SegmentOnPlanePixels
 from groma.factors.relations.orthogonal import (
     LineParallelToPlane,
@@ -76,14 +78,16 @@ __all__ = [
     "LOSSES",
     "WORLD_FIXED",
     "Barron",
-    "CameraDistance",
+    "CameraDirection",
     "Cauchy",
+    "Distance",
     "Example",
     "Factor",
     "FactorCheck",
     "GemanMcClure",
     "Huber",
     "Invariance",
+    "KnownDirection",
     "LineBearing",
     "LineDirection",
     "LineNormal",
@@ -93,7 +97,9 @@ __all__ = [
     "LinePerpendicularToPlane",
     "LineReprojection",
     "LineToPixel",
+    "LinesMeeting",
     "Loss",
+    "OnKnownPlane",
     "OrthogonalDirections",
     "OrthogonalLines",
     "OrthogonalPlanes",
@@ -105,7 +111,6 @@ __all__ = [
     "PlanePerpendicularToDirection",
     "PlaneQuaternion",
     "PointDepth",
-    "PointDistance",
     "PointOnLine",
     "PointOnPlane",
     "PointOnPlanePixels",

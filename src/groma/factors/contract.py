@@ -106,6 +106,9 @@ class Factor(ABC):
     rows: ClassVar[int]
     #: How many of them are independent; 0: all.
     independent_rows: ClassVar[int] = 0
+    #: Whether it says that one thing lies on another: a residual that is zero in truth. What is left of it moves, turns
+    #: and scales with the world, and so does its derivative, but neither tells where the world is, or how large.
+    is_incidence: ClassVar[bool] = False
     #: Which motions of the world it does not notice; None: not declared, and not checked.
     invariance: ClassVar[Invariance | None] = Invariance()
 

@@ -3,12 +3,12 @@
 
 A package offers one by an entry point in the group ``groma.detectors``, ``groma.matchers`` or ``groma.retrieval``; it
 is imported when it is asked for. The entry point names a class or function that is called with the settings below, by
-keyword, and returns the object.
+keyword, and returns the object. A name that ends in ``:FILE`` stands for any file, which is the setting ``file``.
 
 ============================  ==========================================================  =========================
 table                         settings                                                    built in
 ============================  ==========================================================  =========================
-:data:`DETECTORS`             ``min_length`` pixels; ``max_segments``, 0 for all          ``lsd``
+:data:`DETECTORS`             ``min_length`` pixels; ``max_segments``, 0 for all          ``lsd``, ``onnx:FILE``
 :data:`MATCHERS`              none                                                        ``wide_baseline``, ``flow``
 :data:`RETRIEVAL`             none                                                        ``gradients``
 ============================  ==========================================================  =========================
@@ -76,6 +76,11 @@ class Table(Generic[_T]):
         return made
 
     def _make(self, name: str, settings: dict[str, Any]) -> Any:
+        kind, colon, file = name.partition(":")
+        if colon and file and f"{kind}:FILE" in self._factories:
+            name, settings = f"{kind}:FILE", settings | {"file": file}
+        elif name.endswith(":FILE") or f"{kind}:FILE" in self._factories:
+            raise InputError(f"The {self.noun} {kind} needs a file: {kind}:FILE.")
         factory = self._factories.get(name) or self._installed().get(name)
         if factory is None:
             raise InputError(
@@ -99,7 +104,12 @@ class Table(Generic[_T]):
         return {point.name: point for point in entry_points(group=self.group)}
 
 
-DETECTORS = Table("segment detector", SegmentDetector, "groma.detectors", {"lsd": "groma.features.lsd:LsdDetector"})
+DETECTORS = Table(
+    "segment detector",
+    SegmentDetector,
+    "groma.detectors",
+    {"lsd": "groma.features.lsd:LsdDetector", "onnx:FILE": "groma.features.onnx_segments:OnnxDetector"},
+)
 MATCHERS = Table(
     "segment matcher",
     SegmentMatcher,

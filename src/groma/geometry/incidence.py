@@ -19,7 +19,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.geometry import line3
-from groma.geometry.algebra import dot, norm, not_negative, ratio, stack, unit, vectors
+from groma.geometry.algebra import cross, dot, norm, not_negative, ratio, stack, unit, vectors
 
 
 class LineRelation(IntEnum):
@@ -74,7 +74,7 @@ def meet_line_plane(line: FloatArray, plane: FloatArray) -> FloatArray:
     """
     line, plane = vectors(line, 6, "line"), vectors(plane, 4, "plane")
     normal, along = plane[..., :3], line[..., 3:]
-    return stack(np.cross(line[..., :3], normal) + plane[..., 3:] * along, -dot(along, normal)[..., None])
+    return stack(cross(line[..., :3], normal) + plane[..., 3:] * along, -dot(along, normal)[..., None])
 
 
 def join_line_point(line: FloatArray, point: FloatArray) -> FloatArray:
@@ -90,7 +90,7 @@ def join_line_point(line: FloatArray, point: FloatArray) -> FloatArray:
     """
     line, point = vectors(line, 6, "line"), vectors(point, 4, "point")
     position, across = point[..., :3], line[..., :3]
-    return stack(np.cross(line[..., 3:], position) + point[..., 3:] * across, -dot(across, position)[..., None])
+    return stack(cross(line[..., 3:], position) + point[..., 3:] * across, -dot(across, position)[..., None])
 
 
 def meet_planes(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -193,16 +193,16 @@ def closest_points(
     first = line3.normalize(np.where(valid[..., None], first, placeholder))
     second = line3.normalize(np.where(valid[..., None], second, placeholder))
     m1, d1, m2, d2 = first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
-    k = np.cross(d1, d2)
+    k = cross(d1, d2)
     squared = dot(k, k)
     sine = np.minimum(np.sqrt(squared), 1.0)
     parallel = sine <= parallel_sine
     oblique = ~parallel[..., None]
-    foot = np.cross(d1, m1)
-    c1 = ratio(np.cross(np.cross(d2, k), m1) + dot(m2, k)[..., None] * d1, squared[..., None], oblique, 0.0) + np.where(
+    foot = cross(d1, m1)
+    c1 = ratio(cross(cross(d2, k), m1) + dot(m2, k)[..., None] * d1, squared[..., None], oblique, 0.0) + np.where(
         oblique, 0.0, foot
     )
-    c2 = ratio(np.cross(m2, np.cross(d1, k)) - dot(m1, k)[..., None] * d2, squared[..., None], oblique, 0.0)
+    c2 = ratio(cross(m2, cross(d1, k)) - dot(m1, k)[..., None] * d2, squared[..., None], oblique, 0.0)
     c2 = np.where(oblique, c2, line3.closest_point(second, foot))
     gap = c2 - c1
     distance = np.where(parallel, norm(gap), ratio(np.abs(side(first, second)), sine, ~parallel, 0.0))
@@ -275,8 +275,8 @@ def join_lines(
     first, second = (line3.normalize(np.where(known[..., None], line, 0.0)) for line in (first, second))
     parallel = pair.status == LineRelation.PARALLEL
     w = 0.5 * (dot(second[..., :3], first[..., 3:]) - dot(first[..., :3], second[..., 3:]))
-    oblique_plane = stack(np.cross(first[..., 3:], second[..., 3:]), w[..., None])
-    normal = np.cross(first[..., 3:], unit(pair.second - pair.first))
+    oblique_plane = stack(cross(first[..., 3:], second[..., 3:]), w[..., None])
+    normal = cross(first[..., 3:], unit(pair.second - pair.first))
     parallel_plane = stack(normal, -dot(normal, pair.first)[..., None])
     plane = np.where(parallel[..., None], parallel_plane, oblique_plane)
     length = norm(plane[..., :3])[..., None]

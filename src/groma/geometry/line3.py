@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.geometry.algebra import dot, matrices, norm, not_negative, perpendicular, ratio, stack, unit, vectors
+from groma.geometry.algebra import cross, dot, matrices, norm, not_negative, perpendicular, ratio, stack, unit, vectors
 from groma.geometry.so3 import hat
 
 #: A line whose |d| is below this fraction of |m| counts as a line at infinity.
@@ -59,7 +59,7 @@ def from_points(first: FloatArray, second: FloatArray) -> FloatArray:
     """
     first, second = vectors(first, 3, "first"), vectors(second, 3, "second")
     along = second - first
-    return stack(np.cross(first, along), along)
+    return stack(cross(first, along), along)
 
 
 def from_homogeneous_points(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -83,7 +83,7 @@ def from_homogeneous_points(first: FloatArray, second: FloatArray) -> FloatArray
     """
     first, second = vectors(first, 4, "first"), vectors(second, 4, "second")
     return stack(
-        np.cross(first[..., :3], second[..., :3]), first[..., 3:] * second[..., :3] - second[..., 3:] * first[..., :3]
+        cross(first[..., :3], second[..., :3]), first[..., 3:] * second[..., :3] - second[..., 3:] * first[..., :3]
     )
 
 
@@ -95,7 +95,7 @@ def from_point_and_direction(point: FloatArray, direction: FloatArray) -> FloatA
     Plücker notes, eq. (2). Eq. (17) has the opposite sign of m.
     """
     point, direction = vectors(point, 3, "point"), vectors(direction, 3, "direction")
-    return stack(np.cross(point, direction), direction)
+    return stack(cross(point, direction), direction)
 
 
 def from_planes(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -122,7 +122,7 @@ def from_planes(first: FloatArray, second: FloatArray) -> FloatArray:
     """
     first, second = vectors(first, 4, "first"), vectors(second, 4, "second")
     return stack(
-        first[..., 3:] * second[..., :3] - second[..., 3:] * first[..., :3], np.cross(first[..., :3], second[..., :3])
+        first[..., 3:] * second[..., :3] - second[..., 3:] * first[..., :3], cross(first[..., :3], second[..., :3])
     )
 
 
@@ -328,7 +328,7 @@ def foot_point(line: FloatArray) -> FloatArray:
     """
     line = _points_or_nan(line)
     along = line[..., 3:]
-    return np.cross(along, line[..., :3]) / dot(along, along)[..., None]
+    return cross(along, line[..., :3]) / dot(along, along)[..., None]
 
 
 def distance_to_point(line: FloatArray, point: FloatArray) -> FloatArray:
@@ -337,7 +337,7 @@ def distance_to_point(line: FloatArray, point: FloatArray) -> FloatArray:
     Infinity for lines at infinity.
     """
     line, point = _points_or_nan(line), vectors(point, 3, "point")
-    return _or_infinity(norm(np.cross(point, line[..., 3:]) - line[..., :3]) / norm(line[..., 3:]))
+    return _or_infinity(norm(cross(point, line[..., 3:]) - line[..., :3]) / norm(line[..., 3:]))
 
 
 def closest_point(line: FloatArray, point: FloatArray) -> FloatArray:
@@ -347,7 +347,7 @@ def closest_point(line: FloatArray, point: FloatArray) -> FloatArray:
     """
     line, point = _points_or_nan(line), vectors(point, 3, "point")
     along = line[..., 3:]
-    step = np.cross(along, line[..., :3] - np.cross(point, along))
+    step = cross(along, line[..., :3] - cross(point, along))
     return point + step / dot(along, along)[..., None]
 
 

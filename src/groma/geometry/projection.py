@@ -20,7 +20,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.geometry import line3
-from groma.geometry.algebra import apply, cofactor, matrices, norm, not_negative, ratio, stack, vectors
+from groma.geometry.algebra import apply, cofactor, cross, matrices, norm, not_negative, ratio, stack, vectors
 from groma.geometry.so3 import hat, vee
 from groma.geometry.transform import Rigid, rotation_and_translation
 
@@ -166,12 +166,12 @@ def back_project_lines(camera: FloatArray, image_line: FloatArray) -> FloatArray
 # ------------------------------------------------------------------------------------------- Points, lines in the image
 def join_image_points(first: FloatArray, second: FloatArray) -> FloatArray:
     """Image line (..., 3) through two homogeneous image points (..., 3): a x b. Zero for equal points."""
-    return np.cross(vectors(first, 3, "first"), vectors(second, 3, "second"))
+    return cross(vectors(first, 3, "first"), vectors(second, 3, "second"))
 
 
 def meet_image_lines(first: FloatArray, second: FloatArray) -> FloatArray:
     """Homogeneous image point (..., 3) on two image lines (..., 3): l x m; third entry 0 for parallel lines."""
-    return np.cross(vectors(first, 3, "first"), vectors(second, 3, "second"))
+    return cross(vectors(first, 3, "first"), vectors(second, 3, "second"))
 
 
 def skew_of_join(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ import numpy as np
 from groma._numba import kernel
 from groma._typing import FloatArray
 from groma.errors import InputError
-from groma.geometry.algebra import matrices, vectors
+from groma.geometry.algebra import cross, matrices, vectors
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 
@@ -93,7 +93,7 @@ def _quaternions(q: FloatArray) -> FloatArray:
 def multiply(first: FloatArray, second: FloatArray) -> FloatArray:
     """Hamilton product (..., 4): R(first second) = R(first) R(second)."""
     a, b = _quaternions(first), _quaternions(second)
-    vector = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + np.cross(a[..., :3], b[..., :3])
+    vector = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + cross(a[..., :3], b[..., :3])
     scalar = a[..., 3:] * b[..., 3:] - np.sum(a[..., :3] * b[..., :3], axis=-1, keepdims=True)
     return np.concatenate([vector, scalar], axis=-1)
 
@@ -124,19 +124,19 @@ def normalize(q: FloatArray) -> FloatArray:
 def rotate(q: FloatArray, vector: FloatArray) -> FloatArray:
     """Vectors (..., 3) turned by unit quaternions (..., 4); both broadcast."""
     q, v = _quaternions(q), vectors(vector, 3, "A vector")
-    t = 2.0 * np.cross(q[..., :3], v)
-    return v + q[..., 3:] * t + np.cross(q[..., :3], t)
+    t = 2.0 * cross(q[..., :3], v)
+    return v + q[..., 3:] * t + cross(q[..., :3], t)
 
 
 def to_matrix(q: FloatArray) -> FloatArray:
     """Rotation matrix (..., 3, 3) of unit quaternions."""
-    x, y, z, w = np.moveaxis(_quaternions(q), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    q = _quaternions(q)
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    R = np.empty((*x.shape, 3, 3))
+    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    return R
 
 
 def from_matrix(rotation: FloatArray) -> FloatArray:

@@ -5,6 +5,7 @@ from groma.io.archive import read_archive, write_archive
 from groma.io.atomic import atomic_output
 from groma.io.bal import read_bal, write_bal
 from groma.io.colmap.model import from_pycolmap, read_colmap, to_pycolmap, write_colmap
+from groma.io.depth_maps import DepthMaps
 from groma.io.exports.dxf import write_dxf
 from groma.io.exports.gltf import write_gltf
 from groma.io.exports.recording import write_recording
@@ -20,6 +21,7 @@ from groma.io.registry import SceneFormat, check_target, formats, read_scene, re
 from groma.io.trajectories import Trajectory, read_trajectory, read_tum, write_trajectory, write_tum
 
 __all__ = [
+    "DepthMaps",
     "OpenSfmReconstruction",
     "SceneFormat",
     "Structures",

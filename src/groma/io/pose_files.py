@@ -9,6 +9,7 @@ a trajectory of TUM or EuRoC                     where the names of the photogra
 a trajectory of KITTI                            in order, if there are as many; else the numbers in the names are
                                                  lines, from 0
 a pose graph of g2o                              the numbers in the names are ids; else in order, if there are as many
+lines ``name x y z qx qy qz qw``                 by name, as of a model
 ===============================================  ===================================================================
 
 Whatever else is refused. What was concluded and is not in the file is said in a sentence.
@@ -34,6 +35,7 @@ from groma.geometry import se3
 from groma.io.g2o import looks_like_g2o, read_g2o
 from groma.io.reading import existing, reading
 from groma.io.registry import HEAD_BYTES, formats, read_scene
+from groma.io.survey.rows import is_measured_poses, read_measured_poses
 from groma.io.trajectories import read_trajectory
 from groma.scene import Cameras
 
@@ -85,6 +87,8 @@ def read_poses(path: str | os.PathLike[str], photographs: Sequence[str]) -> Pose
     first = b""
     with reading(place, "file of poses"):
         first = next((line for _, line in read_lines(place)), "").encode()
+    if is_measured_poses(first.decode(errors="replace")):
+        return _of_measured(place, photographs)
     return _of_graph(place, photographs) if looks_like_g2o(first) else _of_trajectory(place, photographs)
 
 
@@ -139,6 +143,14 @@ def _of_trajectory(place: Path, photographs: Sequence[str]) -> PosesOfPhotograph
         said = (f"The numbers in the names were taken as lines of {place}, from 0.",)
         return _without_calibration(names, poses[numbers], said)
     raise _unclear(place, count, names, "times" if has_times else "lines, counted from 0")
+
+
+def _of_measured(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:
+    given = read_measured_poses(place)
+    found, said = _by_name(place, given.names, photographs)
+    rows = [row for row, name in enumerate(found) if name is not None]
+    poses = se3.inverse(np.hstack([given.world_from_cam[rows, 3:], given.world_from_cam[rows, :3]]))
+    return _without_calibration([str(found[row]) for row in rows], poses, said)
 
 
 def _of_graph(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:

@@ -11,12 +11,13 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from groma._typing import IntArray
+from groma._typing import FloatArray, IntArray
 from groma.adjustment.report import AdjustReport, AdjustResult
 from groma.bounded.arrays import opened_arrays
 from groma.features.segments import Segments
 from groma.io import atomic_output, read_archive, write_archive
 from groma.io.reading import reading
+from groma.mapping.depth.points import MeasuredDepths
 from groma.mapping.lines.line_map import LineMap
 from groma.mapping.posed.placed import PlacedPhotographs
 from groma.scene import Scene
@@ -136,10 +137,34 @@ def _read_placed(path: Path) -> PlacedPhotographs:
         return PlacedPhotographs(read_archive(path), tuple(notes), tuple(warnings))
 
 
+def _write_depths(measured: MeasuredDepths, path: Path) -> None:
+    # The scene comes last: where it is, the rest is.
+    told = {"units": measured.units, "header": np.array(measured.header())}
+    _write_arrays(path.with_suffix(".units.npz"), told)
+    _write_scene(measured.scene, path)
+
+
+def _read_depths(path: Path) -> MeasuredDepths:
+    units = path.with_suffix(".units.npz")
+    saved = _read_arrays(units)
+    with reading(units, "finished stage"):
+        return MeasuredDepths.of(read_archive(path), saved["units"], str(saved["header"]))
+
+
+def _write_array(array: FloatArray, path: Path) -> None:
+    _write_arrays(path, {"array": array})
+
+
+def _read_array(path: Path) -> FloatArray:
+    return _read_arrays(path)["array"]
+
+
 SCENE = FileKind(_write_scene, read_archive)
 SEGMENTS = FileKind(_write_segments, _read_segments)
 LINE_MAP = FileKind(_write_line_map, _read_line_map)
 ADJUSTED = FileKind(_write_adjusted, _read_adjusted)
 PLACED = FileKind(_write_placed, _read_placed)
+DEPTHS = FileKind(_write_depths, _read_depths)
+ARRAY = FileKind(_write_array, _read_array)
 
-__all__ = ["ADJUSTED", "LINE_MAP", "PLACED", "SCENE", "SEGMENTS", "FileKind"]
+__all__ = ["ADJUSTED", "ARRAY", "DEPTHS", "LINE_MAP", "PLACED", "SCENE", "SEGMENTS", "FileKind"]

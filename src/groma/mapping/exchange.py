@@ -26,6 +26,7 @@ from groma.features.segments import Segments
 from groma.mapping.lines.matches import ImageReader, MatchProvider, given_matches, segment_matches
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.photographs import image_reader
+from groma.mapping.read_rows import check_read_rows
 from groma.scene import Scene
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def with_parts(options: _Options) -> _Options:
     InputError
         If there is no part of a name, or an object is no such part.
     """
+    check_read_rows(options)
     return dataclasses.replace(
         options,
         detector=DETECTORS.make(options.detector, min_length=options.min_segment_length, max_segments=0),

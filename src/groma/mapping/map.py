@@ -6,6 +6,7 @@ Stages, each saved when it is finished, so that an interrupted run goes on where
 1. ``model``      points and poses: read, reconstructed from the images, or found at poses without points
                   (``placed``); adjusted with robust losses (``points``);
                   the points' observations placed anew by their grey levels, and adjusted again (``measured``);
+                  with depth maps brought to their unit, and adjusted with depths (``depths``);
 2. ``segments``   line segments in every image, one image at a time;
 3. ``lines``      3D lines from the segments;
 4. ``joint``      poses, points and lines adjusted together, each point weighted by its own noise, the lines by theirs;
@@ -26,10 +27,11 @@ from functools import partial
 from pathlib import Path
 
 from groma._log import log_warnings, logged_stages
+from groma._typing import FloatArray
 from groma._version import __version__
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult
-from groma.adjustment.survey.attach import Survey
+from groma.adjustment.survey.given import Survey
 from groma.execution import work_with
 from groma.features.contract import ImageRetrieval, SegmentDetector, SegmentMatcher
 from groma.features.external import ExternalMatches
@@ -39,31 +41,27 @@ from groma.features.segments import Segments
 from groma.gates import gate
 from groma.io.colmap.rigs import RigDescription
 from groma.io.colmap.sfm import PointModelOptions
+from groma.io.depth_maps import DepthMaps
 from groma.mapping.checkpoint_files import ADJUSTED, LINE_MAP, SCENE, SEGMENTS
 from groma.mapping.checkpoints import Stages, digest, digest_files, stage
+from groma.mapping.depth.segments import with_line_depths
 from groma.mapping.exchange import NeighborChooser, matches_for, neighbors_for, with_parts
 from groma.mapping.image_segments import detect_segments, given_segments
-from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider, explain
-from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE, left_out, with_confidence
+from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider
+from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.in_views import map_lines_in_views
-from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
-from groma.mapping.photographs import (
-    check_images,
-    check_number,
-    image_files,
-    image_reader,
-    images_left_out,
-)
+from groma.mapping.photographs import check_images, check_number, image_files, image_reader, images_left_out
+from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
 from groma.mapping.refine_points import PointRefinementOptions, refine_points
-from groma.mapping.result import MapResult
+from groma.mapping.result import MapResult, result_of
 from groma.mapping.start import start_of
 from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
 from groma.mapping.surveyed import adjust_with_survey, tied
-from groma.mapping.unused import without_unused
+from groma.mapping.with_depths import find_segment_depths, with_depths
 from groma.scene import Scene
 from groma.scene.local_frame import usual_frame
 from groma.solver.linear.blas import one_blas_thread
@@ -140,6 +138,8 @@ class MapOptions:
     rigs: tuple[RigDescription, ...] = ()
     #: Estimate where cameras sit on their rig.
     refine_rigs: bool = False
+    #: What photographs were read along, ``rows`` or ``columns``; None: taken at once, unless a given model says how.
+    rolling_shutter: str | None = None
 
     def point_model(self, threads: bool = True) -> PointModelOptions:
         """How points are reconstructed, with or without the number of threads, on which no result depends."""
@@ -155,6 +155,7 @@ def map_images(
     progress: StageProgress | None = None,
     line_matches: ExternalMatches | None = None,
     survey: Survey | None = None,
+    depth: DepthMaps | None = None,
 ) -> MapResult:
     """Map a folder of photographs: points, lines and planes, adjusted together.
 
@@ -175,6 +176,8 @@ def map_images(
         Segments and their matches from elsewhere, by image name; nothing is detected then.
     survey : Survey, optional
         Positions, control points and distances; the map is in their frame and adjusted with them.
+    depth : DepthMaps, optional
+        Depth maps of the photographs; the map has their unit of length and is adjusted with them.
 
     Returns
     -------
@@ -206,24 +209,33 @@ def map_images(
     with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
         placed = start_of(folder, names, model, stages)
         start = placed.scene
-        points = stages.run(adjust_points, start)
+        points = stages.run(adjust_read_rows if read_by_rows(start, options) else adjust_points, start)
         if options.refine_points:
             points = stages.run(measure_points, folder, points)
         in_place = tied(start, points, survey) if survey else None
         if in_place is not None:
             start, near = in_place.start, in_place.near
             points = stages.run(adjust_with_survey, in_place.points, given=in_place.points)
+        depths = None if depth is None else with_depths(start, points, near, depth, stages)
+        if depths is not None:
+            start, points, near = depths.start, depths.points, depths.near
         segments = stages.run(find_segments, folder, points, line_matches, given=line_matches)
         matches = matches_for(options, folder, points, segments, line_matches)
-        result = map_segments(points, segments, matches, stages, neighbors_for(options, folder))
+        beside = None
+        if depths is not None and depth is not None:
+            beside = stages.run(find_segment_depths, points, segments, depth, depths.measured)
+        seen = taken_at_once(points, segments)
+        result = map_segments(seen.scene, seen.segments, matches, stages, neighbors_for(options, folder), beside)
+        result = mapped_as_measured(result, seen, stages)
     left_out = images_left_out(names, (model or start).images.names, model is not None)
     result = dataclasses.replace(
         result,
         start=start,
         num_photographs=len(names) if model is None else model.num_images,
         explanation=" ".join([*placed.notes, result.explanation]),
-        warnings=(*left_out, *placed.warnings, *result.warnings),
+        warnings=(*left_out, *placed.warnings, *(depths.measured.warnings if depths else ()), *result.warnings),
         surveyed=None if in_place is None else in_place.surveyed,
+        depths=None if depths is None else depths.measured,
     )
     log_warnings("mapping", [sentence for sentence in result.warnings if sentence not in result.report.warnings])
     if near is None:
@@ -238,15 +250,17 @@ def map_segments(
     matches: Mapping[tuple[int, int], LineMatches] | MatchProvider | None,
     stages: Stages[MapOptions],
     neighbors: NeighborChooser | None = None,
+    depths: FloatArray | None = None,
 ) -> MapResult:
     """Map lines and planes from segments and an adjusted model of points: the stages from ``lines`` on.
 
-    No file of an image is read; ``start`` of the result is ``points``.
+    No file of an image is read; ``start`` of the result is ``points``. ``depths`` are those of the segments, as
+    :func:`~groma.mapping.depth.segments.segment_depths` returns them.
     """
     options = stages.options
     scene = with_point_noise(points)
     line_map = stages.run(find_lines, scene, segments, matches, neighbors, None)
-    scene = line_map.add_to(scene, segments)
+    scene = with_line_depths(line_map.add_to(scene, segments), line_map, segments, depths)
     weighted = _weighted(scene, options)
     for turn in range(GATES.max_rounds if options.refine_poses and scene.num_lines else 0):
         before, tag = scene, f"-{turn + 1}" if turn else ""
@@ -258,7 +272,7 @@ def map_segments(
         weighted = _weighted(joint, options)
         earlier = EarlierMap(before, line_map)
         line_map = stages.run(find_lines_again, joint, segments, matches, neighbors, earlier, tag=tag)
-        scene = line_map.add_to(joint, segments)
+        scene = with_line_depths(line_map.add_to(joint, segments), line_map, segments, depths)
         if scene.num_lines == 0 or moved_px(before, joint, GATES.moved_share) <= options.lines.noise:
             break
     if scene.num_lines:
@@ -269,7 +283,7 @@ def map_segments(
     independent = math.sqrt(1.0 + weighted.line_end_correlation)
     scene = with_shared_noise(scene, weighted.point_sigma_px, weighted.line_sigma_px * independent)
     adjusted = stages.run(adjust_everything, scene, weighted)
-    return _result(points, scene, adjusted, weighted, line_map, options.min_confidence)
+    return result_of(points, scene, adjusted, weighted, line_map, options.min_confidence)
 
 
 # --------------------------------------------------------------------------------------------------------------- stages
@@ -347,6 +361,7 @@ def _robust(options: MapOptions) -> AdjustOptions:
         refine_intrinsics=bool(options.refine_intrinsics),
         refine_rigs=options.refine_rigs,
         max_iterations=options.max_iterations,
+        start_tolerance=0.0,
         check_lens=False,
         threads=options.threads,
     )
@@ -370,29 +385,3 @@ def _adjusted(
     held = dataclasses.replace(adjust_options, refine_poses=options.refine_poses)
     say(doing, 0, held.max_iterations)
     return adjust(scene, held, lambda event: say(doing, event.iteration, event.max_iterations))
-
-
-def _result(
-    points: Scene,
-    before: Scene,
-    adjusted: AdjustResult,
-    weighted: AdjustOptions,
-    line_map: LineMap,
-    min_confidence: float,
-) -> MapResult:
-    scene = with_confidence(with_supported_intervals(adjusted.scene))
-    before = before.replace(line_intervals=scene.line_intervals)
-    kept = scene.lines.confidence >= min_confidence
-    scene, before = without_unused(scene.keep(lines=kept), before.keep(lines=kept))
-    missing = [] if line_map.num_lines else ["No line was mapped; see what became of the segments."]
-    return MapResult(
-        scene=scene,
-        start=points,
-        before=before,
-        report=adjusted.report,
-        adjusted_with=weighted,
-        sigma_px={"points": weighted.point_sigma_px, "lines": weighted.line_sigma_px},
-        explanation=explain(line_map) + left_out(kept, min_confidence),
-        outcomes={outcome.name.lower(): count for outcome, count in line_map.outcome_counts().items()},
-        warnings=(*missing, *adjusted.report.warnings),
-    )

@@ -25,7 +25,11 @@ _STRUCTURE = ("finding planes", "finding directions", "finding what lies on what
 
 
 def planned_stages(
-    options: MapOptions, start: Start = "photographs", surveyed: bool = False, given_segments: bool = False
+    options: MapOptions,
+    start: Start = "photographs",
+    surveyed: bool = False,
+    given_segments: bool = False,
+    depth: bool = False,
 ) -> tuple[str, ...]:
     """Return the names of the stages of :func:`groma.map_images`.
 
@@ -39,18 +43,24 @@ def planned_stages(
         Positions, control points or distances take part.
     given_segments : bool
         Segments come from elsewhere.
+    depth : bool
+        There are depth maps.
     """
+    rolling = options.rolling_shutter is not None
     return (
         "checking images",
         *_STARTS[start],
-        "adjusting points",
+        "adjusting points and motions" if rolling else "adjusting points",
         *(("measuring points", "adjusting points again") if options.refine_points else ()),
         *(("adjusting with measurements",) if surveyed else ()),
+        *(("reading depths of points", "adjusting with depths") if depth else ()),
         "reading segments" if given_segments else "finding segments",
+        *(("reading depths of segments",) if depth else ()),
         *_LINES,
         *(("adjusting points and lines", *_LINES) if options.refine_poses else ()),
         *(_STRUCTURE if options.find_planes else ()),
         "adjusting everything",
+        *(("adjusting with motions",) if rolling else ()),
     )
 
 

@@ -18,7 +18,8 @@ from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.contributions import Contribution, contributions
 from groma.adjustment.diagnosis import diagnose_scene
-from groma.adjustment.report import AdjustReport
+from groma.adjustment.report import AdjustReport, AdjustResult
+from groma.adjustment.rolling_shutter import motions_of
 from groma.adjustment.stages import with_loss
 from groma.adjustment.survey.attach import Surveyed
 from groma.adjustment.survey.protocol import protocol
@@ -26,7 +27,12 @@ from groma.adjustment.uncertainty import pose_uncertainty
 from groma.execution import beside
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
-from groma.mapping.surveyed import has_survey, reliability_of, survey_numbers
+from groma.mapping.depth.points import MeasuredDepths
+from groma.mapping.lines.confidence import left_out, with_confidence
+from groma.mapping.lines.intervals import with_supported_intervals
+from groma.mapping.lines.line_map import LineMap, explain
+from groma.mapping.surveyed import reliability_of, survey_numbers
+from groma.mapping.unused import without_unused
 from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.solver.observability.diagnosis import Diagnosis, Finding
@@ -61,6 +67,8 @@ class MapResult:
     num_photographs: int = 0
     #: How the map got into the frame of measurements, where there are any.
     surveyed: Surveyed | None = None
+    #: What was found out about the depth maps, where there are any.
+    depths: MeasuredDepths | None = None
 
     def diagnose(self) -> Diagnosis:
         """Say in words what the observations determine, at the noise and with the loss of the last adjustment."""
@@ -103,7 +111,12 @@ class MapResult:
         }
         if contributions:
             numbers["contributions"] = [entry.to_dict() for entry in contributions]
-        if has_survey(self.scene):
+        if self.depths is not None:
+            numbers["depth"] = self.depths.to_dict()
+        if len(self.scene.camera_motions):
+            problem = _problem_of(self.scene, self.adjusted_with)
+            numbers["rolling_shutter"] = motions_of(self.scene, problem).to_dict()
+        if self.scene.has_survey:
             found = reliability_of(self.scene, _problem_of(self.scene, self.adjusted_with))
             numbers["survey"] = survey_numbers(self.surveyed, found)
         return numbers
@@ -200,4 +213,31 @@ def last_loss(told: AdjustOptions) -> Loss:
     return loss(told.loss, 1.0 if told.loss_scale is None else told.loss_scale)
 
 
-__all__ = ["MapResult", "last_loss"]
+def result_of(
+    points: Scene,
+    before: Scene,
+    adjusted: AdjustResult,
+    weighted: AdjustOptions,
+    line_map: LineMap,
+    min_confidence: float,
+) -> MapResult:
+    """Return the result of a map from its last adjustment, with the lines that are probably right."""
+    scene = with_confidence(with_supported_intervals(adjusted.scene))
+    before = before.replace(line_intervals=scene.line_intervals)
+    kept = scene.lines.confidence >= min_confidence
+    scene, before = without_unused(scene.keep(lines=kept), before.keep(lines=kept))
+    missing = [] if line_map.num_lines else ["No line was mapped; see what became of the segments."]
+    return MapResult(
+        scene=scene,
+        start=points,
+        before=before,
+        report=adjusted.report,
+        adjusted_with=weighted,
+        sigma_px={"points": weighted.point_sigma_px, "lines": weighted.line_sigma_px},
+        explanation=explain(line_map) + left_out(kept, min_confidence),
+        outcomes={outcome.name.lower(): count for outcome, count in line_map.outcome_counts().items()},
+        warnings=(*missing, *adjusted.report.warnings),
+    )
+
+
+__all__ = ["MapResult", "last_loss", "result_of"]

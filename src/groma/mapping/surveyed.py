@@ -43,12 +43,6 @@ class SurveyedGates:
 GATES = SurveyedGates()
 
 
-def has_survey(scene: Scene) -> bool:
-    """Tell whether a scene holds measurements of other instruments than the cameras."""
-    tables = (scene.camera_positions, scene.control_points, scene.camera_distances, scene.point_distances)
-    return any(map(len, tables))
-
-
 @dataclass(frozen=True, eq=False)
 class SurveyedResult:
     """An adjustment with measurements of other instruments."""
@@ -165,6 +159,6 @@ def weighted(scene: Scene, options: AdjustOptions) -> AdjustOptions:
 
 
 __all__ = [
-    "SurveyedResult", "Tied", "adjust_surveyed", "adjust_with_survey", "has_survey", "reliability_of",
+    "SurveyedResult", "Tied", "adjust_surveyed", "adjust_with_survey", "reliability_of",
     "survey_numbers", "tied", "weighted",
 ]  # fmt: skip

@@ -70,6 +70,7 @@ class NormalEquations:
         self.shares = shares_of(layout)
         self._scratch: list[dict[int, FloatArray]] = [{} for _ in self.shares]
         self._references = [tuple(ref for _, ref in factor.factor.references()) for factor in layout.factors]
+        self._known: dict[str, tuple[FloatArray, FloatArray]] = {}
         self._free = {}
         for name, group in layout.problem.variables.items():
             free = group.free_coordinates()
@@ -110,11 +111,18 @@ class NormalEquations:
 
     def prepare(self, states: States) -> list[tuple]:
         """Evaluate what each factor group reads of the states."""
-        ambients = {name: self.layout.problem.variables[name].manifold.ambient(state) for name, state in states.items()}
+        ambients = {name: self._ambient(name, state) for name, state in states.items()}
         return [
             layout.factor.prepare(tuple(ambients[ref.group] for ref in references))
             for layout, references in zip(self.layout.factors, self._references, strict=True)
         ]
+
+    def _ambient(self, name: str, state: FloatArray) -> FloatArray:
+        """Return what factors read of a group; of one that has not moved, the same array, what was found before."""
+        known = self._known.get(name)
+        if known is None or known[0] is not state:
+            known = self._known[name] = state, self.layout.problem.variables[name].manifold.ambient(state)
+        return known[1]
 
     def cost(
         self,

@@ -10,18 +10,31 @@ from groma.scene.motions import CameraMotions
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.scene import Scene
 from groma.scene.similarity import Similarity
-from groma.scene.survey import CameraDistances, CameraPositions, ControlPoints, Marks, PointDistances
+from groma.scene.survey import (
+    CameraPoses,
+    CameraPositions,
+    ControlPoints,
+    Distances,
+    Held,
+    KnownDirections,
+    KnownPlanes,
+    Marks,
+)
 
 __all__ = [
-    "CameraDistances",
     "CameraMotions",
+    "CameraPoses",
     "CameraPositions",
     "Cameras",
     "ControlPoints",
     "Directions",
+    "Distances",
     "Frames",
+    "Held",
     "Images",
     "Keypoints",
+    "KnownDirections",
+    "KnownPlanes",
     "LineDepths",
     "LineIntervals",
     "LineObservations",
@@ -30,7 +43,6 @@ __all__ = [
     "PlaneObservations",
     "Planes",
     "PointDepths",
-    "PointDistances",
     "PointObservations",
     "Points",
     "PosePriors",

@@ -39,9 +39,13 @@ def measurements_of(scene: "Scene") -> dict[str, int]:
         "pose priors": len(scene.pose_priors),
         "camera motions": len(scene.camera_motions),
         "camera positions": len(scene.camera_positions),
+        "camera poses": len(scene.camera_poses),
         "control points": len(scene.control_points),
         "marks": len(scene.marks),
-        "distances": len(scene.camera_distances) + len(scene.point_distances),
+        "distances": len(scene.distances),
+        "known planes": len(scene.known_planes),
+        "known directions": len(scene.known_directions),
+        "held objects": len(scene.held),
     }
     return {name: count for name, count in counts.items() if count}
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
@@ -76,6 +74,9 @@ class PoseGraph:
 
     def parts(self) -> IntArray:
         """Return the connected part (N,) that each pose belongs to, numbered from 0."""
+        from scipy.sparse import coo_matrix  # takes a quarter of a second to import
+        from scipy.sparse.csgraph import connected_components
+
         count = len(self.poses)
         edges = np.ones(len(self.motions)), (self.motions.first_idx, self.motions.second_idx)
         return connected_components(coo_matrix(edges, shape=(count, count)), directed=False)[1].astype(np.int64)
@@ -97,6 +98,9 @@ class PoseGraph:
 
     def _shortest_paths(self) -> tuple[IntArray, IntArray]:
         """Return the pose before each pose and the motion used, forwards, then backwards; the first have themselves."""
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import breadth_first_order
+
         count, edges = len(self.poses), len(self.motions)
         first, second = self.motions.first_idx, self.motions.second_idx
         ends = np.concatenate([np.stack([first, second]), np.stack([second, first])], axis=1)

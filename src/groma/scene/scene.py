@@ -14,9 +14,8 @@ all references are checked when it is made. Every change gives a new scene.
     point_depths       -> images, points          right_columns -> point_observations
     plane_observations -> images, planes          line_depths   -> line_observations
     pose_priors        -> frames                  line_intervals -> lines
-    camera_motions     -> images
-    camera_positions   -> images                  marks -> images, control_points
-    camera_distances   -> images                  point_distances -> control_points
+    camera_motions, camera_positions, camera_poses -> images    marks -> images, control_points
+    distances, known_planes, known_directions, held -> any objects
 
 Each column declares in its table what it refers to and how it changes when the world moves (see
 :func:`groma.scene.table.column`); checks, selections and transforms here go by that.
@@ -34,6 +33,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3
+from groma.scene import survey
 from groma.scene.camera import Cameras, Rigs, Sensors
 from groma.scene.checks import check_scene
 from groma.scene.counts import measurements_of
@@ -45,7 +45,6 @@ from groma.scene.motions import CameraMotions
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
 from groma.scene.standing_alone import standing_alone
-from groma.scene.survey import CameraDistances, CameraPositions, ControlPoints, Marks, PointDistances
 from groma.scene.table import moved_column, new_index_of, references, rows_of
 
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
@@ -95,21 +94,24 @@ class Scene:
     pose_priors: PosePriors = field(default_factory=PosePriors)
     #: Images that were read row by row, and how their cameras moved meanwhile.
     camera_motions: CameraMotions = field(default_factory=CameraMotions)
-    #: Measured places of cameras, and distances between them.
-    camera_positions: CameraPositions = field(default_factory=CameraPositions)
-    camera_distances: CameraDistances = field(default_factory=CameraDistances)
-    #: Control and check points, where they are in the images, and distances between them.
-    control_points: ControlPoints = field(default_factory=ControlPoints)
-    marks: Marks = field(default_factory=Marks)
-    point_distances: PointDistances = field(default_factory=PointDistances)
+    #: Measured places and poses of cameras.
+    camera_positions: survey.CameraPositions = field(default_factory=survey.CameraPositions)
+    camera_poses: survey.CameraPoses = field(default_factory=survey.CameraPoses)
+    #: Control and check points, and where they are in the images.
+    control_points: survey.ControlPoints = field(default_factory=survey.ControlPoints)
+    marks: survey.Marks = field(default_factory=survey.Marks)
+    #: What was measured of cameras, control points and landmarks; what keeps its place.
+    distances: survey.Distances = field(default_factory=survey.Distances)
+    known_planes: survey.KnownPlanes = field(default_factory=survey.KnownPlanes)
+    known_directions: survey.KnownDirections = field(default_factory=survey.KnownDirections)
+    held: survey.Held = field(default_factory=survey.Held)
 
     def __post_init__(self) -> None:
         check_scene(self)
 
     def __repr__(self) -> str:
-        counts = [(name, getattr(self, f"num_{name}")) for name in ("images", "cameras", "points", "lines", "planes")]
-        counts += [("directions", self.num_directions), ("observations", self.num_observations)]
-        counts += list(self.num_measurements.items())
+        names = "images cameras points lines planes directions observations".split()
+        counts = [*((name, getattr(self, f"num_{name}")) for name in names), *self.num_measurements.items()]
         return f"Scene({', '.join(f'{count:,} {name}' for name, count in counts if count) or 'empty'})"
 
     @classmethod
@@ -133,12 +135,9 @@ class Scene:
             The camera of each image.
         cam_from_world : (N, 7) float
             Poses [qx qy qz qw tx ty tz].
-        **tables
-            Further tables of the scene, by field name.
+        **tables : further tables of the scene, by field name.
         """
         return cls(**standing_alone(cameras, names, camera_idx, cam_from_world), **tables)
-
-    # Counts
 
     @property
     def num_images(self) -> int:
@@ -201,16 +200,25 @@ class Scene:
         return any(map(len, (self.point_depths, self.right_columns, self.line_depths, self.plane_observations)))
 
     @property
+    def has_survey(self) -> bool:
+        """Whether there are measurements of other instruments than the cameras, or something is held."""
+        places = self.camera_positions, self.camera_poses, self.control_points, self.distances
+        return self.is_tied or any(map(len, places))
+
+    @property
     def is_surveyed(self) -> bool:
-        """Whether positions of cameras or control points tell where the scene is, and its scale."""
-        return len(self.camera_positions) + int(self.control_points.is_control.sum()) > 1
+        """Whether places of cameras or control points were measured that tell where the scene is, and its scale."""
+        return len(self.camera_positions) + len(self.camera_poses) + int(self.control_points.is_control.sum()) > 1
+
+    @property
+    def is_tied(self) -> bool:
+        """Whether anything measured outside the images, or held, says where the scene is or how it is turned."""
+        return self.is_surveyed or any(map(len, (self.known_planes, self.known_directions, self.held)))
 
     @property
     def has_scale(self) -> bool:
         """Whether anything measured tells the scale."""
-        return self.is_metric or self.is_surveyed or len(self.camera_distances) + len(self.point_distances) > 0
-
-    # Poses
+        return self.is_metric or self.is_surveyed or len(self.distances) > 0
 
     @property
     def cam_from_world(self) -> FloatArray:
@@ -235,8 +243,6 @@ class Scene:
             np.array_equal(np.sort(self.images.frame_idx), np.arange(len(self.frames)))
             and (self.sensors.cam_from_rig[self.images.sensor_idx] == _IDENTITY).all()
         )
-
-    # New scenes
 
     def replace(self, **tables: Any) -> Self:
         """Return a copy with some tables replaced.
@@ -269,10 +275,9 @@ class Scene:
                 "with_poses needs a scene in which each frame holds one image; this one has rigs. "
                 "Use with_rig_poses(rig_from_world, cam_from_rig)."
             )
-        poses = np.asarray(cam_from_world, float)
+        rig_from_world, poses = np.empty_like(self.frames.rig_from_world), np.asarray(cam_from_world, float)
         if poses.shape != (self.num_images, 7):
             raise ShapeError(f"cam_from_world must have shape ({self.num_images}, 7); got {poses.shape}.")
-        rig_from_world = np.empty_like(self.frames.rig_from_world)
         rig_from_world[self.images.frame_idx] = poses
         return self.with_rig_poses(rig_from_world)
 
@@ -305,10 +310,11 @@ class Scene:
         """Return the scene without lines, planes, directions, and what was measured of them."""
         return self.keep(lines=[], planes=[], directions=[])
 
-    def transformed(self, new_from_old: Similarity | FloatArray) -> Self:
+    def transformed(self, new_from_old: Similarity | FloatArray, measured: bool = True) -> Self:
         """Return the scene seen from another world frame; what the cameras see stays the same.
 
         Lengths in camera and rig frames are scaled too. An array (8,) of :mod:`groma.geometry.sim3` will do as well.
+        Without ``measured`` what other instruments say of places in the world stays, and the scene moves.
         """
         if not isinstance(new_from_old, Similarity):
             new_from_old = Similarity.from_array(new_from_old)
@@ -318,7 +324,9 @@ class Scene:
             columns = {
                 column.name: moved_column(getattr(table, column.name), column.metadata, new_from_old)
                 for column in fields(table)
-                if (column.metadata.get("world") or column.metadata.get("length")) and len(getattr(table, column.name))
+                if (column.metadata.get("world") or column.metadata.get("length"))
+                and (measured or not column.metadata.get("measured"))
+                and len(getattr(table, column.name))
             }
             if columns:
                 tables[item.name] = replace(table, **columns)

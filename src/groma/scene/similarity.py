@@ -54,6 +54,11 @@ class Similarity:
         """Return ``old_from_new``."""
         return type(self)(1 / self.scale, self.rotation.T, -self.rotation.T @ self.translation / self.scale)
 
+    def after(self, first: Self) -> Self:
+        """Return the similarity that does another one first, and then this one."""
+        rotation, translation = self.rotation @ first.rotation, self.points(first.translation)
+        return type(self)(self.scale * first.scale, rotation, translation)
+
     def points(self, xyz: npt.ArrayLike) -> FloatArray:
         """Move points, (..., 3)."""
         return self.scale * (np.asarray(xyz, float) @ self.rotation.T) + self.translation

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 # ruff: noqa: RUF009 - column() is dataclasses.field() with metadata
-"""What instruments measured outside the images: positions of cameras, control points with their marks, distances.
+"""What instruments measured outside the images: poses, control points with marks, distances, directions, planes.
 
 Coordinates are in the world of the scene and its unit of length. A control point is a landmark of its own, beside the
 points of the scene: it is found in images by hand or by its target, and it has a name.
@@ -9,24 +9,39 @@ points of the scene: it is found in images by hand or by its target, and it has 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from enum import IntEnum
+from typing import ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
-from groma.scene.table import Table, check_sigma, check_unique, column, text_column
+from groma.scene.landmarks import check_unit
+from groma.scene.table import OBJECTS, Table, check_sigma, check_unique, column, text_column
 
 #: What is done with the coordinates of a :class:`ControlPoints`: nothing is known of the place; it is measured, and
 #: holds the scene; it is measured, and kept back to check the result.
 UNKNOWN, CONTROL, CHECK = 0, 1, 2
 
 
+class Kind(IntEnum):
+    """What a measurement is of: the table of :data:`~groma.scene.table.OBJECTS` with this number."""
+
+    IMAGE, CONTROL_POINT, LINE, PLANE, POINT, DIRECTION = range(6)
+
+
+#: Kinds that have a place and can be eliminated beside each other, and kinds that have a direction.
+LOCATED = (Kind.IMAGE, Kind.CONTROL_POINT, Kind.LINE, Kind.PLANE)
+DIRECTED = (Kind.IMAGE, Kind.LINE, Kind.PLANE, Kind.DIRECTION)
+
+
 def check_covariance(name: str, covariance: FloatArray) -> None:
-    """Raise when a matrix (N, 3, 3) is not symmetric and positive definite."""
+    """Raise when a matrix (N, m, m) is not symmetric and positive definite."""
     if len(covariance) == 0:
         return
+    root = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 1e-300))  # units of coordinates may differ
+    covariance = covariance / root[:, :, None] / root[:, None, :]
     asymmetry = np.abs(covariance - covariance.transpose(0, 2, 1)).max(axis=(1, 2))
     smallest, size = np.linalg.eigvalsh(covariance)[:, 0], np.abs(covariance).max(axis=(1, 2))
     wrong = (smallest <= 1e-15 * size) | (asymmetry > 1e-6 * size)
@@ -52,9 +67,9 @@ class CameraPositions(Table):
     #: (N,) the image.
     image_idx: IntArray = column(np.int64, refers="images")
     #: (N, 3) measured place, scene units.
-    xyz: FloatArray = column(np.float64, 3, world="points")
+    xyz: FloatArray = column(np.float64, 3, world="points", measured=True)
     #: (N, 3, 3) its covariance, scene units squared.
-    covariance: FloatArray = column(np.float64, 3, 3, world="covariances")
+    covariance: FloatArray = column(np.float64, 3, 3, world="covariances", measured=True)
 
     def _check(self) -> None:
         check_covariance("CameraPositions.covariance", self.covariance)
@@ -71,8 +86,8 @@ class ControlPoints(Table):
     #: (N, 3) where the scene has the point: estimated.
     xyz: FloatArray = column(np.float64, 3, world="points")
     #: (N, 3) measured place and (N, 3, 3) its covariance, scene units; of points of unknown place any numbers.
-    measured: FloatArray = column(np.float64, 3, world="points")
-    covariance: FloatArray = column(np.float64, 3, 3, world="covariances")
+    measured: FloatArray = column(np.float64, 3, world="points", measured=True)
+    covariance: FloatArray = column(np.float64, 3, 3, world="covariances", measured=True)
     #: (N,) :data:`UNKNOWN`, :data:`CONTROL` or :data:`CHECK`.
     role: IntArray = column(np.int64)
 
@@ -113,55 +128,150 @@ class Marks(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class PointDistances(Table):
-    """Measured distances between control points: scale bars, tapes."""
+class Distances(Table):
+    """Measured distances between two objects each: scale bars, tapes, bases of stereo heads, heights above a floor.
+
+    Objects are camera centres, control points, lines and planes. From a line or plane it is measured at the foot of a
+    place.
+    """
 
     noun: ClassVar[str] = "distance"
     optional: ClassVar[bool] = True
-    #: (N,) the two control points.
-    first_idx: IntArray = column(np.int64, refers="control_points")
-    second_idx: IntArray = column(np.int64, refers="control_points")
+    #: (N,) kinds of the two objects (:class:`Kind`), not larger for the first, and which they are.
+    first_kind: IntArray = column(np.int64)
+    first_idx: IntArray = column(np.int64, kinds="first_kind")
+    second_kind: IntArray = column(np.int64)
+    second_idx: IntArray = column(np.int64, kinds="second_kind")
+    #: (N, 3) of a line or plane that is the first: near where it is measured; else any place.
+    anchor: FloatArray = column(np.float64, 3, world="points")
     #: (N,) distance and its standard deviation, scene units.
-    distance: FloatArray = column(np.float64, length=1)
-    sigma: FloatArray = column(np.float64, length=1)
+    distance: FloatArray = column(np.float64, length=1, measured=True)
+    sigma: FloatArray = column(np.float64, length=1, measured=True)
 
     def _check(self) -> None:
-        _check_distances(type(self).__name__, self.first_idx, self.second_idx, self.distance, self.sigma)
+        check_sigma("Distances.distance", self.distance)
+        check_sigma("Distances.sigma", self.sigma)
+        for side in ("first", "second"):
+            check_kinds(f"Distances.{side}_kind", getattr(self, f"{side}_kind"), LOCATED)
+        if (wrong := self.first_kind > self.second_kind).any():
+            raise InputError(f"Distances: row {int(np.argmax(wrong))} has its kinds in the wrong order. Exchange them.")
+        same = (self.first_kind == self.second_kind) & (self.first_idx == self.second_idx)
+        if same.any():
+            raise InputError(
+                f"Distances: row {int(np.argmax(same))} is the distance of something from itself. Drop it."
+            )
+
+    @classmethod
+    def between(
+        cls, kind: Kind, first: npt.ArrayLike, second: npt.ArrayLike, distance: npt.ArrayLike, sigma: npt.ArrayLike
+    ) -> Self:
+        """Return distances between objects of one kind: cameras or control points."""
+        one, two = np.atleast_1d(first), np.atleast_1d(second)
+        kinds, numbers = np.full(len(one), kind), (np.asarray(distance, float), np.asarray(sigma, float))
+        return cls(kinds, one, kinds, two, np.zeros((len(one), 3)), *numbers)
 
 
 @dataclass(frozen=True, eq=False)
-class CameraDistances(Table):
-    """Measured distances between camera centres: the base of a stereo head, a slide."""
+class KnownPlanes(Table):
+    """Objects that are on planes with known coordinates: heights, levelled floors, walls in the frame of a building."""
 
-    noun: ClassVar[str] = "distance"
+    noun: ClassVar[str] = "known plane"
     optional: ClassVar[bool] = True
-    #: (N,) the two images.
-    first_idx: IntArray = column(np.int64, refers="images")
-    second_idx: IntArray = column(np.int64, refers="images")
-    #: (N,) distance and its standard deviation, scene units.
-    distance: FloatArray = column(np.float64, length=1)
-    sigma: FloatArray = column(np.float64, length=1)
+    #: (N,) kind of the object (:class:`Kind`), and which it is: camera centre, control point, line or plane.
+    kind: IntArray = column(np.int64)
+    idx: IntArray = column(np.int64, kinds="kind")
+    #: (N, 3) of a line or plane: near the place that is on the plane, two of a line and three of a plane; else any.
+    anchor: FloatArray = column(np.float64, 3, world="points")
+    #: (N, 4) unit normal and offset, n.X + w = 0, scene units.
+    hesse: FloatArray = column(np.float64, 4, world="planes", measured=True)
+    #: (N,) standard deviation of the distance from it, scene units.
+    sigma: FloatArray = column(np.float64, length=1, measured=True)
 
     def _check(self) -> None:
-        _check_distances(type(self).__name__, self.first_idx, self.second_idx, self.distance, self.sigma)
+        check_kinds("KnownPlanes.kind", self.kind, LOCATED)
+        check_unit("KnownPlanes.hesse[:, :3]", self.hesse[:, :3])
+        check_sigma("KnownPlanes.sigma", self.sigma)
 
 
-def _check_distances(name: str, first: IntArray, second: IntArray, distance: FloatArray, sigma: FloatArray) -> None:
-    check_sigma(f"{name}.distance", distance)
-    check_sigma(f"{name}.sigma", sigma)
-    if (same := first == second).any():
-        raise InputError(f"{name}: row {int(np.argmax(same))} is the distance of something from itself. Drop it.")
+@dataclass(frozen=True, eq=False)
+class KnownDirections(Table):
+    """Directions known in the world: gravity in cameras, lines, planes and vanishing directions that are vertical."""
+
+    noun: ClassVar[str] = "known direction"
+    optional: ClassVar[bool] = True
+    #: (N,) kind of the object (:class:`Kind`): image, line, plane (its normal) or direction; and which it is.
+    kind: IntArray = column(np.int64)
+    idx: IntArray = column(np.int64, kinds="kind")
+    #: (N, 3) unit vector in the world. That of landmarks has no sign.
+    vector: FloatArray = column(np.float64, 3, world="directions", measured=True)
+    #: (N, 3) of images: how the camera sees it, a unit vector (x right, y down, z forward); else as ``vector``.
+    in_camera: FloatArray = column(np.float64, 3)
+    #: (N,) standard deviation of a component, radians.
+    sigma: FloatArray = column(np.float64)
+
+    def _check(self) -> None:
+        check_kinds("KnownDirections.kind", self.kind, DIRECTED)
+        check_unit("KnownDirections.vector", self.vector)
+        check_unit("KnownDirections.in_camera", self.in_camera)
+        check_sigma("KnownDirections.sigma", self.sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPoses(Table):
+    """Measured poses of cameras with their covariance: RTK with an IMU, a motion capture system, another adjustment."""
+
+    noun: ClassVar[str] = "pose"
+    optional: ClassVar[bool] = True
+    #: (N,) the image.
+    image_idx: IntArray = column(np.int64, refers="images")
+    #: (N, 7) pose [qx qy qz qw tx ty tz].
+    cam_from_world: FloatArray = column(np.float64, 7, world="poses", measured=True)
+    #: (N, 6, 6) covariance of the shift along and the turn about the axes of the camera, scene units and radians.
+    covariance: FloatArray = column(
+        np.float64, 6, 6, length=((2, 2, 2, 1, 1, 1),) * 3 + ((1, 1, 1, 0, 0, 0),) * 3, measured=True
+    )
+
+    def _check(self) -> None:
+        check_covariance("CameraPoses.covariance", self.covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class Held(Table):
+    """Objects that keep the place they have: the cameras and landmarks of an earlier adjustment, a datum."""
+
+    noun: ClassVar[str] = "held object"
+    optional: ClassVar[bool] = True
+    #: (N,) kind of the object (:class:`Kind`), and which it is. Of an image its whole frame is held.
+    kind: IntArray = column(np.int64)
+    idx: IntArray = column(np.int64, kinds="kind")
+
+    def _check(self) -> None:
+        check_kinds("Held.kind", self.kind, tuple(Kind))
+
+
+def check_kinds(name: str, kinds: IntArray, allowed: tuple[int, ...]) -> None:
+    """Raise where a kind of object is not allowed."""
+    if len(kinds) and not (known := np.isin(kinds, allowed)).all():
+        row = int(np.argmin(known))
+        names = ", ".join(f"{int(kind)} ({OBJECTS[kind]})" for kind in allowed)
+        raise InputError(f"{name} must be one of {names}; row {row} is {kinds[row]}.")
 
 
 __all__ = [
     "CHECK",
     "CONTROL",
+    "DIRECTED",
+    "LOCATED",
     "UNKNOWN",
-    "CameraDistances",
+    "CameraPoses",
     "CameraPositions",
     "ControlPoints",
+    "Distances",
+    "Held",
+    "Kind",
+    "KnownDirections",
+    "KnownPlanes",
     "Marks",
-    "PointDistances",
     "check_covariance",
     "diagonal_covariance",
 ]

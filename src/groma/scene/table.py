@@ -23,6 +23,8 @@ from groma.errors import InputError, ShapeError
 if TYPE_CHECKING:
     from groma.scene.similarity import Similarity
 
+#: What measurements may refer to by kind and index: tables of the scene, by the number of their kind.
+OBJECTS = ("images", "control_points", "lines", "planes", "points", "directions")
 #: How far a stored quaternion may be from length one.
 _QUATERNION_TOLERANCE = 1e-6
 
@@ -32,10 +34,12 @@ def column(
     *row: int | None,
     fill: float | None = None,
     refers: str | tuple[str, ...] = (),
+    kinds: str = "",
     world: str = "",
-    length: int | tuple[int, ...] = 0,
+    length: int | tuple[Any, ...] = 0,
     optional: bool = False,
     of: str = "",
+    measured: bool = False,
 ) -> Any:
     """Declare a column of arrays.
 
@@ -49,6 +53,8 @@ def column(
         The column may be left out: its rows then hold this number.
     refers : str or (str, str)
         The table of the scene that the indices refer to; of pairs of indices the two tables.
+    kinds : str
+        The indices refer to tables of :data:`OBJECTS`; the column of this name says to which.
     world : str
         What the rows are in the world, for the column to move with it: ``points``, ``directions``, ``lines``,
         ``planes``, ``poses`` or ``covariances`` (of points), methods of :class:`~groma.scene.similarity.Similarity`.
@@ -59,10 +65,13 @@ def column(
         Whether files may lack the column; it then has no rows.
     of : str
         In :class:`~groma.scene.observations.Relations`: the column that this one has a row for each row of.
+    measured : bool
+        An instrument other than the cameras says so, in the world: it stays where the scene is moved to fit it.
     """
     empty = tuple(0 if size is None else size for size in row)
     about = {"dtype": np.dtype(dtype), "row": row, "fill": fill, "optional": optional, "of": of}
     about |= {"refers": (refers,) if isinstance(refers, str) else refers, "world": world, "length": length}
+    about |= {"kinds": kinds, "measured": measured}
     return field(default_factory=lambda: np.zeros((0, *empty), dtype), metadata=about)
 
 
@@ -142,10 +151,24 @@ class Table:
             for item in fields(self)
             if item.metadata["refers"] and item.metadata["refers"][0] in new_index
         }
+        columns |= self._objects_renumbered(new_index)
         if not columns:
             return self, None
         kept = np.flatnonzero(np.all([column >= 0 for column in columns.values()], axis=0))
         return self.take(kept).replace(**{name: column[kept] for name, column in columns.items()}), kept
+
+    def _objects_renumbered(self, new_index: Mapping[str, IntArray]) -> dict[str, IntArray]:
+        """Return the columns that refer to objects by kind, where a table of theirs was renumbered."""
+        columns: dict[str, IntArray] = {}
+        for item in fields(self):
+            if kinds := item.metadata.get("kinds"):
+                before, kind = getattr(self, item.name), getattr(self, kinds)
+                after = before.copy()
+                for number in np.flatnonzero([name in new_index for name in OBJECTS]):
+                    after[kind == number] = new_index[OBJECTS[number]][before[kind == number]]
+                if len(before):
+                    columns[item.name] = after
+        return columns
 
 
 @cache
@@ -238,6 +261,17 @@ def references(scene: type) -> tuple[tuple[str, str, int | None, str], ...]:
         for table in fields(scene)
         for item in fields(table.default_factory)  # type: ignore[arg-type]  # the factories are the classes
         for side, target in enumerate(item.metadata["refers"])
+    )
+
+
+@cache
+def object_references(scene: type) -> tuple[tuple[str, str, str], ...]:
+    """Return (table, column, column of kinds) of all columns of a scene that refer to :data:`OBJECTS`."""
+    return tuple(
+        (table.name, item.name, kinds)
+        for table in fields(scene)
+        for item in fields(table.default_factory)  # type: ignore[arg-type]  # the factories are the classes
+        if (kinds := item.metadata.get("kinds"))
     )
 
 

@@ -122,7 +122,7 @@ def read_saved_map(folder: str | os.PathLike[str]) -> SavedMap:
     if of_photographs:
         raise InputError(
             f"{path} is a map of photographs, made by groma map: tracking goes on in maps of groma track, whose "
-            f"keyframes are of the camera of the sequence. Place frames in it with: groma localize {path} FRAMES -o OUT."
+            f"keyframes are of the camera of the sequence. Place frames in it: groma localize {path} FRAMES -o OUT."
         )
     scene = read_scene(path / "scene.npz")
     known = {name for source in sources for name in source.images}

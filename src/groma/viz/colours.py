@@ -72,9 +72,8 @@ def common_frame(vectors: FloatArray, weights: FloatArray) -> FloatArray:
         return np.eye(3)
     starts = np.linalg.qr(np.random.default_rng(0).normal(size=(8, 3, 3)))[0]
     for _ in range(30):
-        left, _, right = np.linalg.svd(
-            np.einsum("n,sni,nj->sij", weight, (unit @ starts.transpose(0, 2, 1)) ** 3, unit)
-        )
+        along = unit @ starts.transpose(0, 2, 1)
+        left, _, right = np.linalg.svd((weight[:, None] * along * along * along).transpose(0, 2, 1) @ unit)
         starts = left @ right
     shares = np.einsum("n,sni->si", weight, (unit @ starts.transpose(0, 2, 1)) ** 4)
     best = int(np.argmax(shares.sum(axis=1)))

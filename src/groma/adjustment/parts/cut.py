@@ -16,6 +16,8 @@ from groma.adjustment.parts.same import check_same_scene
 from groma.errors import InputError, OutputError
 from groma.io.archive import read_archive, write_archive
 from groma.scene import Scene
+from groma.scene.survey import Kind
+from groma.scene.table import object_references
 
 #: Observations of a part, where a scene is cut: about 400 MB while it is worked on.
 PART_SIZE = 1_000_000
@@ -25,8 +27,8 @@ PART_NAMES = "part-*.npz"
 SHARED = ("cameras", "rigs", "sensors", "frames", "images", "planes", "directions")
 #: Tables that are in the first part alone.
 ONCE = (
-    "keypoints", "plane_observations", "pose_priors", "camera_positions", "camera_distances", "control_points", "marks",
-    "point_distances",
+    "keypoints", "plane_observations", "pose_priors", "camera_positions", "camera_poses", "control_points", "marks",
+    "distances", "known_planes", "known_directions", "held",
 )  # fmt: skip
 
 
@@ -107,6 +109,10 @@ def _parts_of_landmarks(scene: Scene, observations: int) -> tuple[IntArray, IntA
     of_points, of_lines = np.split(part, [scene.num_points])
     tied, pair = np.unique(scene.relations.point_on_line[:, 0], return_index=True)
     of_points[tied] = of_lines[scene.relations.point_on_line[pair, 1]]
+    for name, column, kinds in object_references(Scene):  # what was measured of landmarks is in the first part
+        index, kind = getattr(getattr(scene, name), column), getattr(getattr(scene, name), kinds)
+        of_points[index[kind == Kind.POINT]] = 0
+        of_lines[index[kind == Kind.LINE]] = 0
     return of_points, of_lines
 
 
@@ -119,7 +125,7 @@ def num_ties_cut(scene: Scene, observations: int = PART_SIZE) -> int:
 
 def _without_what_counts_once(scene: Scene) -> Scene:
     """Return a scene without what is in the first part alone: it would count once per part."""
-    relations = scene.relations.take(parallel_planes=[], perpendicular_planes=[])
+    relations = scene.relations.take(lines_meeting=[], parallel_planes=[], perpendicular_planes=[])
     return scene.replace(relations=relations, **{name: type(getattr(scene, name))() for name in ONCE})
 
 

@@ -30,6 +30,7 @@ from groma.adjustment.parts.same import check_same_scene
 from groma.adjustment.parts.together import agreed, exchange
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.stages import with_loss
+from groma.adjustment.terms.objects import with_held
 from groma.errors import InputError
 from groma.factors.contract import Factor
 from groma.factors.losses import Loss
@@ -160,7 +161,7 @@ def open_parts(paths: Sequence[Path], options: AssemblyOptions, reducer: Reducer
             raise InputError("There is nothing to adjust: no part has points, lines or planes with observations.")
     options = replace(options, gauge=_gauge(options, ordered))
     held = first_camera_gauge(head, _sum_of(count, reducer), any(fact["metric"] for fact in ordered))
-    shared = {**camera_variables(head, options, held), **structure_variables(head, options)}
+    shared = with_held({**camera_variables(head, options, held), **structure_variables(head, options)}, head)
     used = {name for fact in ordered for name in fact["kept"]}
     with agreed(reducer):
         if unknown := sorted(used - shared.keys()):
@@ -214,7 +215,7 @@ def _facts(scene: Scene, options: AssemblyOptions, made: Assembly) -> dict[str, 
         "observations": sum(len(group.factor) for group in made.groups if group.observes),
         "measurements": made.num_measurements,
         "kept": sorted(made.problem.variables.keys() - set(LANDMARKS) - _held_besides(made)),
-        "priors": len(scene.pose_priors) > 0 or scene.is_surveyed,
+        "priors": len(scene.pose_priors) > 0 or scene.is_tied,
         "metric": scene.has_scale,
         "gauge": gauge_of(scene, options) if options.gauge == "auto" else options.gauge,
         "squares": {kind: [float(values.sum()), len(values)] for kind, values in squares.items()},
@@ -262,7 +263,9 @@ def _check_same(reducer: Reducer, listing: list[list[Any]]) -> None:
 
 
 def _joined(groups: list[Variables]) -> Variables:
-    return Variables(groups[0].manifold, np.concatenate([group.state for group in groups]))
+    constant = [np.broadcast_to(group.constant, len(group)) for group in groups]
+    state = np.concatenate([group.state for group in groups])
+    return Variables(groups[0].manifold, state, np.concatenate(constant) if np.any(np.concatenate(constant)) else False)
 
 
 __all__ = ["LANDMARKS", "OpenParts", "Part", "open_parts"]

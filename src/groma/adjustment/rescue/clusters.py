@@ -13,8 +13,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import LINE_FACTORS, POINT_FACTORS
@@ -22,6 +20,7 @@ from groma.adjustment.rescue.restart import GATES, triangulated_anew, went_elsew
 from groma.factors.contract import Factor, Ref
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
+from groma.problem.sorting import connected_parts
 from groma.problem.variables import Variables
 from groma.scene import Scene
 from groma.solver.options import SolverOptions
@@ -85,7 +84,7 @@ def _clusters(ties: list[Factor], variables: Mapping[str, Variables]) -> tuple[d
     line, point = (np.concatenate([_indices(factor)[group] for factor in ties]) for group in ("lines", "points"))
     num_lines, size = len(variables["lines"]), len(variables["lines"]) + len(variables["points"])
     ends = line, num_lines + point
-    _, label = connected_components(coo_matrix((np.ones(len(line)), ends), shape=(size, size)), directed=False)
+    label = connected_parts(*ends, size)
     tied = np.zeros(size, bool)
     tied[np.concatenate(ends)] = True
     used = np.zeros(size, bool)

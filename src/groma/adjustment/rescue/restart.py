@@ -74,6 +74,7 @@ def renew_lines(scene: Scene, problem: Problem, threads: int | None = None) -> t
     """
     lines = problem.variables.get("lines")
     factors = [factor for factor in problem.factors if len(factor) and _slot_of_lines(factor)]
+    factors = [factor for factor in factors if not _is_between_lines(factor)]
     if lines is None or lines.is_constant or not factors:
         return problem, np.zeros(0, np.int64)
     chosen, second = _second_starts(scene, problem, factors)
@@ -102,6 +103,10 @@ def went_elsewhere(segments: FloatArray, before: FloatArray, after: FloatArray) 
 
 def _slot_of_lines(factor: Factor) -> str | None:
     return next((slot.name for slot, ref in factor.references() if ref.group == "lines"), None)
+
+
+def _is_between_lines(factor: Factor) -> bool:
+    return sum(ref.group == "lines" for _, ref in factor.references()) > 1
 
 
 def _line_of(factor: Factor) -> IntArray:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.adjustment.survey.attach import Survey, with_survey
+from groma.adjustment.survey.attach import with_survey
+from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.names import require_some, rows_by_name
 from groma.adjustment.survey.similarity import robust_similarity
 from groma.errors import InputError

@@ -2,12 +2,14 @@
 r"""Where a whole scene fits its measurements best, its inner geometry as it is.
 
 Images do not notice a similarity of the whole scene. Measurements of the ground do, but beside hundreds of thousands of
-pixels they weigh little: damped steps creep along these seven directions. Here they are alone:
+pixels they weigh little: damped steps creep along these seven directions. Here they are alone: with their residuals r,
+as the terms of the adjustment make them, and the motions g of the seven directions
+(:mod:`groma.problem.gauge`)
 
-.. math:: \min_{s, R, t} \sum_i \rho\left(\lVert s R x_i + t - m_i \rVert^2_{\Sigma_i}\right)
-          + \sum_j \rho\left((s\,d_j - \tilde d_j)^2 / \sigma_j^2\right)
+.. math:: \min_{a, \varphi, \sigma} \sum_i \rho\left(\lVert r_i \rVert^2_{\Sigma_i}\right), \qquad
+          \frac{\partial r_i}{\partial (a, \varphi, \sigma)} = \sum_b J_{ib}\, g_b
 
-by reweighted Gauss-Newton steps about the middle of the measured places.
+by reweighted Gauss-Newton steps about the middle of the scene.
 """
 
 from __future__ import annotations
@@ -17,77 +19,151 @@ import math
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.adjustment.terms.survey_loss import root_information, survey_loss
-from groma.geometry import so3
-from groma.scene import Scene, Similarity
+from groma.adjustment.assemble import camera_variables, structure_variables
+from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.terms import (
+    camera_poses,
+    control_points,
+    distances,
+    known_geometry,
+    pose_priors,
+)
+from groma.adjustment.terms.contract import Draft
+from groma.factors.contract import Factor
+from groma.geometry import line3, so3
+from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.manifold import Euclidean
+from groma.problem.gauge import world_motions
+from groma.problem.problem import Problem
+from groma.problem.residuals import jacobians_of, residuals_of
+from groma.problem.variables import Variables
+from groma.scene import ControlPoints, Keypoints, Scene, Similarity
+from groma.scene.survey import UNKNOWN, Kind
 
 _STEPS, _TOLERANCE = 50, 1e-6
+#: Directions of less than this share of the information of others are not known.
+_UNKNOWN = 1e-13
+#: Terms whose measurements notice where the scene is.
+_TERMS = (
+    pose_priors.TERM, camera_poses.POSITIONS, camera_poses.POSES, control_points.CONTROL, distances.TERM,
+    known_geometry.PLANES, known_geometry.DIRECTIONS,
+)  # fmt: skip
 
 
 def settled(scene: Scene) -> Scene:
-    """Return a scene with positions or control points where these fit best; what was measured stays.
+    """Return a scene that measurements of other instruments place where these fit best; what was measured stays.
 
-    The scale stays, too, where depths or stereo pairs tell it; scenes with poses known beforehand stay as they are.
+    The scale stays, too, where depths or stereo pairs tell it; scenes of which something is held stay as they are.
     """
-    if not scene.is_surveyed or len(scene.pose_priors):
+    if not scene.is_tied or len(scene.held) or not scene.num_images:
         return scene
-    moved = scene.transformed(_best(scene, with_scale=not scene.is_metric))
-    points = moved.control_points.replace(
-        measured=scene.control_points.measured, covariance=scene.control_points.covariance
-    )
-    return moved.replace(
-        camera_positions=scene.camera_positions,
-        camera_distances=scene.camera_distances,
-        control_points=points,
-        point_distances=scene.point_distances,
-    )
+    return scene.transformed(_best(scene), measured=False)
 
 
-def _best(scene: Scene, with_scale: bool) -> Similarity:
-    seen, places, root = _measured_places(scene)
-    lengths, distances, weights = _measured_distances(scene)
-    middle = places.mean(axis=0)
-    scale, rotation, shift = 1.0, np.eye(3), np.zeros(3)
+def _best(scene: Scene) -> Similarity:
+    """Return the similarity to where a scene fits best."""
+    light = _with_places(scene.keep(points=[], line_observations=[]).replace(keypoints=Keypoints()))
+    centers = light.cam_centers_in_world
+    middle, total = centers.mean(axis=0), Similarity()
+    length = float(np.median(np.linalg.norm(centers - middle, axis=1))) or 1.0
+    free = 6 if scene.is_metric else 7
     for _ in range(_STEPS):
-        away = scale * ((seen - middle) @ rotation.T)
-        residual = np.einsum("nij,nj->ni", root, away + middle + shift - places)
-        cross = np.zeros((len(away), 3, 3))
-        cross[:, [2, 0, 1], [1, 2, 0]], cross[:, [1, 2, 0], [2, 0, 1]] = away, -away
-        J = root @ np.concatenate([np.broadcast_to(np.eye(3), cross.shape), -cross, away[:, :, None]], axis=2)
-        weight = survey_loss(3).evaluate(np.einsum("ni,ni->n", residual, residual))[1]
-        bars = (scale * lengths - distances) * weights
-        bar_weight = survey_loss(1).evaluate(bars**2)[1]
-        rows, of_bars = J.reshape(-1, 7), scale * lengths * weights
-        weighted = rows * np.repeat(weight, 3)[:, None]
-        normal, gradient = weighted.T @ rows, weighted.T @ residual.reshape(-1)
-        normal[6, 6] += of_bars @ (bar_weight * of_bars)
-        gradient[6] += of_bars @ (bar_weight * bars)
-        step, free = np.zeros(7), 7 if with_scale else 6
-        size = np.sqrt(np.maximum(np.diag(normal)[:free], 1e-300))
+        normal, gradient = _normal_equations(_problem(light), total.points(middle), length * total.scale)
+        most = max(float(np.diag(normal).max()), 1e-300)
+        size = np.sqrt(np.maximum(np.diag(normal)[:free], _UNKNOWN * most))  # what nothing measured is left alone
         scaled = normal[:free, :free] / size / size[:, None]
-        step[:free] = -np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) @ (gradient[:free] / size) / size
-        shift, rotation = shift + step[:3], so3.exp(step[None, 3:6])[0] @ rotation
-        scale *= math.exp(min(max(step[6], -1.0), 1.0))
+        step = np.zeros(7)
+        step[:free] = -np.linalg.pinv(scaled, rcond=_UNKNOWN, hermitian=True) @ (gradient[:free] / size) / size
+        next_ = _similarity(step, total.points(middle), length * total.scale)
+        light, total = light.transformed(next_, measured=False), next_.after(total)
         if np.abs(step[:free] * size).max() <= _TOLERANCE:  # in standard deviations
             break
-    return Similarity(scale, rotation, middle + shift - scale * rotation @ middle)
+    return total
 
 
-def _measured_places(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return places (N, 3) in the scene, where they were measured, and square roots (N, 3, 3) of the information."""
-    positions, points = scene.camera_positions, scene.control_points
-    held = points.is_control
-    seen = np.concatenate([scene.cam_centers_in_world[positions.image_idx], points.xyz[held]])
-    places = np.concatenate([positions.xyz, points.measured[held]])
-    return seen, places, root_information(np.concatenate([positions.covariance, points.covariance[held]]))
+def _similarity(step: FloatArray, center: FloatArray, length: float) -> Similarity:
+    """Return the similarity of a step (7,): a shift in lengths, a turn about the center, a logarithm of scale."""
+    turn = step[3:6] * min(1.0, 1.0 / max(float(np.linalg.norm(step[3:6])), 1e-300))
+    scale, rotation = math.exp(min(max(step[6], -1.0), 1.0)), so3.exp(turn[None])[0]
+    return Similarity(scale, rotation, center + length * step[:3] - scale * rotation @ center)
 
 
-def _measured_distances(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return distances (M,) in the scene, as measured, and their inverse standard deviations."""
-    tables = (scene.camera_distances, scene.cam_centers_in_world), (scene.point_distances, scene.control_points.xyz)
-    seen = [np.linalg.norm(xyz[table.second_idx] - xyz[table.first_idx], axis=1) for table, xyz in tables]
-    measured = [table.distance for table, _ in tables]
-    return np.concatenate(seen), np.concatenate(measured), np.concatenate([1.0 / table.sigma for table, _ in tables])
+def _with_places(scene: Scene) -> Scene:
+    """Return the scene with control points in place of lines and planes that are measured at a place on them.
+
+    With the whole scene these places move as points do; on a line that moves alone they stay at the foot of an anchor.
+    """
+    places, tables = [scene.control_points.xyz], {}
+    for name, kinds, column in (("distances", "first_kind", "first_idx"), ("known_planes", "kind", "idx")):
+        table = getattr(scene, name)
+        kind, index = getattr(table, kinds).copy(), getattr(table, column).copy()
+        for of in (Kind.LINE, Kind.PLANE):
+            rows = np.flatnonzero(kind == of)
+            objects = scene.lines.plucker if of == Kind.LINE else scene.planes.hesse
+            places.append(_feet(table.anchor[rows], objects[index[rows]]))
+            kind[rows], index[rows] = Kind.CONTROL_POINT, sum(map(len, places[:-1])) + np.arange(len(rows))
+        tables[name] = table.replace(**{kinds: kind, column: index})
+    xyz = np.concatenate(places)
+    count = len(xyz) - len(scene.control_points)
+    points, unit = scene.control_points, np.tile(np.eye(3), (count, 1, 1))
+    points = ControlPoints(
+        (*points.names, *(f"place {row} on an object" for row in range(count))),
+        xyz,
+        np.concatenate([points.measured, xyz[len(points) :]]),
+        np.concatenate([points.covariance, unit]),
+        np.append(points.role, np.full(count, UNKNOWN)),
+    )
+    return scene.replace(control_points=points, **tables)
 
 
-__all__ = ["settled"]
+def _feet(places: FloatArray, objects: FloatArray) -> FloatArray:
+    """Return the feet (N, 3) of places on lines (N, 6) or planes (N, 4)."""
+    if objects.shape[1] == 6:
+        return line3.closest_point(objects, places)
+    return places - (np.einsum("ni,ni->n", objects[:, :3], places) + objects[:, 3])[:, None] * objects[:, :3]
+
+
+def _problem(scene: Scene) -> Problem:
+    """Return the problem of the measurements alone."""
+    options = AssemblyOptions()
+    variables = {**camera_variables(scene, options), **structure_variables(scene, options)}
+    variables["control_points"] = Variables(Euclidean(3, "point"), scene.control_points.xyz)
+    chart = next(iter(LINE_CHARTS.values()))
+    variables["lines"] = Variables(chart, chart.from_ambient(scene.lines.plucker))
+    draft = Draft(scene, options, variables, [])
+    factors = [group.factor for term in _TERMS if term.applies(draft) for group in term.factors(draft)]
+    return Problem(variables, factors)
+
+
+def _normal_equations(problem: Problem, center: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
+    """Return J^T W J (7, 7) and J^T W r (7,) of the seven motions."""
+    motions = {name: part.transpose(1, 2, 0) for name, part in world_motions(problem, center, length).items()}
+    normal, gradient = np.zeros((7, 7)), np.zeros(7)
+    for factor in problem.factors:
+        residual, information, weight = weighted(factor, problem)
+        J = moved(motions, factor, problem)
+        weighed = np.swapaxes(J, 1, 2) @ (weight[:, None, None] * information)
+        normal += (weighed @ J).sum(axis=0)
+        gradient += np.einsum("nki,ni->k", weighed, residual)
+    return normal, gradient
+
+
+def moved(motions: dict[str, FloatArray], factor: Factor, problem: Problem) -> FloatArray:
+    """Return how residuals change with world motions (count, dof, k) of the groups, (N, m, k)."""
+    blocks = jacobians_of(factor, problem.variables)
+    return np.sum([blocks[slot.name] @ motions[ref.group][ref.index] for slot, ref in factor.references()], axis=0)
+
+
+def weighted(factor: Factor, problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return residuals (N, m), information (N, m, m) and the weights (N,) that a robust loss left."""
+    residual = residuals_of(factor, problem.variables)
+    root = np.asarray(factor.sqrt_information, float)
+    if root.ndim < 3:
+        information = np.broadcast_to(root**2, len(residual))[:, None, None] * np.eye(residual.shape[1])
+    else:
+        information = np.swapaxes(root, 1, 2) @ root
+    squares = np.einsum("ni,nij,nj->n", residual, information, residual)
+    return residual, information, factor.loss.evaluate(squares)[1]
+
+
+__all__ = ["moved", "settled", "weighted"]

@@ -10,9 +10,12 @@ from groma._version import __version__
 
 _TITLES = {
     "camera position": "Positions of cameras",
+    "camera pose": "Poses of cameras (shift along and turn about their axes; degrees)",
     "control point": "Coordinates of control points",
     "mark": "Marks of control points in the images (pixels)",
     "distance": "Distances",
+    "known plane": "Distances from known planes",
+    "known direction": "Turn from known directions, in two axes across them (degrees)",
 }
 _EXPLAINED = """
 residual    measured less computed
@@ -40,6 +43,8 @@ def protocol(summary: Mapping[str, Any]) -> str:
             rows = [one for one in survey["measurements"] if one["kind"] == kind]
             if rows:
                 parts.append(_section(title, _table(rows) + "\n" + _EXPLAINED))
+    if survey.get("held"):
+        parts.append(_section("Held as they are", ", ".join(survey["held"])))
     if survey.get("check_points"):
         parts.append(_section("Check points: computed less measured", _check_table(survey["check_points"])))
     return "\n".join(parts)

@@ -30,13 +30,14 @@ GATES = ReliabilityGates()
 
 @dataclass(frozen=True)
 class Measurement:
-    """One measured coordinate after the adjustment; lengths in scene units, of marks in pixels."""
+    """One measured coordinate after the adjustment; lengths in scene units, of marks in pixels, angles in degrees."""
 
-    #: ``camera position``, ``control point``, ``mark`` or ``distance``.
+    #: ``camera position``, ``camera pose``, ``control point``, ``mark``, ``distance``, ``known plane`` or
+    #: ``known direction``.
     kind: str
-    #: Image, point, point and image, or both ends.
+    #: Image, point, point and image, landmark, or both ends.
     name: str
-    #: ``x``, ``y``, ``z``, ``u``, ``v``, or nothing.
+    #: ``x``, ``y``, ``z``, ``u``, ``v``, ``turn x`` and so on, ``a`` and ``b`` (across a direction), or nothing.
     coordinate: str
     #: Standard deviation as stated.
     sigma: float

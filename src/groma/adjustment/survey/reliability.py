@@ -35,18 +35,25 @@ from scipy.special import ndtri
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.places import at_places_of
+from groma.adjustment.survey.place import moved, weighted
 from groma.adjustment.survey.records import GATES, CheckPoint, Measurement, Reliability, noncentrality
+from groma.adjustment.terms.objects import name_of, rows_by_kind
 from groma.errors import ProblemError
 from groma.factors.contract import Factor
+from groma.factors.losses import Trivial
 from groma.problem.gauge import world_motions
 from groma.problem.problem import Problem
-from groma.problem.residuals import jacobians_of, residuals_of
+from groma.problem.residuals import jacobians_of
 from groma.scene import Scene
 from groma.scene.local_frame import local_frame
 from groma.solver.covariance.marginals import Covariances
 
-#: Names of coordinates by kind of measurement.
-_COORDINATES = {"camera position": "xyz", "control point": "xyz", "mark": "uv", "distance": ("",)}
+#: Names of coordinates by kind of measurement. Angles are told in degrees: which coordinates are angles.
+_COORDINATES = {
+    "camera position": "xyz", "camera pose": ("x", "y", "z", "turn x", "turn y", "turn z"), "control point": "xyz",
+    "mark": "uv", "distance": ("",), "known plane": ("",), "known direction": ("a", "b"),
+}  # fmt: skip
+_ANGLES = {"camera pose": (False,) * 3 + (True,) * 3, "known direction": (True, True)}
 #: A redundancy number below this says that nothing checks a measurement.
 _UNCHECKED = 1e-6
 
@@ -75,16 +82,15 @@ def reliability(
     ProblemError
         If the poses are not determined.
     """
-    tables = (scene.camera_positions, scene.control_points, scene.camera_distances, scene.point_distances)
-    if not any(map(len, tables)):
+    if not scene.has_survey:
         return None
     near = local_frame(scene)
-    moved = scene if near is None else scene.transformed(near)
+    scene = scene if near is None else scene.transformed(near)
     if problem is None:
-        problem = assemble(moved, AssemblyOptions()).problem
+        problem = assemble(scene, AssemblyOptions()).problem
     elif near is not None:
-        problem = at_places_of(problem, moved)
-    entries = list(_entries(moved, problem))
+        problem = at_places_of(problem, scene)
+    entries = list(_entries(scene, problem))
     frame = _frame(problem, [factor for _, _, factor in entries])
     tests = [_tested(frame, *entry) for entry in entries]
     measurements = [row for test in tests for row in _rows(test, level, power)]
@@ -94,7 +100,7 @@ def reliability(
         parts = [_squares_and_shares(test, wrong) for test in tests if test.kind == kind]
         squares, redundancy[kind] = (float(sum(part)) for part in zip(*parts, strict=True))
         components[kind] = float(np.sqrt(squares / redundancy[kind])) if redundancy[kind] > _UNCHECKED else None
-    return Reliability(tuple(measurements), _checked(frame, moved), components, redundancy, level, power)
+    return Reliability(tuple(measurements), _checked(frame, scene), components, redundancy, level, power)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,18 +133,11 @@ def _frame(problem: Problem, factors: list[Factor]) -> _Frame:
     total = np.zeros((free.count, free.count))
     alone = _Frame(covariances)
     for factor in factors:
-        _, information, weight = _weighted(factor, problem)
+        _, information, weight = weighted(factor, problem)
         noise = np.linalg.inv(information) / np.maximum(weight, 1e-12)[:, None, None] + _spread(alone, factor)
-        J = _moved(motions, factor, problem)
+        J = moved(motions, factor, problem)
         total += np.einsum("nik,nij,njl->kl", J, np.linalg.inv(noise), J)
     return _Frame(covariances, motions, np.asarray(np.linalg.pinv(total, 1e-12, True), float))
-
-
-def _moved(motions: dict[str, FloatArray], factor: Factor, problem: Problem) -> FloatArray:
-    """Return how residuals change with world motions, (N, m, k)."""
-    blocks = jacobians_of(factor, problem.variables)
-    parts = [blocks[slot.name] @ motions[ref.group][ref.index] for slot, ref in factor.references()]
-    return np.sum(parts, axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,25 +157,50 @@ class _Test:
 
 def _entries(scene: Scene, problem: Problem) -> Iterator[tuple[str, list[str], Factor]]:
     """Yield kind, names and factors of the measurements, as the terms made them."""
-    images, points = scene.images.names, scene.control_points.names
-    held = np.flatnonzero(scene.control_points.is_control)
-    of_marks = _rows_of_marks(scene)
+    names = {kind: iter(list(rows)) for kind, rows in _names(scene, problem).items()}
     for factor in problem.factors:
-        refs = {slot.name: ref for slot, ref in factor.references()}
-        groups = {ref.group for ref in refs.values()}
-        if factor.type_name == "position_prior" and len(factor) == len(scene.camera_positions):
-            yield "camera position", [images[row] for row in scene.camera_positions.image_idx], factor
+        groups = {ref.group for _, ref in factor.references()}
+        kind = _KINDS.get(factor.type_name, "")
+        if factor.type_name == "point_reprojection" and "control_points" in groups:
+            kind = "mark"
         elif factor.type_name == "vector_prior" and groups == {"control_points"}:
-            yield "control point", [points[row] for row in held], factor
-        elif factor.type_name == "point_reprojection" and "control_points" in groups:
-            rows = next(of_marks)
-            pairs = zip(scene.marks.point_idx[rows], scene.marks.image_idx[rows], strict=True)
-            yield "mark", [f"{points[point]} in {images[image]}" for point, image in pairs], factor
-        elif factor.type_name in ("point_distance", "camera_distance"):
-            in_points = factor.type_name == "point_distance"
-            names, table = (points, scene.point_distances) if in_points else (images, scene.camera_distances)
-            pairs = zip(table.first_idx, table.second_idx, strict=True)
-            yield "distance", [f"{names[first]} to {names[second]}" for first, second in pairs], factor
+            kind = "control point"
+        elif factor.type_name == "pose_prior":  # poses that the scene knows of its frames come first
+            kind = "camera pose" if not isinstance(factor.loss, Trivial) else ""
+        if kind:
+            yield kind, next(names[kind]), factor
+
+
+#: Kinds of measurements by their factors.
+_KINDS = {
+    "position_prior": "camera position", "distance": "distance", "on_known_plane": "known plane",
+    "camera_direction": "known direction", "known_direction": "known direction",
+}  # fmt: skip
+
+
+def _names(scene: Scene, problem: Problem) -> dict[str, Iterator[list[str]]]:
+    """Return by kind the names of the measurements of each factor, in the order in which the terms make them."""
+    images, points, groups = scene.images.names, scene.control_points.names, problem.variables.keys()
+    apart, plane, turned = scene.distances, scene.known_planes, scene.known_directions
+    marks = ((scene.marks.point_idx[rows], scene.marks.image_idx[rows]) for rows in _rows_of_marks(scene))
+
+    def told(kind: IntArray, index: IntArray) -> list[str]:
+        return [name_of(scene, *one) for one in zip(kind.tolist(), index.tolist(), strict=True)]
+
+    first, second = told(apart.first_kind, apart.first_idx), told(apart.second_kind, apart.second_idx)
+    ends = [f"{one} to {other}" for one, other in zip(first, second, strict=True)]
+    on_plane, along = told(plane.kind, plane.idx), told(turned.kind, turned.idx)
+    return {
+        "camera position": iter([[images[row] for row in scene.camera_positions.image_idx]]),
+        "camera pose": iter([[images[row] for row in scene.camera_poses.image_idx]]),
+        "control point": iter([[points[row] for row in np.flatnonzero(scene.control_points.is_control)]]),
+        "mark": ([f"{points[p]} in {images[i]}" for p, i in zip(*rows, strict=True)] for rows in marks),
+        "distance": (
+            [ends[row] for row in rows] for _, rows in rows_by_kind(groups, apart.first_kind, apart.second_kind)
+        ),
+        "known plane": ([on_plane[row] for row in rows] for _, rows in rows_by_kind(groups, plane.kind)),
+        "known direction": ([along[row] for row in rows] for _, rows in rows_by_kind(groups, turned.kind)),
+    }
 
 
 def _rows_of_marks(scene: Scene) -> Iterator[IntArray]:
@@ -187,16 +211,8 @@ def _rows_of_marks(scene: Scene) -> Iterator[IntArray]:
             yield rows
 
 
-def _weighted(factor: Factor, problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return residuals (N, m), information (N, m, m) and the weights (N,) that a robust loss left."""
-    residual = residuals_of(factor, problem.variables)
-    information = _information(factor, *residual.shape)
-    squares = np.einsum("ni,nij,nj->n", residual, information, residual)
-    return residual, information, factor.loss.evaluate(squares)[1]
-
-
 def _tested(frame: _Frame, kind: str, names: list[str], factor: Factor) -> _Test:
-    residual, information, weight = _weighted(factor, frame.covariances.problem)
+    residual, information, weight = weighted(factor, frame.covariances.problem)
     spread = _spread(frame, factor)
     eye = np.eye(residual.shape[1])
     without = np.linalg.pinv(eye - weight[:, None, None] * spread @ information, rcond=1e-12)
@@ -207,18 +223,11 @@ def _tested(frame: _Frame, kind: str, names: list[str], factor: Factor) -> _Test
     return _Test(kind, names, residual, np.einsum("nij,nj->ni", full, alone), information, cofactor, shares, weight)
 
 
-def _information(factor: Factor, count: int, size: int) -> FloatArray:
-    root = np.asarray(factor.sqrt_information, float)
-    if root.ndim < 3:
-        return np.broadcast_to(root**2, count)[:, None, None] * np.eye(size)
-    return np.swapaxes(root, 1, 2) @ root
-
-
 def _spread(frame: _Frame, factor: Factor) -> FloatArray:
     """Return S = J Sigma J^T (N, m, m) of the free variables that factors refer to."""
     spread = _spread_inside(frame.covariances, factor)
     if frame.motions:
-        J = _moved(frame.motions, factor, frame.covariances.problem)
+        J = moved(frame.motions, factor, frame.covariances.problem)
         spread = spread + J @ frame.place @ np.swapaxes(J, 1, 2)
     return spread
 
@@ -248,20 +257,22 @@ def _rows(test: _Test, level: float, power: float) -> Iterator[Measurement]:
     scores = np.einsum("nij,nj->ni", test.information, test.full)
     of_scores = np.einsum("nij,njk,nki->ni", test.information, test.cofactor, test.information)
     limit, shift = float(-ndtri(level / 2.0)), noncentrality(level, power)
+    angles = _ANGLES.get(test.kind, (False,) * 6)
     for row, name in enumerate(test.names):
         for k, coordinate in enumerate(_COORDINATES[test.kind]):
             share, variance = float(test.shares[row, k]), float(of_scores[row, k])
             checked = share > _UNCHECKED and variance > 0.0
             normalized = float(-scores[row, k] / np.sqrt(variance)) if checked else None
+            unit = float(np.degrees(1.0)) if angles[k] else 1.0
             yield Measurement(
                 kind=test.kind,
                 name=name,
                 coordinate=coordinate,
-                sigma=float(deviation[row, k]),
-                residual=float(-test.residual[row, k]),
+                sigma=unit * float(deviation[row, k]),
+                residual=-unit * float(test.residual[row, k]),
                 redundancy=share,
                 normalized=normalized,
-                detectable=float(shift / np.sqrt(variance)) if checked else None,
+                detectable=unit * float(shift / np.sqrt(variance)) if checked else None,
                 external=float(shift * np.sqrt((1.0 - share) / share)) if checked else None,
                 is_suspect=normalized is not None and bool(abs(normalized) > limit),
                 weight=float(test.weight[row]),

@@ -151,12 +151,13 @@ def _of_line(x: FloatArray, y: FloatArray) -> Similarity:
     along, target_along = axes[0], target_axes[0]
     if (x @ along) @ (y @ target_along) < 0.0:
         target_along = -target_along
-    rotation = _turn_between(along, target_along)
+    rotation = turn_between(along, target_along)
     scale = float((x @ along) @ (y @ target_along)) / float((x @ along) @ (x @ along))
     return Similarity(scale, rotation, np.zeros(3))
 
 
-def _turn_between(first: FloatArray, second: FloatArray) -> FloatArray:
+def turn_between(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the smallest rotation (3, 3) that takes one unit vector to another."""
     axis = np.cross(first, second)
     if np.linalg.norm(axis) < 1e-12 and first @ second < 0:
         axis = np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
@@ -191,10 +192,10 @@ def upright(found: RobustSimilarity, scene: Scene, target: FloatArray) -> Robust
     flat, wanted = up - (up @ axis) * axis, np.array([0.0, 0.0, 1.0]) - axis[2] * axis
     if min(np.linalg.norm(flat), np.linalg.norm(wanted)) < 0.1:
         return found
-    turn = _turn_between(unit(flat), unit(wanted))
+    turn = turn_between(unit(flat), unit(wanted))
     old, middle = found.similarity, places.mean(0)
     moved = Similarity(old.scale, turn @ old.rotation, turn @ (old.translation - middle) + middle)
     return RobustSimilarity(moved, found.residuals, found.inliers, found.scatter, True)
 
 
-__all__ = ["GATES", "RobustSimilarity", "SimilarityGates", "robust_similarity", "upright"]
+__all__ = ["GATES", "RobustSimilarity", "SimilarityGates", "robust_similarity", "turn_between", "upright"]

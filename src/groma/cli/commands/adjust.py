@@ -170,6 +170,13 @@ def adjust(
     check: _measured.Check = None,
     distances: _measured.Distances = None,
     distance_sigma: _measured.DistanceSigma = None,
+    directions: _measured.Directions = None,
+    direction_sigma: _measured.DirectionSigma = None,
+    known_planes: _measured.KnownPlanes = None,
+    plane_sigma: _measured.PlaneSigma = None,
+    poses: _measured.Poses = None,
+    pose_sigma: _measured.PoseSigma = None,
+    hold: _measured.Hold = None,
     crs: _measured.Crs = None,
     protocol: Annotated[
         Path | None,
@@ -206,10 +213,7 @@ def adjust(
     if linear_solver != "auto":
         _check_linear_solver(linear_solver)
     console = Console(quiet, verbose, json_target, threads)
-    measured = _measured.Measured(
-        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
-    )
-    _measured.check_measured(measured)
+    measured = _measured.given(locals())
     in_parts = has_company() or is_parts(source)
     if not in_parts:
         _output.check_outputs(force, output, page, covariance, protocol, json_target=json_target)

@@ -46,7 +46,10 @@ def align(
     from groma.cli.shared.console import Console
     from groma.cli.shared.input import check_inputs, refuse_idle
 
-    measured = _measured.Measured(positions=positions, position_sigma="1", control=control, control_sigma="1", crs=crs)
+    measured = _measured.Measured(
+        positions=positions, position_sigma="1" if positions else None,
+        control=control, control_sigma="1" if control else None, crs=crs,
+    )  # fmt: skip
     if (reference is None) == (not measured):
         raise InputError("Pass either a REFERENCE scene, or --positions or --control.")
     refuse_idle(("--crs", crs is not None and not measured, "with --positions or --control"))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from groma.cli.shared import command as _complete
+from groma.cli.shared import depth as _depth
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
 from groma.cli.shared.ranks import led_by_first_rank
@@ -42,7 +43,7 @@ def map_(
             "--poses",
             metavar="FILE",
             help="Poses from elsewhere, without points: a model, transforms.json, reconstruction.json, a trajectory "
-            "(TUM, KITTI), a g2o graph. Points are found, poses improved, wrong ones named.",
+            "(TUM, KITTI), a g2o graph, or name x y z qx qy qz qw. Points are found, poses improved, wrong ones named.",
         ),
     ] = None,
     extend: Annotated[
@@ -92,6 +93,7 @@ def map_(
     refine_rig: Annotated[
         bool, typer.Option("--refine-rig/--fix-rig", help="Estimate where the cameras sit on their rig.")
     ] = False,
+    rolling_shutter: _options.RollingShutter = None,
     line_matches: Annotated[
         Path | None,
         typer.Option(
@@ -142,7 +144,16 @@ def map_(
     check: _measured.Check = None,
     distances: _measured.Distances = None,
     distance_sigma: _measured.DistanceSigma = None,
+    directions: _measured.Directions = None,
+    direction_sigma: _measured.DirectionSigma = None,
+    known_planes: _measured.KnownPlanes = None,
+    plane_sigma: _measured.PlaneSigma = None,
+    pose_sigma: _measured.PoseSigma = None,
+    hold: _measured.Hold = None,
     crs: _measured.Crs = None,
+    depth: _depth.Depth = None,
+    depth_scale: _depth.DepthScale = None,
+    relative_depth: _depth.RelativeDepth = False,
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
@@ -165,14 +176,11 @@ def map_(
 
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
-    measured = _measured.Measured(
-        positions, position_sigma, control, control_sigma, mark_sigma, check, distances, distance_sigma, crs
-    )
-    _measured.check_measured(measured)
-    check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, *measured.files)
-    check_extension(
-        extend, map_images, {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params}
-    )
+    measured = _measured.given(locals() | {"poses": poses if _has_noise(poses, pose_sigma) else None})
+    check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, *measured.files)
+    maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
+    known = {"--model": model, "--poses": poses, "--rig": rig, "--camera-params": camera_params, "--depth": depth}
+    check_extension(extend, map_images, known)
     _check_start(model, poses, rig)
     placed = model is not None or poses is not None or extend is not None
     refuse_idle(
@@ -183,7 +191,6 @@ def map_(
         ("--camera-params", model is not None and camera_params is not None, "on images without a model"),
         ("--truth", truth is not None and not contributions, "with --contributions, which compares with it"),
     )
-
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.extending import end_queries, extend_map
     from groma.cli.shared.mapping import run_map, say_map, stages_of_map, write_map
@@ -209,6 +216,7 @@ def map_(
         mapper=mapper,
         rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
+        rolling_shutter=rolling_shutter,
         threads=threads,
         seed=seed,
     )
@@ -227,17 +235,24 @@ def map_(
             photographs, lambda: [path.relative_to(photographs).as_posix() for path in image_files(photographs)]
         )
     with work_with(threads):
-        result = run_map(console, photographs, work, start, options, matches, survey)
+        result = run_map(console, photographs, work, start, options, matches, survey, maps)
         if extended is not None and survey is None:
             result = in_world_of(result, extended.map)
         found = try_diagnosis(result.diagnose, result.scene.num_images, console, diagnosis)
         numbers = result.summary(found, result.contributions(true) if contributions else ())
-        title = f"Map of {images.absolute().name}"
-        write_map(console, result, output, work, force, images=photographs, title=title, summary=numbers)
+        page = {"images": photographs, "title": f"Map of {images.absolute().name}", "summary": numbers}
+        write_map(console, result, output, work, force, **page)
     end_queries(output)
     say_map(console, result, numbers)
     console.wrote_page(output)
     _output.write_json(json_target, numbers, force)
+
+
+def _has_noise(poses: Path | None, stated: str | None) -> bool:
+    """Whether it is known how exact given poses are; else that is estimated."""
+    from groma.io.measured_poses import holds_covariances
+
+    return poses is not None and (stated is not None or holds_covariances(poses))
 
 
 def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> None:

@@ -149,14 +149,19 @@ def _adjusted(
 ) -> tuple[Scene, AdjustResult, dict[str, Any] | None, Motions | None]:
     """Return the scene as it went into the adjustment, the result, and what is told of measurements and motions."""
     from groma.adjustment.adjust import adjust
+
+    surveyed = bool(wanted.measured) or before.has_survey
+    if not surveyed and wanted.protocol is not None:
+        raise InputError(
+            "--protocol is of measurements; there are none. Add --positions, --control, --distances or others."
+        )
+    if not surveyed and wanted.rolling_shutter is None and not len(before.camera_motions):
+        return before, adjust(before, options, progress), None, None
     from groma.adjustment.rolling_shutter import adjust_rolling_shutter, motions_of, with_rolling_shutter
-    from groma.mapping.surveyed import adjust_surveyed, has_survey
+    from groma.mapping.surveyed import adjust_surveyed  # with what finds noise in images
 
     if wanted.rolling_shutter is not None:
         before = with_rolling_shutter(before, wanted.rolling_shutter)
-    surveyed = bool(wanted.measured) or has_survey(before)
-    if not surveyed and wanted.protocol is not None:
-        raise InputError("--protocol is of measurements; there are none. Add --positions, --control or --distances.")
     rolled = adjust_rolling_shutter(before, options, progress) if len(before.camera_motions) else None
     if not surveyed:
         if rolled is None:

@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from groma.cli.shared import output as _output
+from groma.cli.shared.depth import say_depth
 from groma.cli.shared.diagnosis import DIAGNOSING
 from groma.cli.shared.interrupt import PROCESS
 from groma.cli.shared.measurements import say_survey
 from groma.errors import OutputError
 
 if TYPE_CHECKING:
-    from groma.adjustment.survey.attach import Survey
+    from groma.adjustment.survey.given import Survey
     from groma.cli.shared.console import Console
     from groma.features.external import ExternalMatches
+    from groma.io.depth_maps import DepthMaps
     from groma.mapping.map import MapOptions
     from groma.mapping.plan import Start
     from groma.mapping.result import MapResult
@@ -35,6 +37,7 @@ def run_map(
     options: MapOptions,
     line_matches: ExternalMatches | None = None,
     survey: Survey | None = None,
+    depth: DepthMaps | None = None,
 ) -> MapResult:
     """Map a folder of photographs; Ctrl-C ends the command and keeps the finished stages in ``work``."""
     from groma.cli.shared.interrupt import interruptible
@@ -44,24 +47,30 @@ def run_map(
     check_free(work)
     console.expect_compilation("map")
     start: Start = "photographs" if model is None else "model" if model.num_point_observations else "poses"
-    console.expect_stages(*stages_of_map(options, start, survey is not None, line_matches is not None))
+    console.expect_stages(
+        *stages_of_map(options, start, survey is not None, line_matches is not None, depth is not None)
+    )
     if has_stages(work):
         console.say(f"Going on from the finished stages in {work}, as far as they fit.")
     try:
         with interruptible() as interruption, console.stages() as stages:
-            return map_images(images, work, model, options, interruption.checking(stages), line_matches, survey)
+            return map_images(images, work, model, options, interruption.checking(stages), line_matches, survey, depth)
     except KeyboardInterrupt:
         words = f"finished stages are kept in {work}: the same command goes on from there."
         raise typer.Exit(PROCESS.tell(words)) from None
 
 
 def stages_of_map(
-    options: MapOptions, start: Start = "model", surveyed: bool = False, given_segments: bool = False
+    options: MapOptions,
+    start: Start = "model",
+    surveyed: bool = False,
+    given_segments: bool = False,
+    depth: bool = False,
 ) -> tuple[str, ...]:
     """Return the names of the stages of a map, with those that the command adds."""
     from groma.mapping.plan import planned_stages
 
-    return (*planned_stages(options, start, surveyed, given_segments), DIAGNOSING, WRITING)
+    return (*planned_stages(options, start, surveyed, given_segments, depth), DIAGNOSING, WRITING)
 
 
 def write_map(console: Console, result: MapResult, output: Path, work: Path, force: bool, **how: Any) -> None:
@@ -105,6 +114,7 @@ def say_map(console: Console, result: MapResult, numbers: dict[str, Any], explai
     if explain or console.verbose:
         say_diagnosis(numbers["diagnosis"], console)
     (console.say if explain else console.detail)(result.explanation)
+    say_depth(console, numbers.get("depth") or {})
     say_survey(console, numbers.get("survey") or {})
     for sentence in result.warnings:
         console.warn(sentence)

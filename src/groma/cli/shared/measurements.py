@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Options of commands that take measurements of other instruments: positions, control points, distances."""
+"""Options of commands that take measurements of other instruments: positions, control points, distances, and so on."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +13,7 @@ import typer
 from groma.errors import InputError
 
 if TYPE_CHECKING:
-    from groma.adjustment.survey.attach import Survey
+    from groma.adjustment.survey.given import Survey
     from groma.cli.shared.console import Console
 
 PANEL = "Measurements"
@@ -77,7 +77,8 @@ Distances = Annotated[
     typer.Option(
         "--distances",
         metavar="FILE",
-        help="Measured distances: name, name, distance, standard deviation; between control points or images.",
+        help="Measured distances: name, name, distance, standard deviation; between images, control points and "
+        "landmarks (line:5, plane:2, point:17).",
         rich_help_panel=PANEL,
     ),
 ]
@@ -87,6 +88,71 @@ DistanceSigma = Annotated[
         "--distance-sigma",
         metavar="S",
         help="Standard deviation of distances where the file states none.",
+        rich_help_panel=PANEL,
+    ),
+]
+Directions = Annotated[
+    Path | None,
+    typer.Option(
+        "--directions",
+        metavar="FILE",
+        help="Known directions: photograph, where down is in the axes of its camera (x right, y down, z forward), "
+        "degrees; or line:5 vertical 0.5.",
+        rich_help_panel=PANEL,
+    ),
+]
+DirectionSigma = Annotated[
+    float | None,
+    typer.Option(
+        "--direction-sigma",
+        metavar="DEG",
+        help="Standard deviation of directions where the file states none, degrees.",
+        rich_help_panel=PANEL,
+    ),
+]
+KnownPlanes = Annotated[
+    Path | None,
+    typer.Option(
+        "--known-planes",
+        metavar="FILE",
+        help="What is on planes with known coordinates: p1 z 12.3 0.01, or plane:2 0 0 1 -12.3 0.01 (n.X + w = 0).",
+        rich_help_panel=PANEL,
+    ),
+]
+PlaneSigma = Annotated[
+    float | None,
+    typer.Option(
+        "--plane-sigma",
+        metavar="S",
+        help="Standard deviation of the distance from known planes where the file states none.",
+        rich_help_panel=PANEL,
+    ),
+]
+Poses = Annotated[
+    Path | None,
+    typer.Option(
+        "--poses",
+        metavar="FILE",
+        help="Measured poses: name x y z qx qy qz qw and standard deviations or a covariance; or any file of poses, "
+        "with --pose-sigma.",
+        rich_help_panel=PANEL,
+    ),
+]
+PoseSigma = Annotated[
+    str | None,
+    typer.Option(
+        "--pose-sigma",
+        metavar="S,DEG",
+        help="Standard deviations of poses where the file states none: of positions, and of orientations in degrees.",
+        rich_help_panel=PANEL,
+    ),
+]
+Hold = Annotated[
+    str | None,
+    typer.Option(
+        "--hold",
+        metavar="NAME,...",
+        help="Images (also old/*), control points and landmarks (line:5) that keep the place they have.",
         rich_help_panel=PANEL,
     ),
 ]
@@ -113,21 +179,48 @@ class Measured:
     check: str | None = None
     distances: Path | None = None
     distance_sigma: float | None = None
+    directions: Path | None = None
+    direction_sigma: float | None = None
+    known_planes: Path | None = None
+    plane_sigma: float | None = None
+    poses: Path | None = None
+    pose_sigma: str | None = None
+    hold: str | None = None
     crs: str | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse options that nothing is given for."""
+        needs = {
+            "--position-sigma": (self.position_sigma, self.positions, "--positions"),
+            "--control-sigma": (self.control_sigma, self.control, "--control"),
+            "--check": (self.check, self.control, "--control"),
+            "--distance-sigma": (self.distance_sigma, self.distances, "--distances"),
+            "--direction-sigma": (self.direction_sigma, self.directions, "--directions"),
+            "--plane-sigma": (self.plane_sigma, self.known_planes, "--known-planes"),
+            "--pose-sigma": (self.pose_sigma, self.poses, "--poses"),
+            "--crs": (self.crs, self.positions or self.control, "--positions or --control"),
+        }
+        for option, (given, needed, name) in needs.items():
+            if given is not None and needed is None:
+                raise InputError(f"{option} belongs to {name}. Add it, or leave {option} out.")
 
     @property
     def files(self) -> tuple[Path | None, ...]:
         """Files that must be there."""
         positions = None if self.positions is None or _exif(self.positions) is not None else Path(self.positions)
-        return positions, self.control, self.distances
+        return positions, self.control, self.distances, self.directions, self.known_planes, self.poses
 
     @property
     def given(self) -> dict[str, object]:
-        """Options that name files, by name, for commands that take none of them."""
-        return {"--positions": self.positions, "--control": self.control, "--distances": self.distances}
+        """Options that bring measurements, by name, for commands that take none of them."""
+        return {
+            "--positions": self.positions, "--control": self.control, "--distances": self.distances,
+            "--directions": self.directions, "--known-planes": self.known_planes, "--poses": self.poses,
+            "--hold": self.hold,
+        }  # fmt: skip
 
     def __bool__(self) -> bool:
-        return any(part is not None for part in (self.positions, self.control, self.distances))
+        return any(part is not None for part in self.given.values())
 
     def read(self, images: Path | None, names: Callable[[], Sequence[str]]) -> Survey:
         """Read the files.
@@ -139,43 +232,54 @@ class Measured:
         names : callable
             Gives their names in it, or those of the images of the scene.
         """
-        from groma.adjustment.survey.attach import Survey
-        from groma.io.survey import read_control, read_distances, read_exif_positions, read_positions
+        from groma.adjustment.survey.given import Survey
+        from groma.io import survey as files
+        from groma.io.measured_poses import read_camera_poses
 
-        places = None
-        if self.positions is not None:
-            folder = _exif(self.positions)
-            if folder is None:
-                places = read_positions(self.positions)
-            elif (where := Path(folder) if folder else images) is not None:
-                places = read_exif_positions(where, names())
-            else:
-                raise InputError("--positions exif needs the folder of the photographs: --positions exif:FOLDER.")
         return Survey(
-            positions=places,
-            control=None if self.control is None else read_control(self.control),
-            distances=None if self.distances is None else read_distances(self.distances),
+            positions=self._positions(images, names),
+            control=_read(files.read_control, self.control),
+            distances=_read(files.read_distances, self.distances),
+            directions=_read(files.read_directions, self.directions),
+            planes=_read(files.read_known_planes, self.known_planes),
+            poses=None if self.poses is None else read_camera_poses(self.poses, names()),
             position_sigma=_sigma(self.position_sigma, "--position-sigma"),
             control_sigma=_sigma(self.control_sigma, "--control-sigma"),
             distance_sigma=self.distance_sigma,
+            direction_sigma_deg=self.direction_sigma,
+            plane_sigma=self.plane_sigma,
+            pose_sigma=_sigma(self.pose_sigma, "--pose-sigma", (2, 2)),
             mark_sigma_px=self.mark_sigma,
-            check=tuple(name.strip() for name in self.check.split(",") if name.strip()) if self.check else (),
+            check=_names(self.check),
+            hold=_names(self.hold),
             crs=self.crs,
         )
 
+    def _positions(self, images: Path | None, names: Callable[[], Sequence[str]]) -> Any:
+        from groma.io.survey import read_exif_positions, read_positions
 
-def check_measured(measured: Measured) -> None:
-    """Refuse options that nothing is given for."""
-    needs = {
-        "--position-sigma": (measured.position_sigma, measured.positions, "--positions"),
-        "--control-sigma": (measured.control_sigma, measured.control, "--control"),
-        "--check": (measured.check, measured.control, "--control"),
-        "--distance-sigma": (measured.distance_sigma, measured.distances, "--distances"),
-        "--crs": (measured.crs, measured.positions or measured.control, "--positions or --control"),
-    }
-    for option, (given, needed, name) in needs.items():
-        if given is not None and needed is None:
-            raise InputError(f"{option} belongs to {name}. Add it, or leave {option} out.")
+        if self.positions is None:
+            return None
+        folder = _exif(self.positions)
+        if folder is None:
+            return read_positions(self.positions)
+        where = Path(folder) if folder else images
+        if where is None:
+            raise InputError("--positions exif needs the folder of the photographs: --positions exif:FOLDER.")
+        return read_exif_positions(where, names())
+
+
+def given(options: Mapping[str, Any]) -> Measured:
+    """Return the measurements among the options of a command, whose names are those of the fields."""
+    return Measured(**{item.name: options[item.name] for item in fields(Measured)})
+
+
+def _read(reader: Callable[[Path], Any], path: Path | None) -> Any:
+    return None if path is None else reader(path)
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
 
 
 def _exif(text: str) -> str | None:
@@ -183,15 +287,16 @@ def _exif(text: str) -> str | None:
     return text[5:] if text == "exif" or text.startswith("exif:") else None
 
 
-def _sigma(text: str | None, option: str) -> tuple[float, ...]:
+def _sigma(text: str | None, option: str, count: tuple[int, int] = (1, 3)) -> tuple[float, ...]:
     if text is None:
         return ()
     try:
         values = tuple(float(word) for word in text.split(","))
     except ValueError:
         values = ()
-    if not 1 <= len(values) <= 3 or not all(0.0 < value < float("inf") for value in values):
-        raise InputError(f"{option} must be one to three positive numbers with commas between them; got {text!r}.")
+    if not count[0] <= len(values) <= count[1] or not all(0.0 < value < float("inf") for value in values):
+        number = "two" if count == (2, 2) else "one to three"
+        raise InputError(f"{option} must be {number} positive numbers with commas between them; got {text!r}.")
     return values
 
 
@@ -224,6 +329,7 @@ def say_survey(console: Console, numbers: dict[str, Any]) -> None:
 
 
 __all__ = [
-    "Check", "Control", "ControlSigma", "Crs", "DistanceSigma", "Distances", "MarkSigma", "Measured", "PositionSigma",
-    "Positions", "check_measured", "say_survey",
+    "Check", "Control", "ControlSigma", "Crs", "DirectionSigma", "Directions", "DistanceSigma", "Distances", "Hold",
+    "KnownPlanes", "MarkSigma", "Measured", "PlaneSigma", "PoseSigma", "Poses", "PositionSigma", "Positions",
+    "given", "say_survey",
 ]  # fmt: skip

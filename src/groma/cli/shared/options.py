@@ -43,7 +43,7 @@ LineDetector = Annotated[
         "--line-detector",
         autocompletion=_complete.one_of(*_complete.DETECTORS),
         metavar="NAME",
-        help="What finds line segments: lsd, or a detector of an installed package.",
+        help="What finds line segments: lsd, onnx:FILE (a network like M-LSD), or a detector of an installed package.",
     ),
 ]
 RollingShutter = Annotated[

@@ -29,7 +29,7 @@ def adjust_graph_and_write(
     force : bool
         Replace what is there.
     options : dict
-        Fields of :class:`groma.adjustment.pose_graph.PoseGraphOptions` that were chosen.
+        Fields of :class:`groma.adjustment.graphs.pose_graph.PoseGraphOptions` that were chosen.
     refused : dict
         Options of the command that mean nothing for a pose graph, and their values.
     """
@@ -39,7 +39,7 @@ def adjust_graph_and_write(
     if output is not None and not is_pose_graph(output):
         raise InputError(f"A pose graph is written as .g2o or .g2o.gz; got {output}.")
 
-    from groma.adjustment.pose_graph import PoseGraphOptions, adjust_pose_graph
+    from groma.adjustment.graphs.pose_graph import PoseGraphOptions, adjust_pose_graph
     from groma.compilation.time import compilation_time
     from groma.io.g2o import read_g2o, write_g2o
 

@@ -122,6 +122,7 @@ class _LineAndPlane(Factor):
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("line", "line"), Slot("plane", "plane"))
     invariance: ClassVar[Invariance] = WORLD_FIXED  # anchors and ends are world points
+    is_incidence: ClassVar[bool] = True
     rows: ClassVar[int] = 2
 
     def _evaluate(

@@ -90,6 +90,7 @@ class PointOnLine(Factor):
     slots: ClassVar[tuple[Slot, ...]] = (Slot("point", "point"), Slot("line", "line"))
     rows: ClassVar[int] = 3
     independent_rows: ClassVar[int] = 2
+    is_incidence: ClassVar[bool] = True
 
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

@@ -68,6 +68,7 @@ class PointOnPlane(Factor):
 
     slots: ClassVar[tuple[Slot, ...]] = (Slot("point", "point"), Slot("plane", "plane"))
     rows: ClassVar[int] = 1
+    is_incidence: ClassVar[bool] = True
 
     def linearize(  # noqa: D102
         self, inputs: tuple[Any, ...], begin: int, end: int, columns: tuple[int, ...], record: FloatArray

@@ -25,6 +25,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
+from groma.geometry.algebra import cross
 from groma.geometry.charts.chart import Chart, perpendicular, perpendicular_kernel, random_lines, reject, unit
 
 
@@ -108,7 +109,7 @@ class CartesianLine(Chart):
         """
         state, other = self._checked_pair(state, other)
         d, d_other = state[:, 3:], other[:, 3:]
-        p, p_other = np.cross(d, state[:, :3]), np.cross(d_other, other[:, :3])
+        p, p_other = cross(d, state[:, :3]), cross(d_other, other[:, :3])
         cosine = np.sum(d * d_other, axis=1, keepdims=True)
         cosine = np.where(cosine == 0.0, 1e-100, cosine)  # out of reach: huge, but finite
         # The point of the other line in the plane through p perpendicular to d.
@@ -134,8 +135,8 @@ class CartesianLine(Chart):
             "Use the chart 'orthonormal_right' for lines at infinity, or drop the line.",
         )
         d = unit(scaled[:, 3:])
-        foot = np.cross(d, scaled[:, :3] / length)
-        return np.hstack([np.asarray(np.cross(foot, d), dtype=np.float64), d])
+        foot = cross(d, scaled[:, :3] / length)
+        return np.hstack([np.asarray(cross(foot, d), dtype=np.float64), d])
 
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (m, d) with respect to the increment, (N, 6, 4)."""

@@ -27,8 +27,9 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError
-from groma.execution import work_with
+from groma.execution import beside, work_with
 from groma.mapping.lines.filtering.filters import Evidence, filtered
+from groma.mapping.lines.filtering.texture import load_minimiser
 from groma.mapping.lines.hypotheses.directions import depth_ratios
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.hypotheses.places import Places, find_places
@@ -120,7 +121,8 @@ def map_lines(
         else:
             ratios = np.zeros((len(views.image_idx), 2))
         proposing, linking = partial(report, "proposing lines"), partial(report, "linking segments")
-        places = find_places(scene, views, ratios, compared, matches, options, proposing, known)
+        with beside(load_minimiser):
+            places = find_places(scene, views, ratios, compared, matches, options, proposing, known)
         unmerged = grow(Tracks.none(views, places.rejection), places, compared, options, linking)
         evidence = Evidence(
             options=options,

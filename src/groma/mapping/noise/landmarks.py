@@ -11,6 +11,7 @@ to its ray; only its displacement across the image line is measured. Any camera 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from groma._typing import FloatArray, IntArray
 from groma.cameras import model as camera_model
 from groma.gates import gate
 from groma.geometry import quaternion
-from groma.geometry.algebra import apply, dot, norm, perpendicular, ratio, unit
+from groma.geometry.algebra import apply, cross, dot, norm, perpendicular, ratio, unit
 from groma.scene import Scene
 from groma.scene.line_intervals import shares_on_lines
 
@@ -74,6 +75,10 @@ class LineNoise:
         """Return the noise with a standard deviation (L,) of both ends across the line added, scene units."""
         return replace(self, covariance=self.covariance + length[:, None, None] ** 2 * np.eye(4))
 
+    def by_misfit(self) -> LineNoise:
+        """Return the noise that each line shows in its own residuals where that is more than the usual one."""
+        return replace(self, covariance=self.covariance * np.maximum(self.misfit, 1.0)[:, None, None] ** 2)
+
     def at(self, first_share: FloatArray, second_share: FloatArray, rows: IntArray) -> FloatArray:
         """Cross-covariance (N, 2, 2), along ``across``, of the points at two shares of the segments ``rows``."""
         first = np.stack([1.0 - first_share, first_share], axis=-1)
@@ -86,7 +91,7 @@ class LineNoise:
         blocks = self.covariance.reshape(-1, 2, 2, 2, 2)
         blocks = np.stack([blocks[:, 0, :, 0], blocks[:, 1, :, 1]], axis=1)
         full = np.einsum("lai,leab,lbj->leij", self.across, blocks, self.across)
-        along = np.cross(self.across[:, 0], self.across[:, 1])
+        along = cross(self.across[:, 0], self.across[:, 1])
         size = 0.5 * np.trace(blocks, axis1=2, axis2=3)
         return full + size[..., None, None] * (along[:, :, None] * along[:, None, :])[:, None]
 
@@ -150,17 +155,33 @@ def project_points(
 
     With baselines (N,) the pixels are those in the right images of stereo pairs.
     """
+    rotation = quaternion.to_matrix(scene.cam_from_world[:, :4])
+    pixels, by_world = np.full((len(places), 2), np.nan), np.full((len(places), 2, 3), np.nan)
+    for front, found, by_cam in _projected(scene, image_idx, places, baseline):
+        pixels[front], by_world[front] = found, by_cam @ rotation[image_idx[front]]
+    return pixels, by_world
+
+
+def pixels_of(scene: Scene, image_idx: IntArray, places: FloatArray) -> FloatArray:
+    """Pixels (N, 2) of points in the world; NaN behind the camera."""
+    pixels = np.full((len(places), 2), np.nan)
+    for front, found, _ in _projected(scene, image_idx, places):
+        pixels[front] = found
+    return pixels
+
+
+def _projected(
+    scene: Scene, image_idx: IntArray, places: FloatArray, baseline: FloatArray | float = 0.0
+) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+    """Yield rows in front of their camera, their pixels, and the derivatives by coordinates in the camera."""
     poses = scene.cam_from_world[image_idx]
     in_cam = quaternion.rotate(poses[:, :4], places) + poses[:, 4:]
     in_cam[:, 0] -= baseline
-    pixels, by_world = np.full((len(places), 2), np.nan), np.full((len(places), 2, 3), np.nan)
     for name, rows, params in _by_model(scene, image_idx):
         model = camera_model(name)
-        front = rows if model.sees_behind else rows[in_cam[rows, 2] > 0]
-        chosen = params[np.isin(rows, front, assume_unique=True)]
-        pixels[front], by_cam, _ = model.project_jacobian(chosen, np.ascontiguousarray(in_cam[front]))
-        by_world[front] = by_cam @ quaternion.to_matrix(poses[front, :4])
-    return pixels, by_world
+        seen = model.sees_behind | (in_cam[rows, 2] > 0)
+        pixels, by_cam, _ = model.project_jacobian(params[seen], np.ascontiguousarray(in_cam[rows[seen]]))
+        yield rows[seen], pixels, by_cam
 
 
 def _pixel_rows(scene: Scene) -> tuple[IntArray, FloatArray, FloatArray]:

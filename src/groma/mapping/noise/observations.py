@@ -29,11 +29,11 @@ import numpy as np
 from scipy.special import polygamma
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.assemble import LINE_FACTORS, AssemblyOptions, assemble
+from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.gates import gate
 from groma.mapping.noise.landmarks import GATES as LANDMARK_GATES
-from groma.mapping.noise.landmarks import project_points
+from groma.mapping.noise.landmarks import pixels_of
 from groma.problem.residuals import residuals_of
 from groma.scene import Scene
 
@@ -88,14 +88,14 @@ def line_end_correlation(scene: Scene) -> float:
 
     Segments of lines that few images see follow their line and are left out; where no others are, it is zero.
     """
-    problem = assemble(scene, AssemblyOptions(points=False, planes=False)).problem
+    assembly = assemble(scene, AssemblyOptions(points=False, planes=False))
     images = np.bincount(scene.line_observations.line_idx, minlength=scene.num_lines)
     ends = [np.zeros((0, 2))]
-    for factor in problem.factors:
-        if factor.type_name not in LINE_FACTORS:
+    for group, factor in zip(assembly.groups, assembly.problem.factors, strict=True):
+        if group.observes != "lines":
             continue  # measurements of other instruments
         told = images[factor.line.index] >= GATES.min_views  # type: ignore[attr-defined]
-        residual, unit = residuals_of(factor, problem.variables), np.asarray(factor.sqrt_information)
+        residual, unit = residuals_of(factor, assembly.problem.variables), np.asarray(factor.sqrt_information)
         # Where a camera sees behind itself, each end has a weight of its own.
         weighted = residual * unit[:, None] if unit.ndim == 1 else np.einsum("nij,nj->ni", unit, residual)
         ends.append(weighted[told])
@@ -112,9 +112,7 @@ def moved_px(before: Scene, after: Scene, share: float) -> float:
     Both scenes have the same observations; what counts is where their points are seen, so the frame does not matter.
     """
     table = before.point_observations
-    first, second = (
-        project_points(scene, table.image_idx, scene.points.xyz[table.point_idx])[0] for scene in (before, after)
-    )
+    first, second = (pixels_of(scene, table.image_idx, scene.points.xyz[table.point_idx]) for scene in (before, after))
     away = np.linalg.norm(second - first, axis=1)
     away = away[np.isfinite(away)]
     return float(np.quantile(away, 1.0 - share)) if len(away) else 0.0
@@ -127,7 +125,7 @@ def with_point_noise(scene: Scene) -> Scene:
     observations is one. Points seen seldom stay near the usual noise; a scene with few points is returned as it is.
     """
     table, count = scene.point_observations, scene.num_points
-    pixels, _ = project_points(scene, table.image_idx, scene.points.xyz[table.point_idx])
+    pixels = pixels_of(scene, table.image_idx, scene.points.xyz[table.point_idx])
     residual = (pixels - table.pixel) / table.sigma[:, None]
     seen = np.isfinite(residual).all(axis=1)
     squares, owner = (residual[seen] ** 2).sum(axis=1), table.point_idx[seen]

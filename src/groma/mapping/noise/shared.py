@@ -25,7 +25,7 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.gates import gate
-from groma.mapping.noise.landmarks import project_points
+from groma.mapping.noise.landmarks import pixels_of
 from groma.scene import Scene
 
 
@@ -76,7 +76,7 @@ def with_shared_noise(scene: Scene, point_sigma_px: float, line_sigma_px: float)
     cells = grid.cells(points.image_idx, points.pixel)
     middles = grid.cells(lines.image_idx, 0.5 * (lines.segment[:, :2] + lines.segment[:, 2:]))
     sigma, line_sigma = point_sigma_px * points.sigma, line_sigma_px * lines.sigma
-    pixels, _ = project_points(scene, points.image_idx, scene.points.xyz[points.point_idx])
+    pixels = pixels_of(scene, points.image_idx, scene.points.xyz[points.point_idx])
     residual = (pixels - points.pixel) / sigma[:, None]
     told = (times == 1) & (np.einsum("ni,ni->n", residual, residual) < GATES.max_residual**2)
     covariance = _covariance(grid, cells[told], residual[told], sigma[told])

@@ -14,6 +14,7 @@ relation costs little, a wrong one bends the scene.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -30,6 +31,7 @@ from groma.execution import together
 from groma.geometry.algebra import norm
 from groma.mapping.groups import num_distinct
 from groma.mapping.noise.landmarks import LineNoise, PointNoise, line_noise, point_noise
+from groma.mapping.structure.junctions import meetings
 from groma.mapping.structure.relations import Landmarks, Pairs, along_directions, on_lines, on_planes, spacings
 from groma.scene import Directions, Planes, Relations, Scene
 
@@ -44,11 +46,11 @@ class StructureOptions:
     #: What counts as a plane.
     planes: PlaneOptions = field(default_factory=PlaneOptions)
     #: What counts as a direction shared by lines.
-    directions: DirectionOptions = field(default_factory=DirectionOptions)
+    directions: DirectionOptions = field(default_factory=partial(DirectionOptions, min_coincidences=2))
     #: Whether relations between points and lines are returned.
     points_on_lines: bool = True
     #: Level of the chi-square tests of relations.
-    level: float = 0.95
+    level: float = 0.99
     #: Least probability that a related landmark is no clutter.
     min_probability: float = 0.7
     #: The same for lines on planes and along directions. It is higher, as a wrong relation bends a whole line, and as
@@ -58,9 +60,9 @@ class StructureOptions:
     min_views: int = 3
     #: Landmarks whose reprojection error is so many times the usual one take no part.
     max_misfit: float = 3.0
-    #: Largest deviation of landmarks from the surfaces they lie on, as a length in the images, pixels: walls are not
-    #: flat. Added to the noise of points and lines while relations are tested; the actual deviation is then estimated
-    #: for the adjustment (:mod:`groma.mapping.structure.flatness`).
+    #: Deviation of landmarks from the surfaces they lie on, as a length in the images, pixels, that is added to their
+    #: noise while planes are sought; how far they deviate beyond that is estimated. For what lies on a plane within
+    #: this noise a common deviation is estimated for the adjustment (:mod:`groma.mapping.structure.flatness`).
     surface_sigma_px: float = SURFACE_SIGMA_PX
     #: Standard deviations of points and of segment end points, pixels; None: from the residuals.
     point_sigma_px: float | None = None
@@ -145,27 +147,21 @@ def detect_structure(
     on_line = on_lines(marks, level, least)
     planes = _planes_in(marks, on_line, options, partial(report, "finding planes"))
     report("finding directions", 0, 1)
-    directions = _directions_in(scene, marks, options, candidates)
+    directions = _directions_in(scene, marks, options, candidates, options.surface_sigma_px)
     report("finding what lies on what", 0, 1)
     point_on_plane, line_on_plane = on_planes(marks, planes, level, (least, least_line))
     support = point_on_plane.counts(len(planes)) + 2 * line_on_plane.counts(len(planes))
     planes, new = _only(planes, support >= (options.planes.min_support + 1) // 2)
     found = {"point_on_plane": point_on_plane.renumbered(new), "line_on_plane": line_on_plane.renumbered(new)}
-    along = along_directions(marks, directions, options.directions.parallel_sigma, level, least_line)
-    directions, new = _only_directions(directions, along.counts(len(directions)) >= _MIN_PARALLEL)
-    found["line_along_direction"] = along.renumbered(new)
+    directions, found["line_along_direction"] = _parallels(scene, marks, options, candidates)
     found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()
+    found["lines_meeting"] = meetings(marks, level, least_line)
     orthogonal, parallel = _orthogonal(planes, directions)
     return Structure(
         scene=scene.replace(
             planes=Planes(np.arange(len(planes)) + 1, planes.planes),
             directions=Directions(np.arange(len(directions)) + 1, directions.vectors),
-            relations=Relations(
-                point_on_plane=found["point_on_plane"].pairs,
-                line_on_plane=found["line_on_plane"].pairs,
-                line_along_direction=found["line_along_direction"].pairs,
-                point_on_line=found["point_on_line"].pairs,
-            ),
+            relations=_relations(found, marks, options),
         ),
         planes=planes,
         directions=directions,
@@ -206,12 +202,40 @@ def _planes_in(
 
 
 def _directions_in(
-    scene: Scene, marks: Landmarks, options: StructureOptions, candidates: FloatArray | None
+    scene: Scene, marks: Landmarks, options: StructureOptions, candidates: FloatArray | None, deviation_px: float
 ) -> DirectionSet:
     """Directions that usable lines share."""
     lines = np.flatnonzero(marks.line_usable)
-    turning = marks.line_noise.directions(norm(marks.segments[:, 1] - marks.segments[:, 0]))
+    noise = marks.own_line_noise.widened(deviation_px * marks.line_pixel)
+    turning = noise.directions(norm(marks.segments[:, 1] - marks.segments[:, 0]))
     return directions_from_lines(scene.lines.plucker[lines, 3:], turning[lines], options.directions, candidates)
+
+
+def _parallels(
+    scene: Scene, marks: Landmarks, options: StructureOptions, candidates: FloatArray | None
+) -> tuple[DirectionSet, Pairs]:
+    """Directions and lines along them, sought twice: how exactly lines are parallel is known after the first time."""
+    sigma, level, least = options.directions.parallel_sigma, options.level, options.min_line_probability
+    directions = _directions_in(scene, marks, options, candidates, options.surface_sigma_px)
+    _, deviation = along_directions(marks, directions, sigma, level, least)
+    directions = _directions_in(scene, marks, options, candidates, deviation)
+    along, _ = along_directions(marks, directions, sigma, level, least)
+    directions, new = _only_directions(directions, along.counts(len(directions)) >= _MIN_PARALLEL)
+    return directions, along.renumbered(new)
+
+
+def _relations(found: dict[str, Pairs], marks: Landmarks, options: StructureOptions) -> Relations:
+    """Relations, with standard deviations of their own where landmarks deviate from a structure."""
+    sigma = {}
+    for kind, pixel in (("point_on_plane", marks.point_pixel), ("line_on_plane", marks.line_pixel)):
+        mark, rough = found[kind].pairs[:, 0], found[kind].deviation
+        sigma[f"{kind}_sigma"] = (rough > 0.0) * np.hypot(rough, options.surface_sigma_px) * pixel[mark]
+    first, missing = found["lines_meeting"].pairs[:, 0], found["lines_meeting"].deviation
+    sigma["lines_meeting_sigma"] = missing * marks.line_pixel[first]
+    along, crooked = found["line_along_direction"].pairs[:, 0], found["line_along_direction"].deviation
+    turned = math.sqrt(2.0) * crooked * (marks.line_pixel / norm(marks.segments[:, 1] - marks.segments[:, 0]))[along]
+    sigma["line_along_direction_sigma"] = (crooked > 0.0) * np.hypot(turned, options.directions.parallel_sigma)
+    return Relations(**{kind: pairs.pairs for kind, pairs in found.items()}, **sigma)
 
 
 def _orthogonal(planes: PlaneSet, directions: DirectionSet) -> tuple[IntArray, IntArray]:
@@ -231,11 +255,11 @@ def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
         flat = options.surface_sigma_px * lengths_per_pixel(scene, "point")
         return point_noise(scene, options.point_sigma_px).widened(flat)
 
-    def noise_of_lines() -> LineNoise:
-        flat = options.surface_sigma_px * lengths_per_pixel(scene, "line")
-        return line_noise(scene, options.line_sigma_px).widened(flat)
+    def noise_of_lines() -> tuple[LineNoise, LineNoise]:
+        own = line_noise(scene, options.line_sigma_px)
+        return own.widened(options.surface_sigma_px * lengths_per_pixel(scene, "line")), own.by_misfit()
 
-    points, lines, (point_spacing, end_spacing) = together(
+    points, (lines, own), (point_spacing, end_spacing) = together(
         noise_of_points, noise_of_lines, partial(spacings, scene.points.xyz, scene.lines.segments)
     )
     table = scene.point_observations
@@ -251,10 +275,13 @@ def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:
         point_usable,
         scene.lines.segments,
         lines,
+        own,
         line_usable,
         point_spacing,
         end_spacing,
         scene.line_intervals,
+        lengths_per_pixel(scene, "point"),
+        lengths_per_pixel(scene, "line"),
     )
 
 

@@ -87,7 +87,8 @@ def _of_points(scene: Scene, sigma_px: float | None) -> _Heights:
     """Planes of points, heights over them, their own variances, and the length of a pixel there."""
     if len(scene.relations.point_on_plane) == 0:
         return _NOTHING
-    point, plane = scene.relations.point_on_plane.T
+    common = scene.relations.sigma("point_on_plane") == 0.0  # others have a deviation of their own
+    point, plane = scene.relations.point_on_plane[common].T
     normal, offset = scene.planes.hesse[plane, :3], scene.planes.hesse[plane, 3]
     covariance = point_noise(scene, sigma_px).covariance[point]
     variance = np.einsum("ni,nij,nj->n", normal, covariance, normal)
@@ -99,7 +100,7 @@ def _of_lines(scene: Scene, sigma_px: float | None) -> _Heights:
     """The same of both ends of lines."""
     if len(scene.relations.line_on_plane) == 0:
         return _NOTHING
-    line, plane = scene.relations.line_on_plane.T
+    line, plane = scene.relations.line_on_plane[scene.relations.sigma("line_on_plane") == 0.0].T
     normal, offset = scene.planes.hesse[plane, :3], scene.planes.hesse[plane, 3]
     noise = line_noise(scene, sigma_px)
     slope = np.einsum("nai,ni->na", noise.across[line], normal)

@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import inlier_probability
 from groma.estimators.directions import DirectionSet
+from groma.estimators.membership import Candidates, memberships
 from groma.estimators.plane_search import BAND, PlaneSet, connected_to
 from groma.execution import map_in_threads, num_threads
 from groma.gates import chi_square_gate, gate
@@ -42,6 +43,18 @@ class RelationGates:
     neighbor: int = gate(
         8, "neighbours", "at whose distance a landmark has its surroundings", "chosen on benchmarks/surveyed.py"
     )
+    layer: float = gate(
+        3.0, "bands", "around a plane, in which members are told from clutter", "derived from deviations up to the band"
+    )
+    widest: float = gate(
+        0.33, "layers", "that members of a plane may deviate", "derived from normal noise: the layer holds 3 deviations"
+    )
+    cap: float = gate(
+        0.15, "rad", "around a direction, in which lines are told from clutter", "chosen on benchmarks/structure.py"
+    )
+    most_px: float = gate(
+        3.0, "px", "that ends of lines along a direction may deviate", "chosen on benchmarks/structure.py"
+    )
     num_nearest: int = gate(12, "samples", "of segments that a point is compared with", "cost: time of a search")
     num_samples: tuple[int, int] = gate(
         (50_000, 12), "samples", "of all segments, and per segment on average", "cost: memory"
@@ -57,12 +70,17 @@ class Landmarks:
     point_usable: BoolArray
     segments: FloatArray
     line_noise: LineNoise
+    #: The noise of lines before that of surfaces was added.
+    own_line_noise: LineNoise
     line_usable: BoolArray
     #: (P,) and (L, 2) distances at which points and segment ends have their neighbours.
     point_spacing: FloatArray
     end_spacing: FloatArray
     #: Where the segments are supported.
     intervals: LineIntervals
+    #: (P,) and (L,) length that a pixel spans there, scene units.
+    point_pixel: FloatArray
+    line_pixel: FloatArray
 
 
 @dataclass(frozen=True)
@@ -73,15 +91,17 @@ class Pairs:
     pairs: IntArray
     #: (M,) probability that the landmark is no clutter.
     probability: FloatArray
+    #: (M,) deviation from the structure that is usual for such landmarks, pixels; 0 where their noise explains it.
+    deviation: FloatArray
 
     @staticmethod
     def none() -> Pairs:
         """No pairs."""
-        return Pairs(np.zeros((0, 2), np.int64), np.zeros(0))
+        return Pairs(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
 
     def take(self, rows: IntArray | BoolArray) -> Pairs:
         """Return some of the pairs."""
-        return Pairs(self.pairs[rows], self.probability[rows])
+        return Pairs(self.pairs[rows], self.probability[rows], self.deviation[rows])
 
     def counts(self, num: int) -> IntArray:
         """(num,) landmarks of each structure."""
@@ -90,7 +110,8 @@ class Pairs:
     def renumbered(self, new: IntArray) -> Pairs:
         """Return the pairs with other numbers of structures, without those whose new number is -1."""
         structure = new[self.pairs[:, 1]]
-        return Pairs(np.column_stack([self.pairs[:, 0], structure]), self.probability).take(structure >= 0)
+        pairs = np.column_stack([self.pairs[:, 0], structure])
+        return Pairs(pairs, self.probability, self.deviation).take(structure >= 0)
 
 
 def spacings(
@@ -111,32 +132,87 @@ def on_planes(
     least: tuple[float, float],
     gates: RelationGates = RelationGates(),
 ) -> tuple[Pairs, Pairs]:
-    """Points on planes and lines on planes; their probabilities have to exceed the least of their kind."""
+    """Points on planes and lines on planes; their probabilities have to exceed the least of their kind.
+
+    Walls are rough: how far what belongs to a plane deviates from it is estimated with the share of what belongs there.
+    What stands out on the plane itself, within its own noise, is still held to it as such.
+    """
     num = len(found)
-    parts = map_in_threads(partial(_near_plane, marks, found, level), range(num))
-    points, lines = ([_nothing(), *tables] for tables in (list(zip(*parts, strict=True)) or [(), ()]))
+    if num == 0:
+        return Pairs.none(), Pairs.none()
+    parts = list(zip(*map_in_threads(partial(_near_plane, marks, found, gates.layer), range(num)), strict=True))
+    points, lines = np.concatenate(parts[0]), np.concatenate(parts[1])
+    table = np.concatenate([points, lines])
+    mark, owner = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
+    is_line = np.arange(len(table)) >= len(points)
+    pixel = np.concatenate([marks.point_pixel[mark[~is_line]], marks.line_pixel[mark[is_line]]])
+    label = _label(found.point_label, marks.point_usable), _label(found.segment_label, marks.line_usable)
+    label = np.concatenate(label)[mark + len(marks.points) * is_line]
+    half = gates.layer * found.band
+    typical = np.array([np.median(pixel[owner == k]) if (owner == k).any() else 1.0 for k in range(num)])
+    told = memberships(
+        Candidates(
+            owner=owner,
+            offset=table[:, 2:3],
+            variance=table[:, 3:4] ** 2,
+            unit=pixel,
+            clutter=0.5 / half[owner],
+            counted=(label < 0) | (label == owner),
+            group=owner + num * is_line,
+        ),
+        gates.widest * half / typical,
+    )
     competing = np.arccos(np.clip(np.abs(found.planes[:, :3] @ found.planes[:, :3].T), 0.0, 1.0)) < gates.competing
     results = []
-    for table, enough in zip((np.concatenate(points), np.concatenate(lines)), least, strict=True):
-        probability, _ = inlier_probability(table[:, 2], table[:, 3], table[:, 1].astype(np.int64), found.band)
-        results.append(_best_of_competing(_passing(table, probability, enough), competing, num))
+    for rows, dof, enough in ((~is_line, 1, least[0]), (is_line, 2, least[1])):
+        deviation = told.deviation[owner[rows]]
+        inner = _on_plane_itself(table[rows], found.band, dof, level, enough)
+        squared = table[rows, 4 : 4 + dof] ** 2 / (table[rows, 6 : 6 + dof] + (deviation * pixel[rows])[:, None] ** 2)
+        passed = (squared.sum(axis=1) < chi_square_gate(1.0 - level, dof)) & (told.probability[rows] > enough)
+        probability = np.where(inner > 0.0, np.maximum(inner, told.probability[rows]), told.probability[rows])
+        pairs = np.column_stack([mark, owner])[rows]
+        chosen = Pairs(pairs, probability, np.where(inner > 0.0, 0.0, deviation)).take(passed | (inner > 0.0))
+        results.append(_best_of_competing(chosen, competing, num))
     return results[0], results[1]
 
 
-def _near_plane(marks: Landmarks, found: PlaneSet, level: float, k: int) -> tuple[FloatArray, FloatArray]:
-    """Points and lines in the layer of a plane, where it is connected: tables as :func:`_with_plane` makes them."""
-    point_gate, line_gate = chi_square_gate(1.0 - level, 1), chi_square_gate(1.0 - level, 2)
+def _on_plane_itself(table: FloatArray, band: FloatArray, dof: int, level: float, least: float) -> FloatArray:
+    """Probability of what lies on a plane within its own noise, against all that is in its band; 0 for the others."""
+    owner, height = table[:, 1].astype(np.int64), np.abs(table[:, 2])
+    squared = (table[:, 4 : 4 + dof] ** 2 / table[:, 6 : 6 + dof]).sum(axis=1)
+    near, result = np.flatnonzero(height < band[owner]), np.zeros(len(table))
+    probability, _ = inlier_probability(height[near], table[near, 3], owner[near], band)
+    passed = (squared[near] < chi_square_gate(1.0 - level, dof)) & (probability > least)
+    result[near[passed]] = probability[passed]
+    return result
+
+
+def _label(of_usable: IntArray, usable: BoolArray) -> IntArray:
+    """Labels of all landmarks from those of the usable ones, -1 for the others."""
+    label = np.full(len(usable), -1)
+    label[usable] = of_usable
+    return label
+
+
+def _near_plane(marks: Landmarks, found: PlaneSet, layer: float, k: int) -> tuple[FloatArray, FloatArray]:
+    """Points and lines in the layer of a plane, where it is connected.
+
+    Tables of landmark, plane, height and its deviation, whitened axes of the heights: two offsets, two variances.
+    """
     usable_points, usable_lines = np.flatnonzero(marks.point_usable), np.flatnonzero(marks.line_usable)
-    plane, covariance = found.planes[k], found.covariance[k]
+    plane, covariance, half = found.planes[k], found.covariance[k], layer * found.band[k]
     height = np.abs(marks.points[usable_points] @ plane[:3] + plane[3])
-    rows = usable_points[height < found.band[k]]
+    rows = usable_points[height < half]
     rows = rows[connected_to(found.places[k], marks.points[rows], marks.point_spacing[rows], plane)]
-    points = _with_plane(rows, k, *_point_heights(marks, rows, plane, covariance), point_gate)
+    height, variance = _point_heights(marks, rows, plane, covariance)
+    unused = np.zeros(len(rows))
+    columns = [rows, np.full(len(rows), k), height, np.sqrt(variance), height, unused, variance, unused]
     ends = marks.segments[usable_lines]
-    rows = usable_lines[(np.abs(ends @ plane[:3] + plane[3]) < found.band[k]).all(axis=1)]
-    near = connected_to(found.places[k], marks.segments[rows].reshape(-1, 3), marks.end_spacing[rows].ravel(), plane)
-    rows = rows[near.reshape(-1, 2).all(axis=1)]
-    return points, _with_plane(rows, k, *_line_heights(marks, rows, plane, covariance), line_gate)
+    lines = usable_lines[(np.abs(ends @ plane[:3] + plane[3]) < half).all(axis=1)]
+    near = connected_to(found.places[k], marks.segments[lines].reshape(-1, 3), marks.end_spacing[lines].ravel(), plane)
+    lines = lines[near.reshape(-1, 2).all(axis=1)]
+    height, spread, offset, variance = _line_heights(marks, lines, plane, covariance)
+    return np.column_stack(columns), np.column_stack([lines, np.full(len(lines), k), height, spread, offset, variance])
 
 
 def along_directions(
@@ -145,29 +221,43 @@ def along_directions(
     sigma: float,
     level: float,
     least: float,
-) -> Pairs:
-    """Lines along directions, at most one direction for each line."""
-    rows = np.flatnonzero(marks.line_usable)
-    if len(rows) == 0 or len(found) == 0:
-        return Pairs.none()
-    extent = marks.segments[rows, 1] - marks.segments[rows, 0]
-    own = marks.line_noise.directions(norm(marks.segments[:, 1] - marks.segments[:, 0]))[rows]
-    basis = np.stack(perpendicular(unit(extent)), axis=1)
-    tables, bands = [_nothing()], np.zeros(len(found))
-    largest = chi_square_gate(1.0 - level, 2)
+    gates: RelationGates = RelationGates(),
+) -> tuple[Pairs, float]:
+    """Lines along directions, at most one direction for each line; and how far the ends of lines deviate, pixels."""
+    rows, num = np.flatnonzero(marks.line_usable), len(found)
+    if len(rows) == 0 or num == 0:
+        return Pairs.none(), 0.0
+    length = norm(marks.segments[:, 1] - marks.segments[:, 0])
+    own = marks.own_line_noise.directions(length)[rows]
+    basis = np.stack(perpendicular(unit(marks.segments[rows, 1] - marks.segments[rows, 0])), axis=1)
+    parts = []
     for k, vector in enumerate(found.vectors):
         across = basis @ vector
-        noise = basis @ (own + found.covariance[k]) @ np.swapaxes(basis, 1, 2) + sigma**2 * np.eye(2)
-        squared = np.einsum("na,na->n", across, np.linalg.solve(noise, across[..., None])[..., 0])
-        spread = np.sqrt(np.linalg.eigvalsh(noise)[:, 1])
-        angle = norm(across)
-        passing = squared < largest
-        bands[k] = BAND * float(np.median(spread[passing])) if passing.any() else 0.0
-        near = angle < bands[k]
-        tables.append(_with_plane(rows[near], k, angle[near], spread[near], squared[near], largest))
-    table = np.concatenate(tables)
-    probability, _ = inlier_probability(table[:, 2], table[:, 3], table[:, 1].astype(np.int64), bands)
-    return _best_of_competing(_passing(table, probability, least), np.ones((len(found), len(found)), bool), len(found))
+        near = norm(across) < gates.cap
+        noise = basis[near] @ (own[near] + found.covariance[k]) @ np.swapaxes(basis[near], 1, 2)
+        variance, axes = np.linalg.eigh(noise + sigma**2 * np.eye(2))
+        offset = np.einsum("nab,na->nb", axes, across[near])
+        parts.append((np.flatnonzero(near), np.full(near.sum(), k), offset, variance))
+    at, owner, offset, variance = (np.concatenate(column) for column in zip(*parts, strict=True))
+    label = found.label[at]
+    per_pixel = np.sqrt(2.0) * (marks.line_pixel / np.maximum(length, 1e-300))[rows[at]]
+    told = memberships(
+        Candidates(
+            owner=owner,
+            offset=offset,
+            variance=variance,
+            unit=per_pixel,
+            clutter=np.full(len(at), 1.0 / (np.pi * gates.cap**2)),
+            counted=(label < 0) | (label == owner),
+            group=owner,
+        ),
+        np.full(num, gates.most_px),
+        common=True,
+    )
+    squared = (offset**2 / (variance + ((told.deviation[owner] * per_pixel) ** 2)[:, None])).sum(axis=1)
+    passed = (squared < chi_square_gate(1.0 - level, 2)) & (told.probability > least)
+    pairs = Pairs(np.column_stack([rows[at], owner]), told.probability, told.deviation[owner]).take(passed)
+    return _best_of_competing(pairs, np.ones((num, num), bool), num), float(told.deviation[0])
 
 
 def on_lines(marks: Landmarks, level: float, least: float, gates: RelationGates = RelationGates()) -> Pairs:
@@ -202,37 +292,24 @@ def on_lines(marks: Landmarks, level: float, least: float, gates: RelationGates 
     # On a wall full of points the clutter beside a line is spread over one dimension, not two.
     probability, _ = inlier_probability(distance[near], spread[near], line, band, gates.pooled)
     passed = (squared < largest) & (probability > least)
-    return Pairs(np.column_stack([point, line]), probability).take(passed)
+    return Pairs(np.column_stack([point, line]), probability, np.zeros(len(point))).take(passed)
 
 
 # --------------------------------------------------------------------------------------------------------- Distances
-def _nothing() -> FloatArray:
-    return np.zeros((0, 6))
-
-
-def _with_plane(
-    rows: IntArray, k: int, distance: FloatArray, spread: FloatArray, squared: FloatArray, largest: float
-) -> FloatArray:
-    """Table of landmark, structure, distance, standard deviation, squared whitened distance, gate."""
-    constant = np.ones(len(rows))
-    columns = rows.astype(np.float64), k * constant, distance, spread, squared, largest * constant
-    return np.column_stack(columns)
-
-
 def _point_heights(
     marks: Landmarks, rows: IntArray, plane: FloatArray, covariance: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray]:
     height = marks.points[rows] @ plane[:3] + plane[3]
     lever = np.column_stack([marks.points[rows], np.ones(len(rows))])
     variance = np.einsum("i,nij,j->n", plane[:3], marks.point_noise.covariance[rows], plane[:3])
-    variance = np.maximum(variance + np.einsum("ni,ij,nj->n", lever, covariance, lever), 1e-300)
-    return np.abs(height), np.sqrt(variance), height**2 / variance
+    return height, np.maximum(variance + np.einsum("ni,ij,nj->n", lever, covariance, lever), 1e-300)
 
 
 def _line_heights(
     marks: Landmarks, rows: IntArray, plane: FloatArray, covariance: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Height of the segment where it is known best, its deviation, and the squared whitened heights of both ends.
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Height of the segment where it is known best, its deviation, and along the axes of the noise of the heights of
+    both ends offsets (n, 2) and variances (n, 2).
 
     Clutter beside a plane is often parallel to it (mouldings, frames), so that the height of a segment tells it from
     what lies on the plane, and its tilt does not: the mixture looks at the one, the chi-square test at both.
@@ -246,10 +323,11 @@ def _line_heights(
     noise += np.einsum("nei,ij,nfj->nef", lever, covariance, lever)
     size = np.trace(noise, axis1=1, axis2=2)
     noise = noise + (1e-9 * size + 1e-300)[:, None, None] * np.eye(2)
-    squared = np.einsum("ne,ne->n", height, np.linalg.solve(noise, height[..., None])[..., 0])
+    variance, axes = np.linalg.eigh(noise)
     weight = np.linalg.solve(noise, np.ones((len(rows), 2, 1)))[..., 0]
     information = weight.sum(axis=1)
-    return np.abs((weight * height).sum(axis=1)) / information, 1.0 / np.sqrt(information), squared
+    offset = np.einsum("neb,ne->nb", axes, height)
+    return (weight * height).sum(axis=1) / information, 1.0 / np.sqrt(information), offset, variance
 
 
 def _near_segments(points: FloatArray, segments: FloatArray, gates: RelationGates) -> IntArray:
@@ -264,12 +342,6 @@ def _near_segments(points: FloatArray, segments: FloatArray, gates: RelationGate
     nearest = min(gates.num_nearest, len(samples))
     _, index = KDTree(samples).query(points, k=nearest, workers=num_threads())
     return distinct_pairs(np.repeat(np.arange(len(points)), nearest), owner[index.reshape(len(points), -1)].ravel())[0]
-
-
-def _passing(table: FloatArray, probability: FloatArray, least: float) -> Pairs:
-    """Pairs of a table that pass the chi-square test and are probable enough."""
-    passed = (table[:, 4] < table[:, 5]) & (probability > least)
-    return Pairs(table[:, :2].astype(np.int64), probability).take(passed)
 
 
 def _best_of_competing(found: Pairs, competing: BoolArray, num: int) -> Pairs:

@@ -28,6 +28,7 @@ from groma.problem.gauge import world_motions
 from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 from groma.problem.problem import Problem
+from groma.problem.residuals import jacobians_of, squared_norms
 from groma.solver.linear.blocks import Blocks, multiply
 from groma.solver.linear.schur import ReducedSystem
 from groma.solver.steps import Step
@@ -88,6 +89,7 @@ def free_motions(layout: Layout, equations: NormalEquations, system: ReducedSyst
     combinations = combinations[:, _not_still(kept + landmarks, combinations)]
     if combinations.shape[1]:
         gram, size = _costs(layout, equations, system, kept, landmarks)
+        gram = gram - _costs_of_incidences(layout.problem, motions)
         gram, size = (combinations.T @ M @ combinations for M in (gram, size))
         scale = 1.0 / np.sqrt(np.maximum(np.diag(size), 1e-300))
         values, vectors = np.linalg.eigh(gram * scale[:, None] * scale)
@@ -183,6 +185,27 @@ def _not_still(parts: list[FloatArray], combinations: FloatArray) -> BoolArray:
         (np.abs(part @ combinations).max(axis=0, initial=0.0) for part in parts), np.zeros(combinations.shape[1])
     )
     return size > RANK_TOLERANCE
+
+
+def _costs_of_incidences(problem: Problem, motions: dict[str, FloatArray]) -> FloatArray:
+    """Return the part of J^T J (7, 7) that factors have by what is left of residuals that should be zero.
+
+    Landmarks on others cost less in a smaller scene, by what they miss each other: that is no knowledge of its scale.
+    """
+    gram = np.zeros((7, 7))
+    for factor in problem.factors:
+        if not factor.is_incidence or not len(factor):
+            continue
+        blocks = jacobians_of(factor, problem.variables)
+        J = np.sum(
+            [blocks[slot.name] @ motions[ref.group].transpose(1, 2, 0)[ref.index] for slot, ref in factor.references()],
+            axis=0,
+        )
+        weight = factor.loss.evaluate(squared_norms(factor, problem.variables))[1]
+        root = np.asarray(factor.sqrt_information, float)
+        J = root @ J if root.ndim == 3 else J * np.broadcast_to(root, len(factor))[:, None, None]
+        gram += np.einsum("n,nik,nil->kl", weight, J, J)
+    return gram
 
 
 def _costs(

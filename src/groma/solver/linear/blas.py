@@ -10,8 +10,9 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from functools import lru_cache
 
-import scipy.linalg  # noqa: F401  (loads the library that is to be limited)
 from threadpoolctl import ThreadpoolController
+
+from groma.solver.linear import lapack  # noqa: F401  (loads the library that is to be limited)
 
 
 @lru_cache(maxsize=1)

@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
 
 from groma._numba import loop
 from groma._simd import add_matvec, add_product, set_product, width
@@ -29,6 +28,7 @@ from groma.problem.gauge import gauge_directions
 from groma.problem.layout import Layout
 from groma.problem.sorting import argsort_by
 from groma.solver.linear.elsewhere import Elsewhere
+from groma.solver.linear.lapack import potrf, potrs
 
 #: Cameras in a cluster, unless that makes more clusters than MAX_CLUSTERS.
 CLUSTER_SIZE = 24
@@ -129,7 +129,6 @@ class CoarseSpace:
         self._state: FloatArray | None = None
         self._P = np.zeros(0)
         self._factor: FloatArray | None = None
-        (self._potrf, self._potrs) = get_lapack_funcs(("potrf", "potrs"), (np.zeros((1, 1)),))
 
     def follow(self, states: Mapping[str, FloatArray]) -> None:
         """Take notice of the states at which the next systems are formed."""
@@ -155,7 +154,7 @@ class CoarseSpace:
         A = A + A.T
         diagonal = A.diagonal()
         A[np.diag_indices(7 * n)] += JITTER * diagonal + np.where(diagonal > 0.0, 0.0, 1.0)
-        factor, info = self._potrf(A, lower=1, clean=0, overwrite_a=1)
+        factor, info = potrf(A, lower=1, clean=0, overwrite_a=1)
         self._factor = factor if info == 0 else None
 
     def _motions(self, state: FloatArray) -> FloatArray:
@@ -176,7 +175,7 @@ class CoarseSpace:
         block_width = width(self._kept.width)
         y = np.zeros(7 * self.count)
         _restrict(self._P, self._cluster, r, y, block_width, _ONE, _MODES)
-        y, _ = self._potrs(self._factor, y, lower=1)
+        y, _ = potrs(self._factor, y, lower=1)
         _prolong(self._P, self._cluster, y, z, block_width, _MODES)
 
 

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
 
 from groma._numba import loop
 from groma._typing import FloatArray
 from groma.problem.layout import Layout
 from groma.solver.linear.blocks import Blocks, split
 from groma.solver.linear.contract import PIVOT_TOLERANCE, keeps_poses_alone, register_linear_solver
+from groma.solver.linear.lapack import potrf, potrs
 
 #: Flops of a factorisation, measured on one core.
 DENSE_FLOPS_PER_SECOND = 2.5e10
@@ -65,7 +65,6 @@ class Dense:
         self.fill(blocks, self._matrix)
         smallest = PIVOT_TOLERANCE * self._matrix.diagonal()
         # the upper triangle in C order is the lower triangle of the transpose, which LAPACK takes without a copy
-        potrf, potrs = get_lapack_funcs(("potrf", "potrs"), (self._matrix,))
         factor, info = potrf(self._matrix.T, lower=1, overwrite_a=1, clean=0)
         if info != 0 or (factor.diagonal() ** 2 <= smallest).any():
             return None

@@ -29,11 +29,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs, solve_triangular
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.problem.layout import Layout
 from groma.solver.linear.blocks import Blocks
+from groma.solver.linear.lapack import potrf, potri, solve_lower
 from groma.solver.linear.leaf_fronts import Leaves
 from groma.solver.linear.ordering import fill_reducing_order
 from groma.solver.linear.visible_motion import distinct
@@ -174,7 +174,6 @@ class Fronts:
         """Factorise S, given by its upper blocks; False if it is not positive definite."""
         self._L = {}
         updates: dict[int, list[tuple[IntArray, FloatArray]]] = {}
-        (potrf,) = get_lapack_funcs(("potrf",), (np.zeros((1, 1)),))
         values = np.concatenate([blocks[pair].reshape(-1) for pair in self._layout.blocks] if self._leaves else [[]])
         for f in self._inner:
             front = self._fronts[f]
@@ -193,7 +192,7 @@ class Fronts:
             L, info = potrf(F[:n, :n], lower=1, clean=1)
             if info != 0 or not np.isfinite(L).all():
                 return False
-            below = solve_triangular(L, F[:n, n:], lower=True, check_finite=False).T
+            below = solve_lower(L, F[:n, n:]).T
             if front.parent >= 0:
                 updates.setdefault(front.parent, []).append((front.in_parent, F[n:, n:] - below @ below.T))
             self._L[f] = L, below
@@ -206,14 +205,14 @@ class Fronts:
         for f, (L, below) in self._L.items():
             front = self._fronts[f]
             n = front.size
-            y = solve_triangular(L, x[front.unknowns[:n]], lower=True, check_finite=False)
+            y = solve_lower(L, x[front.unknowns[:n]])
             x[front.unknowns[:n]] = y
             x[front.unknowns[n:]] -= below @ y
         for f, (L, below) in reversed(self._L.items()):
             front = self._fronts[f]
             n = front.size
             y = x[front.unknowns[:n]] - below.T @ x[front.unknowns[n:]]
-            x[front.unknowns[:n]] = solve_triangular(L, y, lower=True, trans=1, check_finite=False)
+            x[front.unknowns[:n]] = solve_lower(L, y, transposed=True)
         self._leaves.solve(x, back=True)
         return x
 
@@ -229,7 +228,6 @@ class Fronts:
         result = {pair: part.reshape(shape) for part, (pair, shape) in zip(parts, shapes.items(), strict=True)}
         kept: dict[int, FloatArray] = {}
         waiting = [front.children for front in self._fronts]
-        (potri,) = get_lapack_funcs(("potri",), (np.zeros((1, 1)),))
         for f in reversed(self._inner):
             front, (L, below) = self._fronts[f], self._L[f]
             n = front.size
@@ -238,7 +236,7 @@ class Fronts:
             inner = np.tril(inner) + np.tril(inner, -1).T
             if front.parent >= 0:
                 Z22 = kept[front.parent][np.ix_(front.in_parent, front.in_parent)]
-                X = solve_triangular(L, below.T, lower=True, trans=1, check_finite=False).T
+                X = solve_lower(L, below.T, transposed=True).T
                 Z21 = -(Z22 @ X)
                 inner = inner - X.T @ Z21
                 Z[n:, n:], Z[n:, :n], Z[:n, n:] = Z22, Z21, Z21.T

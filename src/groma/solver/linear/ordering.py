@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
 
 from groma._typing import IntArray
 
@@ -22,18 +20,19 @@ def fill_reducing_order(rows: IntArray, columns: IntArray, count: int) -> IntArr
     count : int
         Number of block rows.
     """
+    from scipy.sparse import csc_matrix  # takes a quarter of a second to import
+    from scipy.sparse.linalg import splu
+
     degree = np.bincount(rows, minlength=count) + np.bincount(columns, minlength=count)
     every = np.arange(count)
-    graph = scipy.sparse.csc_matrix(
+    graph = csc_matrix(
         (
             np.concatenate([degree + 1.0, np.full(2 * len(rows), -1.0)]),
             (np.concatenate([every, rows, columns]), np.concatenate([every, columns, rows])),
         ),
         shape=(count, count),
     )
-    factors = scipy.sparse.linalg.splu(
-        graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
+    factors = splu(graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return np.asarray(factors.perm_c, np.int64)
 
 

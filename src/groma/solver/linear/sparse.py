@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
 
 from groma._typing import FloatArray, IntArray
 from groma.problem.layout import Layout
@@ -19,6 +18,9 @@ from groma.solver.linear.block_cholesky import BlockCholesky
 from groma.solver.linear.blocks import Blocks, split
 from groma.solver.linear.contract import PIVOT_TOLERANCE, LinearSolver, is_pose_graph, register_linear_solver
 from groma.solver.linear.dense import DENSE_FLOPS_PER_SECOND
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
 
 
 @register_linear_solver("sparse")
@@ -74,8 +76,10 @@ class SparseMatrix:
         pass
 
     @cached_property
-    def _pattern(self) -> tuple[scipy.sparse.csc_matrix, IntArray]:
+    def _pattern(self) -> tuple[csc_matrix, IntArray]:
         """The matrix, and which number of the blocks each of its entries is."""
+        from scipy.sparse import csc_matrix  # takes a quarter of a second to import
+
         layout = self._layout
         n = layout.num_kept_unknowns
         rows_of, columns_of, source = [], [], []
@@ -95,17 +99,17 @@ class SparseMatrix:
             columns_of += [c, r[off]]
             source += [s, s[off]]
         r, c, s = np.concatenate(rows_of), np.concatenate(columns_of), np.concatenate(source)
-        matrix = scipy.sparse.csc_matrix((s + 1.0, (r, c)), shape=(n, n))
+        matrix = csc_matrix((s + 1.0, (r, c)), shape=(n, n))
         matrix.sort_indices()
         return matrix, (matrix.data - 1).astype(np.int64)
 
     def solve(self, blocks: Blocks, rhs: list[FloatArray]) -> list[FloatArray] | None:  # noqa: D102
+        from scipy.sparse.linalg import splu
+
         matrix, source = self._pattern
         matrix.data = np.concatenate([blocks[pair].reshape(-1) for pair in self._layout.blocks])[source]
         try:
-            factor = scipy.sparse.linalg.splu(
-                matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
+            factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         except RuntimeError:  # exactly singular
             return None
         if (factor.U.diagonal() <= PIVOT_TOLERANCE * matrix.diagonal()[np.argsort(factor.perm_c)]).any():

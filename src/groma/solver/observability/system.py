@@ -4,10 +4,9 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse
-from scipy.sparse.csgraph import connected_components
 
 from groma._typing import BoolArray, FloatArray
+from groma.problem.sorting import connected_parts
 from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.modes import Modes, divided, scaled
 from groma.solver.observability.findings import Finding, few, first_upper
@@ -29,8 +28,7 @@ def separate_parts(inspection: Inspection) -> list[Finding]:
     first = np.concatenate([[0], np.cumsum([c.count for c in layout.kept])])
     rows = np.concatenate([first[a] + r for (a, _), (r, _) in layout.blocks.items()])
     columns = np.concatenate([first[b] + c for (_, b), (_, c) in layout.blocks.items()])
-    graph = scipy.sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(first[-1], first[-1]))
-    _, label = connected_components(graph, directed=False)
+    label = connected_parts(rows, columns, int(first[-1]))
     for c, kept in enumerate(layout.kept):
         group = kept.members[0].group
         if inspection.problem.variables[group].manifold.kind != "pose":

@@ -8,15 +8,18 @@ then its eigenvalues are found all at once; else the smallest by inverse iterati
 
 from __future__ import annotations
 
-import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
+from typing import TYPE_CHECKING
 
-from groma._typing import BoolArray, FloatArray
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.problem.layout import Layout
 from groma.solver.linear.blocks import Blocks
 from groma.solver.linear.fronts import Fronts
 from groma.solver.linear.modes import MAX_SHIFT, MODES, ROUNDS, SHIFT, Modes, smallest
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array, csr_array
 
 #: Systems of up to so many unknowns are decomposed completely.
 DENSE = 300
@@ -53,6 +56,29 @@ def weak_modes(layout: Layout, S: Blocks, size: FloatArray, G: FloatArray) -> Mo
     datum = _datum(layout, size, G)
     if not landmarks and layout.num_kept_unknowns > DENSE:
         return smallest(layout, Fronts(layout), {pair: S[pair] + HOLD * datum.get(pair, 0.0) for pair in S})
+    if landmarks:
+        values, vectors = _without(layout, S, landmarks, datum)
+    else:
+        values, vectors = _complete(_as_array(layout, S), _as_array(layout, datum))
+    if len(values) and values[0] < -NEGATIVE:
+        values, vectors = values[:0], vectors[:, :0]
+    return Modes(values, vectors)
+
+
+def _complete(matrix: FloatArray, held: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return all eigenvalues and eigenvectors of a small system where nothing moves along ``held``."""
+    size, directions = np.linalg.eigh(held)
+    free = directions[:, size < 0.5]
+    values, part = np.linalg.eigh(free.T @ matrix @ free)
+    return values, free @ part
+
+
+def _without(
+    layout: Layout, S: Blocks, landmarks: dict[int, BoolArray], datum: Blocks
+) -> tuple[FloatArray, FloatArray]:
+    """Return the smallest eigenvalues, or all, with landmarks eliminated; the vectors are zero there."""
+    from scipy.sparse import bsr_array  # takes a quarter of a second to import
+
     matrix = _as_sparse(layout, S)
     rest = np.ones(layout.num_kept_unknowns, bool)
     for c, blocks in landmarks.items():
@@ -62,21 +88,16 @@ def weak_modes(layout: Layout, S: Blocks, size: FloatArray, G: FloatArray) -> Mo
         coupling = matrix[rest][:, _unknowns(layout, c, blocks)]
         inverse = _inverse(S[c, c][: layout.kept[c].count][blocks])
         count = len(inverse)
-        middle = scipy.sparse.bsr_array((inverse, np.arange(count), np.arange(count + 1)))
+        middle = bsr_array((inverse, np.arange(count), np.arange(count + 1)))
         reduced = reduced - coupling @ (middle @ coupling.T)
     held = _as_sparse(layout, datum)[rest][:, rest]
     if reduced.shape[0] <= DENSE:
-        size, directions = np.linalg.eigh(held.toarray())
-        free = directions[:, size < 0.5]
-        values, part = np.linalg.eigh(free.T @ reduced.toarray() @ free)
-        part = free @ part
+        values, part = _complete(reduced.toarray(), held.toarray())
     else:
         values, part = _by_iteration((reduced + HOLD * held).tocsc())
-    if len(values) and values[0] < -NEGATIVE:
-        values, part = values[:0], part[:, :0]
     vectors = np.zeros((len(rest), len(values)))
     vectors[rest] = part
-    return Modes(values, vectors)
+    return values, vectors
 
 
 def _datum(layout: Layout, size: FloatArray, G: FloatArray) -> Blocks:
@@ -123,13 +144,28 @@ def _lone_landmarks(layout: Layout) -> dict[int, BoolArray]:
     return lone
 
 
-def _unknowns(layout: Layout, c: int, blocks: BoolArray) -> np.ndarray:
+def _unknowns(layout: Layout, c: int, blocks: BoolArray) -> IntArray:
     kept = layout.kept[c]
     return kept.start + np.flatnonzero(np.repeat(blocks, kept.width))
 
 
-def _as_sparse(layout: Layout, S: Blocks) -> scipy.sparse.csr_array:
+def _as_array(layout: Layout, S: Blocks) -> FloatArray:
     """Return all of S from its upper blocks, or those of them that are given."""
+    data, places = _entries(layout, S)
+    whole = np.zeros((layout.num_kept_unknowns,) * 2)
+    whole[places] = data
+    return whole
+
+
+def _as_sparse(layout: Layout, S: Blocks) -> csr_array:
+    """Return what :func:`_as_array` does, as a sparse matrix."""
+    from scipy.sparse import coo_array
+
+    return coo_array(_entries(layout, S), shape=(layout.num_kept_unknowns,) * 2).tocsr()
+
+
+def _entries(layout: Layout, S: Blocks) -> tuple[FloatArray, tuple[IntArray, IntArray]]:
+    """Return the numbers of S, each once, with their rows and columns."""
     data, row, column = [], [], []
     for (a, b), blocks in S.items():
         rows, columns = layout.blocks[a, b]
@@ -143,9 +179,7 @@ def _as_sparse(layout: Layout, S: Blocks) -> scipy.sparse.csr_array:
         data += [flat, flat[off]]
         row += [i, j[off]]
         column += [j, i[off]]
-    n = layout.num_kept_unknowns
-    parts = (np.concatenate(data), (np.concatenate(row), np.concatenate(column)))
-    return scipy.sparse.coo_array(parts, shape=(n, n)).tocsr()
+    return np.concatenate(data), (np.concatenate(row), np.concatenate(column))
 
 
 def _inverse(blocks: FloatArray) -> FloatArray:
@@ -155,17 +189,18 @@ def _inverse(blocks: FloatArray) -> FloatArray:
     return (vectors * np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
 
 
-def _by_iteration(matrix: scipy.sparse.csc_array) -> tuple[FloatArray, FloatArray]:
+def _by_iteration(matrix: csc_array) -> tuple[FloatArray, FloatArray]:
     """Smallest eigenvalues by inverse subspace iteration."""
+    from scipy.sparse import eye_array
+    from scipy.sparse.linalg import splu
+
     n = int(np.diff(matrix.indptr).size)
     X = np.linalg.qr(np.random.default_rng(0).normal(size=(n, MODES)))[0]
     shift = SHIFT
     while True:
         try:
-            factors = scipy.sparse.linalg.splu(
-                (matrix + shift * scipy.sparse.eye_array(n)).tocsc(),
-                permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True},
-            )  # fmt: skip
+            shifted = (matrix + shift * eye_array(n)).tocsc()
+            factors = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
             break
         except RuntimeError:  # exactly singular
             shift *= 10.0

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.pose_graph import motion_problem
+from groma.adjustment.graphs.pose_graph import motion_problem
 from groma.factors.losses import Huber
 from groma.geometry import se3
 from groma.scene.landmarks import Lines
@@ -23,7 +23,7 @@ from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, back, into, planes_back, planes_into
 from groma.tracking.gates import LoopGates, TrackingGates
 from groma.tracking.map.feature_points import match_features
-from groma.tracking.map.landmarks import DEAD
+from groma.tracking.map.landmarks import ALIVE, DEAD
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.pose.depth_check import depth_agreement
 from groma.tracking.pose.relocalise import feature_places, pose_from_matches
@@ -234,11 +234,29 @@ def join_points(track_map: TrackMap, old: Keyframe, new: Keyframe, first: IntArr
     track_map.points.state[drop] = DEAD
 
 
+def join_lines(track_map: TrackMap, pairs: IntArray) -> None:
+    """Lines (n, 2) that are the same become one: the first of each pair stays."""
+    state = track_map.lines.state
+    renamed = np.arange(len(track_map.lines))
+    for keep, drop in pairs.tolist():
+        # A pair found before may have joined one of them already.
+        if state[keep] == ALIVE and state[drop] == ALIVE and keep != drop:
+            renamed[renamed == drop] = keep
+            state[drop] = DEAD
+    for keyframe in track_map.living():
+        table = keyframe.measured.lines
+        index = renamed[table.index]
+        if (index != table.index).any():
+            unique = np.unique(index, return_index=True)[1]
+            keyframe.measured = replace(keyframe.measured, lines=replace(table, index=index).take(unique))
+
+
 __all__ = [
     "LoopSearch",
     "agreeing_pose",
     "can_be",
     "close_loop",
+    "join_lines",
     "join_points",
     "known_loops",
     "move",

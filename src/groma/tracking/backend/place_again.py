@@ -24,6 +24,7 @@ from groma.tracking.frame.camera import TrackCamera, into, rotation
 from groma.tracking.frame.measurements import Measurements, PointMeasurements
 from groma.tracking.gates import TrackingGates
 from groma.tracking.map.landmarks import ALIVE
+from groma.tracking.map.lines import assign, expected_segments
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
@@ -75,6 +76,8 @@ class PlaceAgain:
     #: Described features of the older keyframe and those near it that agree, and (n, 2) which is which of the newest.
     known: KnownFeatures
     pairs: IntArray
+    #: (n, 2) lines of the older map, and lines that the newest keyframe measures at the same place.
+    lines: IntArray
 
     def matches(self, k: int) -> tuple[IntArray, IntArray]:
         """Return the features that agree of the k-th keyframe of those known, and of the newest."""
@@ -119,7 +122,8 @@ def measure_place(
     covariance[:6, :6] = unit[:, None] * np.linalg.inv(estimate.information) * unit
     covariance[6, 6] = variance
     similarity = np.append(relative, math.exp(log_scale))
-    return PlaceAgain(keyframe, newest, pose, similarity, covariance, known, pairs)
+    lines = _same_lines(older, newer, near, newest, pose, gates)
+    return PlaceAgain(keyframe, newest, pose, similarity, covariance, known, pairs, lines)
 
 
 def _refined(
@@ -160,6 +164,23 @@ def _around(track_map: TrackMap, keyframe: Keyframe, newest: Keyframe, gates: Tr
     shared = track_map.shared(keyframe, others)
     best = np.argsort(-shared, kind="stable")[: gates.verification.nearest]
     return [keyframe, *(others[k] for k in best if shared[k] >= gates.loops.shared)]
+
+
+def _same_lines(
+    older: KnownMap, newer: KnownMap, near: list[Keyframe], newest: Keyframe, pose: FloatArray, gates: TrackingGates
+) -> IntArray:
+    """Return lines (n, 2) of the older map that appear where the newest keyframe measures lines of the newer one."""
+    table, seen = older.track_map.lines, newest.measured.lines
+    old = np.unique(np.concatenate([keyframe.measured.lines.index for keyframe in near]))
+    old = old[table.state[old] == ALIVE]
+    if older.track_map is newer.track_map:
+        old = old[~np.isin(old, seen.index)]
+    rows = np.flatnonzero(newer.track_map.lines.state[seen.index] == ALIVE)
+    expected, visible = expected_segments(older.camera, table, old, pose, gates.lines)
+    first, second = assign(
+        expected[visible], seen.ends[rows], gates.lines.distance, gates.lines.angle, gates=gates.lines
+    )
+    return np.column_stack([old[visible][first], seen.index[rows[second]]])
 
 
 def _scale(

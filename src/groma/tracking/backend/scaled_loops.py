@@ -3,8 +3,8 @@
 
 A place that is recognised is in the map twice, as it was seen first and as it was seen again, with a similarity between
 both copies (:mod:`groma.tracking.backend.place_again`). A graph of similarities spreads the error, scale included,
-over the keyframes (:mod:`groma.adjustment.similarity_graph`); landmarks follow the keyframes that saw them first, and
-what was matched becomes one.
+over the keyframes (:mod:`groma.adjustment.graphs.similarity_graph`); landmarks follow the keyframes that saw them
+first, and what was matched becomes one.
 """
 
 from __future__ import annotations
@@ -13,10 +13,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from groma.adjustment.similarity_graph import SimilarityGraphResult, SimilarityMotions, adjust_similarity_graph
+from groma.adjustment.graphs.similarity_graph import SimilarityGraphResult, SimilarityMotions, adjust_similarity_graph
 from groma.geometry import sim3
 from groma.solver.options import SolverOptions
-from groma.tracking.backend.loop_closure import can_be, join_points, known_loops, move, neighbours, search_for_loop
+from groma.tracking.backend.loop_closure import (
+    can_be,
+    join_lines,
+    join_points,
+    known_loops,
+    move,
+    neighbours,
+    search_for_loop,
+)
 from groma.tracking.backend.place_again import KnownMap, PlaceAgain, described, measure_place
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.frame.measurements import PointMeasurements
@@ -46,8 +54,9 @@ def close_scaled_loops(track_map: TrackMap, camera: TrackCamera, options: TrackO
 
 
 def join_place(track_map: TrackMap, place: PlaceAgain, options: TrackOptions) -> None:
-    """Make one of points that a place has twice; where it has them once, the newest keyframe sees them too."""
+    """Make one of landmarks that a place has twice; points that it has once the newest keyframe sees, too."""
     newest = place.newest
+    join_lines(track_map, place.lines)
     for k, keyframe in enumerate(place.known.keyframes):
         first, second = place.matches(k)
         join_points(track_map, keyframe, newest, first, second)

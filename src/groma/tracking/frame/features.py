@@ -16,17 +16,13 @@ import numpy.typing as npt
 
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
+from groma.features.depth.points import depth_at
 from groma.features.images import GrayImage
 from groma.features.point_tracks import corners
 from groma.features.segments import Segments
 from groma.io.sequences.frame import Frame
 from groma.tracking.frame.camera import TrackCamera, back
-from groma.tracking.frame.depth import (
-    DepthImage,
-    depth_at,
-    depth_sigma,
-    segment_inverse_depths,
-)
+from groma.tracking.frame.depth import DepthImage, depth_sigma, segment_inverse_depths
 from groma.tracking.frame.planes import FramePlanes, frame_planes
 from groma.tracking.frame.rectification import (
     RightCamera,
@@ -186,7 +182,7 @@ class FrameFeatures:
     def depths(self, pixels: FloatArray) -> FloatArray:
         """Depths (N,) at pixels from the depth image or the right image; NaN where unknown."""
         if self.depth is not None:
-            return depth_at(self.depth, pixels, self.options.max_depth, self.options.gates.depth)
+            return depth_at(self.depth, pixels, self.options.max_depth)
         if self.frame.right is not None:
             disparity = pixels[:, 0] - self.right_pixels(pixels)[:, 0]
             with np.errstate(divide="ignore"):

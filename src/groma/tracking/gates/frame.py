@@ -53,7 +53,7 @@ class TurnGates:
 
 @dataclass(frozen=True)
 class DepthGates:
-    """Depth images: noise, and where a depth can be read."""
+    """Depth images: noise, and where the depth beside a segment is read."""
 
     inverse_sigma: float = gate(
         0.003,
@@ -65,9 +65,6 @@ class DepthGates:
     near: float = gate(0.5, "px", "depth beside a segment is read from this distance on", SEQUENCES)
     far: float = gate(4.5, "px", "and up to this distance, so that narrow faces are not missed", SEQUENCES)
     correlation: float = gate(6.0, "samples", "neighbouring samples that err alike count as one", SEQUENCES)
-    jump: float = gate(0.01, "scene units", "depths around a pixel differ by less, plus a share", SEQUENCES)
-    jump_share: float = gate(0.04, "share", "share of the depth by which they may differ", SEQUENCES)
-    min_known: int = gate(4, "pixels", "known depths among a pixel and its eight neighbours", SEQUENCES)
     grid: int = gate(20, "px", "distance of the places whose depth is kept, and on planes", "cost: 768 in 640 x 480")
     far_share: float = gate(
         0.25, "share", "largest noise of a stereo depth; far points serve as well as near ones", SEQUENCES

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from groma._typing import FloatArray
+from groma.features.depth.points import DEPTH_POINTS
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.depth import depth_sigma
 from groma.tracking.frame.features import grid_pixels, grid_shape
@@ -54,7 +55,7 @@ def depth_agreement(
     if known.sum() < check.min_places:
         return np.nan, np.nan
     measured, expected = measured[known], expected[known]
-    tolerance = gates.depth.jump_share * measured + check.sigma * depth_sigma(measured, gates.depth)
+    tolerance = DEPTH_POINTS.jump_share * measured + check.sigma * depth_sigma(measured, gates.depth)
     away = measured - expected
     return float((np.abs(away) < tolerance).mean()), float((away > tolerance).mean())
 

@@ -20,8 +20,10 @@ Scenes without texture, such as plain boxes, keep their lines that are seen in f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.special import betaln, expit, gammaln, log_expit
@@ -139,10 +141,15 @@ def edge_odds(
         prior = (weights**2 / spread**2).sum() + ((odds - prior_odds) ** 2).sum() / odds_sigma**2
         return value + 0.5 * prior, slope
 
-    from scipy.optimize import minimize  # takes a third of a second to import
-
-    p = minimize(cost, np.concatenate([1.0 / spread, prior_odds]), jac=True, method="L-BFGS-B").x
+    p = load_minimiser()(cost, np.concatenate([1.0 / spread, prior_odds]), jac=True, method="L-BFGS-B").x
     return lines @ p[:-2] + ratio + log_expit(p[-1]) - log_expit(p[-2])
+
+
+def load_minimiser() -> Callable[..., Any]:
+    """Return SciPy's minimiser. It takes a third of a second to import, and can be loaded beside other work."""
+    from scipy.optimize import minimize
+
+    return minimize
 
 
 def _log_chance(seen: IntArray, expected: IntArray, min_images: int, kind: tuple[float, float]) -> FloatArray:
@@ -163,4 +170,4 @@ def _beta_binomial(hits: FloatArray, tries: FloatArray, kind: tuple[float, float
     return number + betaln(hits + a, tries - hits + b) - betaln(a, b)
 
 
-__all__ = ["TextureGates", "edge_odds", "num_expected"]
+__all__ = ["TextureGates", "edge_odds", "load_minimiser", "num_expected"]

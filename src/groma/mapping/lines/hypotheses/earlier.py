@@ -20,7 +20,7 @@ from groma.gates import gate
 from groma.mapping.groups import grouped
 from groma.mapping.lines.line_map import LineMap
 from groma.mapping.lines.views import LineViews
-from groma.mapping.noise.landmarks import project_points
+from groma.mapping.noise.landmarks import pixels_of
 from groma.scene import Scene
 
 
@@ -106,7 +106,7 @@ def _moved_px(
 
 def _pixels(before: Scene, after: Scene, image: int, places: FloatArray) -> FloatArray:
     """Homogeneous pixels (n, 3) where a scene saw points, undistorted by the lens of another; NaN behind a camera."""
-    pixels, _ = project_points(before, np.full(len(places), image), places)
+    pixels = pixels_of(before, np.full(len(places), image), places)
     camera = after.images.camera_idx[image]
     model = camera_models.model(after.cameras.models[camera])
     straight = np.full((len(places), 3), np.nan)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Gravity, heights, distances, poses with covariance, held cameras: are predicted errors those that occur?
+
+    python benchmarks/known_geometry.py --data DATA [--draws 30]
+
+Cameras, points and who sees what are those of castle-P30 (``measurements.py castle``); pixels (0.3 px) and
+measurements are drawn anew each time. The squared error of a camera in units of its covariance is 3 on average if the
+covariance is right. Then the wrong phones (gravity 2 to 10 degrees off) that the test names, and the right ones.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from measurements import PIXEL, projected, spread, with_control, with_positions
+
+import groma
+from groma.adjustment.survey.reliability import reliability
+from groma.geometry import quaternion, se3
+from groma.io import read_scene
+from groma.scene import CameraPoses, Distances, Held, KnownDirections, KnownPlanes, Scene
+from groma.scene.survey import UNKNOWN, Kind
+
+#: Standard deviations: gravity (degrees), heights, distances, and of poses (position, degrees).
+GRAVITY, HEIGHT, DISTANCE, POSE = 0.5, 0.01, 0.005, (0.02, 0.3)
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def with_gravity(scene: Scene, rng: np.random.Generator, wrong: dict[int, float]) -> Scene:
+    """Return the scene with gravity in every camera; of some it is so many degrees off."""
+    count = scene.num_images
+    seen = quaternion.rotate(scene.cam_from_world[:, :4], np.tile(DOWN, (count, 1)))
+    turns = rng.normal(size=(count, 3)) * np.radians(GRAVITY)
+    for row, degrees in wrong.items():
+        across = np.cross(seen[row], rng.normal(size=3))
+        turns[row] += np.radians(degrees) * across / np.linalg.norm(across)
+    seen = quaternion.rotate(quaternion.exp(turns), seen)
+    every = np.arange(count)
+    table = KnownDirections(every * 0, every, np.tile(DOWN, (count, 1)), seen, np.full(count, np.radians(GRAVITY)))
+    return scene.replace(known_directions=table)
+
+
+def with_heights(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Return the scene with measured heights of all cameras."""
+    every, height = np.arange(scene.num_images), scene.cam_centers_in_world[:, 2]
+    measured = height + rng.normal(size=len(every)) * HEIGHT
+    hesse = np.column_stack([np.tile([0.0, 0.0, 1.0], (len(every), 1)), -measured])
+    anchors = np.zeros((len(every), 3))
+    return scene.replace(known_planes=KnownPlanes(every * 0, every, anchors, hesse, np.full(len(every), HEIGHT)))
+
+
+def with_distances(scene: Scene, true: np.ndarray, rng: np.random.Generator) -> Scene:
+    """Return the scene with distances of ten cameras from a control point, and between two control points."""
+    cameras = np.linspace(0, scene.num_images - 1, 10).astype(int)
+    apart = np.linalg.norm(scene.cam_centers_in_world[cameras] - true[0], axis=1)
+    numbers = np.append(apart, np.linalg.norm(true[1] - true[0])) + rng.normal(size=11) * DISTANCE
+    kinds = np.append(np.full(10, Kind.IMAGE), Kind.CONTROL_POINT), np.full(11, Kind.CONTROL_POINT)
+    ends = np.append(cameras, 0), np.append(np.zeros(10, int), 1)
+    sigma = np.full(11, DISTANCE)
+    return scene.replace(distances=Distances(kinds[0], ends[0], kinds[1], ends[1], np.zeros((11, 3)), numbers, sigma))
+
+
+def with_poses(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Return the scene with measured poses whose six errors depend on each other."""
+    count = scene.num_images
+    root = (np.eye(6) + 0.4 * np.triu(np.ones((6, 6)), 1)) * np.repeat([POSE[0], np.radians(POSE[1])], 3)[:, None]
+    errors = se3.exp(rng.normal(size=(count, 6)) @ root.T)
+    poses = se3.compose(se3.inverse(errors), scene.cam_from_world)
+    return scene.replace(camera_poses=CameraPoses(np.arange(count), poses, np.tile(root @ root.T, (count, 1, 1))))
+
+
+def drawn_scenes(truth: Scene, drawn: Scene, rng: np.random.Generator) -> dict[str, Scene]:
+    """Return one draw of every scene: what holds its frame, and what else was measured."""
+    chosen = spread(truth, 2)
+    marked = with_control(drawn, rng, chosen, [UNKNOWN] * 2, 1.0)
+    placed = with_positions(marked, rng)
+    few = placed.replace(camera_positions=placed.camera_positions.take([0, 10, 20]))
+    known = with_distances(with_heights(with_gravity(few, rng, {}), rng), truth.points.xyz[chosen], rng)
+    far = int(np.argmax(np.linalg.norm(truth.cam_centers_in_world - truth.cam_centers_in_world[0], axis=1)))
+    return {
+        "3 positions": few,
+        "3 positions, gravity, heights, distances": known,
+        "poses with covariance": with_poses(drawn, rng),
+        "two cameras held": drawn.replace(held=Held([0, 0], [0, far])),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--draws", type=int, default=30)
+    parser.add_argument("--points", type=int, default=2000, help="points of the castle that take part")
+    arguments = parser.parse_args()
+    truth = read_scene(arguments.data / "strecha_castle_p30" / "sparse_gt")
+    thinned = np.random.default_rng(0).permutation(truth.num_points) < arguments.points
+    truth = truth.keep(points=thinned).replace(keypoints=type(truth.keypoints)())
+    exact, table = projected(truth), truth.point_observations
+    options = groma.AdjustOptions(loss="none", point_sigma_px=PIXEL, check_lens=False)
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    named, blamed = {2: 0, 4: 0, 10: 0}, 0
+    for draw in range(arguments.draws):
+        rng = np.random.default_rng(draw)
+        drawn = truth.replace(point_observations=table.replace(pixel=exact + rng.normal(size=exact.shape) * PIXEL))
+        for name, scene in drawn_scenes(truth, drawn, rng).items():
+            result = groma.adjust(scene, options)
+            found = result.uncertainty()
+            free = np.trace(found.centers, axis1=1, axis2=2) > 0.0
+            off = (result.scene.cam_centers_in_world - truth.cam_centers_in_world)[free]
+            squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.centers[free]), off)
+            sizes = (off**2).sum(axis=1).mean(), np.trace(found.centers[free], axis1=1, axis2=2).mean()
+            rows.setdefault(name, []).append((squares.mean(), *sizes))
+        wrong = dict(zip(rng.choice(truth.num_images, 3, replace=False).tolist(), named, strict=True))
+        result = groma.adjust(with_gravity(with_positions(drawn, rng), rng, wrong), options)
+        tests = reliability(result.scene, result.problem).suspects
+        suspects = {one.name for one in tests if one.kind == "known direction"}
+        for row, degrees in wrong.items():
+            named[degrees] += truth.images.names[row] in suspects
+        blamed += len(suspects - {truth.images.names[row] for row in wrong})
+    for name, values in rows.items():
+        ratio, off, sigma = np.mean(values, axis=0)
+        rms, predicted = 1e3 * np.sqrt([off, sigma])
+        print(f"{name}: NEES {ratio:.2f} (3), rms error {rms:.1f} mm, predicted {predicted:.1f} mm")
+    print(f"wrong phones named, by degrees: {named} of {arguments.draws}; right ones blamed: {blamed}")
+
+
+if __name__ == "__main__":
+    main()

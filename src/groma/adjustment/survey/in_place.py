@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where measurements say that a scene is, before anything is adjusted.
+
+Places determine a similarity that most of them agree on. Without places, known directions turn the scene, known planes
+turn and lift it, distances scale it; whatever none of them tells stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.adjustment.survey.given import Survey
+from groma.adjustment.survey.level import level
+from groma.adjustment.survey.names import rows_by_name
+from groma.adjustment.survey.similarity import GATES, RobustSimilarity, robust_similarity, upright
+from groma.adjustment.survey.tables import listed
+from groma.adjustment.survey.triangulate import triangulated
+from groma.errors import InputError
+from groma.evaluation.alignment import camera_centers, pose_alignment
+from groma.io.survey import WorldFrame, common_frame
+from groma.scene import Scene, Similarity
+from groma.scene.survey import Kind
+
+
+@dataclass(frozen=True, eq=False)
+class Placing:
+    """Where a scene goes."""
+
+    similarity: Similarity
+    #: How well places fit; None where none determined the similarity.
+    fit: RobustSimilarity | None = None
+
+
+def placing(before: Scene, scene: Scene, survey: Survey, frame: WorldFrame, notes: list[str]) -> Placing:
+    """Return where the measurements say that a scene is.
+
+    Parameters
+    ----------
+    before : Scene
+        Without the measurements that are new.
+    scene : Scene
+        The same with them.
+    survey, frame
+        What was given, and the frame of its places.
+    notes : list of str
+        Sentences are added to it.
+
+    Raises
+    ------
+    InputError
+        If places are too few, or axes do not fit.
+    """
+    if len(scene.held):
+        notes.append("The scene stays where it is, because parts of it are held.")
+        return Placing(Similarity())
+    if before.is_tied:
+        notes.append("The scene is placed by measurements already and stays where it is.")
+        return Placing(Similarity())
+    source, target, names = _correspondences(scene)
+    if len(source) == 0:
+        scaled = _scaled(scene, notes)
+        return Placing(level(scene.transformed(scaled, measured=False), notes).after(scaled))
+    if len(source) < 3:
+        raise InputError(
+            f"The measurements place only {len(source)} cameras or control points of the scene; three are "
+            "needed. Add positions, or control points that two images show."
+        )
+    try:
+        fit = robust_similarity(source, target)
+    except InputError:
+        _check_exchanged(scene, survey, source, None)
+        raise
+    _check_exchanged(scene, survey, source, fit)
+    if fit.on_line and len(scene.camera_poses) > 1:
+        fit = _by_orientations(scene, fit, source, target)
+    elif fit.on_line:
+        fit = upright(fit, scene, target)
+        notes.append(
+            "The measured places are on a line: they do not tell how the scene is turned about it. It was turned so "
+            "that the cameras stand upright."
+        )
+    if len(far := np.flatnonzero(~fit.inliers)):
+        rows = far[np.argsort(-np.linalg.norm(fit.residuals[far], axis=1))]
+        told = [f"{names[row]} ({np.linalg.norm(fit.residuals[row]):.3g})" for row in rows]
+        notes.append(f"Far from where the others put them, before the adjustment: {listed(told, 'places')}.")
+    if _is_there(scene, fit):
+        notes.append("The given poses are in the frame of the measurements already: the scene stays where it is.")
+        return Placing(Similarity())
+    notes.append(
+        f"The scene was brought into {frame.description} by a similarity (scale {fit.similarity.scale:.6g}) to "
+        f"{int(fit.inliers.sum())} of {len(fit.inliers)} measured places, which scatter by {fit.scatter:.3g} a "
+        "coordinate."
+    )
+    return Placing(fit.similarity, fit)
+
+
+def _correspondences(scene: Scene) -> tuple[FloatArray, FloatArray, Sequence[str]]:
+    """Return places in the scene, where they were measured, and their names."""
+    positions, poses, points = scene.camera_positions, scene.camera_poses, scene.control_points
+    images = np.concatenate([positions.image_idx, poses.image_idx])
+    seen, _ = triangulated(scene, scene.marks, len(points))
+    usable = np.flatnonzero(points.is_control & np.isfinite(seen).all(axis=1))
+    source = np.concatenate([scene.cam_centers_in_world[images], seen[usable]])
+    target = np.concatenate([positions.xyz, camera_centers(poses.cam_from_world), points.measured[usable]])
+    names = [scene.images.names[row] for row in images] + [points.names[row] for row in usable]
+    return source, target, names
+
+
+def _by_orientations(scene: Scene, fit: RobustSimilarity, source: FloatArray, target: FloatArray) -> RobustSimilarity:
+    """Return a similarity to places on a line, turned about it as measured poses say."""
+    table = scene.camera_poses
+    found = pose_alignment(scene.cam_from_world[table.image_idx], table.cam_from_world).similarity
+    return replace(fit, similarity=found, residuals=target - found.points(source), on_line=False)
+
+
+def _is_there(scene: Scene, fit: RobustSimilarity) -> bool:
+    """Whether poses from elsewhere place the scene where the measurements do, to within what both know."""
+    priors = scene.pose_priors
+    if not len(priors):
+        return False
+    centers = scene.cam_centers_in_world
+    moved = np.linalg.norm(fit.similarity.points(centers) - centers, axis=1)
+    noise = np.hypot(fit.scatter, float(np.median(priors.sigma[:, :3])))
+    return bool(np.median(moved) <= 3.0 * noise)
+
+
+def _check_exchanged(scene: Scene, survey: Survey, source: FloatArray, fit: RobustSimilarity | None) -> None:
+    """Refuse longitudes and latitudes that fit much better the other way round, or only so."""
+    given = survey.positions
+    if given is None or not given.system.is_geographic or survey.control is not None or len(source) < 4:
+        return
+    swapped = replace(given, coordinates=given.coordinates[:, [1, 0, 2]])
+    if np.abs(swapped.coordinates[:, 1]).max() > 90.0 or len(source) != len(scene.camera_positions):
+        return
+    xyz = common_frame([swapped])[0][0]
+    try:
+        other = robust_similarity(source, xyz[rows_by_name(given.names, scene.images.names) >= 0])
+    except InputError:
+        return
+    if fit is None or other.scatter * GATES.mirrored < fit.scatter:
+        raise InputError(
+            f"{given.source}: its places fit the scene much better with longitude and latitude exchanged. x is the "
+            "longitude; correct the order."
+        )
+
+
+def _scaled(scene: Scene, notes: list[str]) -> Similarity:
+    """Return the scaling of a scene to its measured distances."""
+    table = scene.distances
+    points, _ = triangulated(scene, scene.marks, len(scene.control_points))
+    places = {Kind.IMAGE: scene.cam_centers_in_world, Kind.CONTROL_POINT: points}
+    ratios = []
+    for row, (kind, other) in enumerate(zip(table.first_kind, table.second_kind, strict=True)):
+        first = places[kind][table.first_idx[row]] if kind in places else table.anchor[row]
+        index = table.second_idx[row]
+        if other in places:
+            apart = np.linalg.norm(places[other][index] - first)
+        elif other == Kind.LINE:
+            line = scene.lines.plucker[index]
+            apart = np.linalg.norm(np.cross(first, line[3:]) - line[:3])
+        else:
+            apart = abs(scene.planes.hesse[index] @ np.append(first, 1.0))
+        ratios.append(table.distance[row] / apart if apart > 0.0 else np.nan)
+    usable = [ratio for ratio in ratios if np.isfinite(ratio)]
+    if not usable:
+        return Similarity()
+    similarity = Similarity(float(np.median(usable)))
+    notes.append(f"The scene was scaled by {similarity.scale:.6g} to its measured distances.")
+    return similarity
+
+
+__all__ = ["Placing", "placing"]

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Tables of positions and control points from files: names are found in the scene, accuracies as they were stated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from groma._counted import counted
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.adjustment.survey.given import Survey
+from groma.adjustment.survey.names import nearest, require_some, rows_by_name
+from groma.errors import InputError
+from groma.io.survey import ControlFile, Places
+from groma.scene import CameraPositions, ControlPoints, Marks, Scene
+from groma.scene.survey import CHECK, CONTROL, UNKNOWN, diagonal_covariance
+
+#: Names that a sentence lists at most.
+_LISTED = 5
+
+
+def position_table(scene: Scene, survey: Survey, xyz: FloatArray, notes: list[str]) -> CameraPositions:
+    """Return the table of positions."""
+    given = survey.positions
+    assert given is not None
+    rows = rows_by_name(given.names, scene.images.names)
+    require_some(rows, given.names, scene.images.names, given.source, "an image")
+    tell_unknown(given, rows, scene.images.names, "images that are not in the scene", notes)
+    known = np.flatnonzero(np.asarray(rows) >= 0)
+    sigma = sigma_of(given, survey.position_sigma, "--position-sigma")
+    if (twice := len(known) - len(np.unique(rows[known]))) > 0:
+        raise InputError(f"{given.source}: {counted(twice, 'images')} have two positions under different names.")
+    return CameraPositions(rows[known], xyz[known], diagonal_covariance(sigma[known]))
+
+
+def control_tables(
+    scene: Scene, survey: Survey, given: ControlFile, xyz: FloatArray, notes: list[str]
+) -> tuple[ControlPoints, Marks]:
+    """Return the tables of control points and of their marks."""
+    places = given.places
+    known_place: BoolArray = np.asarray(np.isfinite(xyz).all(axis=1))
+    if unknown := [name for name in survey.check if name not in places.names]:
+        raise InputError(
+            f"--check names {unknown[0]!r}, which is no control point{nearest(unknown[0], places.names)}. The file has "
+            f"{', '.join(places.names[:_LISTED])}."
+        )
+    image = rows_by_name(given.image_names, scene.images.names)
+    require_some(image, given.image_names, scene.images.names, places.source, "an image")
+    if missing := len(set(np.asarray(given.image_names)[image < 0].tolist())):
+        notes.append(
+            f"{places.source}: {counted(int((image < 0).sum()), 'marks')} in {counted(missing, 'images')} that are not "
+            "in the scene."
+        )
+    pixels = given.pixels
+    if given.normalized:
+        camera = scene.images.camera_idx[np.maximum(image, 0)]
+        extent = np.stack([scene.cameras.width[camera], scene.cameras.height[camera]], axis=1).astype(float)
+        pixels = pixels * extent.max(axis=1, keepdims=True) + extent / 2.0
+    _check_inside(scene, places.source, image, pixels)
+    is_check = given.is_check | np.isin(places.names, survey.check)
+    role = np.where(~known_place, UNKNOWN, np.where(is_check, CHECK, CONTROL))
+    marked = np.bincount(given.point_idx[image >= 0], minlength=len(role))
+    keep = np.flatnonzero((marked >= 2) | ((marked == 1) & (role == CONTROL)))
+    if left := [places.names[row] for row in np.flatnonzero(~np.isin(np.arange(len(role)), keep))]:
+        notes.append(f"Left out, marked in too few images: {listed(left, 'control points')}.")
+    sigma = sigma_of(places, survey.control_sigma, "--control-sigma", known_place & (role != UNKNOWN))
+    names = tuple(places.names[row] for row in keep)
+    start = np.where(known_place[:, None], xyz, 0.0)[keep]
+    points = ControlPoints(names, start, start, diagonal_covariance(sigma[keep]), role[keep])
+    new_row = np.full(len(role), -1)
+    new_row[keep] = np.arange(len(keep))
+    rows = np.flatnonzero((image >= 0) & (new_row[given.point_idx] >= 0))
+    noise = np.full(len(rows), survey.mark_sigma_px)
+    return points, Marks(image[rows], new_row[given.point_idx[rows]], pixels[rows], noise)
+
+
+def _check_inside(scene: Scene, source: str, image: IntArray, pixels: FloatArray) -> None:
+    """Refuse marks outside their images: they were made in images of another size."""
+    camera = scene.images.camera_idx[np.maximum(image, 0)]
+    size = np.stack([scene.cameras.width[camera], scene.cameras.height[camera]], axis=1)
+    outside = (image >= 0) & (size > 0).all(axis=1) & ((pixels < -1.0) | (pixels > size + 1.0)).any(axis=1)
+    if outside.any():
+        row = int(np.argmax(outside))
+        name, (width, height) = scene.images.names[image[row]], size[row]
+        raise InputError(
+            f"{source}: {counted(int(outside.sum()), 'marks')} lie outside their images, such as "
+            f"({pixels[row, 0]:.0f}, {pixels[row, 1]:.0f}) in {name} of {width} x {height} pixels. Were they made in "
+            "images of another size?"
+        )
+
+
+def sigma_of(given: Places, stated: tuple[float, ...], option: str, needed: Any = True) -> FloatArray:
+    """Return standard deviations (N, 3): of the file, else as stated."""
+    sigma = given.sigma.copy()
+    if stated:
+        east, north, up = {1: stated * 3, 2: (stated[0], *stated), 3: stated}[len(stated)]
+        sigma[:] = np.where(np.isfinite(sigma), sigma, [east, north, up])
+    missing = ~np.isfinite(sigma).all(axis=1)
+    if (missing & needed).any():
+        raise InputError(
+            f"{given.source} does not say how exact its coordinates are. Say it: {option} 0.02, or horizontal and "
+            f"vertical: {option} 0.02,0.04 (units of the coordinates)."
+        )
+    sigma[missing] = 1.0
+    return sigma
+
+
+def tell_unknown(given: Places, rows: IntArray, known: Sequence[str], words: str, notes: list[str]) -> None:
+    """Say which names of a file the scene does not know."""
+    unknown = [given.names[row] for row in np.flatnonzero(rows < 0)]
+    if unknown:
+        listed = [name + nearest(name, known) for name in unknown[:_LISTED]]
+        more = f" and {len(unknown) - _LISTED} more" if len(unknown) > _LISTED else ""
+        notes.append(f"{given.source}: {counted(len(unknown), 'positions')} of {words}: {', '.join(listed)}{more}.")
+
+
+def listed(names: Sequence[str], kind: str) -> str:
+    """Return how many there are, and the first names."""
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f"{counted(len(names), kind)}, {', '.join(names[:_LISTED])}{more}"
+
+
+__all__ = ["control_tables", "listed", "position_table", "sigma_of", "tell_unknown"]

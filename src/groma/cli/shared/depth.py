@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Options of commands that take depth maps of photographs, and what is said of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from groma._counted import counted
+from groma.cli.shared.input import refuse_idle
+from groma.errors import InputError
+
+if TYPE_CHECKING:
+    from groma.cli.shared.console import Console
+    from groma.io.depth_maps import DepthMaps
+
+PANEL = "Depth maps"
+Depth = Annotated[
+    Path | None,
+    typer.Option(
+        "--depth",
+        metavar="FOLDER",
+        help="Depth maps of the photographs, of their names and sizes: 16-bit PNG (millimetres), .npy or .npz "
+        "(metres); they give the map its unit of length.",
+        rich_help_panel=PANEL,
+    ),
+]
+DepthScale = Annotated[
+    float | None,
+    typer.Option(
+        "--depth-scale",
+        metavar="S",
+        help="Numbers in depth maps per metre. Default: 1000 for whole numbers, 1 for fractions.",
+        rich_help_panel=PANEL,
+    ),
+]
+RelativeDepth = Annotated[
+    bool,
+    typer.Option(
+        "--relative-depth/--metric-depth",
+        help="Each depth map has a scale of its own, as guessed from one photograph; it is estimated.",
+        rich_help_panel=PANEL,
+    ),
+]
+
+
+def depth_maps(folder: Path | None, scale: float | None, relative: bool, images: Path) -> DepthMaps | None:
+    """Return what the options mean; None without a folder."""
+    from groma.io.depth_maps import DepthMaps
+
+    refuse_idle(
+        ("--depth-scale", scale is not None and folder is None, "with --depth"),
+        ("--relative-depth", relative and folder is None, "with --depth"),
+    )
+    if folder is None:
+        return None
+    if images.absolute() in (folder.absolute(), *folder.absolute().parents):
+        raise InputError(f"{folder} lies in {images}: its files would be taken for photographs. Move it elsewhere.")
+    return DepthMaps(folder, scale, relative)
+
+
+def say_depth(console: Console, numbers: dict[str, Any]) -> None:
+    """Say what depth maps were worth: the entry ``depth`` of ``summary.json``."""
+    if not numbers:
+        return
+    what = f"{counted(numbers['num_point_depths'], 'depths')} of points in {counted(numbers['num_maps'], 'maps')}"
+    middle, sigma = numbers["median_depth"], numbers["sigma_at_median"]
+    if numbers["unit"] == "relative":
+        console.say(f"Depth up to scale: {what}, good to {sigma / middle:.1%}. A scale of each map was estimated.")
+        return
+    unit = "" if numbers["scale"] == 1.0 else f" (1 unit of the model was {numbers['scale']:.4g})"
+    console.say(
+        f"Depth: {what}, median {middle:.3g}, good to {sigma:.2g} there. The map has their unit of length{unit}."
+    )

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Which features belong to a structure that is not exact: a mixture whose members deviate from it, as do real walls.
+
+A plane of a building is no plane, and its joints are not quite parallel. How far its members are off, beyond their own
+noise, is not known in advance; features tell it, together with the share of them that are members. With the offset
+:math:`x` of a feature in the axes of its noise, variances :math:`s_a^2` there, and what the unit of deviation is at the
+feature, :math:`\ell`, members of a structure with the deviation t have the density
+
+.. math:: g(x; t) = \prod_a N(x_a;\; 0,\; s_a^2 + t^2 \ell^2),
+
+clutter a constant one, c. For every t that is tried the share :math:`\pi` follows by expectation maximisation; the t of
+most likelihood is kept, or none where that is not significantly more likely. Then
+
+.. math:: P = \frac{\pi\, g(x; t)}{\pi\, g(x; t) + (1 - \pi)\, c} .
+
+All axes count: a feature that is uncertain along one, as a short line is in depth, can be certain along the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators.association import maximise_shares
+from groma.gates import chi_square_gate, gate
+
+
+@dataclass(frozen=True)
+class MembershipGates:
+    """How deviations and shares are estimated."""
+
+    rounds: int = gate(30, "rounds", "of expectation and maximisation", "cost: converges in fewer")
+    pooled: float = gate(
+        4.0, "features", "that the share of all counts in that of each", "chosen on walls full of points"
+    )
+    tried: int = gate(12, "deviations", "that are tried", "cost: each two fifths larger than the one before")
+    significance: float = gate(0.05, "probability", "to find a deviation where there is none", "convention: 5 %")
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """N pairs of a feature and a structure that it may belong to."""
+
+    #: (N,) the structure of each.
+    owner: IntArray
+    #: (N, D) offset along the axes of its noise, and the variances there.
+    offset: FloatArray
+    variance: FloatArray
+    #: (N,) what a deviation of one is at the feature.
+    unit: FloatArray
+    #: (N,) density of clutter there.
+    clutter: FloatArray
+    #: (N,) pairs that take part in the estimates; others are known to belong elsewhere.
+    counted: BoolArray
+    #: (N,) pairs with the same number have the same share; kinds of features may differ in it.
+    group: IntArray
+
+
+@dataclass(frozen=True)
+class Membership:
+    """Who belongs to what."""
+
+    #: (N,) probability that each pair is one.
+    probability: FloatArray
+    #: (K,) deviation of the members of each structure, 0 where their noise explains it.
+    deviation: FloatArray
+
+
+def memberships(
+    found: Candidates, most: FloatArray, common: bool = False, gates: MembershipGates = MembershipGates()
+) -> Membership:
+    """Estimate how far members of structures deviate, and with which probability features are members.
+
+    Parameters
+    ----------
+    found : Candidates
+        Pairs of features and structures.
+    most : (K,) float64
+        Largest deviation that members of each structure may have; deviations down to a fiftieth are tried.
+    common : bool
+        Whether all structures have the same deviation: few members cannot tell their own.
+    gates : MembershipGates
+        How they are estimated.
+    """
+    num, rows = len(most), np.flatnonzero(found.counted)
+    if len(found.owner) == 0:
+        return Membership(np.zeros(0), np.zeros(num))
+    shrink = np.concatenate([[0.0], np.geomspace(0.02, 1.0, gates.tried)])
+    likelihood, shares = np.zeros((len(shrink), num)), []
+    groups = int(found.group.max()) + 1
+    for k, part in enumerate(shrink):
+        density = _density(found, part * most[found.owner])
+        share = maximise_shares(
+            density[rows], found.clutter[rows], found.group[rows], groups, gates.pooled, gates.rounds
+        )  # fmt: skip
+        shares.append(share)
+        mixed = share[found.group] * density + (1.0 - share[found.group]) * found.clutter
+        likelihood[k] = np.bincount(found.owner[rows], np.log(mixed[rows]), num)
+    if common:
+        likelihood[:] = likelihood.sum(axis=1, keepdims=True)
+    best = likelihood.argmax(axis=0)
+    gain = likelihood.max(axis=0) - likelihood[0]
+    # Where the widest fits best nothing stands out from clutter, whatever it is.
+    best[(gain < 0.5 * chi_square_gate(gates.significance, 1)) | (best == len(shrink) - 1)] = 0
+    deviation = shrink[best] * most
+    density = _density(found, deviation[found.owner])
+    share = np.array(shares)[best[found.owner], found.group]
+    member = share * density
+    return Membership(member / (member + (1.0 - share) * found.clutter), deviation)
+
+
+def _density(found: Candidates, deviation: FloatArray) -> FloatArray:
+    """Density of members; far away it is small, not zero."""
+    variance = found.variance + ((deviation * found.unit) ** 2)[:, None]
+    squared = np.minimum((found.offset**2 / variance).sum(axis=1), 1400.0)
+    return np.exp(-0.5 * squared) / np.sqrt((2.0 * np.pi * variance).prod(axis=1))
+
+
+__all__ = ["Candidates", "Membership", "MembershipGates", "memberships"]

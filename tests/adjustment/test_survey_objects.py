@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Measurements of any object: distances, known planes and directions, poses with covariance, and what is held.
+
+Truth is that of made scenes with lines and planes; distances and heights are computed here by plain geometry.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from _survey import ELSEWHERE, SIGMA, control, control_file, made, measured_positions, on_rigs, positions
+
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.survey.attach import with_survey
+from groma.adjustment.survey.given import Survey
+from groma.adjustment.survey.place import settled
+from groma.adjustment.survey.reliability import reliability
+from groma.errors import InputError
+from groma.geometry import quaternion, se3
+from groma.io.survey import DirectionsFile, DistancesFile, PlanesFile, PosesFile
+from groma.problem.residuals import residuals_of
+from groma.scene import CameraPoses, Held, KnownDirections, KnownPlanes, PosePriors
+from groma.scene.survey import Kind
+from groma.scene.synthetic.scenes import holistic
+
+LEAST_SQUARES = AdjustOptions(loss="none", point_sigma_px=0.5, check_lens=False)
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """A scene with points, lines and planes, and four control points."""
+    scene = holistic(8, noise_px=0.5, seed=1).truth
+    points, marks, xyz = control(scene, np.random.default_rng(2), 4, 0)
+    return scene.replace(control_points=points.replace(xyz=xyz, role=np.zeros(4, int)), marks=marks)
+
+
+def of_line(scene, row, place):
+    """The distance of a place from a line, by its segment."""
+    first, second = scene.lines.segments[row]
+    along = (second - first) / np.linalg.norm(second - first)
+    return np.linalg.norm(place - first - ((place - first) @ along) * along)
+
+
+def residuals(scene, kind):
+    """Residuals of the factors of one type at a scene."""
+    problem = assemble(scene, AssemblyOptions()).problem
+    return np.concatenate([residuals_of(f, problem.variables) for f in problem.factors if f.type_name == kind])
+
+
+def test_distances_between_objects_of_every_kind(truth):
+    """Names are found, kinds are put in order, and the residuals of true distances are zero."""
+    centers, plane, line = truth.cam_centers_in_world, truth.planes.hesse[0], 3
+    p0, middle = truth.control_points.xyz[0], truth.lines.segments[5].mean(axis=0)
+    near = truth.points.xyz[4]
+    rows = [
+        ("00001.png", "00004.png", np.linalg.norm(centers[3] - centers[0])),
+        ("p0", "00002.png", np.linalg.norm(centers[1] - p0)),
+        (f"line:{truth.lines.ids[line]}", "p0", of_line(truth, line, p0)),
+        ("00003.png", f"line:{truth.lines.ids[line]}", of_line(truth, line, centers[2])),
+        (f"line:{truth.lines.ids[5]}", f"line:{truth.lines.ids[line]}", of_line(truth, line, middle)),
+        (f"plane:{truth.planes.ids[0]}", "p0", abs(plane[:3] @ p0 + plane[3])),
+        ("00003.png", f"plane:{truth.planes.ids[0]}", abs(plane[:3] @ centers[2] + plane[3])),
+        (f"point:{truth.points.ids[4]}", "p0", np.linalg.norm(near - p0)),
+    ]
+    first, second, distance = zip(*rows, strict=True)
+    given = DistancesFile(first, second, np.array(distance), np.full(len(rows), np.nan), "bars.csv")
+    found = with_survey(truth, Survey(distances=given, distance_sigma=1e-3))
+    assert found.similarity.scale == pytest.approx(1.0, abs=1e-9)
+    scene, table = found.scene, found.scene.distances
+    assert (table.first_kind <= table.second_kind).all() and len(table) == len(rows)
+    # the scene point has become a control point, marked where it was observed
+    assert scene.num_points == truth.num_points - 1 and scene.control_points.names[-1] == f"point:{truth.points.ids[4]}"
+    assert (truth.point_observations.point_idx == 4).sum() == (scene.marks.point_idx == 4).sum() > 1
+    there = np.vstack([truth.control_points.xyz, near])
+    off = residuals(scene.replace(control_points=scene.control_points.replace(xyz=there)), "distance")
+    np.testing.assert_allclose(off, 0.0, atol=1e-9)
+
+
+def gravity_file(scene, rng, sigma_deg=0.5, world=DOWN):
+    """Where down is in the cameras of a scene whose world has it at ``world``."""
+    turn = scene.cam_from_world[:, :4]
+    seen = quaternion.rotate(turn, np.tile(world, (len(turn), 1)))
+    seen = quaternion.rotate(quaternion.exp(rng.normal(size=(len(turn), 3)) * np.radians(sigma_deg)), seen)
+    count = len(seen)
+    return DirectionsFile(scene.images.names, seen, np.tile(DOWN, (count, 1)), np.full(count, sigma_deg), "imu.txt")
+
+
+def test_gravity_turns_a_scene_and_holds_it(truth):
+    """Two of eight phones are wrong: the scene is level all the same, and they are named."""
+    rng = np.random.default_rng(4)
+    given = gravity_file(truth, rng)
+    for wrong in (1, 6):
+        given.vectors[wrong] = quaternion.rotate(quaternion.exp(np.array([0.2, 0.0, 0.1])), given.vectors[wrong])
+    found = with_survey(truth.transformed(ELSEWHERE), Survey(directions=given))
+    up = found.scene.planes.hesse[:, 2]
+    assert np.abs(np.abs(up) - np.abs(truth.planes.hesse[:, 2])).max() < np.radians(1.0)
+    assert any("turned by" in note for note in found.notes) and found.similarity.scale == 1.0
+    result = adjust(found.scene, LEAST_SQUARES)
+    tests = reliability(result.scene, result.problem)
+    named = {one.name for one in tests.suspects}
+    assert {"00002.png", "00007.png"} <= named and tests.suspects[0].name in ("00002.png", "00007.png")
+    assert {one.kind for one in tests.measurements} >= {"known direction"}
+    one = next(one for one in tests.measurements if one.name == "00001.png" and one.kind == "known direction")
+    assert one.sigma == pytest.approx(0.5) and one.coordinate == "a"  # degrees
+
+
+def rolls(count):
+    """Turns about the optical axis, phones held upright and on their side."""
+    angle = np.random.default_rng(0).uniform(-1.5, 1.5, count)
+    return se3.exp(np.column_stack([np.zeros((count, 5)), angle]))
+
+
+def test_axes_of_phones_are_checked(truth):
+    given = gravity_file(truth, np.random.default_rng(4))
+    turned = given.vectors @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]).T
+    with pytest.raises(InputError, match="axes turned by 90 degrees"):
+        with_survey(truth, Survey(directions=replace(given, vectors=turned)))
+    with pytest.raises(InputError, match="contradict their poses"):
+        with_survey(truth, Survey(directions=replace(given, vectors=given.vectors[[3, 0, 5, 1, 7, 2, 4, 6]])))
+    rolled = truth.with_poses(se3.compose(rolls(8), truth.cam_from_world))
+    opengl = gravity_file(rolled, np.random.default_rng(4))
+    with pytest.raises(InputError, match="OpenGL"):
+        with_survey(rolled, Survey(directions=replace(opengl, vectors=opengl.vectors * [1, -1, -1])))
+    upward = DirectionsFile(given.names, -given.vectors, given.in_world, given.sigma_deg, "imu.txt")
+    assert any("Accelerometers measure up" in note for note in with_survey(truth, Survey(directions=upward)).notes)
+
+
+def test_lines_have_known_directions(truth):
+    """A scene of another frame is turned until two lines run as they were measured, either way round."""
+    known = truth.lines.plucker[[3, 7], 3:] * [[1.0], [-1.0]]
+    names = tuple(f"line:{truth.lines.ids[row]}" for row in (3, 7))
+    given = DirectionsFile(names, known, np.tile(DOWN, (2, 1)), np.full(2, np.nan), "lines.txt")
+    turn = np.append(se3.exp(np.array([[0.5, 1.0, 20.0, 0.3, -0.5, 0.2]]))[0], 1.0)
+    found = with_survey(truth.transformed(turn), Survey(directions=given, direction_sigma_deg=0.2))
+    result = adjust(found.scene, LEAST_SQUARES)
+    along = np.abs(np.einsum("ni,ni->n", result.scene.lines.plucker[[3, 7], 3:], known))
+    assert along.min() > np.cos(np.radians(0.5))
+    with pytest.raises(InputError, match="--direction-sigma"):
+        with_survey(truth, Survey(directions=given))
+
+
+def test_known_planes_lift_and_turn(truth):
+    """Three control points and a plane of the scene at known heights."""
+    floor = int(np.argmax(np.abs(truth.planes.hesse[:, 2])))
+    normal, offset = truth.planes.hesse[floor, :3], truth.planes.hesse[floor, 3]
+    names = ("p0", "p1", "p2", f"plane:{truth.planes.ids[floor]}", "00001.png")
+    heights = np.append(truth.control_points.xyz[:3] @ normal, [-offset, truth.cam_centers_in_world[0] @ normal])
+    given = PlanesFile(names, np.column_stack([np.tile(normal, (5, 1)), -heights]), np.full(5, 0.002), "levels.txt")
+    far = se3.exp(np.array([[0.5, 1.0, 20.0, 0.02, -0.03, 0.0]]))[0]
+    moved = truth.transformed(np.append(far, 1.0))
+    found = with_survey(moved, Survey(planes=given))
+    table = found.scene.known_planes
+    assert table.kind.tolist() == [Kind.CONTROL_POINT] * 3 + [Kind.PLANE] * 3 + [Kind.IMAGE]
+    result = adjust(found.scene, LEAST_SQUARES)
+    after = result.scene
+    np.testing.assert_allclose(after.control_points.xyz[:3] @ normal, heights[:3], atol=0.01)
+    plane = after.planes.hesse[floor] * np.sign(after.planes.hesse[floor, :3] @ normal)
+    np.testing.assert_allclose(plane, truth.planes.hesse[floor], atol=0.02)
+    tests = reliability(after, result.problem)
+    assert tests.redundancy["known plane"] > 0.5 and len(tests.suspects) == 0
+
+
+def test_what_is_held_keeps_its_place(truth):
+    lines, image = truth.lines.ids[[2, 4]], truth.images.names[5]
+    start = holistic(8, noise_px=0.5, seed=1).start
+    given = Survey(hold=(image, f"line:{lines[0]}", f"point:{start.points.ids[7]}", f"plane:{start.planes.ids[0]}"))
+    found = with_survey(start, given)
+    after = adjust(found.scene, LEAST_SQUARES).scene
+    frame = start.images.frame_idx[5]
+    assert np.array_equal(after.frames.rig_from_world[frame], start.frames.rig_from_world[frame])
+    np.testing.assert_allclose(after.lines.plucker[2], start.lines.plucker[2], atol=1e-12)
+    assert np.array_equal(after.points.xyz[7], start.points.xyz[7])
+    np.testing.assert_allclose(after.planes.hesse[0], start.planes.hesse[0], atol=1e-12)
+    assert np.abs(after.frames.rig_from_world[frame - 1] - start.frames.rig_from_world[frame - 1]).max() > 1e-4
+    assert sorted(with_survey(start, Survey(hold=("*3.png", "00001.png"))).scene.held.idx.tolist()) == [0, 2]
+    with pytest.raises(InputError, match=r"neither a control point nor an image.*nearest: 0000\d\.png"):
+        with_survey(start, Survey(hold=("0000l.png",)))
+
+
+def measured_poses(scene, rng, center=0.02, degrees=0.3):
+    """A file of poses with correlated noise, and its covariance in the axes of the world."""
+    count = scene.num_images
+    mix = np.eye(6) + 0.4 * np.triu(np.ones((6, 6)), 1)
+    root = mix * np.repeat([center, np.radians(degrees)], 3)[:, None]
+    noise = rng.normal(size=(count, 6)) @ root.T
+    world = se3.inverse(scene.cam_from_world)
+    turned = quaternion.multiply(quaternion.exp(noise[:, 3:]), world[:, :4])
+    rows = np.hstack([scene.cam_centers_in_world + noise[:, :3], turned])
+    return PosesFile(scene.images.names, rows, np.tile(root @ root.T, (count, 1, 1)), "poses.txt")
+
+
+def test_errors_of_poses_are_those_of_their_covariance(truth):
+    """The covariance in the axes of the world becomes one in those of each camera."""
+    squares = []
+    for draw in range(40):
+        given = measured_poses(truth, np.random.default_rng(draw))
+        table = with_survey(truth.replace(held=Held([0], [0])), Survey(poses=given)).scene.camera_poses
+        twist = se3.log(se3.compose(truth.cam_from_world[table.image_idx], se3.inverse(table.cam_from_world)))
+        squares.append(np.einsum("ni,nij,nj->n", twist, np.linalg.inv(table.covariance), twist))
+    # 320 squares of chi-square 6: the mean has a standard deviation of 0.19
+    assert np.mean(squares) == pytest.approx(6.0, abs=0.8)
+
+
+def test_poses_place_a_scene_and_wrong_ones_are_named(truth):
+    given = measured_poses(truth, np.random.default_rng(3))
+    given.world_from_cam[4, 0] += 0.5
+    found = with_survey(truth.transformed(ELSEWHERE), Survey(poses=given))
+    assert np.abs(found.scene.cam_centers_in_world - truth.cam_centers_in_world).max() < 0.1
+    result = adjust(found.scene, LEAST_SQUARES)
+    tests = reliability(result.scene, result.problem)
+    assert tests.suspects[0].name == "00005.png" and tests.suspects[0].kind == "camera pose"
+    rows = [one for one in tests.measurements if one.name == "00001.png" and one.kind == "camera pose"]
+    assert [one.coordinate for one in rows] == ["x", "y", "z", "turn x", "turn y", "turn z"]
+    off = np.delete(result.scene.cam_centers_in_world - truth.cam_centers_in_world, 4, axis=0)
+    assert np.sqrt((off**2).mean()) < 0.02
+    with pytest.raises(InputError, match="--pose-sigma"):
+        with_survey(truth, Survey(poses=PosesFile(given.names, given.world_from_cam, given.covariance * np.nan, "p")))
+
+
+def test_poses_of_cameras_on_rigs():
+    scene = on_rigs(made()[0])
+    table = CameraPoses(np.arange(8), scene.cam_from_world, np.tile(np.eye(6), (8, 1, 1)))
+    np.testing.assert_allclose(residuals(scene.replace(camera_poses=table), "pose_prior"), 0.0, atol=1e-12)
+    down = quaternion.rotate(scene.cam_from_world[:, :4], np.tile(DOWN, (8, 1)))
+    of_images = np.zeros(8, int), np.arange(8)
+    gravity = KnownDirections(*of_images, np.tile(DOWN, (8, 1)), down, np.full(8, 0.01))
+    heights = np.column_stack([np.tile([0, 0, 1.0], (8, 1)), -scene.cam_centers_in_world[:, 2]])
+    planes = KnownPlanes(*of_images, np.zeros((8, 3)), heights, np.full(8, 0.01))
+    both = scene.replace(known_directions=gravity, known_planes=planes)
+    np.testing.assert_allclose(residuals(both, "camera_direction"), 0.0, atol=1e-7)
+    np.testing.assert_allclose(residuals(both, "on_known_plane"), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_given_poses_beside_control_points(truth, same):
+    """In the frame of the control points they go on weighing; in another one they have done their work."""
+    scene = made()[0]
+    start = scene if same else scene.transformed(ELSEWHERE)
+    count = scene.num_frames
+    priors = PosePriors(np.arange(count), start.frames.rig_from_world, np.full((count, 6), 0.05))
+    given, xyz = control_file(scene, np.random.default_rng(2))
+    found = with_survey(start.replace(pose_priors=priors), Survey(control=given, control_sigma=(SIGMA,)))
+    assert len(found.scene.pose_priors) == (count if same else 0)
+    assert any(("already" if same else "in another frame") in note for note in found.notes)
+    after = adjust(found.scene, LEAST_SQUARES).scene
+    assert np.abs(after.control_points.xyz - xyz).max() < 3 * SIGMA
+    positioned = Survey(positions=measured_positions(scene, np.random.default_rng(1)))
+    by_positions = with_survey(start.replace(pose_priors=priors), positioned)
+    assert len(by_positions.scene.pose_priors) == (count if same else 0)
+
+
+def test_a_scene_settles_where_all_measurements_fit(truth):
+    """A similarity away from where it was measured in several ways it goes back, measurements staying."""
+    rng = np.random.default_rng(0)
+    scene = truth.replace(camera_positions=positions(truth, rng, 1e-9))
+    scene = with_survey(scene, Survey(directions=gravity_file(truth, rng, 1e-6))).scene
+    twist = np.array([0.05, 0.1, -0.02, np.sqrt(1 - 0.0129), 0.3, -0.2, 0.1, 1.1])
+    back = settled(scene.transformed(twist, measured=False))
+    np.testing.assert_allclose(back.cam_centers_in_world, truth.cam_centers_in_world, atol=1e-6)
+    assert np.array_equal(back.camera_positions.xyz, scene.camera_positions.xyz)
