@@ -135,7 +135,8 @@ class Scene:
             The camera of each image.
         cam_from_world : (N, 7) float
             Poses [qx qy qz qw tx ty tz].
-        **tables : further tables of the scene, by field name.
+        **tables
+            Further tables of the scene, by field name.
         """
         return cls(**standing_alone(cameras, names, camera_idx, cam_from_world), **tables)
 
