@@ -88,7 +88,7 @@ def test_command_says_shows_and_writes_them(tmp_path, scenes, capsys):
     words += ["--contributions", "--truth", str(tmp_path / "truth.npz"), "--report", str(page), "--json", str(numbers)]
     assert run(words) == 0
     said = capsys.readouterr()
-    assert "With and without" in said.out + said.err
+    assert "By kind of landmark" in said.out and "and points on lines" in said.out
     entries = json.loads(numbers.read_text())["contributions"]
     assert [entry["added"] for entry in entries] == list(KINDS)
     text = page.read_text()
