@@ -115,7 +115,7 @@ class Scene:
         return f"Scene({', '.join(f'{count:,} {name}' for name, count in counts if count) or 'empty'})"
 
     @classmethod
-    def from_images(  # noqa: D417
+    def from_images(
         cls,
         cameras: Cameras,
         names: Sequence[str],
