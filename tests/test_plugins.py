@@ -102,7 +102,7 @@ def test_every_part_keeps_its_contract(python):
 
 def test_nothing_is_imported_before_it_is_asked_for(python):
     said, _ = python("-c", "import groma, groma.features.registry as r, sys\nprint(r.DETECTORS.names(), *sys.modules)")
-    assert said.startswith("['hough', 'lsd']")
+    assert said.startswith("['hough', 'lsd', 'onnx:FILE']")
     assert "groma_plugin_example" not in said
 
 
@@ -177,7 +177,7 @@ def test_photographs_are_mapped_with_its_detector_and_matcher(python, tmp_path):
     python("-m", "groma.cli.main", "map", "photos", "-o", "out", *options, "--line-detector", "hough")
     assert read_scene(tmp_path / "out" / "scene.npz").num_lines > 0
     _, complaint = python("-m", "groma.cli.main", "map", "photos", "-o", "no", "--line-detector", "huff", expected=1)
-    assert "There is no segment detector named 'huff'; choose one of hough, lsd." in complaint
+    assert "There is no segment detector named 'huff'; choose one of hough, lsd, onnx:FILE." in complaint
 
 
 BROKEN = "import groma\nraise RuntimeError('made for\\nanother version')\n"
