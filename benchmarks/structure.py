@@ -182,6 +182,10 @@ def counts(truth: Truth, scene: Scene) -> dict[str, tuple[int, int, int]]:
         right = judged & inside[mark, true_plane[plane]]
         pairs = np.unique(np.column_stack([mark, true_plane[plane]])[right], axis=0)
         result[name] = len(pairs), int(judged.sum() - right.sum()) + len(pairs), int(inside.sum())
+    known_pairs = known[relations.lines_meeting].all(axis=1)
+    found, true = (np.sort(pairs, axis=1) for pairs in (relations.lines_meeting[known_pairs], truth.meeting))
+    right = (found[:, None] == true[None]).all(axis=2).any(axis=1) if len(true) else np.zeros(len(found), bool)
+    result["lines_meeting"] = int(right.sum()), len(found), len(true)
     return result
 
 

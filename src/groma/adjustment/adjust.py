@@ -103,6 +103,8 @@ class AdjustOptions:
     #: :class:`groma.adjustment.assemble.AssemblyOptions`.
     structure_form: str = "metric"
     structure_sigma_px: float = SURFACE_SIGMA_PX
+    #: Hold lines together that meet: see :class:`groma.adjustment.assemble.AssemblyOptions`.
+    meeting_lines: bool = False
     #: Most steps tried.
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in a step.
@@ -358,7 +360,7 @@ def _is_coupled(problem: Problem) -> bool:
     """Whether points are tied to lines. Lines are then not eliminated, and long steps tear points off their lines and
     planes by the product of two displacements, which is much where ties are tight: points take the steps of their own.
     """
-    return any(factor.type_name == "point_on_line" for factor in problem.factors)
+    return any(factor.type_name in ("point_on_line", "lines_meeting") for factor in problem.factors)
 
 
 def assembly_options_of(

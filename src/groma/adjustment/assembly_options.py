@@ -88,6 +88,9 @@ class AssemblyOptions:
     #: Points on lines tie points to lines, and only one of the two can be eliminated. With more lines than this they
     #: are measured in pixels instead, which leaves points and lines uncoupled. The solver keeps no more unasked.
     max_coupled_lines: int = 4000
+    #: Hold lines together that meet. This ties lines to lines, so that all lines stay in the reduced system: for scenes
+    #: of some hundred lines.
+    meeting_lines: bool = False
     #: Loss of what comes from matching, and of the relations between landmarks.
     loss: Loss = field(default_factory=Trivial)
     #: Another loss of the relations between landmarks.

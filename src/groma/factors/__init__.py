@@ -51,6 +51,7 @@ from groma.factors.priors.vector_prior import VectorPrior
 from groma.factors.relations.line_direction import LineDirection
 from groma.factors.relations.line_on_plane import LineOnPlane, SegmentOnPlane
 from groma.factors.relations.line_to_pixel import LineToPixel
+from groma.factors.relations.lines_meeting import LinesMeeting
 from groma.factors.relations.on_plane_pixels import PointOnPlanePixels, SegmentOnPlanePixels
 from groma.factors.relations.orthogonal import (
     LineParallelToPlane,
@@ -96,6 +97,7 @@ __all__ = [
     "LinePerpendicularToPlane",
     "LineReprojection",
     "LineToPixel",
+    "LinesMeeting",
     "Loss",
     "OnKnownPlane",
     "OrthogonalDirections",

@@ -105,6 +105,8 @@ class Relations:
     line_along_direction: IntArray = column(np.int64, 2, refers=("lines", "directions"))
     #: (R, 2) point, line.
     point_on_line: IntArray = column(np.int64, 2, refers=("points", "lines"))
+    #: (R, 2) line, line.
+    lines_meeting: IntArray = column(np.int64, 2, refers=("lines", "lines"), optional=True)
     #: (R, 2) plane, plane.
     parallel_planes: IntArray = column(np.int64, 2, refers=("planes", "planes"), optional=True)
     #: (R, 2) plane, plane.
@@ -114,6 +116,7 @@ class Relations:
     line_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="line_on_plane")
     line_along_direction_sigma: FloatArray = column(np.float64, fill=0.0, of="line_along_direction")
     point_on_line_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="point_on_line")
+    lines_meeting_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="lines_meeting")
     parallel_planes_sigma: FloatArray = column(np.float64, fill=0.0, of="parallel_planes")
     perpendicular_planes_sigma: FloatArray = column(np.float64, fill=0.0, of="perpendicular_planes")
 

@@ -14,9 +14,8 @@ all references are checked when it is made. Every change gives a new scene.
     point_depths       -> images, points          right_columns -> point_observations
     plane_observations -> images, planes          line_depths   -> line_observations
     pose_priors        -> frames                  line_intervals -> lines
-    camera_motions     -> images
-    camera_positions   -> images                  marks -> images, control_points
-    camera_poses       -> images                  distances, known_planes, known_directions, held -> any objects
+    camera_motions, camera_positions, camera_poses -> images    marks -> images, control_points
+    distances, known_planes, known_directions, held -> any objects
 
 Each column declares in its table what it refers to and how it changes when the world moves (see
 :func:`groma.scene.table.column`); checks, selections and transforms here go by that.
@@ -34,6 +33,7 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3
+from groma.scene import survey
 from groma.scene.camera import Cameras, Rigs, Sensors
 from groma.scene.checks import check_scene
 from groma.scene.counts import measurements_of
@@ -45,9 +45,6 @@ from groma.scene.motions import CameraMotions
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
 from groma.scene.standing_alone import standing_alone
-from groma.scene.survey import CameraPoses, CameraPositions, ControlPoints, Distances, Held
-
-from groma.scene.survey import KnownDirections, KnownPlanes, Marks  # isort: skip
 from groma.scene.table import moved_column, new_index_of, references, rows_of
 
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
@@ -98,24 +95,23 @@ class Scene:
     #: Images that were read row by row, and how their cameras moved meanwhile.
     camera_motions: CameraMotions = field(default_factory=CameraMotions)
     #: Measured places and poses of cameras.
-    camera_positions: CameraPositions = field(default_factory=CameraPositions)
-    camera_poses: CameraPoses = field(default_factory=CameraPoses)
+    camera_positions: survey.CameraPositions = field(default_factory=survey.CameraPositions)
+    camera_poses: survey.CameraPoses = field(default_factory=survey.CameraPoses)
     #: Control and check points, and where they are in the images.
-    control_points: ControlPoints = field(default_factory=ControlPoints)
-    marks: Marks = field(default_factory=Marks)
+    control_points: survey.ControlPoints = field(default_factory=survey.ControlPoints)
+    marks: survey.Marks = field(default_factory=survey.Marks)
     #: What was measured of cameras, control points and landmarks; what keeps its place.
-    distances: Distances = field(default_factory=Distances)
-    known_planes: KnownPlanes = field(default_factory=KnownPlanes)
-    known_directions: KnownDirections = field(default_factory=KnownDirections)
-    held: Held = field(default_factory=Held)
+    distances: survey.Distances = field(default_factory=survey.Distances)
+    known_planes: survey.KnownPlanes = field(default_factory=survey.KnownPlanes)
+    known_directions: survey.KnownDirections = field(default_factory=survey.KnownDirections)
+    held: survey.Held = field(default_factory=survey.Held)
 
     def __post_init__(self) -> None:
         check_scene(self)
 
     def __repr__(self) -> str:
-        counts = [(name, getattr(self, f"num_{name}")) for name in ("images", "cameras", "points", "lines", "planes")]
-        counts += [("directions", self.num_directions), ("observations", self.num_observations)]
-        counts += list(self.num_measurements.items())
+        names = "images cameras points lines planes directions observations".split()
+        counts = [*((name, getattr(self, f"num_{name}")) for name in names), *self.num_measurements.items()]
         return f"Scene({', '.join(f'{count:,} {name}' for name, count in counts if count) or 'empty'})"
 
     @classmethod
@@ -139,8 +135,7 @@ class Scene:
             The camera of each image.
         cam_from_world : (N, 7) float
             Poses [qx qy qz qw tx ty tz].
-        **tables
-            Further tables of the scene, by field name.
+        **tables : further tables of the scene, by field name.
         """
         return cls(**standing_alone(cameras, names, camera_idx, cam_from_world), **tables)
 
@@ -208,7 +203,7 @@ class Scene:
     def has_survey(self) -> bool:
         """Whether there are measurements of other instruments than the cameras, or something is held."""
         places = self.camera_positions, self.camera_poses, self.control_points, self.distances
-        return any(map(len, (*places, self.known_planes, self.known_directions, self.held)))
+        return self.is_tied or any(map(len, places))
 
     @property
     def is_surveyed(self) -> bool:

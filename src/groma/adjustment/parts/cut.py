@@ -125,7 +125,7 @@ def num_ties_cut(scene: Scene, observations: int = PART_SIZE) -> int:
 
 def _without_what_counts_once(scene: Scene) -> Scene:
     """Return a scene without what is in the first part alone: it would count once per part."""
-    relations = scene.relations.take(parallel_planes=[], perpendicular_planes=[])
+    relations = scene.relations.take(lines_meeting=[], parallel_planes=[], perpendicular_planes=[])
     return scene.replace(relations=relations, **{name: type(getattr(scene, name))() for name in ONCE})
 
 

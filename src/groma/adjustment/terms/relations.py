@@ -14,6 +14,7 @@ from groma.cameras import model as camera_model
 from groma.factors.contract import Factor, Ref
 from groma.factors.relations.line_direction import LineDirection
 from groma.factors.relations.line_on_plane import SegmentOnPlane
+from groma.factors.relations.lines_meeting import LinesMeeting
 from groma.factors.relations.orthogonal import OrthogonalPlanes
 from groma.factors.relations.parallel import ParallelPlanes
 from groma.factors.relations.point_on_line import PointOnLine
@@ -26,6 +27,7 @@ RELATION_FACTORS = {
     "segment_on_plane": "line_on_plane",
     "line_direction": "line_along_direction",
     "point_on_line": "point_on_line",
+    "lines_meeting": "lines_meeting",
     "parallel_planes": "parallel_planes",
     "orthogonal_planes": "perpendicular_planes",
 }
@@ -86,6 +88,8 @@ def metric_rows(draft: Draft, kind: str) -> IntArray:
     count = len(getattr(draft.scene.relations, kind))
     if kind == "point_on_line" and draft.scene.num_lines > draft.options.max_coupled_lines:
         return np.zeros(0, np.int64)
+    if kind == "lines_meeting":
+        return np.arange(count if draft.options.meeting_lines else 0)
     if draft.options.structure_form == "metric":
         return np.arange(count)
     return np.flatnonzero(draft.scene.relations.sigma(kind) > 0.0)
@@ -112,6 +116,14 @@ def _points_on_lines(draft: Draft, rows: IntArray) -> Factor:
     weights = _weights(draft, "point_on_line", "point", rows)
     return PointOnLine(
         point=Ref("points", point), line=Ref("lines", line), sqrt_information=weights, loss=draft.relation_loss
+    )
+
+
+def _lines_meeting(draft: Draft, rows: IntArray) -> Factor:
+    first, second = draft.scene.relations.lines_meeting[rows].T
+    weights = _weights(draft, "lines_meeting", "line", rows)
+    return LinesMeeting(
+        first=Ref("lines", first), second=Ref("lines", second), sqrt_information=weights, loss=draft.relation_loss
     )
 
 
@@ -159,6 +171,7 @@ def _plane_pairs(factor: type[ParallelPlanes] | type[OrthogonalPlanes], kind: st
 _MAKERS: dict[str, Callable[[Draft, IntArray], Factor]] = {
     "point_on_plane": _points_on_planes,
     "point_on_line": _points_on_lines,
+    "lines_meeting": _lines_meeting,
     "line_on_plane": _lines_on_planes,
     "line_along_direction": _lines_along_directions,
     "parallel_planes": _plane_pairs(ParallelPlanes, "parallel_planes"),

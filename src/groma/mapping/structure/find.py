@@ -31,6 +31,7 @@ from groma.execution import together
 from groma.geometry.algebra import norm
 from groma.mapping.groups import num_distinct
 from groma.mapping.noise.landmarks import LineNoise, PointNoise, line_noise, point_noise
+from groma.mapping.structure.junctions import meetings
 from groma.mapping.structure.relations import Landmarks, Pairs, along_directions, on_lines, on_planes, spacings
 from groma.scene import Directions, Planes, Relations, Scene
 
@@ -154,6 +155,7 @@ def detect_structure(
     found = {"point_on_plane": point_on_plane.renumbered(new), "line_on_plane": line_on_plane.renumbered(new)}
     directions, found["line_along_direction"] = _parallels(scene, marks, options, candidates)
     found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()
+    found["lines_meeting"] = meetings(marks, level, least_line)
     orthogonal, parallel = _orthogonal(planes, directions)
     return Structure(
         scene=scene.replace(
@@ -228,6 +230,8 @@ def _relations(found: dict[str, Pairs], marks: Landmarks, options: StructureOpti
     for kind, pixel in (("point_on_plane", marks.point_pixel), ("line_on_plane", marks.line_pixel)):
         mark, rough = found[kind].pairs[:, 0], found[kind].deviation
         sigma[f"{kind}_sigma"] = (rough > 0.0) * np.hypot(rough, options.surface_sigma_px) * pixel[mark]
+    first, missing = found["lines_meeting"].pairs[:, 0], found["lines_meeting"].deviation
+    sigma["lines_meeting_sigma"] = missing * marks.line_pixel[first]
     along, crooked = found["line_along_direction"].pairs[:, 0], found["line_along_direction"].deviation
     turned = math.sqrt(2.0) * crooked * (marks.line_pixel / norm(marks.segments[:, 1] - marks.segments[:, 0]))[along]
     sigma["line_along_direction_sigma"] = (crooked > 0.0) * np.hypot(turned, options.directions.parallel_sigma)

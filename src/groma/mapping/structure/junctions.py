@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Lines that meet: corners and branches of edges.
+
+Two lines meet where the distance between them, measured where they come nearest, is within the noise of both there, and
+where both are seen up to that place. As lines pass each other by chance, too, distances are a mixture of those of lines
+that meet and of evenly spread ones (:mod:`groma.estimators.membership`); a pair is kept if it is none by chance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from groma._typing import FloatArray, IntArray
+from groma.estimators.membership import Candidates, memberships
+from groma.execution import num_threads
+from groma.gates import chi_square_gate, gate
+from groma.geometry.algebra import dot, norm, unit
+from groma.mapping.groups import distinct_pairs
+from groma.mapping.structure.relations import Landmarks, Pairs
+
+
+@dataclass(frozen=True)
+class JunctionGates:
+    """Which lines may meet."""
+
+    reach_px: float = gate(
+        8.0, "px", "from the end of a line to the place of meeting", "chosen on benchmarks/structure.py"
+    )
+    layer_px: float = gate(
+        8.0, "px", "of distance, in which lines that meet are told from others", "chosen on benchmarks/structure.py"
+    )
+    most_px: float = gate(1.0, "px", "that lines that meet may miss each other", "chosen on benchmarks/structure.py")
+    min_sine: float = gate(0.17, "1", "of the angle of two lines that meet", "convention: ten degrees")
+    nearest: int = gate(24, "samples", "of lines that an end of a line is compared with", "cost: time of a search")
+    sample_px: float = gate(8.0, "px", "between samples of a line", "derived from the reach")
+    max_samples: int = gate(256, "samples", "of a line", "cost: memory")
+
+
+def meetings(marks: Landmarks, level: float, least: float, gates: JunctionGates = JunctionGates()) -> Pairs:
+    """Pairs (first, second) of usable lines that meet, the smaller number first."""
+    rows = np.flatnonzero(marks.line_usable)
+    if len(rows) < 2:
+        return Pairs.none()
+    pairs = rows[_neighbours(marks.segments[rows], marks.line_pixel[rows], gates)]
+    first, second = pairs.T
+    ends = marks.segments
+    start = ends[first, 0], ends[second, 0]
+    along = ends[first, 1] - start[0], ends[second, 1] - start[1]
+    crossed = np.cross(unit(along[0]), unit(along[1]))
+    sine = norm(crossed)
+    normal = crossed / np.maximum(sine, 1e-12)[:, None]
+    between = start[1] - start[0]
+    # Shares of the segments at which the lines come nearest to each other.
+    scale = np.maximum(sine, 1e-12) ** 2
+    share = tuple(
+        dot(np.cross(between, unit(other)), crossed) / (scale * norm(own))
+        for own, other in ((along[0], along[1]), (along[1], along[0]))
+    )
+    pixel = 0.5 * (marks.line_pixel[first] + marks.line_pixel[second])
+    near = (sine > gates.min_sine) & (np.abs(dot(between, normal)) < gates.layer_px * pixel)
+    for line, place in ((first, share[0]), (second, share[1])):
+        margin = gates.reach_px * marks.line_pixel[line] / norm(ends[line, 1] - ends[line, 0])
+        near &= marks.intervals.covers(line, np.clip(place, 0.0, 1.0), 0.0) | (np.abs(place - 0.5) > 0.5)
+        near &= (place > -margin) & (place < 1.0 + margin)
+    # One of the two ends there at least; where both go on, they cross in front of each other or on a surface.
+    ending = [
+        np.minimum(np.abs(place), np.abs(place - 1.0)) * norm(step) < gates.reach_px * marks.line_pixel[line]
+        for line, place, step in ((first, share[0], along[0]), (second, share[1], along[1]))
+    ]
+    kept = np.flatnonzero(near & (ending[0] | ending[1]))
+    if len(kept) == 0:
+        return Pairs.none()
+    distance = dot(between, normal)[kept] / pixel[kept]
+    variance = np.zeros(len(kept))
+    for line, place in ((first, share[0]), (second, share[1])):
+        slope = np.einsum("nai,ni->na", marks.own_line_noise.across[line[kept]], normal[kept])
+        noise = marks.own_line_noise.at(place[kept], place[kept], line[kept])
+        variance += np.einsum("na,nab,nb->n", slope, noise, slope)
+    variance /= pixel[kept] ** 2
+    everything = np.zeros(len(kept), np.int64)
+    told = memberships(
+        Candidates(
+            owner=everything,
+            offset=distance[:, None],
+            variance=variance[:, None],
+            unit=np.ones(len(kept)),
+            clutter=np.full(len(kept), 0.5 / gates.layer_px),
+            counted=np.ones(len(kept), bool),
+            group=everything,
+        ),
+        np.array([gates.most_px]),
+    )
+    deviation = told.deviation[0]
+    passed = distance**2 < chi_square_gate(1.0 - level, 1) * (variance + deviation**2)
+    passed &= told.probability > least
+    return Pairs(pairs[kept], told.probability, np.full(len(kept), deviation)).take(passed)
+
+
+def _neighbours(segments: FloatArray, pixel: FloatArray, gates: JunctionGates) -> IntArray:
+    """Pairs (M, 2) of segments, one of which ends near the other; the smaller number first."""
+    length = norm(segments[:, 1] - segments[:, 0])
+    count = np.clip(np.ceil(length / (gates.sample_px * pixel)), 2, gates.max_samples).astype(np.int64)
+    owner = np.repeat(np.arange(len(segments)), count)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+    share = number / (count[owner] - 1)
+    samples = segments[owner, 0] + share[:, None] * (segments[owner, 1] - segments[owner, 0])
+    ends = segments.reshape(-1, 3)
+    nearest = min(gates.nearest, len(samples))
+    _, index = KDTree(samples).query(ends, k=nearest, workers=num_threads())
+    one, other = np.repeat(np.arange(len(ends)) // 2, nearest), owner[index.reshape(len(ends), -1)].ravel()
+    different = one != other
+    low, high = np.minimum(one, other)[different], np.maximum(one, other)[different]
+    return distinct_pairs(low, high)[0]
+
+
+__all__ = ["JunctionGates", "meetings"]
