@@ -16,11 +16,13 @@ from groma.adjustment.survey.attach import with_survey
 from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.place import settled
 from groma.adjustment.survey.reliability import reliability
+from groma.adjustment.terms.open_motions import coordinates_to_hold
+from groma.adjustment.uncertainty import position_sigma
 from groma.errors import InputError
 from groma.geometry import quaternion, se3
 from groma.io.survey import DirectionsFile, DistancesFile, PlanesFile, PosesFile
 from groma.problem.residuals import residuals_of
-from groma.scene import CameraPoses, Held, KnownDirections, KnownPlanes, PosePriors
+from groma.scene import CameraPoses, Distances, Held, KnownDirections, KnownPlanes, PosePriors
 from groma.scene.survey import Kind
 from groma.scene.synthetic.scenes import holistic
 
@@ -260,3 +262,40 @@ def test_a_scene_settles_where_all_measurements_fit(truth):
     back = settled(scene.transformed(twist, measured=False))
     np.testing.assert_allclose(back.cam_centers_in_world, truth.cam_centers_in_world, atol=1e-6)
     assert np.array_equal(back.camera_positions.xyz, scene.camera_positions.xyz)
+
+
+@pytest.mark.parametrize(("kinds", "open_"), [("g", 5), ("h", 3), ("gh", 3), ("gd", 4), ("i", 1), ("ii", 0)])
+def test_what_measurements_leave_open_is_held_and_nothing_else(truth, kinds, open_):
+    """Gravity leaves shifts, heading and scale; heights shifts aside and heading; two held cameras nothing."""
+    rng, scene = np.random.default_rng(0), truth
+    if "g" in kinds:
+        scene = with_survey(scene, Survey(directions=gravity_file(scene, rng))).scene
+    heights = np.column_stack([np.tile([0, 0, 1.0], (8, 1)), -truth.cam_centers_in_world[:, 2]])
+    if "h" in kinds:
+        planes = PlanesFile(truth.images.names, heights, np.full(8, 0.01), "levels.txt")
+        scene = with_survey(truth, Survey(planes=planes)).scene.replace(known_directions=scene.known_directions)
+    if "d" in kinds:
+        scene = scene.replace(distances=Distances.between(Kind.IMAGE, 0, 1, [1.0], [0.1]))
+    if "i" in kinds:
+        scene = truth.replace(held=Held(np.zeros(len(kinds), int), np.arange(len(kinds))))
+    held = coordinates_to_hold(scene, np.ones(8, bool))
+    assert held.sum() == open_
+
+
+def test_gravity_keeps_the_size_of_a_scene():
+    """Relations between landmarks cost less in a smaller scene, which gravity does not prevent."""
+    made_ = holistic(12, noise_px=0.5, seed=1)
+    found = with_survey(made_.start, Survey(directions=gravity_file(made_.truth, np.random.default_rng(0))))
+    told = AdjustOptions(loss="none", point_sigma_px=0.5, line_sigma_px=0.5, check_lens=False)
+    result = adjust(found.scene, told)
+    size = [np.linalg.norm(one.cam_centers_in_world.std(axis=0)) for one in (result.scene, made_.truth)]
+    assert size[0] == pytest.approx(size[1], rel=0.03) and result.report.solve.iterations < 20
+    spread = result.uncertainty()
+    assert spread.gauge == "inner" and position_sigma(spread.centers).max() < 0.03
+
+
+def test_poses_whose_noise_is_known_replace_estimated_ones(truth):
+    priors = PosePriors(np.arange(8), truth.frames.rig_from_world, np.full((8, 6), 0.05))
+    given = Survey(poses=measured_poses(truth, np.random.default_rng(3)))
+    found = with_survey(truth.replace(pose_priors=priors), given).scene
+    assert len(found.pose_priors) == 0 and len(found.camera_poses) == 8

@@ -112,7 +112,7 @@ def test_near_names_are_suggested(arguments, suggested, tmp_path, capsys):
         (["track", "HERE", "-o", "OUT", "--camera-model", "PINHOLE"], "belong together"),
         (["track", "HERE", "-o", "OUT", "--camera", "x", "--camera-model", "PINHOLE", "--camera-params", "1,1,1,1"],
          "exclude each other"),
-        (["align", "HERE", "HERE", "--crs", "utm"], "--crs acts only with"),
+        (["align", "HERE", "HERE", "--crs", "utm"], "--crs belongs to --positions or --control"),
         (["selfcheck", "--runs", "3"], "--runs acts only with --nees"),
         (["view", "HERE", "--live", "--images", "HERE"], "--images acts only without --live"),
     ],

@@ -137,6 +137,25 @@ def test_a_photograph_that_one_map_has_in_a_wrong_place_gets_that_of_the_other(m
     assert _off(made.scene, truth).max() < 0.2
 
 
+def test_a_photograph_that_is_found_at_the_wrong_side_keeps_its_own_pose(maps, truth, tmp_path, monkeypatch):
+    """A thing whose sides look alike: one photograph is found two units off, by half of what its own map has of it."""
+    localize, wrong = maps["a"].localize, maps["b"].files[2]
+
+    def misled(path, camera):
+        found = localize(path, camera)
+        if path != wrong:
+            return found
+        pose, rows = found.pose.cam_from_world.copy(), np.flatnonzero(found.pose.point_inliers)
+        pose[4:] += 2.0
+        agree = np.zeros_like(found.pose.point_inliers)
+        agree[rows[: (maps["b"].scene.point_observations.image_idx == 2).sum() // 2]] = True
+        return replace(found, pose=replace(found.pose, cam_from_world=pose, point_inliers=agree))
+
+    monkeypatch.setattr(maps["a"], "localize", misled)
+    made = merged_model(maps["a"], maps["b"], tmp_path / "images", "similarity", quiet)
+    assert _off(made.scene, truth).max() < 0.2
+
+
 def test_maps_of_different_places_are_not_joined(place, maps, tmp_path):
     (tmp_path / "b").mkdir()
     for name in HALVES["b"]:

@@ -125,6 +125,7 @@ def test_photographs_whose_mirror_image_fits_far_better_are_doubted():
     # What is symmetric fits both ways, and most photographs are not mirrored.
     assert doubted_if_mirrored(right, own, few) is right
     assert doubted_if_mirrored(right, many, own) is right
+    assert doubted_if_mirrored(right, own, Evidence(90, 100, -500.0)) is right
 
 
 def test_the_index_is_kept_and_made_anew_for_another_map(place, localizer):

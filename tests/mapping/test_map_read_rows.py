@@ -16,7 +16,7 @@ from groma.features.segments import Segments
 from groma.geometry import quaternion
 from groma.io import read_scene
 from groma.mapping.map import MapOptions, map_images
-from groma.mapping.read_rows import as_measured, taken_at_once
+from groma.mapping.read_rows import as_measured, read_by_rows, taken_at_once
 
 COUNT = 7
 
@@ -98,3 +98,5 @@ def test_what_images_cannot_do_is_refused(rendered, tmp_path):
     ):
         with pytest.raises(InputError, match=said):
             map_images(folder, tmp_path / "work", truth, options)
+    with pytest.raises(InputError, match="Depths know no rolling shutter"):
+        read_by_rows(truth, MapOptions(rolling_shutter="rows"), depth=object())

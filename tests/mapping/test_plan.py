@@ -37,3 +37,9 @@ def test_what_a_map_begins_with_changes_its_first_stages(start, named):
     assert (named in stages) == (named is not None)
     assert "adjusting with measurements" in stages and "reading segments" in stages
     assert "finding segments" not in stages
+
+
+def test_a_rolling_shutter_adds_an_adjustment_with_motions():
+    stages = planned_stages(MapOptions(rolling_shutter="rows"))
+    assert "adjusting points and motions" in stages and "adjusting points" not in stages
+    assert stages[-1] == "adjusting with motions"

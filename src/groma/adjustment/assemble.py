@@ -36,6 +36,7 @@ from groma.adjustment.terms import (
 )
 from groma.adjustment.terms.contract import Draft, Group, Term
 from groma.adjustment.terms.objects import with_held
+from groma.adjustment.terms.open_motions import coordinates_to_hold
 from groma.adjustment.terms.readout import MOTIONS
 from groma.cameras import model as camera_model
 from groma.geometry import quaternion, se3
@@ -129,8 +130,10 @@ def assemble(scene: Scene, options: AssemblyOptions, more: Sequence[Term] = ()) 
 
 def gauge_of(scene: Scene, options: AssemblyOptions) -> str:
     """Whether the first frame must be held; see :attr:`AssemblyOptions.gauge`."""
-    if len(scene.pose_priors) or scene.is_tied:
+    if len(scene.pose_priors) or scene.is_surveyed:
         return "free"
+    if scene.is_tied:
+        return "first_camera"  # of what measurements leave open
     wireframe = options.points and options.lines and len(scene.relations.point_on_line) > 0
     metric = (wireframe or (options.planes and len(scene.relations) > 0)) and options.structure_form == "metric"
     ends = options.lines and options.planes and len(scene.relations.line_on_plane) > 0
@@ -219,6 +222,8 @@ def first_camera_gauge(
     """Hold the first frame, or a given one, and of the frame farthest from it the translation along the line between
     the two; this unless measurements tell the scale.
 
+    Where other instruments measured something, only what they leave open is held.
+
     Frames with less than half of the usual number of observations are not taken for either: a camera that hardly
     anything holds would leave the scale to relations measured in lengths, which shrink the scene.
 
@@ -237,6 +242,8 @@ def first_camera_gauge(
         return held
     count = observations_of_frames(scene) if count is None else count
     fit = np.flatnonzero(count >= 0.5 * np.median(count))
+    if scene.is_tied:
+        return coordinates_to_hold(scene, count >= 0.5 * np.median(count))
     first = int(fit[0]) if first is None else first
     held[first] = True
     centers = se3.inverse(poses)[:, 4:]

@@ -204,8 +204,8 @@ def _covariances(
     if problem is None:
         held = "first_camera" if gauge == "held" else "free"
         problem = assemble(scene, replace(options, gauge=held)).problem
-    elif gauge != "measured":
-        problem = _in_gauge(problem, scene, gauge)
+    else:
+        problem = _in_gauge(problem, scene, "inner" if gauge == "measured" else gauge)
     if gauge == "measured":
         with suppress(ProblemError):
             return gauge, Covariances(problem)

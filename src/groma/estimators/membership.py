@@ -48,7 +48,7 @@ class Candidates:
     #: (N, D) offset along the axes of its noise, and the variances there.
     offset: FloatArray
     variance: FloatArray
-    #: (N,) what a deviation of one is at the feature.
+    #: (N,) what a deviation of one is at the feature, or (N, D) along each axis.
     unit: FloatArray
     #: (N,) density of clutter there.
     clutter: FloatArray
@@ -113,7 +113,7 @@ def memberships(
 
 def _density(found: Candidates, deviation: FloatArray) -> FloatArray:
     """Density of members; far away it is small, not zero."""
-    variance = found.variance + ((deviation * found.unit) ** 2)[:, None]
+    variance = found.variance + (deviation[:, None] * found.unit.reshape(len(deviation), -1)) ** 2
     squared = np.minimum((found.offset**2 / variance).sum(axis=1), 1400.0)
     return np.exp(-0.5 * squared) / np.sqrt((2.0 * np.pi * variance).prod(axis=1))
 

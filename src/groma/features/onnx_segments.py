@@ -52,7 +52,7 @@ class NetworkGates:
                             "cost: time grows with the number of tiles")  # fmt: skip
     overlap: float = gate(0.1, "share", "of a tile that its neighbours see, too", "convention: a tenth")
     shifts: tuple[float, ...] = gate(
-        (2.5, 5.0), "px", "to both sides of a segment, where an edge is looked for too; twice the reach of the fit",
+        (2.5, 5.0), "px", "to either side of a segment, where an edge is looked for too",
         "derived from cells of two pixels, and tiles reduced by up to 1.25",
     )  # fmt: skip
     same: float = gate(
@@ -175,8 +175,10 @@ def _on_edges(gray: GrayImage, ends: FloatArray, gates: NetworkGates = NETWORK) 
     way = ends[:, 2:] - ends[:, :2]
     length = np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
     across = np.tile(np.column_stack([way[:, 1], -way[:, 0]]) / length, (1, 2))
-    shifts = [0.0, *(side * shift for shift in gates.shifts for side in (-1.0, 1.0))]
-    tried = [measure_edges(gray, ends + shift * across) for shift in shifts]
+    tried = [
+        measure_edges(gray, ends + shift * across)
+        for shift in (0.0, *gates.shifts, *(-shift for shift in gates.shifts))
+    ]
     moved, sigma, strength = (np.stack(column) for column in zip(*tried, strict=True))
     # A place where the fit failed counts as half as strong.
     best = np.argmax(np.where(sigma < EDGES.unfitted_sigma, strength, 0.5 * strength), axis=0)

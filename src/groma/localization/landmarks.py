@@ -69,7 +69,7 @@ class DescribedLandmarks:
 
     def match(self, points: DescribedPoints, landmarks: IntArray) -> IntArray:
         """Pairs (n, 2) of points of a query and of some points of the map that are alike."""
-        found = [np.zeros((0, 2), np.int64)]
+        found: list[IntArray] = [np.zeros((0, 2), np.int64)]
         for upright in (False, True):
             rows = np.flatnonzero(points.upright == upright)
             own = landmarks[self.upright[landmarks] == upright]

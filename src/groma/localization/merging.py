@@ -29,6 +29,7 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.verdict import moved as way_between
 from groma.localization.posed_model import gather_photographs, with_photographs
+from groma.mapping.noise.landmarks import project_points
 from groma.scene import Scene, Similarity
 
 
@@ -243,7 +244,10 @@ def _line_sigma(segments: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _pose_of(moved: Scene, image: int, found: LocalizedImage) -> FloatArray:
-    """The pose (7,) of a photograph that both maps tell: the first's where the second has it in another place."""
+    """The pose (7,) of a photograph that both maps tell: its own, unless more agrees with that in the first map.
+
+    A thing whose sides look alike is found at the wrong side by a few photographs; their own map then knows better.
+    """
     pose, matches = found.pose, found.pose.matches
     assert pose.cam_from_world is not None
     lines = matches.segments3d[pose.line_inliers].mean(axis=1)
@@ -251,7 +255,14 @@ def _pose_of(moved: Scene, image: int, found: LocalizedImage) -> FloatArray:
     own = moved.cam_from_world[image]
     way = way_between(pose.camera, own, pose.cam_from_world, places)
     # Under its own pose half of what agrees with the first map would not.
-    return pose.cam_from_world if way > max_errors(matches)[0] else own
+    limit = max_errors(matches)[0]
+    if way <= limit:
+        return own
+    seen = moved.point_observations
+    seen = seen.take(np.flatnonzero(seen.image_idx == image))
+    pixel = project_points(moved, seen.image_idx, moved.points.xyz[seen.point_idx])[0]
+    agree = np.linalg.norm(pixel - seen.pixel, axis=1) <= limit
+    return own if agree.sum() > pose.point_inliers.sum() else pose.cam_from_world
 
 
 def _as_placed(scene: Scene, image: int, pose: FloatArray | None) -> PlacedImage:

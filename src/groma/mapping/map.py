@@ -209,7 +209,7 @@ def map_images(
     with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
         placed = start_of(folder, names, model, stages)
         start = placed.scene
-        points = stages.run(adjust_read_rows if read_by_rows(start, options) else adjust_points, start)
+        points = stages.run(adjust_read_rows if read_by_rows(start, options, depth) else adjust_points, start)
         if options.refine_points:
             points = stages.run(measure_points, folder, points)
         in_place = tied(start, points, survey) if survey else None

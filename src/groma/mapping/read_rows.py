@@ -69,9 +69,12 @@ def check_read_rows(options: MapOptions) -> None:
         )
 
 
-def read_by_rows(scene: Scene, options: MapOptions) -> bool:
-    """Tell whether photographs were read row by row: it was said, or the scene knows."""
-    return options.rolling_shutter is not None or len(scene.camera_motions) > 0
+def read_by_rows(scene: Scene, options: MapOptions, depth: object = None) -> bool:
+    """Tell whether photographs were read row by row: it was said, or the scene knows. Refuse depths beside it."""
+    rolling = options.rolling_shutter is not None or len(scene.camera_motions) > 0
+    if rolling and depth is not None:
+        raise InputError("Depths know no rolling shutter. Leave --depth or --rolling-shutter out.")
+    return rolling
 
 
 @stage("rows", SCENE)

@@ -45,7 +45,7 @@ from groma.scene.motions import CameraMotions
 from groma.scene.observations import Keypoints, LineObservations, PointObservations, Relations
 from groma.scene.similarity import Similarity
 from groma.scene.standing_alone import standing_alone
-from groma.scene.table import moved_column, new_index_of, references, rows_of
+from groma.scene.table import moved_table, new_index_of, references, rows_of
 
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
@@ -135,7 +135,8 @@ class Scene:
             The camera of each image.
         cam_from_world : (N, 7) float
             Poses [qx qy qz qw tx ty tz].
-        **tables : further tables of the scene, by field name.
+        **tables
+            Further tables of the scene, by field name.
         """
         return cls(**standing_alone(cameras, names, camera_idx, cam_from_world), **tables)
 
@@ -318,19 +319,8 @@ class Scene:
         """
         if not isinstance(new_from_old, Similarity):
             new_from_old = Similarity.from_array(new_from_old)
-        tables = {}
-        for item in fields(self):
-            table = getattr(self, item.name)
-            columns = {
-                column.name: moved_column(getattr(table, column.name), column.metadata, new_from_old)
-                for column in fields(table)
-                if (column.metadata.get("world") or column.metadata.get("length"))
-                and (measured or not column.metadata.get("measured"))
-                and len(getattr(table, column.name))
-            }
-            if columns:
-                tables[item.name] = replace(table, **columns)
-        return self.replace(**tables)
+        tables = ((item.name, getattr(self, item.name)) for item in fields(self))
+        return self.replace(**{name: moved_table(table, new_from_old, measured) for name, table in tables})
 
     def subset(self, image_idx: npt.ArrayLike, min_observations: int = 1) -> Self:
         """Return the scene of some images, with the points and lines that they see.

@@ -275,7 +275,17 @@ def object_references(scene: type) -> tuple[tuple[str, str, str], ...]:
     )
 
 
-def moved_column(values: FloatArray, about: Mapping[str, Any], new_from_old: Similarity) -> FloatArray:
+def moved_table(table: Any, new_from_old: Similarity, measured: bool = True) -> Any:
+    """Return a table seen from another world; without ``measured`` what instruments say of the world stays."""
+    columns = {}
+    for item in fields(table):
+        about, values = item.metadata, getattr(table, item.name)
+        if (about.get("world") or about.get("length")) and len(values) and (measured or not about.get("measured")):
+            columns[item.name] = _moved_column(values, about, new_from_old)
+    return replace(table, **columns) if columns else table
+
+
+def _moved_column(values: FloatArray, about: Mapping[str, Any], new_from_old: Similarity) -> FloatArray:
     """Return a column seen from another world, or in another unit of length, as its declaration says."""
     if about["world"]:
         return getattr(new_from_old, about["world"])(values)

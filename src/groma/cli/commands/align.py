@@ -44,7 +44,7 @@ def align(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
-    from groma.cli.shared.input import check_inputs, refuse_idle
+    from groma.cli.shared.input import check_inputs
 
     measured = _measured.Measured(
         positions=positions, position_sigma="1" if positions else None,
@@ -52,7 +52,6 @@ def align(
     )  # fmt: skip
     if (reference is None) == (not measured):
         raise InputError("Pass either a REFERENCE scene, or --positions or --control.")
-    refuse_idle(("--crs", crs is not None and not measured, "with --positions or --control"))
     console = Console(quiet, verbose, json_target, threads)
     _output.check_outputs(force, output, json_target=json_target)
     check_inputs(source, reference, *measured.files)

@@ -199,7 +199,6 @@ def map_(
     from groma.io import read_scene
     from groma.localization.extension import in_world_of
     from groma.mapping.map import MapOptions
-    from groma.mapping.photographs import image_files
 
     options = MapOptions(
         min_segment_length=min_length,
@@ -229,11 +228,7 @@ def map_(
         stages = stages_of_map(options, "model", bool(measured), matches is not None)
         extended = extend_map(console, extend, images, map_images, output, force, stages)
         photographs, start = extended.folder, extended.scene
-    survey = None
-    if measured:
-        survey = measured.read(
-            photographs, lambda: [path.relative_to(photographs).as_posix() for path in image_files(photographs)]
-        )
+    survey = measured.read(photographs, lambda: _names_in(photographs)) if measured else None
     with work_with(threads):
         result = run_map(console, photographs, work, start, options, matches, survey, maps)
         if extended is not None and survey is None:
@@ -246,6 +241,13 @@ def map_(
     say_map(console, result, numbers)
     console.wrote_page(output)
     _output.write_json(json_target, numbers, force)
+
+
+def _names_in(folder: Path) -> list[str]:
+    """Names of the photographs in a folder."""
+    from groma.mapping.photographs import image_files
+
+    return [path.relative_to(folder).as_posix() for path in image_files(folder)]
 
 
 def _has_noise(poses: Path | None, stated: str | None) -> bool:

@@ -232,8 +232,7 @@ def _unless_mirrored(
     """Return a verdict, or another one where the mirror image of a photograph fits clearly better."""
     points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
     own = evidence_of(fitted(best.camera, points, best.pose, _errors(points, options)), points)
-    # Of what agrees as well, half as many must.
-    other = _best_of_others(best.camera, mirror, options, own.agree // 2)
+    other = _best_of_others(best.camera, mirror, options, own.agree + 1)
     return verdict if other is None else doubted_if_mirrored(verdict, own, evidence_of(other, mirror))
 
 

@@ -136,10 +136,11 @@ def judge(
 def doubted_if_mirrored(verdict: Verdict, own: Evidence, mirror: Evidence, gates: VerdictGates = VERDICT) -> Verdict:
     """Return a verdict, or ``uncertain`` where the mirror image fits far better than the photograph (own).
 
-    Mirrored photographs are as rare as wrong poses may be: by so much less likely by chance must be what agrees with
-    the mirror image.
+    More must agree with the mirror image, and, since mirrored photographs are as rare as wrong poses may be, be by so
+    much less likely by chance.
     """
-    if not mirror.significant or mirror.log_alarms > own.log_alarms + math.log(1.0 - gates.right):
+    rare = mirror.log_alarms <= own.log_alarms + math.log(1.0 - gates.right)
+    if not (mirror.significant and mirror.agree > own.agree and rare):
         return verdict
     words = (
         f"{mirror.agree} measurements speak for its mirror image, {own.agree} for the photograph: it may be mirrored."

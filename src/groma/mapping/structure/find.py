@@ -6,7 +6,8 @@ From a scene with poses, points and perhaps lines:
 1. the noise of every landmark, from its observations, the cameras held;
 2. planes in points and segments (:mod:`groma.estimators.plane_fit`), directions shared by lines
    (:mod:`groma.estimators.directions`), with covariances;
-3. relations, each a statistical test: point on plane, line on plane, line along direction, point on line.
+3. relations, each a statistical test: point on plane, line on plane, line along direction, point on line, lines that
+   meet.
 
 There are no tolerances in pixels or scene units; all tests use the covariances. Uncertain pairs are left out: a missing
 relation costs little, a wrong one bends the scene.

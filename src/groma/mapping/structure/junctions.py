@@ -32,6 +32,9 @@ class JunctionGates:
     layer_px: float = gate(
         8.0, "px", "of distance, in which lines that meet are told from others", "chosen on benchmarks/structure.py"
     )
+    end_px: float = gate(
+        2.5, "px", "deviation of the end of a line from where it meets another", "chosen on benchmarks/structure.py"
+    )
     most_px: float = gate(1.0, "px", "that lines that meet may miss each other", "chosen on benchmarks/structure.py")
     min_sine: float = gate(0.17, "1", "of the angle of two lines that meet", "convention: ten degrees")
     nearest: int = gate(24, "samples", "of lines that an end of a line is compared with", "cost: time of a search")
@@ -56,47 +59,51 @@ def meetings(marks: Landmarks, level: float, least: float, gates: JunctionGates 
     # Shares of the segments at which the lines come nearest to each other.
     scale = np.maximum(sine, 1e-12) ** 2
     share = tuple(
-        dot(np.cross(between, unit(other)), crossed) / (scale * norm(own))
+        dot(np.asarray(np.cross(between, unit(other)), np.float64), crossed) / (scale * norm(own))
         for own, other in ((along[0], along[1]), (along[1], along[0]))
     )
     pixel = 0.5 * (marks.line_pixel[first] + marks.line_pixel[second])
     near = (sine > gates.min_sine) & (np.abs(dot(between, normal)) < gates.layer_px * pixel)
+    gap = []
     for line, place in ((first, share[0]), (second, share[1])):
-        margin = gates.reach_px * marks.line_pixel[line] / norm(ends[line, 1] - ends[line, 0])
-        near &= marks.intervals.covers(line, np.clip(place, 0.0, 1.0), 0.0) | (np.abs(place - 0.5) > 0.5)
-        near &= (place > -margin) & (place < 1.0 + margin)
-    # One of the two ends there at least; where both go on, they cross in front of each other or on a surface.
-    ending = [
-        np.minimum(np.abs(place), np.abs(place - 1.0)) * norm(step) < gates.reach_px * marks.line_pixel[line]
-        for line, place, step in ((first, share[0], along[0]), (second, share[1], along[1]))
-    ]
-    kept = np.flatnonzero(near & (ending[0] | ending[1]))
+        length_px = norm(ends[line, 1] - ends[line, 0]) / marks.line_pixel[line]
+        gap.append((np.abs(place - 0.5) - 0.5) * length_px)  # beyond the nearer end, below zero before it
+        near &= marks.intervals.covers(line, np.clip(place, 0.0, 1.0), 1e-9) & (gap[-1] < gates.reach_px)
+    # Lines that both go on cross in front of each other, or on a surface.
+    kept = np.flatnonzero(near & (np.maximum(*gap) > -gates.reach_px))
     if len(kept) == 0:
         return Pairs.none()
-    distance = dot(between, normal)[kept] / pixel[kept]
     variance = np.zeros(len(kept))
-    for line, place in ((first, share[0]), (second, share[1])):
-        slope = np.einsum("nai,ni->na", marks.own_line_noise.across[line[kept]], normal[kept])
-        noise = marks.own_line_noise.at(place[kept], place[kept], line[kept])
-        variance += np.einsum("na,nab,nb->n", slope, noise, slope)
-    variance /= pixel[kept] ** 2
-    everything = np.zeros(len(kept), np.int64)
-    told = memberships(
-        Candidates(
-            owner=everything,
-            offset=distance[:, None],
-            variance=variance[:, None],
-            unit=np.ones(len(kept)),
-            clutter=np.full(len(kept), 0.5 / gates.layer_px),
-            counted=np.ones(len(kept), bool),
-            group=everything,
-        ),
-        np.array([gates.most_px]),
-    )
+    for line, place in ((first[kept], share[0][kept]), (second[kept], share[1][kept])):
+        slope = np.einsum("nai,ni->na", marks.own_line_noise.across[line], normal[kept])
+        variance += np.einsum("na,nab,nb->n", slope, marks.own_line_noise.at(place, place, line), slope)
+    distance = (dot(between, normal) / pixel)[kept]
+    candidates = _candidates(distance, variance / pixel[kept] ** 2, np.column_stack(gap)[kept], gates)
+    told = memberships(candidates, np.array([gates.most_px]))
     deviation = told.deviation[0]
-    passed = distance**2 < chi_square_gate(1.0 - level, 1) * (variance + deviation**2)
+    passed = distance**2 < chi_square_gate(1.0 - level, 1) * (candidates.variance[:, 0] + deviation**2)
     passed &= told.probability > least
     return Pairs(pairs[kept], told.probability, np.full(len(kept), deviation)).take(passed)
+
+
+def _candidates(distance: FloatArray, variance: FloatArray, gap: FloatArray, gates: JunctionGates) -> Candidates:
+    """Distances with their variances (N,) and gaps at the ends (N, 2), all in pixels, as one mixture.
+
+    The gap at the end of a line tells something where the line ends; where it goes on it is as likely either way.
+    """
+    even = 0.5 / gates.reach_px
+    ending = gap > -gates.reach_px
+    end_variance = np.where(ending, gates.end_px**2, 0.5 / (np.pi * even**2))
+    num = len(distance)
+    return Candidates(
+        owner=np.zeros(num, np.int64),
+        offset=np.column_stack([distance, np.where(ending, gap, 0.0)]),
+        variance=np.column_stack([variance, end_variance]),
+        unit=np.tile([1.0, 0.0, 0.0], (num, 1)),
+        clutter=np.full(num, 0.5 / gates.layer_px * even**2),
+        counted=np.ones(num, bool),
+        group=np.zeros(num, np.int64),
+    )
 
 
 def _neighbours(segments: FloatArray, pixel: FloatArray, gates: JunctionGates) -> IntArray:

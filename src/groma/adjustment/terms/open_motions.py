@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Which motions of a whole scene its measurements leave open, and coordinates of frames that hold these and no others.
+
+Of a shift a, a turn :math:`\varphi` and a scale :math:`\sigma` of the world about its middle, a place q that is known
+tells :math:`a + \varphi \times q + \sigma q`, one on a known plane the part of it along the normal, a known direction v
+the turns across it, a distance the scale. The null space G of all that is open. As many coordinates of frames as it has
+columns are held, those in which G is largest and independent (QR with pivots), so that nothing measured is touched.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.linalg import qr
+
+from groma._typing import BoolArray, FloatArray
+from groma.geometry.charts.pose_charts import POSE_CHARTS
+from groma.problem.gauge import gauge_directions
+from groma.scene import Scene
+from groma.scene.survey import Kind
+
+#: Singular values below this fraction of the largest do not count.
+_RANK = 1e-6
+
+
+def coordinates_to_hold(scene: Scene, usable: BoolArray) -> BoolArray:
+    """Return coordinates (F, 6) of frames that hold what measurements leave open.
+
+    Parameters
+    ----------
+    scene : Scene
+        With measurements of other instruments.
+    usable : (F,) bool
+        Frames that may be held.
+    """
+    frames = scene.frames.rig_from_world
+    centers = scene.cam_centers_in_world
+    middle = centers.mean(axis=0)
+    length = float(np.median(np.linalg.norm(centers - middle, axis=1))) or 1.0
+    told = _told(scene, middle, length)
+    _, values, vectors = np.linalg.svd(told)
+    size = np.append(values, np.zeros(7 - len(values)))
+    motions = vectors[size <= _RANK * max(float(size.max(initial=0.0)), 1.0)].T
+    held = np.zeros((len(frames), 6), bool)
+    if motions.shape[1]:
+        moved = gauge_directions(POSE_CHARTS["left"], frames, middle, length).transpose(1, 2, 0) @ motions
+        moved[:, :3] /= length
+        moved[~usable] = 0.0
+        found: Any = qr(moved.reshape(-1, motions.shape[1]).T, mode="r", pivoting=True)
+        held.reshape(-1)[found[-1][: motions.shape[1]]] = True
+    return held
+
+
+def _told(scene: Scene, middle: FloatArray, length: float) -> FloatArray:
+    """Return rows (n, 7) of what measurements say of the motions, in units of the length."""
+    centers, marked = scene.cam_centers_in_world, scene.control_points.xyz
+    rows = [np.zeros((1, 7))]
+    images = scene.held.idx[scene.held.kind == Kind.IMAGE]
+    places = [centers[scene.camera_positions.image_idx], centers[scene.camera_poses.image_idx], centers[images]]
+    places += [marked[scene.control_points.is_control]]
+    places += [scene.points.xyz[scene.held.idx[scene.held.kind == Kind.POINT]]]
+    rows += [_of_places((one - middle) / length).reshape(-1, 7) for one in places]
+    table = scene.known_planes
+    on = table.anchor.copy()
+    for kind, xyz in ((Kind.IMAGE, centers), (Kind.CONTROL_POINT, marked)):
+        of = table.kind == kind
+        on[of] = xyz[table.idx[of]]
+    rows.append(np.einsum("ni,nik->nk", table.hesse[:, :3], _of_places((on - middle) / length)))
+    across = np.zeros((len(scene.known_directions), 3, 7))
+    across[:, :, 3:6] = np.eye(3) - scene.known_directions.vector[:, :, None] * scene.known_directions.vector[:, None]
+    turns = np.zeros((3 * min(len(images) + len(scene.camera_poses), 1), 7))
+    turns[:, 3:6] = np.eye(3)[: len(turns)]
+    scale = np.zeros((min(len(scene.distances) + scene.is_metric, 1), 7))
+    scale[:, 6] = 1.0
+    return np.concatenate([*rows, across.reshape(-1, 7), turns, scale])
+
+
+def _of_places(q: FloatArray) -> FloatArray:
+    """Return how places (N, 3) move with the seven motions, (N, 3, 7)."""
+    moved = np.zeros((len(q), 3, 7))
+    moved[:, :, :3], moved[:, :, 6] = np.eye(3), q
+    moved[:, [0, 1, 2], [4, 5, 3]], moved[:, [1, 2, 0], [3, 4, 5]] = q[:, [2, 0, 1]], -q[:, [2, 0, 1]]
+    return moved
+
+
+__all__ = ["coordinates_to_hold"]
