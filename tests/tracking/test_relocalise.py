@@ -4,10 +4,9 @@
 import numpy as np
 import pytest
 
-from groma.features.depth.points import depth_at
+from groma.features.depth.points import DEPTH_POINTS, depth_at
 from groma.geometry import se3
 from groma.tracking.frame.camera import TrackCamera, into
-from groma.tracking.gates import DEFAULT
 from groma.tracking.pose.near_matches import pair_near
 from groma.tracking.pose.relocalise import pose_from_matches
 
@@ -72,7 +71,7 @@ def test_depths_are_medians_of_what_is_known_and_alike():
         column, row = int(np.clip(int(u), 1, 78)), int(np.clip(int(v), 1, 58))
         near = image[row - 1 : row + 2, column - 1 : column + 2].astype(float)
         near = near[near > 0]
-        gates = DEFAULT.depth
+        gates = DEPTH_POINTS
         good = len(near) >= max(gates.min_known, 1) and np.ptp(near) < gates.jump + gates.jump_share * near.min()
         expected = np.median(near) if good and np.median(near) <= 2.9 else np.nan
         np.testing.assert_equal(depth, expected)

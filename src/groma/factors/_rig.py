@@ -321,9 +321,10 @@ def normalize_rows(factor: Any, field: str, size: int) -> None:
     """
     rows = getattr(factor, field)
     norm = np.linalg.norm(rows[:, :size], axis=1)
-    if not (norm > 0.0).all():
+    usable = (norm > 0.0) & np.isfinite(norm)
+    if not usable.all():
         raise InputError(
-            f"{type(factor).__name__}.{field} must not be zero; row {int(np.argmin(norm))} is. "
+            f"{type(factor).__name__}.{field} must be finite and not zero; row {int(np.argmin(usable))} is not. "
             "Leave these observations out."
         )
     norm[np.abs(norm - 1.0) < 1e-15] = 1.0

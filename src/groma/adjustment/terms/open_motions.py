@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.linalg import qr
 
 from groma._typing import BoolArray, FloatArray
 from groma.geometry.charts.pose_charts import POSE_CHARTS
@@ -44,6 +43,8 @@ def coordinates_to_hold(scene: Scene, usable: BoolArray) -> BoolArray:
     motions = vectors[size <= _RANK * max(float(size.max(initial=0.0)), 1.0)].T
     held = np.zeros((len(frames), 6), bool)
     if motions.shape[1]:
+        from scipy.linalg import qr  # takes a quarter of a second to import
+
         moved = gauge_directions(POSE_CHARTS["left"], frames, middle, length).transpose(1, 2, 0) @ motions
         moved[:, :3] /= length
         moved[~usable] = 0.0

@@ -16,7 +16,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
 
 from groma._typing import FloatArray, IntArray
 from groma.features.depth.noise import DepthNoise
@@ -80,6 +79,8 @@ def fitted_noise(depth: FloatArray, difference: FloatArray, sigma: FloatArray) -
     middle = np.array([np.median(depth[rows]) for rows in groups])
     spread = ROBUST * np.array([np.median(np.abs(difference[rows])) for rows in groups])
     spread = np.maximum(spread, NOISE.least * middle)  # with what the points err by: rather too much than too little
+    from scipy.optimize import nnls  # takes 0.2 s to import
+
     constant, quadratic = nnls(np.column_stack([1.0 / spread, middle**2 / spread]), np.ones(len(middle)))[0]
     if constant == 0.0:
         constant = NOISE.least * float(middle[0])
