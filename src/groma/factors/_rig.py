@@ -317,16 +317,14 @@ class CameraFactor(Factor):
 def normalize_rows(factor: Any, field: str, size: int) -> None:
     """Scale the rows of field ``field`` so that their first ``size`` numbers have norm one.
 
-    Rows that have it already, to rounding, keep their bits. Raises InputError for rows of zeros.
+    Rows that have it already, to rounding, keep their bits. Raises InputError for rows that are zero or not finite.
     """
     rows = getattr(factor, field)
     norm = np.linalg.norm(rows[:, :size], axis=1)
-    usable = (norm > 0.0) & np.isfinite(norm)
-    if not usable.all():
-        raise InputError(
-            f"{type(factor).__name__}.{field} must be finite and not zero; row {int(np.argmin(usable))} is not. "
-            "Leave these observations out."
-        )
+    for wrong, words in ((~np.isfinite(norm), "be finite; row {} is not"), (norm == 0.0, "not be zero; row {} is")):
+        if wrong.any():
+            told = words.format(int(np.argmax(wrong)))
+            raise InputError(f"{type(factor).__name__}.{field} must {told}. Leave these observations out.")
     norm[np.abs(norm - 1.0) < 1e-15] = 1.0
     object.__setattr__(factor, field, rows / norm[:, None])
 
