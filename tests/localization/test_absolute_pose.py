@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Poses from matches: exact where matches are, as uncertain as stated, refused where there is nothing in it."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.stats import binom
@@ -48,6 +50,19 @@ def test_lenses_with_distortion(model):
     found = of(world, ("points", "lines"), camera)
     assert found.status == "localized"
     assert max(world.errors(found.cam_from_world)) < 1e-6
+
+
+def test_wrong_matches_do_not_pull_the_pose_away():
+    """Matches of a rendered room, two thirds of which are wrong, and more noise stated than there is."""
+    made = np.load(Path(__file__).parents[1] / "data" / "localization" / "rendered_room.npz")
+    camera = QueryCamera("PINHOLE", made["camera"], *map(int, made["size"]))
+    options = PoseOptions(max_error=4.0, look_for_rival=False)
+    found = estimate_absolute_pose(camera, made["points2d"], made["points3d"], sigma=(2.0, 2.0), options=options)
+    assert found.status == "localized", found.sentence
+    off = se3.log(se3.compose(found.cam_from_world[None], se3.inverse(made["cam_from_world"][None])))[0]
+    assert np.abs(off).max() < 0.1
+    away = np.linalg.norm(camera.project(found.cam_from_world, made["points3d"]) - made["points2d"], axis=1)
+    assert (away < 4.0).sum() >= 44
 
 
 def test_most_matches_may_be_wrong():
