@@ -72,7 +72,7 @@ class _InnerLibrary(_Library):
         self._verify_declare_only_symbols()
         self._finalized = True
 
-    def serialize_using_object_code(self) -> tuple[str, str, bytes]:
+    def serialize_using_object_code(self) -> Any:
         self._ensure_finalized()
         return self.name, "bitcode", self._get_module_for_linking().as_bitcode()
 
