@@ -216,7 +216,9 @@ def tell_rendered(seed: int, tell: Callable[[str, Scene, MapResult], None], opti
         images.mkdir()
         for name, image in zip(room.scene.images.names, room.images, strict=True):
             cv2.imwrite(str(images / name), image)
-        result = map_images(images, Path(work) / "map", None, replace(options, camera_model="PINHOLE", camera_params=camera))
+        result = map_images(
+            images, Path(work) / "map", None, replace(options, camera_model="PINHOLE", camera_params=camera)
+        )
     tell(f"boxes {seed}", room.scene, result)
 
 

@@ -41,7 +41,6 @@ from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.survey import survey_card
 from groma.viz.report.tables import contributions_card
 
-
 #: Fields of a result that are scenes of one frame.
 SCENES_OF_RESULT = ("scene", "start", "before", "adjusted")
 

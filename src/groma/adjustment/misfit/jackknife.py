@@ -2,8 +2,8 @@
 r"""How far the cameras move when one landmark after the other is left out.
 
 Covariances :math:`(J^\top J)^{-1}` hold where all errors are independent and of the size that was assumed. The segments
-of a bowed edge, of an outline that moves with the view, of a wrong track err together, and a camera may hang on a few of
-them. What a landmark contributes then shows in how far the cameras move without it. With the rows J of its
+of a bowed edge, of an outline that moves with the view, of a wrong track err together, and a camera may hang on a few
+of them. What a landmark contributes then shows in how far the cameras move without it. With the rows J of its
 observations, whitened, weighted by the loss and free of what the landmark itself takes up, their residuals r, and the
 covariance C of the cameras, they move in one step by
 
@@ -42,7 +42,10 @@ class JackknifeGates:
     """What is believed of single landmarks."""
 
     max_leverage: float = gate(
-        0.9, "share", "of an error that cameras follow at most: more tells nothing", "derived from an error ten times as large"
+        0.9,
+        "share",
+        "of an error that cameras follow at most: more tells nothing",
+        "derived from an error ten times as large",
     )
 
 
@@ -193,7 +196,8 @@ def _pull(rows: _Rows, taken: IntArray, stated: FloatArray) -> FloatArray:
     error = (np.swapaxes(axes, 1, 2) @ residual)[:, :, 0] / (1.0 - np.minimum(shares, GATES.max_leverage))
     pull = (np.swapaxes(J, 1, 2) @ (axes @ error[:, :, None]))[:, :, 0]
     flat = (columns + len(stated) * np.arange(batch)[:, None]).ravel()
-    return np.bincount(flat, pull.ravel(), batch * len(stated)).reshape(batch, len(stated))
+    sums = np.bincount(flat, pull.ravel(), batch * len(stated)).astype(np.float64, copy=False)
+    return sums.reshape(batch, len(stated))
 
 
 __all__ = ["GATES", "JackknifeGates", "landmark_jackknife", "observations_alone"]
