@@ -28,7 +28,8 @@ def found(vectors, seed=0, sigma=SIGMA):
     turn = quaternion.to_matrix(se3.exp(rng.normal(size=(1, 6)))[:, :4])[0]
     noisy = np.asarray(vectors) @ turn.T + rng.normal(0.0, sigma, (len(vectors), 3))
     noisy *= rng.choice([-1.0, 1.0], (len(vectors), 1)) / np.linalg.norm(noisy, axis=1, keepdims=True)
-    return right_angles(noisy, sigma**2 * (np.eye(3) - noisy[:, :, None] * noisy[:, None, :]), 0.99)
+    kind = np.zeros(len(noisy), bool)
+    return right_angles(noisy, sigma**2 * (np.eye(3) - noisy[:, :, None] * noisy[:, None, :]), kind, 0.99)
 
 
 def pairs(angles):
@@ -62,11 +63,11 @@ def test_a_room_has_all_its_right_angles(seed):
     assert len(parallel) >= len(true_parallel) - 1 and parallel <= true_parallel
     assert (angles.pairs[:, 0] < angles.pairs[:, 1]).all() and (angles.probability > 0.9).all()
     # Seven pairs of a vector count as one deviation of it, which is at most about what vectors are uncertain by.
-    assert angles.sigma == pytest.approx(np.full(len(angles.sigma), angles.sigma.mean()), rel=0.1)
-    assert GATES.held < angles.sigma.mean() / np.sqrt(7 / 2) < 2.0 * SIGMA
+    assert (GATES.held < angles.sigma / np.sqrt(7 / 2)).all() and angles.sigma.max() / np.sqrt(7 / 2) < 3.0 * SIGMA
+    assert angles.sigma[angles.right] == pytest.approx(np.full(len(right), angles.sigma[angles.right].mean()), rel=0.1)
 
 
-@pytest.mark.parametrize("degrees", [0.6, 1.0, 3.0])
+@pytest.mark.parametrize("degrees", [1.0, 3.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_an_angle_that_is_a_little_off_is_not_right(degrees, seed):
     """A wing that stands askew: what belongs to the rest keeps its angles, and the wing its own."""
@@ -74,9 +75,18 @@ def test_an_angle_that_is_a_little_off_is_not_right(degrees, seed):
     askew = np.cos(angle) * X + np.sin(angle) * Y
     right, parallel = pairs(found(np.array([X, X, Y, Y, Z, Z, askew, askew]), seed))
     true_right, true_parallel = true_pairs([0, 0, 1, 1, 2, 2])
-    wing = {(4, 6), (4, 7), (5, 6), (5, 7)}
-    assert right <= true_right | wing and len(right) >= 14
+    assert right <= true_right | {(4, 6), (4, 7), (5, 6), (5, 7)} and len(right) >= 14
     assert parallel <= true_parallel | {(6, 7)} and len(parallel) >= 3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_half_a_degree_is_not_forced(seed):
+    """What is related in spite of it has as much slack."""
+    angle = np.deg2rad(0.5)
+    askew = np.cos(angle) * X + np.sin(angle) * Y
+    angles = found(np.array([X, X, Y, Y, Z, Z, askew, askew]), seed)
+    wing = (angles.pairs >= 6).any(axis=1) & (angles.pairs < 4).any(axis=1)
+    assert (angles.sigma[wing] > 0.5 * angle).all()
 
 
 def test_a_house_that_is_nowhere_square_is_left_as_it_is():
@@ -105,7 +115,7 @@ def test_how_right_angles_are_is_estimated():
     exact = found(np.array([X, Y, Z])[kinds], 5, 1e-4)
     assert len(angles.pairs) > 0.85 * 66 and len(exact.pairs) == 66
     assert np.deg2rad(0.15) < angles.sigma.mean() / np.sqrt(11 / 2) < np.deg2rad(0.4)
-    assert exact.sigma.max() / np.sqrt(11 / 2) < 2e-4
+    assert exact.sigma.max() / np.sqrt(11 / 2) < 3e-4
 
 
 def test_uncertain_vectors_and_few_say_nothing():

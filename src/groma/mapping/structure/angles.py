@@ -6,9 +6,9 @@ together. At a right angle :math:`x = u \cdot v` is normal, with :math:`u^\top\S
 parallel vectors the two components of v across u are, with :math:`B(\Sigma_u + \Sigma_v)B^\top`.
 
 Angles that are meant to be right deviate by t beyond that noise; of the others one half is nearly right, with a normal
-deviation of a degree, and the other half is spread evenly. The t of a scene and the shares of right and parallel pairs
-are estimated together (:mod:`groma.estimators.membership`). An angle that is surely a little off is therefore no right
-one, and t has a bound: a house whose angles all are a degree off has no right angles, and none is forced on it.
+deviation of two degrees, and the other half is spread evenly. For each kind of pair, t and the share of those that are
+right are estimated together (:mod:`groma.estimators.membership`). An angle that is surely a little off is therefore no
+right one, and t has a bound: a house whose angles are all a degree off has no right angles, and none is forced on it.
 
 Many pairs are tried, so they are kept, the surest first, only as long as the expected share of wrong ones among them,
 the mean of :math:`1 - P`, stays small: the false discovery rate.
@@ -55,13 +55,18 @@ class AngleGates:
     )
     exact: float = gate(8.7e-4, "rad", "that angles deviate which count as exact", "convention: 0.05 degrees")
     most: float = gate(8.7e-3, "rad", "that angles deviate which are meant to be right", "convention: half a degree")
-    nearly: float = gate(0.0175, "rad", "that angles deviate which are nearly right", "convention: one degree")
+    nearly: float = gate(
+        0.036,
+        "rad",
+        "that angles deviate which are nearly right",
+        "derived: the mean of the most and the layer, in logarithms",
+    )
     held: float = gate(1e-4, "rad", "by which right angles are held at least", "cost: conditioning of an adjustment")
     tried: int = gate(100, "deviations", "from the least to the most", "cost: each a twentieth larger than the last")
     known: float = gate(
         0.01, "rad", "standard deviation of an angle, above which it says nothing", "chosen on synthetic rooms"
     )
-    wrong: float = gate(0.02, "share", "of wrong pairs to be expected among those kept", "convention: 98 % are right")
+    wrong: float = gate(0.05, "share", "of wrong pairs to be expected among those kept", "convention: 5 %")
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,8 @@ def angles_between(
         directions.covariance,
         *([] if vertical is None else [vertical[1][None]]),
     ]
-    found, num = right_angles(np.concatenate(vectors), np.concatenate(covariance), level), len(planes)
+    is_direction = np.arange(sum(map(len, vectors))) >= len(planes)
+    found, num = right_angles(np.concatenate(vectors), np.concatenate(covariance), is_direction, level), len(planes)
     of_kind, relations = (found.pairs >= num).sum(axis=1), {}
     for number, names in enumerate(_KINDS):
         for right, name in enumerate(names):
@@ -110,7 +116,9 @@ def vertical_of(scene: Scene) -> Vector | None:
     return vector, (np.eye(3) - np.outer(vector, vector)) / information
 
 
-def right_angles(vectors: FloatArray, covariance: FloatArray, level: float, gates: AngleGates = AngleGates()) -> Angles:
+def right_angles(
+    vectors: FloatArray, covariance: FloatArray, kind: BoolArray, level: float, gates: AngleGates = AngleGates()
+) -> Angles:
     """Find parallel and perpendicular pairs.
 
     Parameters
@@ -119,6 +127,8 @@ def right_angles(vectors: FloatArray, covariance: FloatArray, level: float, gate
         Unit vectors; their signs have no meaning.
     covariance : (N, 3, 3) float64
         Their covariances, square radians.
+    kind : (N,) bool
+        Vectors of two kinds, planes and directions: pairs of other kinds deviate by other angles.
     level : float
         Level of the chi-square tests.
     gates : AngleGates
@@ -130,29 +140,32 @@ def right_angles(vectors: FloatArray, covariance: FloatArray, level: float, gate
     live = np.column_stack([np.ones(len(found)), ~right])
     certain = (variance * live).max(axis=1) < gates.known**2
     exact = variance + gates.exact**2 * live
+    family = 2 * kind[found].sum(axis=1) + right
     even = np.where(right, 0.5 / gates.layer, 1.0 / (np.pi * gates.layer**2))
     told = memberships(
         Candidates(
-            owner=np.zeros(len(found), np.int64),
+            owner=family,
             offset=offset,
             variance=exact,
             unit=live,
             clutter=0.5 * even + 0.5 * _normal(offset, exact + gates.nearly**2 * live),
             counted=certain,
-            group=right.astype(np.int64),
+            group=family,
         ),
-        np.array([gates.most]),
+        np.full(6, gates.most),
     )
-    squared = (offset**2 / (exact + (told.deviation[0] * live) ** 2)).sum(axis=1)
+    squared = (offset**2 / (exact + (told.deviation[family, None] * live) ** 2)).sum(axis=1)
     passed = certain & (squared < np.where(right, *(chi_square_gate(1.0 - level, freedom) for freedom in (1, 2))))
     order = np.flatnonzero(passed)[np.argsort(-told.probability[passed], kind="stable")]
     wrong = np.cumsum(1.0 - told.probability[order]) / np.arange(1, len(order) + 1)
     kept = np.sort(order[wrong <= gates.wrong])
     times = np.bincount(found[kept].ravel(), minlength=len(vectors))
-    per_vector = len(kept) / max(np.count_nonzero(times), 1)
-    axes = live[kept] > 0.0
-    deviation = _upper_end(offset[kept][axes] ** 2, variance[kept][axes], max(per_vector, 1.0), gates)
-    sigma = deviation * np.sqrt(np.maximum(0.25 * times[found[kept]].sum(axis=1), 1.0))
+    per_vector = max(len(kept) / max(np.count_nonzero(times), 1), 1.0)
+    deviation, axes = np.zeros(6), live > 0.0
+    for k in np.unique(family[kept]):
+        rows = kept[family[kept] == k]
+        deviation[k] = _upper_end(offset[rows][axes[rows]] ** 2, variance[rows][axes[rows]], per_vector, gates)
+    sigma = deviation[family[kept]] * np.sqrt(np.maximum(0.25 * times[found[kept]].sum(axis=1), 1.0))
     return Angles(found[kept], right[kept], told.probability[kept], sigma)
 
 
