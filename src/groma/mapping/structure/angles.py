@@ -137,7 +137,7 @@ def right_angles(
     found, offset, variance, right = _near(vectors, covariance, gates)
     if len(found) == 0:
         return Angles(found, right, np.zeros(0), np.zeros(0))
-    live = np.column_stack([np.ones(len(found)), ~right])
+    live = np.column_stack([np.ones(len(found)), (~right).astype(np.float64)])
     certain = (variance * live).max(axis=1) < gates.known**2
     exact = variance + gates.exact**2 * live
     family = 2 * kind[found].sum(axis=1) + right

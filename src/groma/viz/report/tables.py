@@ -281,14 +281,17 @@ def _plane_table(scene: Scene, after: Drawable) -> str:
 def _relation_table(scene: Scene, outcomes: Mapping[str, Mapping[str, int]]) -> str:
     """Return how many relations of each kind there are, and what became of those that an adjustment held."""
     there = num_relations(scene)
-    given_up = {kind: f"{outcome['dropped']:,}" for kind, outcome in outcomes.items()}
+    became = {kind: [f"{outcome['held']:,}", f"{outcome['dropped']:,}"] for kind, outcome in outcomes.items()}
     rows = [
-        [kind.replace("_", " "), f"{there.get(kind, 0):,}", given_up.get(kind, "")]
+        [kind.replace("_", " "), f"{there.get(kind, 0):,}", *became.get(kind, ["", ""])]
         for kind in scene.relations.kinds()
-        if kind in there or kind in given_up
+        if kind in there or kind in became
     ]
-    caption = "What lies on what, and which angles are right. What the robust loss gave up is no longer in the scene."
-    return table("Relations", caption, ["", "number", "given up"], rows) if rows else ""
+    caption = (
+        "What lies on what, and which angles are right: how many there are, and how many of them the last adjustment "
+    )
+    caption += "held and gave up. What it gave up is no longer in the scene; lines that meet are held on request."
+    return table("Relations", caption, ["", "number", "held", "given up"], rows) if rows else ""
 
 
 def _direction_table(scene: Scene) -> str:
