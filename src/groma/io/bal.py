@@ -153,8 +153,11 @@ def bal_params(scene: Scene) -> tuple[FloatArray, FloatArray]:
 
 
 def looks_like_bal(head: bytes) -> bool:
-    """Tell from the first bytes of a file, decompressed where needed, whether three counts stand there."""
-    words = head.split(None, 3)[:3]
+    """Tell from the first bytes of a file, decompressed where needed, whether its first line holds three counts.
+
+    More numbers in it are a pose.
+    """
+    words = (head.lstrip().splitlines() or [b""])[0].split(None, 3)
     return len(words) == 3 and all(word.isdigit() for word in words)
 
 
@@ -182,7 +185,7 @@ def _refuse_broken_zlib() -> None:
 
 def _split(text: bytes, path: Path) -> tuple[list[int], bytes]:
     head = text[:200].split(None, 3)[:3]
-    if not looks_like_bal(text[:200]) or max(len(word) for word in head) > 15:
+    if len(head) < 3 or not all(word.isdigit() and len(word) <= 15 for word in head):
         raise FileFormatError(
             f"{path} must begin with three counts (cameras, points, observations); it begins with {text[:40]!r}."
         )
