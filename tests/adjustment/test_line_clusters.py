@@ -87,7 +87,7 @@ def test_a_point_on_two_lines_makes_them_one_cluster(scenes):
 
 def test_what_ties_a_cluster_to_lines_outside_of_it_stays_out(scenes):
     """A width between two lines of which one is turned: the other is not in its cluster, and has to stay."""
-    truth, wrong, points = scenes
+    truth, wrong, _ = scenes
     others = [BAD + 1, BAD + 2]
     places = truth.lines.segments[others].mean(axis=1)
     lengths = np.linalg.norm(places - truth.lines.segments[BAD].mean(axis=0), axis=1)
