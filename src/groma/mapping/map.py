@@ -203,6 +203,7 @@ def map_images(
     near = None if model is None else usual_frame(model)
     if model is not None and near is not None:
         model = model.transformed(near)
+    read_by_rows(model or Scene(), options, depth)  # refuses depths beside it before anything is computed
     check_number(folder, names, model, options.lines.min_images)
     check_images(folder, names, model, say)
     key = digest(__version__, digest_files(folder, files), model)
