@@ -24,8 +24,6 @@ from groma.scene import Scene
 
 #: Images of a map that are asked how often points are found again, at most.
 _ASKED = 40
-#: Points that are expected in a part, for it to tell something: none is seen by chance once in twenty.
-_LEAST = 3.0
 #: Pieces that lines are cut into, to tell the parts that they cross.
 _PIECES = 16
 
@@ -95,7 +93,7 @@ def parts_shown(
     shown = np.concatenate([matches.points2d[best.point_inliers], _along(ends, _PIECES)[0]])
     point, times = _seen_by(index, near)
     pixel = camera.project(best.pose, index.xyz[point])
-    expected = [(pixel, again.rate[times], _LEAST)]
+    expected = [(pixel, again.rate[times], gates.expected)]
     if lines and scene.num_lines:
         rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in near])
         known = np.unique(scene.line_observations.line_idx[index.segment[rows]])

@@ -65,6 +65,9 @@ class VerdictGates:
     parts: int = gate(
         8, "parts", "per longer side: what is expected in one is to be seen in it", "chosen on the filing cabinet"
     )
+    expected: float = gate(
+        3.0, "points", "expected in a part, for it to count", "derived from Poisson: none is seen once in twenty"
+    )
     whole: float = gate(
         0.99, "probability", "that more of what is expected is there than is missing", "chosen on the filing cabinet"
     )
