@@ -9,6 +9,7 @@ with them, and the best are estimated from all that agrees: points, lines and pl
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,9 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.execution import map_in_threads
 from groma.geometry import se3
-from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
+from groma.localization.pose.gates import VERDICT
+from groma.localization.pose.hypotheses import propose, straightened
+from groma.localization.pose.matches import Matches
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.features import Descriptors, Features, FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
@@ -93,14 +96,35 @@ def pose_from_matches(
     min_inliers: int = DEFAULT.finding.min_inliers,
     max_error: float = DEFAULT.finding.max_error,
 ) -> tuple[FloatArray, BoolArray] | None:
-    """Pose (7,) from places in the world and their pixels, and which agree; None where chance explains them as well."""
-    options, sigma = PoseOptions(max_error=max_error, look_for_rival=False), 0.5 * max_error
-    pose = estimate_absolute_pose(camera.query, pixel, places, sigma=(sigma, sigma), options=options).cam_from_world
+    """Pose (7,) from places in the world and their pixels, and which agree; None where chance explains them as well.
+
+    It is the best that few matches propose, fitted to those that agree; :func:`estimate_pose` weighs them.
+    """
+    straight = straightened(camera.query, Matches(pixel, places))
+    # A pose that fewer agree with is of no interest; it need not be looked for as long.
+    pose = propose(straight, (max_error, max_error), 0, min_inliers / max(len(pixel), 1))
     if pose is None:
         return None
     away = np.linalg.norm(camera.project(into(pose, places)) - pixel, axis=1)
     agree: BoolArray = away <= max_error  # what is behind the camera is NaN, and does not
-    return (pose, agree) if agree.sum() >= min_inliers else None
+    if agree.sum() < min_inliers or _log_alarms(camera, pixel, agree, max_error) > 0.0:
+        return None
+    return pose, agree
+
+
+def _log_alarms(camera: TrackCamera, pixel: FloatArray, agree: BoolArray, max_error: float) -> float:
+    """Natural logarithm of the number of poses that so much agrees with by chance: see the verdict of localisation.
+
+    What agrees in one cell of the image counts once.
+    """
+    cell = np.floor(pixel / (camera.width / VERDICT.cells)).astype(np.int64)
+    number = cell[:, 1] * (2 * VERDICT.cells) + cell[:, 0]
+    of, agreeing = len(np.unique(number)), len(np.unique(number[agree]))
+    if agreeing <= 3:
+        return math.inf
+    chance = min(math.pi * max_error**2 / (camera.width * camera.height) * len(pixel) / of, 0.5)
+    ways = math.comb(of, agreeing) * math.comb(agreeing, 3) * max(of - 3, 1)
+    return math.log(ways) + (agreeing - 3) * math.log(chance)
 
 
 @dataclass(frozen=True)
