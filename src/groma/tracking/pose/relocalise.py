@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.execution import map_in_threads
 from groma.geometry import se3
 from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import propose, straightened
@@ -152,13 +151,19 @@ def find_pose(
 ) -> Found | None:
     """Find the pose of a frame near some keyframes; ``guesses`` are poses to be tried as well."""
     search = _Search(track_map, camera, data, known_features(track_map, camera, keyframes), predicted, prior_sigma)
-    if guesses:
-        near = map_in_threads(search.proposal_near, guesses)
-        best = search.best_of([*guesses, *(pose for pose in near if pose is not None)])
-        if best is not None and best.score >= data.options.gates.verification.strong:
-            # What repeats itself agrees with a wrong guess, too; what no guess suggests may agree with more.
-            keyframes = keyframes[:1]
-    return search.best_of([pose for pose in map(search.proposal, keyframes) if pose is not None])
+    gates = data.options.gates
+    strong = gates.verification.strong
+    best: Found | None = None
+    for guess in search.in_order(guesses):
+        near = search.proposal_near(guess)
+        best = search.best_of([guess] if near is None else [near, guess], most=1)
+        if best is not None and best.score >= strong:
+            break
+    if best is not None and best.score >= strong:
+        # What repeats itself agrees with a wrong guess, too; what no guess suggests may agree with more.
+        keyframes = keyframes[:1]
+    others = [search.proposal(keyframe, best) for keyframe in keyframes]
+    return search.best_of([pose for pose in others if pose is not None], gates.finding.max_refined)
 
 
 class _Search:
@@ -181,30 +186,37 @@ class _Search:
         pairs = self.near(guess, self.gates.search * self.camera.width)
         return self._from_pairs(self.known.places[pairs[:, 0]], pairs[:, 1])
 
-    def proposal(self, keyframe: Keyframe) -> FloatArray | None:
-        """Pose from all features that match those of one keyframe."""
+    def in_order(self, guesses: list[FloatArray]) -> list[FloatArray]:
+        """Guesses, those first that most features agree with."""
+        agree = np.array([len(self.near(guess, 3 * self.gates.near)) for guess in guesses])
+        return [guesses[k] for k in np.argsort(-agree, kind="stable")]
+
+    def proposal(self, keyframe: Keyframe, best: Found | None) -> FloatArray | None:
+        """Pose from all features that match those of one keyframe; None where no more agree than with the best."""
         first, second = match_features(keyframe.features, self.data.features, self.all_gates.features.max_bits)
         places = feature_places(self.track_map, self.camera, keyframe, first)
         known = np.isfinite(places[:, 0])
-        return self._from_pairs(places[known], second[known])
+        places, second = places[known], second[known]
+        if best is not None:
+            seen = self.camera.project(into(best.estimate.pose, places))
+            away = np.linalg.norm(seen - self.data.features.pixel[second], axis=1)
+            others = ~(away <= self.gates.near)
+            if 2 * others.sum() < len(others):
+                return None
+            places, second = places[others], second[others]
+        return self._from_pairs(places, second)
 
     def _from_pairs(self, places: FloatArray, second: IntArray) -> FloatArray | None:
         pixel = self.data.features.pixel[second]
         found = pose_from_matches(self.camera, places, pixel, self.gates.min_inliers, self.gates.max_error)
         return found[0] if found is not None else None
 
-    def best_of(self, starts: list[FloatArray]) -> Found | None:
-        """Refine the starts that most agrees with; return the best pose so far."""
-        planes, seen = self.track_map.planes, self.data.planes
-        judged = [len(self.near(start, 3 * self.gates.near)) for start in starts]
-        if seen:
-            gates = self.all_gates.planes
-            agreeing = [
-                len(assign_planes(planes, seen, start, gates.wide_angle, gates.wide_distance, gates)[0])
-                for start in starts
-            ]
-            judged = [one + self.gates.plane_weight * other for one, other in zip(judged, agreeing, strict=True)]
-        for k in np.argsort(-np.array(judged), kind="stable")[: self.gates.max_refined]:
+    def best_of(self, starts: list[FloatArray], most: int) -> Found | None:
+        """Refine the starts that most agrees with, and more than with the best pose so far; return the best then."""
+        judged = [self._agreeing(start) for start in starts]
+        for k in np.argsort(-np.array(judged), kind="stable")[:most]:
+            if self._best is not None and judged[k] <= self._agreeing(self._best.estimate.pose):
+                break
             if self._is_known(starts[k]):
                 continue
             found = self._refine(starts[k])
@@ -214,6 +226,17 @@ class _Search:
                 if self._best is None or found.score > self._best.score:
                     self._best = found
         return self._best
+
+    def _agreeing(self, pose: FloatArray) -> float:
+        """Features and planes that roughly agree with a pose."""
+        count = float(len(self.near(pose, 3 * self.gates.near)))
+        if not self.data.planes:
+            return count
+        gates = self.all_gates.planes
+        planes = assign_planes(
+            self.track_map.planes, self.data.planes, pose, gates.wide_angle, gates.wide_distance, gates
+        )
+        return count + self.gates.plane_weight * len(planes[0])
 
     def _is_known(self, start: FloatArray) -> bool:
         """Whether a start is as good as at a pose that was tried."""
