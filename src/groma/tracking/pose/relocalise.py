@@ -29,7 +29,7 @@ from groma.tracking.map.lines import FollowedSegments, assign, expected_segments
 from groma.tracking.map.planes import assign_planes
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
-from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
+from groma.tracking.pose.estimate import LOSSES, PoseEstimate, estimate_pose, rough_pose
 from groma.tracking.pose.near_matches import pair_near
 
 
@@ -265,9 +265,12 @@ class _Search:
             if len(pairs) + len(line_table) + len(planes) < 3:
                 return None
             view = replace(track_map.view, points=temporary)
-            measured = Measurements(table, line_table, planes)
-            estimate = estimate_pose(camera, view, measured, self.predicted, self.prior_sigma, pose)
-            pose = estimate.pose
+            around = (camera, view, Measurements(table, line_table, planes), self.predicted, self.prior_sigma, pose)
+            if factor == gates.rounds[-1]:
+                estimate = estimate_pose(*around, LOSSES[-1:])
+                pose = estimate.pose
+            else:
+                pose = rough_pose(*around)
         assert estimate is not None
         agree = pairs[estimate.points] if data.options.points else pairs[:0]
         counts = estimate.counts
