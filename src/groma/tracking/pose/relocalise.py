@@ -23,7 +23,7 @@ from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.features import Descriptors, Features, FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.gates import DEFAULT
-from groma.tracking.map.feature_points import match_features, points_of_features
+from groma.tracking.map.feature_points import match_descriptors, points_of_features
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.lines import FollowedSegments, assign, expected_segments
 from groma.tracking.map.planes import assign_planes
@@ -192,19 +192,26 @@ class _Search:
         return [guesses[k] for k in np.argsort(-agree, kind="stable")]
 
     def proposal(self, keyframe: Keyframe, best: Found | None) -> FloatArray | None:
-        """Pose from all features that match those of one keyframe; None where no more agree than with the best."""
-        first, second = match_features(keyframe.features, self.data.features, self.all_gates.features.max_bits)
-        places = feature_places(self.track_map, self.camera, keyframe, first)
-        known = np.isfinite(places[:, 0])
-        places, second = places[known], second[known]
+        """Pose from features that match those of one keyframe, wherever they are.
+
+        Where a pose is there already, only what is left beside it is looked at, and only as long as more of that could
+        agree with another one.
+        """
+        first, second = keyframe.features, self.data.features
+        rows, columns = np.arange(len(first.pixel)), np.arange(len(second.pixel))
+        agreeing = 0
         if best is not None:
-            seen = self.camera.project(into(best.estimate.pose, places))
-            away = np.linalg.norm(seen - self.data.features.pixel[second], axis=1)
-            others = ~(away <= self.gates.near)
-            if 2 * others.sum() < len(others):
-                return None
-            places, second = places[others], second[others]
-        return self._from_pairs(places, second)
+            mine = best.pairs[self.known.of[best.pairs[:, 0]] == self.known.keyframes.index(keyframe)]
+            agreeing = len(mine)
+            rows, columns = np.delete(rows, self.known.row[mine[:, 0]]), np.delete(columns, mine[:, 1])
+        if min(len(rows), len(columns)) <= agreeing:
+            return None
+        one, other = match_descriptors(first.descriptor[rows], second.descriptor[columns], self.all_gates.features.max_bits)
+        places = feature_places(self.track_map, self.camera, keyframe, rows[one])
+        known = np.isfinite(places[:, 0])
+        if known.sum() <= agreeing:
+            return None
+        return self._from_pairs(places[known], columns[other[known]])
 
     def _from_pairs(self, places: FloatArray, second: IntArray) -> FloatArray | None:
         pixel = self.data.features.pixel[second]
