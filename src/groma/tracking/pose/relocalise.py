@@ -206,7 +206,9 @@ class _Search:
             rows, columns = np.delete(rows, self.known.row[mine[:, 0]]), np.delete(columns, mine[:, 1])
         if min(len(rows), len(columns)) <= agreeing:
             return None
-        one, other = match_descriptors(first.descriptor[rows], second.descriptor[columns], self.all_gates.features.max_bits)
+        one, other = match_descriptors(
+            first.descriptor[rows], second.descriptor[columns], self.all_gates.features.max_bits
+        )
         places = feature_places(self.track_map, self.camera, keyframe, rows[one])
         known = np.isfinite(places[:, 0])
         if known.sum() <= agreeing:
