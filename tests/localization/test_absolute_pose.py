@@ -13,9 +13,10 @@ from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3, so3
 from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
 from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
-from groma.localization.pose.refinement import fitted
+from groma.localization.pose.refinement import fitted, refine
 from groma.localization.pose.verdict import votes_of_a_rival
 
 #: What wrong matches may still do: the loss leaves them a small weight. A pixel is 0.007 here.
@@ -63,6 +64,42 @@ def test_wrong_matches_do_not_pull_the_pose_away():
     assert np.abs(off).max() < 0.1
     away = np.linalg.norm(camera.project(found.cam_from_world, made["points3d"]) - made["points2d"], axis=1)
     assert (away < 4.0).sum() >= 44
+
+
+def test_far_wrong_matches_have_no_pull():
+    """Two thirds are off to one side, by 30 to 200 pixels: the pose is that of the others, to the last digits."""
+    rng = np.random.default_rng(53)
+    for _ in range(3):
+        world = make_world(rng, points=150, lines=60)
+        world.points2d[:] += rng.normal(0.0, 1.0, world.points2d.shape)
+        world.segments2d[:] += rng.normal(0.0, 1.0, world.segments2d.shape)
+        wrong, wrong_lines = np.arange(150) >= 50, np.arange(60) >= 20
+        world.points2d[wrong, 0] += rng.uniform(30.0, 200.0, 100)
+        way = world.segments2d[:, 1] - world.segments2d[:, 0]
+        across = np.column_stack([-way[:, 1], way[:, 0]]) / np.linalg.norm(way, axis=1, keepdims=True)
+        world.segments2d[wrong_lines] += rng.uniform(30.0, 200.0, (40, 1, 1)) * across[wrong_lines, None]
+        every = Matches(world.points2d, world.points3d, world.segments2d, world.segments3d)
+        start = se3.compose(se3.exp(np.array([[0.01, -0.01, 0.01, 0.002, 0.002, -0.002]])), world.pose[None])[0]
+        among = refine(CAMERA, every, start, max_errors(every))
+        squares = np.concatenate([among.points.square[wrong], among.lines.square[wrong_lines]])
+        assert squares.min() > max_errors(every)[0] ** 2  # none of them is near by chance
+        alone = refine(CAMERA, every.take(~wrong, ~wrong_lines), start, max_errors(every))
+        assert among.pose == pytest.approx(alone.pose, abs=1e-9)
+        assert max(world.errors(among.pose)) < 0.02
+
+
+def test_matches_that_a_start_misses_are_gathered():
+    """A start that agrees with a few of the matches alone, as of a sample of noisy ones, ends at all of them."""
+    rng = np.random.default_rng(59)
+    world = make_world(rng, points=100, lines=0)
+    matches = Matches(world.points2d + rng.normal(0.0, 1.0, world.points2d.shape), world.points3d)
+    start = se3.compose(se3.exp(np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.04]])), world.pose[None])[0]
+    errors = max_errors(matches)
+    near = fitted(CAMERA, matches, start, errors).points.square <= errors[0] ** 2
+    assert 20 < near.sum() < 80
+    found = refine(CAMERA, matches, start, errors)
+    assert (found.points.square <= errors[0] ** 2).all()
+    assert max(world.errors(found.pose)) < 0.02
 
 
 def test_most_matches_may_be_wrong():

@@ -257,27 +257,8 @@ def _best(camera: QueryCamera, matches: Matches, options: PoseOptions, share: fl
     errors = _errors(matches, options)
     starts = [_with_focal_length(camera, factor) for factor in options.focal_factors]
     found = [(propose(straightened(one, matches), errors, options.seed, share), one) for one in starts]
-    refined = [_refined(one, matches, pose, errors, options) for pose, one in found if pose is not None]
+    refined = [refine(one, matches, pose, errors, options.refine_lens) for pose, one in found if pose is not None]
     return max(refined, key=lambda one: int(one.point_inliers.sum() + one.line_inliers.sum()), default=None)
-
-
-def _refined(
-    camera: QueryCamera, matches: Matches, start: FloatArray, errors: tuple[float, float], options: PoseOptions
-) -> Refined:
-    """Fit a pose to all matches; where many wrong ones pull it away, to those that agree with the start."""
-    found = refine(camera, matches, start, errors, options.refine_lens)
-    before = _near(fitted(camera, matches, start, errors), matches, errors)
-    if sum(map(np.count_nonzero, _near(found, matches, errors))) >= sum(map(np.count_nonzero, before)):
-        return found
-    again = refine(camera, matches.take(*before), start, errors, options.refine_lens)
-    return fitted(again.camera, matches, again.pose, errors, options.refine_lens)
-
-
-def _near(found: Refined, matches: Matches, errors: tuple[float, float]) -> tuple[BoolArray, BoolArray]:
-    """Which points and lines are within the largest errors."""
-    near = (found.points.square <= (errors[0] / matches.point_sigma) ** 2) & np.isfinite(found.points.square)
-    beside = (found.lines.square <= (errors[1] / matches.segment_sigma) ** 2) & np.isfinite(found.lines.square)
-    return near, beside
 
 
 def _with_focal_length(camera: QueryCamera, factor: float) -> QueryCamera:

@@ -27,7 +27,8 @@ class RefinementGates:
     """How a pose is fitted to what agrees with it."""
 
     outlier: float = gate(3e-3, "probability", "of a residual that noise exceeds", "convention: three sigma")
-    wide_loss: float = gate(1.5, "sigma", "scale of the Cauchy loss of the first stage", "chosen on tracked sequences")
+    rounds: int = gate(5, "rounds", "of collecting what is near the pose, at most", "cost: of a fit each")
+    wide_loss: float = gate(1.5, "sigma", "scale of the Cauchy loss of these", "chosen on tracked sequences")
     last_loss: float = gate(
         1.9, "sigma", "scale of the Geman-McClure loss that follows, of many matches", "chosen on stairs of 7-Scenes"
     )

@@ -61,7 +61,7 @@ def landmark_covariances(problem: Problem, group: str, count: int) -> FloatArray
         np.add.at(total, rows, np.einsum("n,nki,nkj->nij", weight, J, J))
     free = np.broadcast_to(np.eye(3), (count, 3, 3))
     if group == "lines":
-        free = _motions_of_lines(problem.variables[group].ambient()[:count])
+        free = motions_of_lines(problem.variables[group].ambient()[:count])
     inside = np.swapaxes(free, 1, 2) @ total @ free
     values = np.linalg.eigvalsh(inside) if count else np.zeros((0, 1))
     good = values[:, 0] > 1e-12 * values[:, -1]
@@ -70,7 +70,7 @@ def landmark_covariances(problem: Problem, group: str, count: int) -> FloatArray
     return found
 
 
-def _motions_of_lines(lines: FloatArray) -> FloatArray:
+def motions_of_lines(lines: FloatArray) -> FloatArray:
     """Bases (L, 6, 4) of the motions of (m, d) that keep the direction's length and m . d = 0."""
     m, d = lines[:, :3], lines[:, 3:]
     zero = np.zeros_like(d)
@@ -78,4 +78,4 @@ def _motions_of_lines(lines: FloatArray) -> FloatArray:
     return np.swapaxes(np.linalg.svd(held)[2][:, 2:], 1, 2)
 
 
-__all__ = ["landmark_covariances", "landmark_rows", "records", "residual_squares", "times"]
+__all__ = ["landmark_covariances", "landmark_rows", "motions_of_lines", "records", "residual_squares", "times"]

@@ -20,7 +20,6 @@ Reference: K.-Y. Liang, S. Zeger, *Longitudinal data analysis using generalized 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -39,7 +38,8 @@ from groma.geometry import se3
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import REFINEMENT, RefinementGates
 from groma.localization.pose.matches import Matches, nearest_claims
-from groma.localization.pose.records import landmark_rows, records, residual_squares, times
+from groma.localization.pose.records import landmark_rows, records, times
+from groma.localization.pose.residuals import Residuals, residual_squares_of, residuals, without_far
 from groma.problem.problem import Problem
 from groma.scene import LineObservations, Lines, PointObservations, Points, Scene
 from groma.solver.options import SolverOptions
@@ -82,24 +82,6 @@ def _widen(image, derivative, covariance, rows, out):
 
 
 # ----------------------------------------------------------------------------------------------------------- Public
-@dataclass(frozen=True, eq=False)
-class Residuals:
-    """What a pose leaves of the matches, in standard deviations, and what it says about the pose."""
-
-    #: (n, 2) whitened residuals, NaN where a match has no image; (n, 2, 6 + k) their derivatives by the left twist, and
-    #: by what is estimated of the lens.
-    value: FloatArray
-    by_pose: FloatArray
-    #: (n,) square pixels of an ellipse of one standard deviation, over pi: root of the determinant of the noise.
-    spread: FloatArray
-
-    @property
-    def square(self) -> FloatArray:
-        """(n,) squared lengths; infinite where a match has no image."""
-        square = (self.value**2).sum(axis=1)
-        return np.where(np.isfinite(square), square, np.inf)
-
-
 @dataclass(frozen=True, eq=False)
 class Refined:
     """A pose fitted to what agrees with it."""
@@ -191,7 +173,7 @@ def refine(
     refine_lens: bool = False,
     gates: RefinementGates = REFINEMENT,
 ) -> Refined:
-    """Fit a pose.
+    """Fit a pose to what is near it, again to what is near then, until that stays the same; last with a narrow loss.
 
     Parameters
     ----------
@@ -200,30 +182,40 @@ def refine(
     start : (7,)
         cam_from_world.
     max_error
-        Matches of points and lines further from there, pixels, say nothing about the noise.
+        Matches of points and lines further from where a pose puts them, pixels, say nothing about pose and noise.
     refine_lens
         Estimate focal length and distortion, too.
     gates
         Numbers of the fit.
     """
-    pose, agree, problem = start, 0, _problem(camera, matches, start, refine_lens)
-    for stage in ("wide", "last"):
-        loss = Cauchy(gates.wide_loss) if stage == "wide" else GemanMcClure(last_scale(agree, gates))
-        weighted = with_loss(_with_landmarks(problem, matches), loss)
-        solved = solve(weighted, _LENS if refine_lens else _POSE).problem
+    problem, options = problem_of(camera, matches, start, refine_lens), _LENS if refine_lens else _POSE
+    limits = [
+        (error / sigma) ** 2
+        for error, sigma in zip(max_error, (matches.point_sigma, matches.segment_sigma), strict=True)
+    ]
+    near: tuple[BoolArray, BoolArray] | None = None
+    for round_ in range(gates.rounds + 1):
+        weighted = _with_landmarks(problem, matches)
+        squares = residual_squares_of(weighted, matches)
+        before, near = near, (squares[0] <= limits[0], squares[1] <= limits[1])
+        last = round_ == gates.rounds or (before is not None and all(map(np.array_equal, near, before)))
+        loss = GemanMcClure(last_scale(_agreeing(squares, gates), gates)) if last else Cauchy(gates.wide_loss)
+        solved = solve(with_loss(without_far(weighted, near), loss), options).problem
         estimated = _camera_of(solved, camera) if refine_lens else camera
         if estimated is None:
             break
-        pose, camera = solved.variables["frames"].state[0], estimated
+        camera = estimated
         problem = problem.with_states({name: group.state for name, group in solved.variables.items()})
-        squares = [
-            residual_squares(solved, name, len(rows))
-            for name, rows in (("points", matches.points2d), ("lines", matches.segments2d))
-        ]
-        agree = int((np.concatenate(squares) <= chi_square_gate(gates.outlier, 2)).sum())
+        if last:
+            break
+    pose = problem.variables["frames"].state[0]
     if refine_lens:
-        problem = _problem(camera, matches, pose, False)
+        problem = problem_of(camera, matches, pose, False)
     return _fitted(_with_landmarks(problem, matches), camera, matches, max_error, refine_lens, gates)
+
+
+def _agreeing(squares: tuple[FloatArray, FloatArray], gates: RefinementGates) -> int:
+    return int((np.concatenate(squares) <= chi_square_gate(gates.outlier, 2)).sum())
 
 
 def last_scale(agree: int, gates: RefinementGates = REFINEMENT) -> float:
@@ -243,7 +235,7 @@ def fitted(
     gates: RefinementGates = REFINEMENT,
 ) -> Refined:
     """Say which matches agree with a pose as it is; parameters as of :func:`refine`."""
-    problem = _with_landmarks(_problem(camera, matches, pose, False), matches)
+    problem = _with_landmarks(problem_of(camera, matches, pose, False), matches)
     return _fitted(problem, camera, matches, max_error, refine_lens, gates)
 
 
@@ -286,35 +278,11 @@ def _in_front(camera: QueryCamera, matches: Matches, pose: FloatArray) -> BoolAr
     return np.einsum("ni,ni->n", start, ray) * square > np.einsum("ni,ni->n", start, way) * along
 
 
-def residuals(problem: Problem, landmarks: str, count: int, lens: Sequence[int] = ()) -> Residuals:
-    """Whitened residuals of the matches of one kind, ``points`` or ``lines``; each match has a landmark of its own.
-
-    ``lens`` are the parameters of the camera that are estimated, too.
-    """
-    value, by_pose, spread = np.full((count, 2), np.nan), np.zeros((count, 2, 6 + len(lens))), np.ones(count)
-    for factor in problem.factors:
-        rows = landmark_rows(factor, landmarks)
-        if rows is None:
-            continue
-        size = next(
-            (problem.variables[r.group].manifold.dof for slot, r in factor.references() if slot.name == "intrinsics"), 0
-        )
-        record = records(problem, factor, {"pose": 6, "intrinsics": size} if lens and size else {"pose": 6})
-        kept = [*range(6), *(6 + k for k in lens if size)]
-        weight = np.broadcast_to(times(factor.sqrt_information, np.eye(2)[None]), (len(factor), 2, 2))
-        white = weight @ record
-        seen = (record != 0.0).any(axis=(1, 2))  # what cannot be evaluated is zero
-        value[rows[seen]] = white[seen, :, -1]
-        by_pose[rows[seen], :, : len(kept)] = white[seen][:, :, kept]
-        spread[rows] = 1.0 / np.abs(weight[:, 0, 0] * weight[:, 1, 1] - weight[:, 0, 1] * weight[:, 1, 0])
-    return Residuals(value, by_pose, spread)
-
-
 def _lens_columns(camera: QueryCamera) -> list[int]:
     return sorted((*camera.kind.focal_indices, *camera.kind.extra_indices))
 
 
-def _problem(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool) -> Problem:
+def problem_of(camera: QueryCamera, matches: Matches, pose: FloatArray, refine_lens: bool = False) -> Problem:
     """The problem of one pose, with the noise of the image alone."""
     image = np.zeros(matches.num_points, np.int64), np.zeros(matches.num_lines, np.int64)
     scene = Scene.from_images(
@@ -379,4 +347,4 @@ def _camera_of(problem: Problem, camera: QueryCamera) -> QueryCamera | None:
     return QueryCamera(camera.model, state, camera.width, camera.height)
 
 
-__all__ = ["Refined", "Residuals", "cells_of", "fitted", "refine", "residuals"]
+__all__ = ["Refined", "cells_of", "fitted", "problem_of", "refine"]
