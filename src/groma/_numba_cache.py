@@ -46,6 +46,7 @@ from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
 from groma import _numba_digest, _numba_turns
+from groma._numba_library import rebuilt
 
 #: A file that contains one of these holds compiled code, or chooses it.
 _MARKS = (b"_numba import", b"njit(", b"numba.extending", b"llvmlite")
@@ -250,7 +251,7 @@ class _Cache(FunctionCache):
                 return None
             if key is not None:
                 self._note(self._cache_file.path(key), sig)
-            return self._impl.rebuild(target_context, data)
+            return rebuilt(target_context, data)
 
     def _find(self, key: _Key | None, sig: Any) -> Any:
         """Return what was compiled, by this process or another; or take the turn to compile it, and return None."""
