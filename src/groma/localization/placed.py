@@ -42,6 +42,8 @@ class PlacedImage:
     segment: FloatArray
     #: Seconds beside finding features.
     seconds: float
+    #: What parts of the map are off by, as seen from the camera, radians: part of the covariance.
+    shared_error: float = 0.0
 
     @property
     def camera(self) -> QueryCamera:
@@ -61,6 +63,7 @@ class PlacedImage:
                 entry["center_sigma"] = np.sqrt(np.diag(shift)).tolist()
                 entry["rotation_sigma_deg"] = float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]))))
         entry |= {"num_point_inliers": len(self.point), "num_line_inliers": len(self.line)}
+        entry["shared_error_deg"] = float(np.rad2deg(self.shared_error))
         return entry | {"seconds": self.seconds, "sentence": self.sentence}
 
     def write(self, path: Path, digest: str) -> None:
@@ -91,6 +94,7 @@ def placed(name: str, found: LocalizedImage) -> PlacedImage:
         found.line[lines],
         pose.matches.segments2d[lines].reshape(-1, 4),
         found.seconds,
+        pose.matches.shared_error,
     )
 
 
@@ -114,7 +118,8 @@ def read_placed(path: Path, digest: str) -> PlacedImage | None:
         return None
     for name in ("name", "status", "sentence", "model"):
         values[name] = str(values[name])
-    return PlacedImage(**values | {"seconds": float(values["seconds"])})  # type: ignore[arg-type]
+    numbers = {name: float(values[name]) for name in ("seconds", "shared_error")}
+    return PlacedImage(**values | numbers)  # type: ignore[arg-type]
 
 
 __all__ = ["PlacedImage", "placed", "read_placed", "unreadable"]
