@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The directive ``drawn``: a figure of the mathematics, drawn when the pages are built, by groma's own functions.
 
-``drawn NAME`` draws the function NAME of this module; its docstring is the caption. Nothing is drawn by hand: charts
-are moved by ``retract``, pixels come from the camera models, weights from the losses.
+``drawn NAME`` draws the function NAME of this module or of ``_guide_figures``; its docstring is the caption. Nothing
+is drawn by hand: charts are moved by ``retract``, pixels come from the camera models, weights from the losses.
 """
 
 from collections.abc import Callable
 from pathlib import Path
 
+import _guide_figures
 import matplotlib as mpl
 import numpy as np
 from docutils import nodes
@@ -331,9 +332,10 @@ class Drawn(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Draw the figure into the folder of the build."""
         name = self.arguments[0]
-        draw: Callable[[Figure], None] | None = globals().get(name) if not name.startswith("_") else None
-        if draw is None or getattr(draw, "__module__", "") != __name__:
-            raise ExtensionError(f"drawn: there is no figure {name!r} in _figures.py.")
+        figures = {**vars(_guide_figures), **globals()}
+        draw: Callable[[Figure], None] | None = figures.get(name) if not name.startswith("_") else None
+        if draw is None or getattr(draw, "__module__", "") not in (__name__, _guide_figures.__name__):
+            raise ExtensionError(f"drawn: there is no figure {name!r} in _figures.py and _guide_figures.py.")
         figure = Figure(figsize=(5, 3.6), layout="constrained")
         draw(figure)
         words = " ".join((draw.__doc__ or "").split())

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import sys
-from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +22,8 @@ _RENAMED = {
 }
 
 
-class _Finder(MetaPathFinder):
-    """Comes last, so it is asked only for modules that nobody else found."""
+class _Finder:
+    """Comes last, so it is asked only for modules that nobody else found; without its abstract base, slow to import."""
 
     def find_spec(self, fullname: str, path: Any, target: Any = None) -> None:
         package, _, name = fullname.rpartition(".")

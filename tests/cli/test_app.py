@@ -119,3 +119,12 @@ def test_warnings_of_the_library_are_lines(capsys, quiet):
         warnings.simplefilter("default")
         command(quiet=quiet)
     assert capsys.readouterr().err == ("" if quiet else "warning: 2 lines were left out.\n")
+
+
+def test_long_help_has_headings_and_what_every_command_takes_comes_last(capsys):
+    assert run(["map", "--help"]) == 0
+    said = capsys.readouterr().out
+    headings = [line[:-1] for line in said.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert headings[:3] == ["Arguments", "Options", "Cameras and poses"] and headings[-1] == "General"
+    assert said.index("Measurements:") < said.index("--positions") < said.index("Depth maps:")
+    assert said.index("General:") < said.index("--no-color") < said.index("--help", said.index("--no-color"))

@@ -32,6 +32,7 @@ from groma.io import (
     write_tum,
 )
 from groma.scene import Cameras, Scene
+from groma.scene.survey import Kind
 from groma.scene.synthetic.scenes import holistic
 
 BAL = Path(__file__).parents[1] / "data" / "bal"
@@ -207,12 +208,44 @@ def _changed(tmp_path: Path, **changes: object) -> Path:
         ({"version": np.array(99)}, "Update groma"),
         ({"format": np.array("other")}, "not a groma archive"),
         ({"cameras__models": np.array(["X", "Y", "Z"])}, "bad.npz"),
+        ({"camera_distances__first_idx": np.array([0])}, "camera_distances.second_idx is missing"),
+        ({"barometers__image_idx": np.array([0])}, "'barometers.image_idx', which this groma does not know"),
     ],
 )
 def test_archive_messages(tmp_path, changes, message):
     path = _changed(tmp_path, **changes)
     with pytest.raises(FileFormatError, match=message):
         read_scene(path)
+
+
+def test_distances_of_earlier_archives_are_read(tmp_path):
+    """Archives once held distances in two tables; read as none, these rows would be gone after the next write."""
+    bars = {"first_idx": np.array([0, 3]), "second_idx": np.array([1, 2]), "distance": np.array([2.0, 3.0])}
+    arrays = {f"camera_distances__{name}": column for name, column in bars.items()}
+    path = _changed(tmp_path, **arrays, camera_distances__sigma=np.array([0.01, 0.02]))
+    table = read_scene(path).distances
+    np.testing.assert_array_equal(table.first_kind, [Kind.IMAGE] * 2)
+    np.testing.assert_array_equal(table.second_kind, [Kind.IMAGE] * 2)
+    for name, column in bars.items():
+        np.testing.assert_array_equal(getattr(table, name), column)
+    np.testing.assert_array_equal(table.sigma, [0.01, 0.02])
+    write_scene(read_scene(path), tmp_path / "new.npz")
+    np.testing.assert_array_equal(read_scene(tmp_path / "new.npz").distances.distance, [2.0, 3.0])
+    both = _changed(
+        tmp_path,
+        **arrays,
+        camera_distances__sigma=np.ones(2),
+        point_distances__first_idx=np.array([0]),
+        point_distances__second_idx=np.array([1]),
+        point_distances__distance=np.array([0.5]),
+        point_distances__sigma=np.array([0.1]),
+        control_points__names=np.array(["a", "b"]),
+        control_points__xyz=np.zeros((2, 3)),
+        control_points__measured=np.zeros((2, 3)),
+        control_points__covariance=np.tile(np.eye(3), (2, 1, 1)),
+        control_points__role=np.zeros(2, np.int64),
+    )
+    assert read_scene(both).distances.first_kind.tolist() == [Kind.IMAGE] * 2 + [Kind.CONTROL_POINT]
 
 
 @pytest.mark.parametrize(

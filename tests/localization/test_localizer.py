@@ -159,6 +159,28 @@ def test_the_index_is_kept_and_made_anew_for_another_map(place, localizer):
     assert read_index(other, "any") is None
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("point", lambda array: array + 10**6),
+        ("begin", lambda array: array[::-1].copy()),
+        ("pixel", lambda array: array[:-1]),
+        ("xyz", lambda array: np.full_like(array, np.nan)),
+        ("descriptor", lambda array: array.astype(float)),
+        ("image", lambda array: array[:, :5]),
+        ("digest", lambda array: np.array(3.5)),
+    ],
+)
+def test_an_index_whose_arrays_do_not_fit_is_made_anew(place, localizer, tmp_path, name, value):
+    with np.load(place / "map.npz.index.npz") as file:
+        arrays = dict(file)
+    digest = str(arrays["digest"])
+    np.savez(tmp_path / "index.npz", **arrays)
+    assert read_index(tmp_path / "index.npz", digest).is_of(localizer.scene)
+    np.savez(tmp_path / "index.npz", **{**arrays, name: value(arrays[name])})
+    assert read_index(tmp_path / "index.npz", digest) is None
+
+
 def test_an_index_beside_nothing_that_can_be_written_is_not_kept(place, monkeypatch):
     from groma.errors import OutputError
     from groma.localization import map_index

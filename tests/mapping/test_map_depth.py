@@ -12,7 +12,7 @@ from _facade_depth import facade_depths
 from groma.cli.main import run
 from groma.errors import FileFormatError, InputError
 from groma.evaluation.poses import evaluate_poses
-from groma.geometry import quaternion
+from groma.geometry import quaternion, se3
 from groma.io import read_scene
 from groma.io.depth_maps import DepthMaps
 from groma.mapping.depth.noise import cells_of, fitted_noise, shared_errors
@@ -20,7 +20,7 @@ from groma.mapping.depth.points import measure_depths
 from groma.mapping.depth.unit import own_units
 from groma.mapping.map import MapOptions, map_images
 from groma.mapping.plan import planned_stages
-from groma.scene import Similarity
+from groma.scene import Frames, Images, Rigs, Sensors, Similarity
 
 SIGMA = 0.01  # units of the world, of a depth map
 
@@ -102,6 +102,34 @@ def test_every_map_may_have_a_unit_of_its_own(corner, small, tmp_path):
     assert result.summary()["depth"]["scale"] is None
     metric = measure_depths(small, replace(maps, relative=False))
     assert any("do not agree on a unit" in sentence for sentence in metric.warnings)
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_cameras_on_a_rig_have_depths_too(corner, small, tmp_path, refined):
+    """The four photographs as one moment of a rig: held or estimated, its cameras are apart in the unit of the maps."""
+    poses, rows = corner[1].cam_from_world, np.arange(4)
+    mounted = se3.compose(poses, se3.inverse(np.repeat(poses[:1], 4, axis=0)))
+    sensors = Sensors(rows * 0, np.repeat(small.sensors.kind[:1], 4), rows + 1, small.images.camera_idx, mounted,
+                      (rows == 0).astype(int), rows * 0 + 1)  # fmt: skip
+    images = Images(rows + 1, small.images.names, small.images.camera_idx, rows * 0, rows)
+    whole = corner[1].replace(rigs=Rigs([1]), sensors=sensors, frames=Frames([1], [0], poses[:1]), images=images)
+    maps = DepthMaps(write_depths(tmp_path / "depth", corner[1]))
+    model = whole.transformed(Similarity(1.0 / 3.0))
+    result = map_images(corner[0], tmp_path / "work", model, MapOptions(refine_rigs=refined), depth=maps)
+    assert result.depths.scale == pytest.approx(3.0, rel=5e-3)
+    assert result.scene.num_measurements["point depths"] > 200
+    np.testing.assert_allclose(result.scene.sensors.cam_from_rig, mounted, atol=5e-3)
+
+
+def test_depths_beside_a_rolling_shutter_are_refused_at_once(corner, small, tmp_path):
+    """Before minutes are spent on features: here no stage may begin."""
+    named = []
+    with pytest.raises(InputError, match="Depths know no rolling shutter"):
+        map_images(
+            corner[0], tmp_path / "work", small, MapOptions(rolling_shutter="rows"),
+            lambda name, done, all_: named.append(name), depth=DepthMaps(tmp_path),
+        )  # fmt: skip
+    assert not named
 
 
 def test_maps_of_something_else_are_refused(corner, small, tmp_path):

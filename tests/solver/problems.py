@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from groma.factors import LineReprojection, PointOnPlane, PointReprojection
@@ -14,8 +16,22 @@ from groma.geometry.charts.pose_charts import POSE_CHARTS
 from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
+from groma.solver.options import SolverOptions
 
 INTRINSICS = np.array([800.0, 780.0, 500.0, 400.0])
+
+#: Until nothing moves any more.
+EXACT = SolverOptions(function_tolerance=1e-12)
+
+
+def held(problem):
+    """Hold the first pose and one coordinate of the second."""
+    constant = np.zeros((len(problem.variables["poses"]), 6), dtype=bool)
+    constant[0] = True
+    constant[1, 2] = True
+    variables = dict(problem.variables)
+    variables["poses"] = dataclasses.replace(variables["poses"], constant=constant)
+    return Problem(variables, problem.factors)
 
 
 def cameras_on_a_ring(rng, count: int, radius: float = 6.0):

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 import zipfile
+from collections.abc import Mapping
 from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
@@ -22,14 +23,19 @@ import numpy as np
 import numpy.typing as npt
 
 from groma.bounded.arrays import ArrayMembers, Header, opened_arrays
+from groma.bounded.text import shown
 from groma.errors import FileFormatError
 from groma.io.atomic import atomic_output
 from groma.io.reading import existing, reading
 from groma.io.registry import SceneFormat, register_format
-from groma.scene import Scene
+from groma.scene import Distances, Scene
+from groma.scene.survey import Kind
 
 FORMAT, VERSION = "groma scene", 1
 _KIND = "groma archive"
+#: Tables that archives held before all distances were in one: of what their distances are.
+_OF_DISTANCES = {"camera_distances": Kind.IMAGE, "point_distances": Kind.CONTROL_POINT}
+_COLUMNS_OF_DISTANCES = ("first_idx", "second_idx", "distance", "sigma")
 
 
 def write_archive(scene: Scene, path: str | os.PathLike[str], force: bool = False) -> None:
@@ -55,7 +61,8 @@ def read_archive(path: str | os.PathLike[str]) -> Scene:
     Raises
     ------
     FileFormatError
-        If a member is missing, has another type or shape than a scene's, or the scene is not valid.
+        If a member is missing, has another type or shape than a scene's or is none of a scene, or the scene is not
+        valid.
     """
     place = existing(path)
     with reading(place, _KIND), opened_arrays(place) as members:
@@ -75,7 +82,30 @@ def read_archive(path: str | os.PathLike[str]) -> Scene:
                 for item in fields(kind)
             }
             tables[table.name] = kind(**columns)
+        tables["distances"] = _with_earlier_distances(members, tables["distances"])
+        _refuse_unknown(members, tables, place)
         return Scene(**tables)
+
+
+def _with_earlier_distances(members: ArrayMembers, table: Distances) -> Distances:
+    """Return the distances with those that an archive holds in two tables, by what they are between."""
+    parts = [table]
+    for name, kind in _OF_DISTANCES.items():
+        if f"{name}.first_idx" in members:
+            columns = [_read_array(members, f"{name}.{column}", (None,)) for column in _COLUMNS_OF_DISTANCES]
+            parts.append(Distances.between(kind, *columns))
+    return Distances(*(np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(table)))
+
+
+def _refuse_unknown(members: ArrayMembers, tables: Mapping[str, Any], place: Path) -> None:
+    """Raise if an archive holds what a scene has no place for: it would be lost where the scene is written again."""
+    known = {"format", "version"} | {f"{name}.{item.name}" for name, kind in tables.items() for item in fields(kind)}
+    known |= {f"{name}.{column}" for name in _OF_DISTANCES for column in _COLUMNS_OF_DISTANCES}
+    if unknown := [name for name in members.names if name not in known]:
+        raise FileFormatError(
+            f"{place} holds {shown(unknown[0])}, which this groma does not know and would lose. It was written by a "
+            "newer one, or added to: update groma, or take it out."
+        )
 
 
 def _may_lack(kind: Any, item: Field[Any]) -> bool:
@@ -86,8 +116,6 @@ def _may_lack(kind: Any, item: Field[Any]) -> bool:
 def _read_column(members: ArrayMembers, name: str, item: Field[Any], may_lack: bool) -> Any:
     if name not in members and (may_lack or item.metadata.get("fill") is not None):
         return np.zeros((0, *item.metadata["row"]), item.metadata["dtype"])
-    if name not in members:
-        raise FileFormatError(f"Array {name} is missing. The file is incomplete or of another program.")
     dtype = item.metadata["dtype"]
     array = _read_array(members, name, (None, *item.metadata["row"]))
     if dtype is None:
@@ -121,6 +149,8 @@ def _read_array(members: ArrayMembers, name: str, shape: tuple[int | None, ...])
         if header.dtype.kind not in "iufU" or (header.fortran and len(shape) > 1):
             raise FileFormatError(f"Array {name} must hold numbers or text in C order; got dtype {header.dtype}.")
 
+    if name not in members:
+        raise FileFormatError(f"Array {name} is missing. The file is incomplete or of another program.")
     return members.read(name, check)
 
 

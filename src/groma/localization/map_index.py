@@ -22,8 +22,8 @@ from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.fit import noise_of
-from groma.bounded.arrays import opened_arrays
-from groma.errors import FileFormatError, InputError, OutputError
+from groma.bounded.arrays import form, opened_arrays
+from groma.errors import GromaError, InputError, OutputError
 from groma.execution import map_work
 from groma.features.matching.descriptor import describe
 from groma.features.segments import Segments
@@ -45,7 +45,16 @@ _VERSION = 2
 _NEIGHBORS = 12
 
 #: What a damaged file of arrays raises.
-_UNREADABLE = (OSError, KeyError, ValueError, zipfile.BadZipFile, FileFormatError)
+UNREADABLE = (OSError, KeyError, ValueError, zipfile.BadZipFile, GromaError)
+
+#: What each array of the file is.
+_FORMS = {
+    "xyz": form("f", None, 3), "point_covariance": form("f", None, 3, 3), "line_covariance": form("f", None, 6, 6),
+    **dict.fromkeys(("begin", "point", "segment_begin", "segment"), form("iu", None)),
+    "pixel": form("f", None, 2), "descriptor": form("u", None, 128), "segment_descriptor": form("f", None, 72),
+    "vocabulary": form("f", None, 128), "image": form("f", None, None),
+    "shared_error": form("f", 2),
+}  # fmt: skip
 
 Progress = Callable[[str, int, int], None]
 
@@ -75,6 +84,30 @@ class MapIndex:
     #: points alone, and from points and lines.
     shared_error: FloatArray = field(default_factory=lambda: np.zeros(2))
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether the arrays fit each other; those of a damaged file need not."""
+        count, images = len(self.point), len(self.begin) - 1
+        told = (self.xyz, self.pixel, self.segment_descriptor, self.vocabulary, self.image, self.shared_error)
+        return (
+            len(self.pixel) == len(self.descriptor) == count
+            and len(self.segment_descriptor) == len(self.segment)
+            and len(self.point_covariance) == len(self.xyz)
+            and len(self.segment_begin) - 1 == len(self.image) == images
+            and self.image.shape[1] == 128 * len(self.vocabulary)
+            and _divides(self.begin, count)
+            and _divides(self.segment_begin, len(self.segment))
+            and bool(((self.point >= 0) & (self.point < len(self.xyz))).all())
+            and bool((self.segment >= 0).all() and (self.shared_error >= 0.0).all())
+            and all(np.isfinite(part).all() for part in told)
+        )
+
+    def is_of(self, scene: Scene) -> bool:
+        """Whether the index can be one of a map."""
+        counts = len(self.begin) - 1 == scene.num_images and len(self.line_covariance) == scene.num_lines
+        inside = (self.segment < len(scene.line_observations)).all() and len(self.xyz) >= scene.num_points
+        return bool(counts and inside)
+
     def write(self, path: Path, digest: str, folder: Path) -> None:
         """Write the index whole or not at all; ``digest`` is that of the map, ``folder`` holds its photographs."""
         arrays = {item.name: getattr(self, item.name) for item in fields(self)}
@@ -86,21 +119,27 @@ def read_index(path: Path, digest: str) -> MapIndex | None:
     """Read an index; None where there is none, where it is damaged, and where it belongs to another map."""
     try:
         with opened_arrays(path) as members:
-            if str(members.read("digest")) != digest:
+            if str(members.read("digest", form("U"))) != digest:
                 return None
-            return MapIndex(**{item.name: members.read(item.name) for item in fields(MapIndex)})
-    except _UNREADABLE:
+            found = MapIndex(**{name: members.read(name, check) for name, check in _FORMS.items()})
+    except UNREADABLE:
         return None
+    return found if found.is_whole else None
+
+
+def _divides(begin: IntArray, count: int) -> bool:
+    """Whether rows from each begin to the next are all rows, in order."""
+    return bool(len(begin) and begin[0] == 0 and begin[-1] == count and (np.diff(begin) >= 0).all())
 
 
 def images_told(path: Path) -> Path | None:
     """Return the folder of photographs that an index tells, if it is there."""
     try:
         with opened_arrays(path) as members:
-            folder = Path(str(members.read("folder")))
-    except _UNREADABLE:
+            folder = Path(str(members.read("folder", form("U"))))
+            return folder if folder.is_dir() else None
+    except UNREADABLE:
         return None
-    return folder if folder.is_dir() else None
 
 
 def digest_of(scene: Scene, files: Sequence[Path]) -> str:
@@ -229,7 +268,7 @@ def kept_index(scene: Scene, files: Sequence[Path], path: Path | None, say: Prog
         return build_index(scene, files, say), ""
     digest = digest_of(scene, files)
     index = read_index(path, digest)
-    if index is not None:
+    if index is not None and index.is_of(scene):
         return index, ""
     index = build_index(scene, files, say)
     try:

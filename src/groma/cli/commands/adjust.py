@@ -47,11 +47,16 @@ def adjust(
             help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron, truncated, or one of an installed "
             "package. auto: robust "
             "(Cauchy, then Geman-McClure) for what comes from matching, none for BAL files.",
+            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = "auto",
     loss_scale: Annotated[
         float | None,
-        typer.Option(metavar="S", help="Scale of the loss, in units of the noise (pixels for images). Default: 1."),
+        typer.Option(
+            metavar="S",
+            help="Scale of the loss, in units of the noise (pixels for images). Default: 1.",
+            rich_help_panel=_options.ADJUSTMENT,
+        ),
     ] = None,
     camera_model: Annotated[
         str | None,
@@ -61,6 +66,7 @@ def adjust(
             metavar="NAME",
             help="Change the lens model of all cameras first (PINHOLE to OPENCV, ...); what it adds starts at 0 and is "
             "estimated.",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     refine_intrinsics: Annotated[
@@ -68,20 +74,41 @@ def adjust(
         typer.Option(
             "--refine-intrinsics/--fix-intrinsics",
             help="Estimate the calibration too. Default: for BAL files and with --camera-model.",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     refine_principal_point: Annotated[
-        bool, typer.Option("--refine-principal-point", help="With the intrinsics: principal points too.")
+        bool,
+        typer.Option(
+            "--refine-principal-point",
+            help="With the intrinsics: principal points too.",
+            rich_help_panel=_options.CAMERAS,
+        ),
     ] = False,
     refine_rigs: Annotated[
-        bool, typer.Option("--refine-rigs", help="Estimate where the cameras sit on their rig.")
+        bool,
+        typer.Option(
+            "--refine-rigs", help="Estimate where the cameras sit on their rig.", rich_help_panel=_options.CAMERAS
+        ),
     ] = False,
     rolling_shutter: _options.RollingShutter = None,
-    points: Annotated[bool, typer.Option("--points/--no-points", help="Use points.")] = True,
-    lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Use lines.")] = True,
-    planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Use planes.")] = True,
+    points: Annotated[
+        bool, typer.Option("--points/--no-points", help="Use points.", rich_help_panel=_options.ADJUSTMENT)
+    ] = True,
+    lines: Annotated[
+        bool, typer.Option("--lines/--no-lines", help="Use lines.", rich_help_panel=_options.ADJUSTMENT)
+    ] = True,
+    planes: Annotated[
+        bool, typer.Option("--planes/--no-planes", help="Use planes.", rich_help_panel=_options.ADJUSTMENT)
+    ] = True,
     max_iterations: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="Stop after N steps. Default: 50, for pose graphs 100.")
+        int | None,
+        typer.Option(
+            min=0,
+            metavar="N",
+            help="Stop after N steps. Default: 50, for pose graphs 100.",
+            rich_help_panel=_options.ADJUSTMENT,
+        ),
     ] = None,
     linear_solver: Annotated[
         str,
@@ -89,6 +116,7 @@ def adjust(
             autocompletion=_complete.one_of(*_complete.LINEAR_SOLVERS),
             metavar="NAME",
             help="How each step is solved: auto, dense, sparse, pcg, or a solver of an installed package.",
+            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = "auto",
     line_chart: Annotated[
@@ -98,6 +126,7 @@ def adjust(
             metavar="NAME",
             help="Line parametrisation: cartesian (default), orthonormal_left, orthonormal_right, free_left, "
             "free_right, or one of an installed package.",
+            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = None,
     line_residual: Annotated[
@@ -105,11 +134,15 @@ def adjust(
         typer.Option(
             help="How segments are compared with lines: endpoints, distances in the image; bearing, angles of rays; "
             "normal, the plane through camera and segment, also against the ray to the line's anchor.",
+            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = "endpoints",
     plane_residual: Annotated[
         PlaneResidual,
-        typer.Option(help="How measured planes are compared: normal_offset, in the camera; quaternion, in the world."),
+        typer.Option(
+            help="How measured planes are compared: normal_offset, in the camera; quaternion, in the world.",
+            rich_help_panel=_options.ADJUSTMENT,
+        ),
     ] = "normal_offset",
     gauge: Annotated[
         str | None,
@@ -118,10 +151,17 @@ def adjust(
             metavar="NAME",
             help="free; first_camera, to hold the first camera and the scale; or auto (default): free, unless distances"
             " between landmarks are in scene units.",
+            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = None,
     page: Annotated[
-        Path | None, typer.Option("--report", metavar="FILE", help="Also write an HTML page: before and after.")
+        Path | None,
+        typer.Option(
+            "--report",
+            metavar="FILE",
+            help="Also write an HTML page: before and after.",
+            rich_help_panel=_options.RESULTS,
+        ),
     ] = None,
     covariance: Annotated[
         Path | None,
@@ -130,6 +170,7 @@ def adjust(
             metavar="FILE",
             help="Also write how certain the result is: covariances (.npz) or standard deviations (.json) of images, "
             "points, lines, planes and directions.",
+            rich_help_panel=_options.RESULTS,
         ),
     ] = None,
     covariance_gauge: Annotated[
@@ -137,6 +178,7 @@ def adjust(
         typer.Option(
             "--covariance-gauge",
             help="What it refers to: inner, all camera centres together; held, the first camera and the scale.",
+            rich_help_panel=_options.RESULTS,
         ),
     ] = "auto",
     sigma0: Annotated[
@@ -146,6 +188,7 @@ def adjust(
             metavar="S",
             help="With --covariance: the noise of the measurements in units of that stated (1 pixel unless the scene "
             "says otherwise).",
+            rich_help_panel=_options.RESULTS,
         ),
     ] = 1.0,
     diagnosis: Annotated[
@@ -153,6 +196,7 @@ def adjust(
         typer.Option(
             "--diagnosis/--no-diagnosis",
             help="Say what the data do not determine. Default: yes up to 300 images.",
+            rich_help_panel=_options.RESULTS,
         ),
     ] = None,
     keep: Annotated[
@@ -160,6 +204,7 @@ def adjust(
         typer.Option(
             "--keep",
             help="With a folder of parts: keep them in memory from one step to the next; auto: where they fit.",
+            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = "auto",
     positions: _measured.Positions = None,

@@ -84,9 +84,16 @@ def _say(console: "Console", found: "Alignment") -> None:
     )
     if found.angles is not None:
         console.say(f"Orientations differ by {np.degrees(np.median(found.angles)):.3g} degrees (median).")
-    for row in np.argsort(-distance)[:_TOLD]:
-        x, y, z = found.residuals[row]
-        left = "" if found.inliers[row] else ", left out"
-        console.say(f"  {found.names[row]}: off by {distance[row]:.4g} ({x:.4g}, {y:.4g}, {z:.4g}){left}")
+    worst = np.argsort(-distance)[:_TOLD]
+    rows = [
+        [
+            found.names[row],
+            f"{distance[row]:.4g}",
+            *(f"{value:.4g}" for value in found.residuals[row]),
+            "used" if found.inliers[row] else "left out",
+        ]
+        for row in worst
+    ]
+    console.table(("largest residuals", "off by", "x", "y", "z", ""), rows)
     for sentence in found.notes:
         console.say(sentence)

@@ -47,10 +47,15 @@ def poses(
         )
     if scores.num_images < 3:
         console.warn("The alignment takes the centres of one or two images onto each other, whatever their poses.")
-    console.say(f"  camera centres   {scores.center_rmse:.6g} rms, in units of the reference")
-    console.say(f"  rotations        {scores.rotation_deg_mean:.4g} deg mean, {scores.rotation_deg_max:.4g} max")
-    areas = ", ".join(f"{value:.3f} at {degrees:g} deg" for degrees, value in scores.auc.items())
-    console.say(f"  pose error AUC   {areas}")
+    rows = [
+        ["camera centres, units of the reference", f"{scores.center_rmse:.4g}", "", ""],
+        ["rotations, degrees", "", f"{scores.rotation_deg_mean:.4g}", f"{scores.rotation_deg_max:.4g}"],
+    ]
+    console.table(("", "rms", "mean", "largest"), rows)
+    console.table(
+        ("pose error within", *(f"{degrees:g}°" for degrees in scores.auc)),
+        [["area under curve", *(f"{value:.3f}" for value in scores.auc.values())]],
+    )
     _output.write_json(json_target, scores.to_dict(), force)
 
 
@@ -123,11 +128,19 @@ def _compare_lines(
     console.say(f"{lines_there}, {scores.length:.6g} long; reference {scores.reference_length:.6g} long")
     if scores.num_lines == 0:
         console.warn(f"{estimate} holds no lines.")
-    console.say("  threshold  recall of length  precision: lines  lines 90 %   length   length found")
-    for tau, recall in scores.recall_length.items():
-        shares = [recall, scores.precision_count[tau], scores.precision_strict[tau], scores.precision_length[tau]]
-        row = "  ".join(_percent(share, width) for share, width in zip(shares, (14, 14, 8, 6), strict=True))
-        console.say(f"  {tau:9.4g}  {row}  {scores.inlier_length[tau]:13.6g}")
+    header = ("within", "length found", "of the reference", "lines right", "for 90 % right", "length right")
+    rows = [
+        [
+            f"{tau:.4g}",
+            f"{scores.inlier_length[tau]:.6g}",
+            *map(
+                _percent,
+                (recall, scores.precision_count[tau], scores.precision_strict[tau], scores.precision_length[tau]),
+            ),
+        ]
+        for tau, recall in scores.recall_length.items()
+    ]
+    console.table(header, rows)
     return scores.to_dict()
 
 
@@ -139,10 +152,12 @@ def _compare_silhouettes(console: Console, estimate: Path, folder: Path) -> dict
     scores = evaluate_silhouettes(scene, read_silhouettes(folder, scene.images.names))
     found = scores.to_dict()
     console.say(f"{counted(scene.num_lines, 'lines')} in {counted(scores.num_views, 'views')} with a silhouette")
-    for limit in LIMITS:
-        count = int((scores.distance > limit).sum())
-        share = count / max(scene.num_lines, 1)
-        console.say(f"  leave it by more than {limit:2g} px: {count:6,} ({_percent(share, 0).strip()})")
+    beyond = [int((scores.distance > limit).sum()) for limit in LIMITS]
+    rows = [
+        [f"{limit:g} px", f"{count:,}", _percent(count / max(scene.num_lines, 1))]
+        for limit, count in zip(LIMITS, beyond, strict=True)
+    ]
+    console.table(("leave it by more than", "lines", "share"), rows)
     return found
 
 
@@ -183,19 +198,24 @@ def planes(
             raise InputError("--threshold is for a reference of points. For planes pass --max-angle and --max-offset.")
         found = evaluate_planes(scene, read_scene(reference), max_angle, max_offset)
         planes_there = counted(found.num_planes, "planes")
-        console.say(f"{len(found.matches):,} of {planes_there} match {found.num_reference:,} of the reference")
-        console.say(f"  precision   {_percent(found.precision)}, recall {_percent(found.recall)}")
+        console.say(
+            f"{len(found.matches):,} of {planes_there} match {found.num_reference:,} of the reference: "
+            f"precision {_percent(found.precision)}, recall {_percent(found.recall)}"
+        )
         if len(found.matches):
-            console.say(f"  normals     {found.normal_deg_mean:.4g} deg mean, {found.normal_deg_max:.4g} max")
-            console.say(
-                f"  offsets     {found.offset_mean:.4g} mean, {found.offset_max:.4g} max, in units of the reference"
-            )
+            rows = [
+                ["normals, degrees", f"{found.normal_deg_mean:.4g}", f"{found.normal_deg_max:.4g}"],
+                ["offsets, units of the reference", f"{found.offset_mean:.4g}", f"{found.offset_max:.4g}"],
+            ]
+            console.table(("", "mean", "largest"), rows)
         _output.write_json(json_target, found.to_dict(), force)
         return
     shares = score_planes_by_points(scene.planes.hesse, read_reference(reference).surface_points(), threshold)
     console.say(f"{counted(shares.num_planes, 'planes')}, {counted(shares.num_points, 'points')}")
-    for tau, share in shares.inlier_share.items():
-        console.say(f"  {tau:9.4g}  {100 * share:5.1f} % of the points, {shares.inlier_rmse[tau]:.4g} rms")
+    rows = [
+        [f"{tau:.4g}", _percent(share), f"{shares.inlier_rmse[tau]:.4g}"] for tau, share in shares.inlier_share.items()
+    ]
+    console.table(("within", "of the points", "rms"), rows)
     _output.write_json(json_target, shares.to_dict(), force)
 
 
@@ -235,11 +255,9 @@ def trajectory(
     from groma.io import read_trajectory
     from groma.io.trajectories import read_times
 
-    def row(name: str, spread: Spread, unit: str) -> None:
-        console.say(
-            f"  {name:20s} {spread.rmse:10.6g} rms {spread.mean:10.6g} mean {spread.median:10.6g} median "
-            f"{spread.max:10.6g} max  {unit}"
-        )
+    def row(name: str, spread: Spread, unit: str) -> list[str]:
+        values = (spread.rmse, spread.mean, spread.median, spread.max)
+        return [f"{name}, {unit}", *(f"{value:.4g}" for value in values)]
 
     ours, theirs = read_trajectory(estimate, format), read_trajectory(reference, format)
     beside = reference.with_name("times.txt")
@@ -266,23 +284,25 @@ def trajectory(
         + (", by positions and orientations" if scores.by_orientations else "")
     )
     if scores.by_orientations:
-        console.say("  The positions alone do not determine the rotation between the two.")
+        console.say("The positions alone do not determine the rotation between the two.")
     step = f"{rpe_delta:g} {rpe_unit.removesuffix('s') if rpe_delta == 1 else rpe_unit}"
-    row("absolute, position", scores.ate, "m")
-    row("absolute, rotation", scores.rotation_deg, "deg")
+    rows = [row("absolute position", scores.ate, "m"), row("absolute rotation", scores.rotation_deg, "deg")]
     if scores.rpe_translation is None or scores.rpe_rotation_deg is None:
         console.warn(f"No two associated poses are {step} apart; there are no relative errors.")
     else:
-        row("relative, position", scores.rpe_translation, f"m per {step}")
-        row("relative, rotation", scores.rpe_rotation_deg, f"deg per {step}")
+        rows += [
+            row("relative position", scores.rpe_translation, f"m per {step}"),
+            row("relative rotation", scores.rpe_rotation_deg, f"deg per {step}"),
+        ]
+    console.table(("", "rms", "mean", "median", "largest"), rows)
     if scores.drift_percent is not None:
         console.say(
-            f"  drift                {scores.drift_percent:10.6g} %   {scores.drift_deg_per_metre:10.6g} deg/m, "
-            f"mean over segments of {scores.segment_lengths[0]:.4g} to {scores.segment_lengths[-1]:.4g} m"
+            f"Drift {scores.drift_percent:.4g} % and {scores.drift_deg_per_metre:.4g} deg/m, mean over segments of "
+            f"{scores.segment_lengths[0]:.4g} to {scores.segment_lengths[-1]:.4g} m."
         )
     _output.write_json(json_target, scores.to_dict(), force)
 
 
-def _percent(share: float, width: int = 0) -> str:
+def _percent(share: float) -> str:
     """A share in percent; a dash where there is nothing to have a share of."""
-    return f"{100 * share:{width}.1f} %" if share == share else f"{'–':>{width}} %"
+    return f"{100 * share:.1f} %" if share == share else "–"

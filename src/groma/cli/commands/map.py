@@ -35,6 +35,7 @@ def map_(
             metavar="MODEL",
             help="Poses, cameras and points: a COLMAP model, an archive (.npz) or the OUT of a map. Without it they "
             "are reconstructed.",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     poses: Annotated[
@@ -44,6 +45,7 @@ def map_(
             metavar="FILE",
             help="Poses from elsewhere, without points: a model, transforms.json, reconstruction.json, a trajectory "
             "(TUM, KITTI), a g2o graph, or name x y z qx qy qz qw. Points are found, poses improved, wrong ones named.",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     extend: Annotated[
@@ -52,12 +54,16 @@ def map_(
             "--extend",
             metavar="MAP",
             help="Place the photographs in this map, OUT of groma map or a COLMAP model, and map all of both.",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     map_images: Annotated[
         Path | None,
         typer.Option(
-            "--map-images", metavar="FOLDER", help="With --extend: the photographs of MAP, where it does not tell."
+            "--map-images",
+            metavar="FOLDER",
+            help="With --extend: the photographs of MAP, where it does not tell.",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     camera_model: Annotated[
@@ -67,11 +73,16 @@ def map_(
             metavar="NAME",
             help="Lens model, by COLMAP's name. Without --model the one to estimate (SIMPLE_RADIAL); with it the one "
             "that its cameras are changed to, and what it adds is estimated.",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     camera_params: Annotated[
         str | None,
-        typer.Option(metavar="F,CX,CY,...", help="Without --model: the calibration, if it is known; it is then kept."),
+        typer.Option(
+            metavar="F,CX,CY,...",
+            help="Without --model: the calibration, if it is known; it is then kept.",
+            rich_help_panel=_options.CAMERAS,
+        ),
     ] = None,
     mapper: Annotated[
         str,
@@ -79,6 +90,7 @@ def map_(
             autocompletion=_complete.one_of(*_complete.MAPPERS),
             metavar="NAME",
             help="Without --model and --poses: place cameras incremental(ly) or global(ly).",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = "incremental",
     rig: Annotated[
@@ -88,16 +100,24 @@ def map_(
             metavar="FILE",
             help="Images taken at the same moment by cameras fixed to each other: COLMAP's rig_config.json. Found by "
             "itself in IMAGES.",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     refine_rig: Annotated[
-        bool, typer.Option("--refine-rig/--fix-rig", help="Estimate where the cameras sit on their rig.")
+        bool,
+        typer.Option(
+            "--refine-rig/--fix-rig",
+            help="Estimate where the cameras sit on their rig.",
+            rich_help_panel=_options.CAMERAS,
+        ),
     ] = False,
     rolling_shutter: _options.RollingShutter = None,
     line_matches: Annotated[
         Path | None,
         typer.Option(
-            metavar="NPZ", help="Segments and their matches from elsewhere; the documentation has the layout."
+            metavar="NPZ",
+            help="Segments and their matches from elsewhere; the documentation has the layout.",
+            rich_help_panel=_options.LANDMARKS,
         ),
     ] = None,
     line_detector: _options.LineDetector = "lsd",
@@ -108,32 +128,65 @@ def map_(
             autocompletion=_complete.one_of(*_complete.MATCHERS),
             metavar="NAME",
             help="Match segments by wide_baseline, flow, or a matcher of an installed package. Default: poses alone.",
+            rich_help_panel=_options.LANDMARKS,
         ),
     ] = None,
-    min_length: Annotated[float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")] = 12.0,
+    min_length: Annotated[
+        float,
+        typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.", rich_help_panel=_options.LANDMARKS),
+    ] = 12.0,
     min_confidence: Annotated[
         float,
-        typer.Option(min=0.0, max=1.0, metavar="P", help="Leave out lines less probably right than this; 0 keeps all."),
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            metavar="P",
+            help="Leave out lines less probably right than this; 0 keeps all.",
+            rich_help_panel=_options.LANDMARKS,
+        ),
     ] = 0.5,
-    planes: Annotated[bool, typer.Option("--planes/--no-planes", help="Look for planes and directions.")] = True,
+    planes: Annotated[
+        bool,
+        typer.Option(
+            "--planes/--no-planes", help="Look for planes and directions.", rich_help_panel=_options.LANDMARKS
+        ),
+    ] = True,
     refine_poses: Annotated[
-        bool, typer.Option("--refine-poses/--fix-poses", help="Move the cameras too, or the landmarks alone.")
+        bool,
+        typer.Option(
+            "--refine-poses/--fix-poses",
+            help="Move the cameras too, or the landmarks alone.",
+            rich_help_panel=_options.ADJUSTMENT,
+        ),
     ] = True,
     refine_intrinsics: Annotated[
         bool | None,
         typer.Option(
             "--refine-intrinsics/--fix-intrinsics",
             help="Estimate the calibration too. Default: where --camera-model changes it.",
+            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = None,
-    max_iterations: Annotated[int, typer.Option(min=1, metavar="N", help="Stop each adjustment after N steps.")] = 50,
+    max_iterations: Annotated[
+        int,
+        typer.Option(
+            min=1, metavar="N", help="Stop each adjustment after N steps.", rich_help_panel=_options.ADJUSTMENT
+        ),
+    ] = 50,
     refine_points: Annotated[
-        bool, typer.Option("--refine-points/--keep-points", help="Measure the points of the model again in the images.")
+        bool,
+        typer.Option(
+            "--refine-points/--keep-points",
+            help="Measure the points of the model again in the images.",
+            rich_help_panel=_options.ADJUSTMENT,
+        ),
     ] = False,
     diagnosis: Annotated[
         bool | None,
         typer.Option(
-            "--diagnosis/--no-diagnosis", help="Say what the data do not determine. Default: yes up to 300 images."
+            "--diagnosis/--no-diagnosis",
+            help="Say what the data do not determine. Default: yes up to 300 images.",
+            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = None,
     positions: _measured.Positions = None,

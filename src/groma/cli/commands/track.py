@@ -37,6 +37,7 @@ def track(
             metavar="CAMERA",
             help="Calibration file, or its numbers as OpenCV has them: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: what "
             "the sequence says.",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     camera_model: Annotated[
@@ -46,11 +47,17 @@ def track(
             autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
             metavar="NAME",
             help="Lens model, by COLMAP's name; with its parameters, in place of --camera.",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     camera_params: Annotated[
         str | None,
-        typer.Option("--camera-params", metavar="F,CX,CY,...", help="The parameters, pixels counted as COLMAP does."),
+        typer.Option(
+            "--camera-params",
+            metavar="F,CX,CY,...",
+            help="The parameters, pixels counted as COLMAP does.",
+            rich_help_panel=_options.CAMERAS,
+        ),
     ] = None,
     kind: Annotated[
         str | None,
@@ -59,13 +66,23 @@ def track(
             autocompletion=_complete.one_of(*_complete.SEQUENCES),
             metavar="KIND",
             help="rgbd, stereo or mono; told by the files otherwise.",
+            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
-    points: Annotated[bool, typer.Option("--points/--no-points", help="Follow points.")] = True,
-    lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Follow line segments.")] = True,
+    points: Annotated[
+        bool, typer.Option("--points/--no-points", help="Follow points.", rich_help_panel=_options.LANDMARKS)
+    ] = True,
+    lines: Annotated[
+        bool, typer.Option("--lines/--no-lines", help="Follow line segments.", rich_help_panel=_options.LANDMARKS)
+    ] = True,
     line_detector: _options.LineDetector = "lsd",
     planes: Annotated[
-        bool, typer.Option("--planes/--no-planes", help="Find planes in depth images, or in points and lines.")
+        bool,
+        typer.Option(
+            "--planes/--no-planes",
+            help="Find planes in depth images, or in points and lines.",
+            rich_help_panel=_options.LANDMARKS,
+        ),
     ] = True,
     loops: Annotated[bool, typer.Option("--loops/--no-loops", help="Close loops.")] = True,
     max_frames: Annotated[

@@ -16,11 +16,30 @@ from typer.core import TyperCommand
 
 from groma.errors import did_you_mean
 
-NoColor = Annotated[bool, typer.Option("--no-color", help="Use no colours; so does the environment variable NO_COLOR.")]
+#: Heading of ``--help`` for what every command takes; options without a heading come first.
+GENERAL = "General"
+NoColor = Annotated[
+    bool,
+    typer.Option(
+        "--no-color", help="Use no colours; so does the environment variable NO_COLOR.", rich_help_panel=GENERAL
+    ),
+]
 
 
 class Command(TyperCommand):
-    """A command that suggests what may have been meant where a value is not one of its choices."""
+    """A command whose help has headings, and that suggests what may have been meant by a value that is no choice."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the options under their headings, in the order in which these first appear."""
+        sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is not None:
+                sections.setdefault(_heading(parameter), []).append(record)
+        for heading, records in sections.items():
+            if records:
+                with formatter.section(heading):
+                    formatter.write_dl(records)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse as usual."""
@@ -32,6 +51,13 @@ class Command(TyperCommand):
             if "is not one of" in error.message:
                 error.message += did_you_mean(value, choices)
             raise
+
+
+def _heading(parameter: Any) -> str:
+    if parameter.param_type_name == "argument":
+        return "Arguments"
+    default = GENERAL if parameter.name == "help" else "Options"
+    return getattr(parameter, "rich_help_panel", None) or default
 
 
 def with_common_options(command: Callable[..., None]) -> Callable[..., None]:
