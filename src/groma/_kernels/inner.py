@@ -22,6 +22,8 @@ from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.sigutils import normalize_signature
 
+from groma._numba_library import rebuilt
+
 #: How the names of wrappers begin.
 _WRAPPER = "_ZN7cpython"
 #: How many functions are being compiled: one inside the other. Numba compiles in one thread at a time.
@@ -119,7 +121,7 @@ class Results(CompileResultCacheImpl):
     def rebuild(self, target_context: Any, payload: Any) -> Any:
         (name, kind, content), fndesc, environment, signature, *rest = payload
         if kind != "bitcode":
-            return super().rebuild(target_context, payload)
+            return rebuilt(target_context, payload)
         objectmode, lifted, annotation, reload_init, _ = rest
         for initialise in reload_init:
             initialise()
