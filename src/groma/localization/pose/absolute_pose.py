@@ -202,7 +202,7 @@ def pose_from_matches(
     if guided is not None and first.significant:
         used = guided(best)
         errors = _errors(used, options)
-        best = refine(best.camera, used, best.pose, errors, options.refine_lens)
+        best = refine(best.camera, used, best.pose, errors, options.refine_lens, gathered=True)
         own = fitted(best.camera, matches, best.pose, errors, options.refine_lens)
         first = evidence_of(own, matches, places)
     covariance = best.covariance(used)
