@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Map the lines of posed images with groma and LIMAP, from the same segments and the same matches.
 
-    python benchmarks/lines.py [SCENE ...] [--data DIR] [--python-limap PYTHON]
+    python benchmarks/lines.py [SCENE ...] [--data DIR] [--python-limap PYTHON] [--curves SVG]
 
 Without a Python that has pylimap 2 groma runs alone. Scenes whose data is not in the folder are left out.
 """
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from _line_curves import drawing
 from _line_scenes import LIMAP_MIN_LENGTH, MIN_LENGTH, NUM_NEIGHBORS, SCENES, LineScene
 from _workshop import CACHE, CONTESTANTS, RESULTS, ROOT, machine, run_program
 
@@ -322,13 +323,14 @@ def main() -> int:
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=", ".join(SCENES))
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the data sets")
     parser.add_argument("--python-limap", help="Python that has pylimap 2; without it groma runs alone")
+    parser.add_argument("--curves", type=Path, help="draw what is right over what is found, .svg")
     parser.add_argument("--matching", choices=MATCHING, help="one kind of matches; default: both")
     arguments = parser.parse_args()
     if unknown := {*arguments.scenes} - {*SCENES}:
         parser.error(f"no such scene: {', '.join(sorted(unknown))}")
     RESULTS.mkdir(exist_ok=True)
     CACHE.mkdir(parents=True, exist_ok=True)
-    texts = []
+    texts, results = [], []
     for name in arguments.scenes or SCENES:
         try:
             source = SCENES[name](arguments.data)
@@ -345,8 +347,11 @@ def main() -> int:
                 draw(task, lines, len(source.images) // 2, RESULTS / f"lines-{name}-{matching}-{lines.contestant}.png")
         result = {"scene": name, "thresholds": source.thresholds, "machine": machine(), "rows": rows}
         (RESULTS / f"lines-{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+        results.append(result)
         texts.append(table(source, rows))
         print("\n" + texts[-1], flush=True)
+    if arguments.curves:
+        arguments.curves.write_text(drawing([result for result in results if "curve" in result["rows"][1]]))
     return 0 if texts else 1
 
 

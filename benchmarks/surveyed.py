@@ -192,8 +192,9 @@ def subsets(scene: Scene, count: int) -> list[np.ndarray]:
 def tell_deviations(name: str, truth: Scene, result: MapResult) -> None:
     """Print a row: errors of the centres and their deviations (thousandths), stated and by leaving out landmarks."""
     found = groma.adjust(result.before, replace(result.adjusted_with, gauge="free"))
-    scores = evaluate_poses(found.scene, truth)
-    alone = Covariances(observations_alone(found.problem), "inner", datum={"frames": [1, 1, 1, 0, 0, 0]})
+    problem, scores = found.problem, evaluate_poses(found.scene, truth)
+    assert problem is not None
+    alone = Covariances(observations_alone(problem), "inner", datum={"frames": [1, 1, 1, 0, 0, 0]})
     row = {image: k for k, image in enumerate(truth.images.names)}
     true = truth.cam_centers_in_world[[row[image] for image in found.scene.images.names]]
     errors = np.linalg.norm(found.scene.transformed(scores.alignment).cam_centers_in_world - true, axis=1)
