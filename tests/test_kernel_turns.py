@@ -10,7 +10,7 @@ import time
 import numba
 import pytest
 
-from groma import _numba_cache, _numba_turns
+from groma import _numba_inner, _numba_turns
 
 pytestmark = [
     pytest.mark.kernels,
@@ -109,4 +109,4 @@ def test_what_does_not_compile_keeps_no_turn(tmp_path, monkeypatch):
     with pytest.raises(numba.TypingError):
         compiled(1.0)
     assert len(given) == 1
-    assert _numba_cache._depth == 0
+    assert not _numba_inner.is_inside()

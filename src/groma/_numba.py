@@ -17,8 +17,10 @@ from typing import Any
 from numba import njit
 
 from groma._numba_cache import keep_on_disk
+from groma._numba_inner import Pipeline
 
 _OPTIONS = {
+    "pipeline_class": Pipeline,
     "nogil": True,
     "no_cfunc_wrapper": True,  # for callers in C, of which there are none
     "error_model": "numpy",

@@ -40,12 +40,12 @@ from typing import Any
 
 from llvmlite.binding import get_host_cpu_features, get_process_triple
 from numba.core import config, sigutils
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
+from numba.core.caching import FunctionCache, NullCache
 from numba.core.registry import cpu_target
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
-from groma import _numba_digest, _numba_turns
+from groma import _numba_digest, _numba_inner, _numba_turns
 
 #: A file that contains one of these holds compiled code, or chooses it.
 _MARKS = (b"_numba import", b"njit(", b"numba.extending", b"llvmlite")
@@ -85,8 +85,6 @@ counts = Counts()
 on_miss: list[Callable[[Counts], None]] = []
 #: Files that were written or found, and which function, for which argument types.
 _used: dict[Path, tuple[str, str, tuple]] = {}
-#: How many functions are being compiled: one inside the other.
-_depth = 0
 _lock = threading.Lock()
 #: Held while a file is written; a process that ends at once takes it first.
 writing = threading.Lock()
@@ -203,7 +201,7 @@ def environment_digest() -> str:
 
 
 class _Cache(FunctionCache):
-    _impl_class = CompileResultCacheImpl
+    _impl_class = _numba_inner.Results
 
     def __init__(self, function: Any, dispatcher: Any = None) -> None:
         super().__init__(function)
@@ -226,7 +224,8 @@ class _Cache(FunctionCache):
             return None
         found = _numba_digest.dependence(self._compiled, sigutils.normalize_signature(sig)[0])
         content = _digest((_numba_digest.environment(), kinds, processor, found.content))
-        return _Key(_digest((kinds, processor, found.selected)), content)
+        variant = "for linking" if _numba_inner.is_inside() else "for Python"
+        return _Key(_digest((kinds, processor, found.selected, variant)), content)
 
     def is_there(self, sig: Any, target_context: Any) -> bool:
         """Whether the function need not be compiled, or is being compiled by another process."""
@@ -262,7 +261,7 @@ class _Cache(FunctionCache):
             data = place.load(self._key(sig, shipped.processor))
         if data is not None:
             return data
-        if _depth == 0:
+        if not _numba_inner.is_inside():
             counts.missed += 1
             for call in on_miss:
                 call(counts)
@@ -291,6 +290,8 @@ class _Cache(FunctionCache):
             _numba_turns.give_back(Path(self.cache_path), name)
 
     def _note(self, path: Path, sig: Any) -> None:
+        if _numba_inner.is_inside():
+            return
         with _lock:
             _used[path] = self._function.__module__, self._function.__qualname__, sigutils.normalize_signature(sig)[0]
 
@@ -316,18 +317,16 @@ def _watch(compiler: Any, cache: Any) -> None:
     compile_function = compiler.compile
 
     def compile_watched(*arguments: Any) -> Any:
-        global _depth
         collects = gc.isenabled()
         gc.disable()
-        _depth += 1
         try:
-            return compile_function(*arguments)
+            with _numba_inner.one_deeper():
+                return _numba_inner.completed(compile_function(*arguments))
         except BaseException:
             if isinstance(cache, _Cache):
                 cache.end_turn()
             raise
         finally:
-            _depth -= 1
             if collects:
                 gc.enable()
 
@@ -338,6 +337,7 @@ def keep_on_disk(dispatcher: Any) -> Any:
     """Let a compiled function be kept on disk where some folder can be written; return it."""
     if hasattr(dispatcher, "py_func"):  # a plain function without the compiler
         dispatcher._cache = _Unopened(dispatcher)
+        _numba_inner.tell_apart(dispatcher)
     return dispatcher
 
 

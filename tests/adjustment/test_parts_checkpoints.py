@@ -98,6 +98,35 @@ def test_a_damaged_checkpoint_is_told(parts, tmp_path):
         adjust_parts(parts, tmp_path / "out", options=OPTIONS)
 
 
+@pytest.mark.parametrize(
+    ("file", "name", "value"),
+    [
+        ("state.npz", "told", np.array("{}")),
+        ("state.npz", "told", np.array("[1")),
+        ("state.npz", "frames", np.zeros((2, 7))),
+        ("state.npz", "frames", None),
+        ("part-00000.{slot}.npz", "points", np.full((3, 3), np.nan)),
+        ("part-00000.{slot}.npz", "points", np.array(["a"])),
+        ("part-00000.{slot}.npz", "moved", np.zeros(0, bool)),
+    ],
+)
+def test_a_checkpoint_whose_arrays_are_others_is_told(parts, tmp_path, file, name, value):
+    with pytest.raises(Killed):
+        adjust_parts(parts, tmp_path / "out", options=OPTIONS, progress=killed_at(2))
+    folder = tmp_path / "out" / ".checkpoint"
+    with np.load(folder / "state.npz") as state:
+        slot = json.loads(str(state["told"]))["slot"]
+    place = folder / file.format(slot=slot)
+    with np.load(place) as kept:
+        arrays = {**kept, name: value}
+    if name == "told" and str(value) == "{}":
+        told = json.loads(str(np.load(folder / "state.npz")["told"]))
+        arrays[name] = np.array(json.dumps({"key": told["key"]}))
+    np.savez(place, **{key: array for key, array in arrays.items() if array is not None})
+    with pytest.raises(FileFormatError, match=r"damaged\. Pass --force to begin anew"):
+        adjust_parts(parts, tmp_path / "out", options=OPTIONS)
+
+
 def test_parts_in_memory_give_the_same(parts, tmp_path):
     for keep in ("always", "never", "auto"):
         adjust_parts(parts, tmp_path / keep, options=OPTIONS, keep=keep)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from groma.bounded.arrays import opened_arrays, read_array
+from groma.bounded.arrays import form, opened_arrays, read_array
 from groma.bounded.content import READING, expanded_limit, read_content
 from groma.bounded.images import decoded, image_size
 from groma.bounded.names import listed_file, outside, stays_inside
@@ -116,3 +116,23 @@ def test_arrays(tmp_path):
         (tmp_path / "b.npy").write_bytes(damaged)
         with pytest.raises(FileFormatError):
             read_array(tmp_path / "b.npy")
+
+
+def test_text_that_is_none(tmp_path):
+    """Beyond the last character of Unicode, Python has errors of its own."""
+    np.savez(tmp_path / "a.npz", good=np.array("é"), bad=np.array([0x110000], "<u4").view("<U1"))
+    with opened_arrays(tmp_path / "a.npz") as members:
+        assert str(members.read("good")) == "é"
+        with pytest.raises(FileFormatError, match="text that is none"):
+            members.read("bad")
+
+
+@pytest.mark.parametrize(("kinds", "shape"), [("f", (None, 3)), ("iu", (2, 3)), ("iu", (None, 2)), ("iu", (None,))])
+def test_forms_of_arrays(tmp_path, kinds, shape):
+    np.savez(tmp_path / "a.npz", a=np.zeros((2, 3), np.int32))
+    with opened_arrays(tmp_path / "a.npz") as members:
+        if (kinds, shape) == ("iu", (2, 3)):
+            assert members.read("a", form(kinds, *shape)).shape == (2, 3)
+        else:
+            with pytest.raises(FileFormatError, match="expected"):
+                members.read("a", form(kinds, *shape))

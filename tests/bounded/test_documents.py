@@ -17,6 +17,8 @@ from groma.errors import FileFormatError
         (b"[-Infinity]", "expected finite numbers; got -Infinity"),
         (b'{"a": 1,\n"b": }', "not JSON from line 2, column 6"),
         (b"", "not JSON from line 1, column 1"),
+        (b'{"a": "\xff"}', "not a text file"),
+        (b'{"a": ' + b"1" * 5000 + b"}", "a number that is too long"),
     ],
 )
 def test_what_is_no_document(tmp_path, content, words):

@@ -59,19 +59,21 @@ def test_types_are_read_as_numba_writes_them():
 def started(monkeypatch):
     """Processes that would be started."""
     calls = []
-    monkeypatch.setattr(ahead.Ahead, "_start", lambda self: calls.append(self._work))
+    monkeypatch.setattr(ahead.Ahead, "_start", lambda self, count: calls.append((self._work, count)))
     monkeypatch.setenv(ahead.VARIABLE, "3")
     return calls
 
 
-def test_processes_start_once_more_is_missing_than_there(started):
+@pytest.mark.parametrize("can_fork", [True, False])
+def test_processes_start_once_more_is_missing_than_there(started, monkeypatch, can_fork):
+    monkeypatch.setattr(ahead, "CAN_FORK", can_fork)
     said = []
     expected = ahead.Ahead("adjust", lambda: said.append("compiling"))
     expected(Counts(missed=1, loaded=5))
     assert not said and not started
     expected(Counts(missed=6, loaded=5))
     expected(Counts(missed=7, loaded=5))
-    assert said == ["compiling"] and started == ["adjust"] * 3
+    assert said == ["compiling"] and started == ([("adjust", 3)] if can_fork else [("adjust", 1)] * 3)
 
 
 @pytest.mark.parametrize(("threads", "count"), [(1, 0), (2, 2), (None, 2), (5, 2)])

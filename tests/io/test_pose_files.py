@@ -110,6 +110,14 @@ def test_lines_of_kitti_and_ids_of_a_graph_are_numbers_in_names(tmp_path, scene)
         read_poses(tmp_path / "graph.g2o", other[:4])
 
 
+@pytest.mark.parametrize("rows", ["1 0 0 {} 0 1 0 0 0 0 1 0", "{0} {0} 0 0 0 0 0 1"])
+def test_poses_in_whole_numbers_are_no_counts_of_a_model(tmp_path, rows):
+    """Three whole numbers begin a file of Bundle Adjustment in the Large, on a line of their own."""
+    (tmp_path / "poses.txt").write_text("\n".join(rows.format(row) for row in range(3)))
+    found = read_poses(tmp_path / "poses.txt", ["0.png", "1.png", "2.png"])
+    np.testing.assert_array_equal(found.cam_from_world[:, 4], [0, -1, -2])
+
+
 def test_axes_that_mirror_and_other_files_are_refused(tmp_path, scene):
     write_scene(scene, tmp_path / "transforms.json")
     document = json.loads((tmp_path / "transforms.json").read_text())

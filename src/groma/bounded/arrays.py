@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -113,6 +114,19 @@ class ArrayMembers:
         )
 
 
+def form(kinds: str, *shape: int | None) -> Check:
+    """Return a check that an array is of one of some kinds of NumPy (``f``, ``iu``) and of a shape; None: any size."""
+
+    def check(header: Header) -> None:
+        sizes = zip(shape, header.shape, strict=False)
+        fits = len(header.shape) == len(shape) and all(size in (None, got) for size, got in sizes)
+        if header.dtype.kind not in kinds or not fits:
+            expected = f"({', '.join('n' if size is None else str(size) for size in shape)})"
+            raise FileFormatError(f"expected {kinds} of the shape {expected}; got {header.dtype} {header.shape}.")
+
+    return check
+
+
 @contextmanager
 def opened_arrays(path: str | os.PathLike[str]) -> Iterator[ArrayMembers]:
     """Open an ``.npz`` file; what is wrong with the zip file itself is raised as :mod:`zipfile` does."""
@@ -160,7 +174,9 @@ def _content(stream: IO[bytes], header: Header, size: int, where: str) -> Array:
     if header.dtype.itemsize == 0 or size == 0:
         return np.zeros(header.shape, header.dtype)
     flat = np.frombuffer(content, header.dtype)
+    if header.dtype.kind == "U" and np.frombuffer(content, header.dtype.byteorder + "u4").max() > sys.maxunicode:
+        raise FileFormatError(f"{where} holds text that is none. Save it with numpy.savez.")
     return flat.reshape(header.shape, order="F" if header.fortran else "C").copy()
 
 
-__all__ = ["ArrayMembers", "Check", "Header", "opened_arrays", "read_array"]
+__all__ = ["ArrayMembers", "Check", "Header", "form", "opened_arrays", "read_array"]

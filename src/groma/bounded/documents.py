@@ -46,6 +46,10 @@ def read_document(path: str | os.PathLike[str]) -> Any:
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
         raise FileFormatError(f"{path} is not JSON from {where} on: {error.msg}. Fetch or write it again.") from error
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path} is not JSON: it is not a text file. Check the path.") from error
+    except ValueError as error:  # whole numbers of thousands of digits
+        raise FileFormatError(f"{path} holds a number that is too long ({error}). Correct the file.") from error
 
 
 def begins_with(head: bytes, mark: bytes) -> bool:

@@ -28,12 +28,12 @@ from groma.bounded.content import read_content
 from groma.errors import FileFormatError, InputError, OutputError
 from groma.geometry import quaternion
 from groma.io.atomic import atomic_output
+from groma.io.pose_conventions import BAL, FLIP
 from groma.io.reading import existing, reading
 from groma.io.registry import HEAD_BYTES, SceneFormat, register_format
 from groma.scene import Cameras, PointObservations, Points, Scene
 
-_FLIP = np.array([1.0, -1.0, -1.0])
-#: The rotation by pi about x, which is ``diag(1, -1, -1)``.
+#: The rotation by pi about x, which is :data:`FLIP`.
 _FLIP_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 _KIND = "BAL file"
 
@@ -90,7 +90,7 @@ def write_bal(scene: Scene, path: str | os.PathLike[str], force: bool = False) -
     pixel = (seen.pixel - principal_point[seen.image_idx]) * [1, -1]
     poses = scene.cam_from_world
     rotation = quaternion.log(quaternion.multiply(_FLIP_QUATERNION, poses[:, :4]))
-    numbers = np.hstack([rotation, poses[:, 4:] * _FLIP, params]).ravel().tolist() + scene.points.xyz.ravel().tolist()
+    numbers = np.hstack([rotation, poses[:, 4:] * FLIP, params]).ravel().tolist() + scene.points.xyz.ravel().tolist()
     text = io.StringIO()
     text.write(f"{scene.num_images} {scene.num_points} {len(seen)}\n")
     rows = zip(seen.image_idx.tolist(), seen.point_idx.tolist(), *pixel.T.tolist(), strict=True)
@@ -153,8 +153,11 @@ def bal_params(scene: Scene) -> tuple[FloatArray, FloatArray]:
 
 
 def looks_like_bal(head: bytes) -> bool:
-    """Tell from the first bytes of a file, decompressed where needed, whether three counts stand there."""
-    words = head.split(None, 3)[:3]
+    """Tell from the first bytes of a file, decompressed where needed, whether its first line holds three counts.
+
+    More numbers in it are a pose.
+    """
+    words = (head.lstrip().splitlines() or [b""])[0].split(None, 3)
     return len(words) == 3 and all(word.isdigit() for word in words)
 
 
@@ -182,7 +185,7 @@ def _refuse_broken_zlib() -> None:
 
 def _split(text: bytes, path: Path) -> tuple[list[int], bytes]:
     head = text[:200].split(None, 3)[:3]
-    if not looks_like_bal(text[:200]) or max(len(word) for word in head) > 15:
+    if len(head) < 3 or not all(word.isdigit() and len(word) <= 15 for word in head):
         raise FileFormatError(
             f"{path} must begin with three counts (cameras, points, observations); it begins with {text[:40]!r}."
         )
@@ -207,8 +210,8 @@ def _scene(image_idx: IntArray, point_idx: IntArray, pixel: FloatArray, camera: 
         raise FileFormatError(
             f"Camera {int(angle.argmax())} is turned by {angle.max():.3g} rad; not a rotation vector."
         )
-    turned = quaternion.multiply(_FLIP_QUATERNION, quaternion.exp(camera[:, :3]))
-    turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    poses = BAL.cam_from_world(camera[:, :3], camera[:, 3:6])
+    poses[:, :4] /= np.linalg.norm(poses[:, :4], axis=1, keepdims=True)
     cameras = Cameras(
         ids=np.arange(count) + 1,
         models=("BAL",) * count,
@@ -220,7 +223,7 @@ def _scene(image_idx: IntArray, point_idx: IntArray, pixel: FloatArray, camera: 
         cameras,
         [f"{index:05d}" for index in range(count)],
         np.arange(count),
-        np.hstack([turned, camera[:, 3:6] * _FLIP]),
+        poses,
         points=Points.at(xyz),
         point_observations=PointObservations.numbered(image_idx, point_idx, pixel * [1, -1]),
     )

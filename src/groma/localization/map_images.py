@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from pathlib import Path
 
-from groma.bounded.names import stays_inside
-from groma.errors import InputError
-from groma.io.endings import IMAGES
+from groma.bounded.documents import read_document
+from groma.bounded.names import IMAGES, stays_inside
+from groma.errors import GromaError, InputError
 from groma.scene import Scene
 
 
@@ -44,10 +43,10 @@ def image_paths(scene: Scene, folder: Path) -> list[Path]:
 def images_in_summary(map_: Path) -> Path | None:
     """Return the folder of photographs that the summary of a map tells, if it is there."""
     try:
-        told = json.loads((map_ / "summary.json").read_text(encoding="utf-8")).get("images")
-    except (OSError, ValueError, AttributeError):
+        told = read_document(map_ / "summary.json").get("images")
+        return Path(told) if isinstance(told, str) and Path(told).is_dir() else None
+    except (OSError, ValueError, AttributeError, GromaError):
         return None
-    return Path(told) if isinstance(told, str) and Path(told).is_dir() else None
 
 
 __all__ = ["image_paths", "images_in_summary"]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,21 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.bounded.arrays import opened_arrays
-from groma.errors import FileFormatError
+from groma.bounded.arrays import form, opened_arrays
 from groma.geometry import quaternion
 from groma.io import atomic_output
 from groma.localization.localizer import LocalizedImage
+from groma.localization.map_index import UNREADABLE
 from groma.localization.pose.camera import QueryCamera
+
+#: What each array of a file is.
+_FORMS = {
+    **dict.fromkeys(("name", "status", "sentence", "model"), form("U")),
+    **dict.fromkeys(("pose", "params"), form("f", None)),
+    **dict.fromkeys(("point", "line"), form("iu", None)),
+    "covariance": form("f", None, None), "size": form("iu", 2), "pixel": form("f", None, 2),
+    "segment": form("f", None, 4), "seconds": form("f"), "shared_error": form("f"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +50,19 @@ class PlacedImage:
     segment: FloatArray
     #: Seconds beside finding features.
     seconds: float
+    #: What parts of the map are off by, as seen from the camera, radians: part of the covariance.
+    shared_error: float = 0.0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the parts fit each other; those of a damaged file need not."""
+        has_pose = len(self.pose) == 7 and self.covariance.shape == (6, 6) and bool(self.model)
+        numbers = self.pose, self.params, self.pixel, self.segment
+        return (
+            (has_pose or not len(self.pose))
+            and (len(self.point), len(self.line)) == (len(self.pixel), len(self.segment))
+            and all(np.isfinite(part).all() for part in numbers)
+        )
 
     @property
     def camera(self) -> QueryCamera:
@@ -61,6 +82,7 @@ class PlacedImage:
                 entry["center_sigma"] = np.sqrt(np.diag(shift)).tolist()
                 entry["rotation_sigma_deg"] = float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]))))
         entry |= {"num_point_inliers": len(self.point), "num_line_inliers": len(self.line)}
+        entry["shared_error_deg"] = float(np.rad2deg(self.shared_error))
         return entry | {"seconds": self.seconds, "sentence": self.sentence}
 
     def write(self, path: Path, digest: str) -> None:
@@ -91,6 +113,7 @@ def placed(name: str, found: LocalizedImage) -> PlacedImage:
         found.line[lines],
         pose.matches.segments2d[lines].reshape(-1, 4),
         found.seconds,
+        pose.matches.shared_error,
     )
 
 
@@ -109,12 +132,15 @@ def read_placed(path: Path, digest: str) -> PlacedImage | None:
         with opened_arrays(path) as members:
             if str(members.read("digest")) != digest:
                 return None
-            values: dict[str, Any] = {item.name: members.read(item.name) for item in fields(PlacedImage)}
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile, FileFormatError):
+            values: dict[str, Any] = {name: members.read(name, check) for name, check in _FORMS.items()}
+            for name in ("name", "status", "sentence", "model"):
+                values[name] = str(values[name])
+            found = PlacedImage(**values | {name: float(values[name]) for name in ("seconds", "shared_error")})
+            if found.model:
+                found.camera  # noqa: B018 - refuses a calibration that is none
+    except UNREADABLE:
         return None
-    for name in ("name", "status", "sentence", "model"):
-        values[name] = str(values[name])
-    return PlacedImage(**values | {"seconds": float(values["seconds"])})  # type: ignore[arg-type]
+    return found if found.is_whole else None
 
 
 __all__ = ["PlacedImage", "placed", "read_placed", "unreadable"]

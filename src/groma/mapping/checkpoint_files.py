@@ -156,7 +156,9 @@ def _write_array(array: FloatArray, path: Path) -> None:
 
 
 def _read_array(path: Path) -> FloatArray:
-    return _read_arrays(path)["array"]
+    saved = _read_arrays(path)
+    with reading(path, "finished stage"):
+        return saved["array"]
 
 
 SCENE = FileKind(_write_scene, read_archive)

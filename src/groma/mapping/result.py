@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from groma._json import json_text
 from groma._typing import FloatArray
 from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
 from groma.adjustment.assemble import AssemblyOptions, assemble
@@ -24,6 +23,7 @@ from groma.adjustment.stages import with_loss
 from groma.adjustment.survey.attach import Surveyed
 from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
+from groma.bounded.json_text import json_text
 from groma.execution import beside
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
@@ -35,6 +35,7 @@ from groma.mapping.surveyed import reliability_of, survey_numbers
 from groma.mapping.unused import without_unused
 from groma.problem.problem import Problem
 from groma.scene import Scene
+from groma.scene.counts import num_relations
 from groma.solver.observability.diagnosis import Diagnosis, Finding
 from groma.viz.pictures import ImageFiles
 from groma.viz.report.page import PageContents, write_report
@@ -108,6 +109,7 @@ class MapResult:
             "line_confidence": _confidence_numbers(self.scene.lines.confidence),
             "num_planes": self.scene.num_planes,
             "num_directions": self.scene.num_directions,
+            "num_relations": num_relations(self.scene),
             "sigma_px": self.sigma_px,
             "segments": self.outcomes,
             "explanation": self.explanation,

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
-from groma.errors import InputError
+from groma.bounded.documents import read_document
+from groma.errors import GromaError, InputError
 from groma.io import read_scene
 from groma.io.sequences import Kind, open_sequence
 from groma.io.sequences.frame import Frame
@@ -114,10 +114,10 @@ def read_saved_map(folder: str | os.PathLike[str]) -> SavedMap:
     remedy = "Pass OUT of groma track, made of a sequence on disk."
     missing = f"{path} is no map to track in: its summary.json does not tell"
     try:
-        told = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+        told = read_document(path / "summary.json")
         of_photographs = "sources" not in told and isinstance(told.get("images"), str)
         sources = () if of_photographs else tuple(_source(one) for one in told["sources"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, GromaError) as error:
         raise InputError(f"{missing} where the frames of its keyframes are. {remedy}") from error
     if of_photographs:
         raise InputError(
@@ -134,12 +134,12 @@ def read_saved_map(folder: str | os.PathLike[str]) -> SavedMap:
 
 
 def _source(told: dict[str, Any]) -> FrameSource:
-    if not isinstance(told["path"], str) or told.get("kind") not in (None, "rgbd", "stereo", "mono"):
+    camera, scale, kind = (told.get(name) for name in ("camera", "depth_scale", "kind"))
+    good = isinstance(told["path"], str) and kind in (None, "rgbd", "stereo", "mono")
+    if not good or not isinstance(camera, str | None) or not isinstance(scale, int | float | None):
         raise ValueError("not a source")
     images = {str(image): str(frame) for image, frame in told["images"].items()}
-    return FrameSource(
-        told["path"], told.get("camera"), told.get("depth_scale"), cast("Kind | None", told.get("kind")), images
-    )
+    return FrameSource(told["path"], camera, scale, cast("Kind | None", kind), images)
 
 
 def sources_of(

@@ -13,8 +13,8 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,10 @@ import numpy as np
 from groma._typing import BoolArray, FloatArray
 from groma.adjustment.parts.opened import LANDMARKS, OpenParts
 from groma.adjustment.parts.together import agreed
+from groma.bounded.arrays import opened_arrays
 from groma.errors import FileFormatError
 from groma.io.atomic import atomic_output
+from groma.io.reading import reading
 from groma.solver.reduce.contract import Reducer
 from groma.solver.reduce.journal import Waypoint
 from groma.solver.report import Iteration, SolveReport
@@ -72,24 +74,31 @@ class Checkpoint:
 
     def load(self) -> States | None:
         """Return the states of an earlier run and take over where it stood; None where there was none."""
-        if not (self._folder / "state.npz").exists():
+        path = self._folder / "state.npz"
+        if not path.exists():
             return None
-        arrays = _load(self._folder / "state.npz")
-        told = json.loads(str(arrays.pop("told")))
-        if told["key"] != self._key:
-            return None
-        self._slot = told["slot"]
-        self.progressed = Progressed(told["stage"], told["scale"], [(a, _history(b)) for a, b in told["earlier"]])
-        standing = Standing(told["initial_cost"], told["fell"], tuple(_history(told["history"])), _ended(told["ended"]))
-        self.begin = Waypoint(standing, told["damping"], told["last_ratio"], told["curvature"])
-        states: dict[str, FloatArray] = {**{n: g.state.copy() for n, g in self._opened.variables.items()}}
-        states |= {name: array for name, array in arrays.items() if name in states}
+        with _reading(path):
+            arrays = _load(path)
+            told = json.loads(str(arrays.pop("told")))
+            if told["key"] != self._key:
+                return None
+            self._slot = int(told["slot"])
+            self.progressed = Progressed(told["stage"], told["scale"], [(a, _history(b)) for a, b in told["earlier"]])
+            history = tuple(_history(told["history"]))
+            standing = Standing(told["initial_cost"], told["fell"], history, _ended(told["ended"]))
+            self.begin = Waypoint(standing, told["damping"], told["last_ratio"], told["curvature"])
+            states: dict[str, FloatArray] = {name: group.state.copy() for name, group in self._opened.variables.items()}
+            for name in states.keys() - set(LANDMARKS):
+                states[name][:] = _like(arrays[name], states[name])
         for part in self._opened.parts:
-            arrays = _load(self._file(part.path, self._slot))
-            for name, rows in part.rows.items():
-                states[name][rows] = arrays[name]
-            if "lines" in part.rows:
-                self.moved[part.rows["lines"]] = arrays["moved"]
+            path = self._file(part.path, self._slot)
+            with _reading(path):
+                arrays = _load(path)
+                for name, rows in part.rows.items():
+                    states[name][rows] = _like(arrays[name], states[name][rows])
+                if "lines" in part.rows:
+                    moved = self.moved[part.rows["lines"]]
+                    self.moved[part.rows["lines"]] = _like(arrays["moved"], moved)
         return states
 
     def enter(self, progressed: Progressed) -> None:
@@ -151,12 +160,26 @@ def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
-def _load(path: Path) -> dict[str, np.ndarray]:
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Say of whatever goes wrong what is to be done."""
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise FileFormatError(f"{path} is damaged ({error}). Pass --force to begin anew.") from error
+        with reading(path, "checkpoint"):
+            yield
+    except FileFormatError as error:
+        raise FileFormatError(f"{path} is damaged. Pass --force to begin anew.") from error
+
+
+def _load(path: Path) -> dict[str, np.ndarray]:
+    with opened_arrays(path) as members:
+        return {name: members.read(name) for name in members.names}
+
+
+def _like(array: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Return an array that takes the place of another one; ValueError if it is of another form, or not finite."""
+    if array.shape != own.shape or array.dtype != own.dtype or not np.isfinite(array).all():
+        raise ValueError("other variables")
+    return array
 
 
 def _history(records: list[dict[str, Any]]) -> list[Iteration]:

@@ -172,18 +172,18 @@ def read_measured_poses(path: str | os.PathLike[str]) -> PosesFile:
         If a line is not of that form, a quaternion is not of unit length, or a covariance not positive definite.
     """
     expected = "name x y z qx qy qz qw, and two standard deviations or a covariance"
-    names, poses, covariances = [], [], []
+    poses: dict[str, list[float]] = {}
+    covariances = []
     for where, words in _rows(path, "file of poses", expected, (8, 10, 29, 44), 1):
         numbers = _numbers(words[1:], where, expected)
         length = float(np.linalg.norm(numbers[3:7]))
         if abs(length - 1.0) > 1e-3:
             raise FileFormatError(f"{where}: expected a unit quaternion qx qy qz qw; its length is {length:.4g}.")
-        if words[0] in names:
+        if words[0] in poses:
             raise FileFormatError(f"{where}: {shown(words[0])} has a pose already. Leave one of the two out.")
-        names.append(words[0])
-        poses.append([*numbers[:3], *(np.array(numbers[3:7]) / length)])
+        poses[words[0]] = [*numbers[:3], *(np.array(numbers[3:7]) / length)]
         covariances.append(_covariance(numbers[7:], where))
-    return PosesFile(tuple(names), np.array(poses), np.array(covariances), str(path))
+    return PosesFile(tuple(poses), np.array(list(poses.values())), np.array(covariances), str(path))
 
 
 def is_measured_poses(line: str) -> bool:
