@@ -53,8 +53,12 @@ class RightTurn:
         return RightTurn(covariance @ (own @ self.angles + information @ other), covariance)
 
     def is_as_sure_as(self, other: RightTurn, gates: RectificationGates = DEFAULT.rectification) -> bool:
-        """Whether the angle that is hardest to tell, yaw, is known as well as in an earlier estimate."""
-        return bool(self.covariance[1, 1] <= gates.as_sure * other.covariance[1, 1])
+        """Whether the angle that is hardest to tell, yaw, is known as well as in an earlier estimate.
+
+        That one was as sure as it said, or as the difference says.
+        """
+        earlier = other.covariance[1, 1] + (self.angles[1] - other.angles[1]) ** 2
+        return bool(self.covariance[1, 1] <= gates.as_sure * earlier)
 
     def confirming(self, assumed: RightTurn) -> RightTurn:
         """Return the estimate with what followed points cannot tell: in part they agree with what was assumed.
