@@ -157,8 +157,9 @@ def test_a_map_tells_all_three_angles(assumed):
     for seed in range(4):
         track_map, _ = _map(seed, TURN, assumed)
         before = RightTurn(assumed, KNOWN)
-        turn, job = estimate_turn(track_map, CAMERA, before, TrackOptions())
-        assert job is not None
+        found = estimate_turn(track_map, CAMERA, before, TrackOptions())
+        turn = found.turn
+        assert found.job is not None and found.left_open == math.inf  # nothing is described here
         error = turn.angles - TURN
         total += error[1] ** 2 / turn.covariance[1, 1]
         np.testing.assert_allclose(error * [710, 700, 610], 0.0, atol=0.12)
@@ -177,8 +178,9 @@ def test_what_followed_points_have_in_common_is_seen_by_described_features(monke
         track_map = _map(seed, biased, TURN)[0]
         described = _map(seed + 10, TURN, TURN, noise=0.2)[0]
         monkeypatch.setattr(stereo_calibration, "described_tracks", lambda *_, described=described: described)
-        turn, job = estimate_turn(track_map, CAMERA, RightTurn(TURN, KNOWN), TrackOptions())
-        assert job is not None
+        found = estimate_turn(track_map, CAMERA, RightTurn(TURN, KNOWN), TrackOptions())
+        turn = found.turn
+        assert found.job is not None and found.left_open < math.inf
         error, sigma = 700 * (turn.angles - TURN)[1], 700 * np.sqrt(turn.covariance[1, 1])
         total += (error / sigma) ** 2
         errors.append(abs(error))
@@ -197,8 +199,9 @@ def test_described_features_tell_yaw_where_their_chain_is_broken(monkeypatch):
         described.keyframes[k] = replace(keyframe, measured=replace(keyframe.measured, points=own))
     monkeypatch.setattr(stereo_calibration, "described_tracks", lambda *_: described)
     unknown = RightTurn.unknown()  # yaw is not known: described features alone tell it
-    turn, job = estimate_turn(track_map, CAMERA, unknown, TrackOptions())
-    assert job is None and turn.covariance[1, 1] < 0.1 * unknown.covariance[1, 1]
+    found = estimate_turn(track_map, CAMERA, unknown, TrackOptions())
+    turn = found.turn
+    assert found.job is None and turn.covariance[1, 1] < 0.1 * unknown.covariance[1, 1]
     assert abs(700 * (turn.angles - TURN)[1]) < 0.3
 
 
@@ -209,12 +212,19 @@ def test_a_later_estimate_counts_where_it_contradicts_an_earlier_one():
     assert not RightTurn(TURN, 5e-8 * np.eye(3)).is_as_sure_as(sure)
 
 
+def test_what_is_left_of_an_assumed_yaw_is_bounded_by_described_features():
+    assumed, found = RightTurn(NONE, np.eye(3)), RightTurn(TURN, 1e-10 * np.eye(3))
+    assert found.confirming(assumed).covariance[1, 1] == pytest.approx(TURN[1] ** 2, rel=1e-3)
+    assert found.confirming(assumed, 1e-9).covariance[1, 1] == pytest.approx(1.1e-9)
+    assert found.confirming(assumed, 0.0).covariance[1, 1] == pytest.approx(1e-10)
+
+
 def test_a_camera_that_stands_tells_no_yaw():
     """Without motion a wrong yaw is a wrong depth: it stays as uncertain as before."""
     track_map, _ = _map(0, TURN, keyframes=1)
-    turn, job = estimate_turn(track_map, CAMERA, RightTurn(NONE, KNOWN), TrackOptions())
-    assert job is None
-    sigma = np.degrees(np.sqrt(np.diag(turn.covariance)))
+    found = estimate_turn(track_map, CAMERA, RightTurn(NONE, KNOWN), TrackOptions())
+    assert found.job is None
+    sigma = np.degrees(np.sqrt(np.diag(found.turn.covariance)))
     assert sigma[1] == pytest.approx(GATES.sigma_deg, rel=1e-3) and sigma[0] < 0.01 > sigma[2]
 
 
@@ -230,8 +240,8 @@ def test_a_map_is_corrected_and_its_scene_is_that_of_a_rectified_pair():
     good = wrong > 0
     track_map.points.xyz[good] = (at * (wrong / at[:, 2])[:, None])[good]
     before = RightTurn(NONE, KNOWN)
-    turn, job = estimate_turn(track_map, CAMERA, before, TrackOptions())
-    correct_map(track_map, CAMERA, before, turn, TrackOptions(), job)
+    found = estimate_turn(track_map, CAMERA, before, TrackOptions())
+    correct_map(track_map, CAMERA, before, found.turn, TrackOptions(), found.job)
     seen = track_map.points.alive & (np.bincount(track_map.keyframes[0].measured.points.index, minlength=700) > 0)
     away = np.linalg.norm(track_map.points.xyz - places, axis=1)[seen] / places[seen, 2]
     assert np.median(away) < 0.01 < np.median(np.abs(wrong / at[:, 2] - 1.0))

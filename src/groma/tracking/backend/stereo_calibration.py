@@ -61,10 +61,19 @@ from groma.tracking.options import TrackOptions
 YAW = 4
 
 
-def estimate_turn(
-    track_map: TrackMap, camera: TrackCamera, turn: RightTurn, options: TrackOptions
-) -> tuple[RightTurn, AdjustmentJob | None]:
-    """Return how the right camera is turned, and the adjustment of the map that told it, if one did.
+@dataclass(frozen=True)
+class TurnEstimate:
+    """How the right camera is turned, as a map tells it."""
+
+    turn: RightTurn
+    #: The adjustment of the map that told it, if one did.
+    job: AdjustmentJob | None = None
+    #: Variance of yaw up to which followed points may agree with what was assumed, unseen by described features.
+    left_open: float = math.inf
+
+
+def estimate_turn(track_map: TrackMap, camera: TrackCamera, turn: RightTurn, options: TrackOptions) -> TurnEstimate:
+    """Return how the right camera is turned.
 
     Parameters
     ----------
@@ -79,16 +88,19 @@ def estimate_turn(
     known = RightTurn.unknown(gates).joined(*_rows_of(track_map, camera, turn, gates))
     living = track_map.living()
     if len(living) < gates.min_keyframes:
-        return known, None
+        return TurnEstimate(known)
     features = described_tracks(track_map, camera, options.gates, options.point_sigma_px)
     described = _by_columns(features, camera, turn, known, gates, 2)
     followed = None
     if tells_yaw(camera, turn, gates) and _step(living) <= gates.max_step:
         followed = _by_columns(track_map, camera, turn, known, gates, gates.min_views)
-    if described is None or followed is None:
-        told = described or followed
-        return known if told is None else told.with_(known), None if followed is None else followed.job
-    return followed.corrected(described).with_(known), followed.job
+    if followed is None:
+        return TurnEstimate(known if described is None else described.with_(known), None, 0.0)
+    if described is None:
+        return TurnEstimate(followed.with_(known), followed.job)
+    if described.variance <= followed.variance:
+        return TurnEstimate(described.with_(known), followed.job, 0.0)
+    return TurnEstimate(followed.corrected(described).with_(known), followed.job, described.variance)
 
 
 @dataclass(frozen=True)
@@ -101,8 +113,6 @@ class _Yaw:
 
     def corrected(self, described: _Yaw) -> _Yaw:
         """Return what followed points tell without what they have in common; see the module."""
-        if described.variance <= self.variance:
-            return replace(described, job=self.job)
         noise = self.variance + described.variance
         common = max((self.yaw - described.yaw) ** 2 - noise, 0.0)
         share = common / (common + noise)
@@ -307,4 +317,4 @@ def _log(rotation: FloatArray) -> FloatArray:
     return so3.log(rotation[None])[0]
 
 
-__all__ = ["correct_map", "estimate_turn", "shift_between", "tells_yaw"]
+__all__ = ["TurnEstimate", "correct_map", "estimate_turn", "shift_between", "tells_yaw"]
