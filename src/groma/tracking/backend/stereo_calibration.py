@@ -17,7 +17,6 @@ difference it is:
           s = \frac{\tau^2}{\tau^2 + \sigma_f^2 + \sigma_d^2}, \qquad \omega = (1 - s)\,\omega_f + s\,\omega_d .
 
 Where they agree, this is what followed points tell: both are of the same images, so their mean would be hardly better.
-While described features are the more precise ones, as from few keyframes, they count alone.
 
 Reference: R. DerSimonian, N. Laird, *Meta-analysis in clinical trials*, 1986.
 """
@@ -98,8 +97,6 @@ def estimate_turn(track_map: TrackMap, camera: TrackCamera, turn: RightTurn, opt
         return TurnEstimate(known if described is None else described.with_(known), None, 0.0)
     if described is None:
         return TurnEstimate(followed.with_(known), followed.job)
-    if described.variance <= followed.variance:
-        return TurnEstimate(described.with_(known), followed.job, 0.0)
     return TurnEstimate(followed.corrected(described).with_(known), followed.job, described.variance)
 
 
