@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -29,7 +29,7 @@ from groma.errors import InputError
 from groma.estimators.directions import DirectionOptions, DirectionSet, agreeing, directions_from_lines
 from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
 from groma.execution import together
-from groma.geometry.algebra import norm, perpendicular
+from groma.geometry.algebra import norm
 from groma.mapping.groups import num_distinct
 from groma.mapping.noise.landmarks import LineNoise, PointNoise, line_noise, point_noise
 from groma.mapping.structure.angles import Vector, angles_between, vertical_of
@@ -217,29 +217,12 @@ def _directions_in(
 def _parallels(
     scene: Scene, marks: Landmarks, options: StructureOptions, candidates: FloatArray | None
 ) -> tuple[DirectionSet, Pairs]:
-    """Directions and lines along them; the directions are fitted to these lines, which deviate from them."""
+    """Directions and lines along them."""
     directions = _directions_in(scene, marks, options, candidates)
     sigma, level, least = options.directions.parallel_sigma, options.level, options.min_line_probability
     along = along_directions(marks, directions, sigma, level, least)
     directions, new = _only_directions(directions, along.counts(len(directions)) >= _MIN_PARALLEL)
-    along = along.renumbered(new)
-    line, owner = along.pairs.T
-    length = norm(marks.segments[:, 1] - marks.segments[:, 0])
-    noise = marks.own_line_noise.widened(along.deviation.max(initial=0.0) * marks.line_pixel).directions(length)
-    return _fitted(directions, scene.lines.plucker[line, 3:], noise[line] + sigma**2 * np.eye(3), owner), along
-
-
-def _fitted(directions: DirectionSet, lines: FloatArray, covariance: FloatArray, owner: IntArray) -> DirectionSet:
-    """Directions by least squares from unit vectors (M, 3) of the lines along them, with their covariances."""
-    basis = np.stack(perpendicular(lines), axis=1)
-    weight = np.swapaxes(basis, 1, 2) @ np.linalg.inv(basis @ covariance @ np.swapaxes(basis, 1, 2)) @ basis
-    information, count = np.zeros((len(directions), 3, 3)), np.bincount(owner, minlength=len(directions))
-    np.add.at(information, owner, weight)
-    values, axes = np.linalg.eigh(information)
-    vectors = axes[:, :, 0] * np.copysign(1.0, np.einsum("di,di->d", axes[:, :, 0], directions.vectors))[:, None]
-    scale = np.maximum(values[:, 0] / np.maximum(2 * count - 2, 1), 1.0)
-    spread = axes[:, :, 1:] * np.sqrt(scale[:, None, None] / values[:, None, 1:])
-    return replace(directions, vectors=vectors, covariance=spread @ np.swapaxes(spread, 1, 2))
+    return directions, along.renumbered(new)
 
 
 def _relations(found: dict[str, Pairs], marks: Landmarks, options: StructureOptions) -> Relations:
