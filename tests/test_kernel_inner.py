@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from groma import _numba
-from groma._numba_inner import Pipeline, _NoMachineCode
+from groma._kernels.inner import Pipeline, _NoMachineCode
 from groma.compiled import kernel, loop
 
 pytestmark = [
@@ -120,7 +120,7 @@ PROGRAM = """
 import sys
 import numpy as np
 from groma.compiled import kernel, loop
-from groma._numba_cache import counts
+from groma._kernels.cache import counts
 
 @kernel
 def square(x):

@@ -4,8 +4,8 @@
 A command says what kind of work it does. Nothing happens until it has to compile: then a process is started, which
 makes the compiler ready and, where the system can, forks until there are as many as cores. They go through the list of
 what such work calls (:mod:`groma.compilation.needed`), in the order in which it is called, and leave out what is there
-or is being compiled (:mod:`groma._numba_turns`). The command finds the functions on disk when it gets to them, or waits
-for the process that is at it. The processes end with the command.
+or is being compiled (:mod:`groma._kernels.turns`). The command finds the functions on disk when it gets to them, or
+waits for the process that is at it. The processes end with the command.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
+from typing import Any
 
-from groma import _numba_cache
+from groma._kernels import cache as kernel_cache
 from groma.compilation.needed import IMPORTS, function, needed
 
 #: How many processes, if the user says so; 0 for none.
@@ -39,7 +40,7 @@ class Ahead:
         self._running: list[subprocess.Popen[bytes]] = []
         self._is_started = False
 
-    def __call__(self, counts: _numba_cache.Counts) -> None:
+    def __call__(self, counts: kernel_cache.Counts) -> None:
         """Hear that a function is missing."""
         if self._is_started or counts.missed <= counts.loaded:
             return
@@ -70,15 +71,15 @@ class Ahead:
 
 def expect(work: str, announce: Callable[[], None], threads: int | None = None) -> None:
     """Let processes help with what some work needs, if it comes to that; ``announce`` is called then."""
-    _numba_cache.on_miss[:] = [Ahead(work, announce, threads)]
+    kernel_cache.on_miss[:] = [Ahead(work, announce, threads)]
 
 
 def end() -> None:
     """End the processes; nothing more is expected."""
-    for ahead in _numba_cache.on_miss:
+    for ahead in kernel_cache.on_miss:
         if isinstance(ahead, Ahead):
             ahead.stop()
-    _numba_cache.on_miss.clear()
+    kernel_cache.on_miss.clear()
 
 
 def _count(threads: int | None) -> int:
@@ -92,7 +93,7 @@ def _count(threads: int | None) -> int:
 def _end_with_the_command(forked: list[int]) -> None:
     """End at once when the input does, but not in the middle of a file, and after the processes that were forked."""
     sys.stdin.buffer.read()
-    with _numba_cache.writing:
+    with kernel_cache.writing:
         _wait_for(forked)
         os._exit(0)
 
@@ -105,8 +106,9 @@ def _wait_for(forked: list[int]) -> None:
 
 def make_ready(work: str) -> None:
     """Import what some work imports, and what the compiler does at its first use."""
-    from numba.core.registry import cpu_target
+    from numba.core.registry import cpu_target as target
 
+    cpu_target: Any = target
     if work in IMPORTS:
         import_module(IMPORTS[work])
     for module, name, _ in needed(work):

@@ -22,7 +22,7 @@ from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.sigutils import normalize_signature
 
-from groma._numba_library import rebuilt
+from groma._kernels.library import rebuilt
 
 #: How the names of wrappers begin.
 _WRAPPER = "_ZN7cpython"
@@ -74,7 +74,7 @@ class _InnerLibrary(_Library):
         self._verify_declare_only_symbols()
         self._finalized = True
 
-    def serialize_using_object_code(self) -> tuple[str, str, bytes]:
+    def serialize_using_object_code(self) -> Any:
         self._ensure_finalized()
         return self.name, "bitcode", self._get_module_for_linking().as_bitcode()
 
