@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Map the lines of posed images with groma and LIMAP, from the same segments and the same matches.
 
-    python benchmarks/lines.py [SCENE ...] [--data DIR] [--python-limap PYTHON]
+    python benchmarks/lines.py [SCENE ...] [--data DIR] [--python-limap PYTHON] [--curves SVG]
 
 Without a Python that has pylimap 2 groma runs alone. Scenes whose data is not in the folder are left out.
 """
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from _line_curves import drawing
 from _line_scenes import LIMAP_MIN_LENGTH, MIN_LENGTH, NUM_NEIGHBORS, SCENES, LineScene
 from _workshop import CACHE, CONTESTANTS, RESULTS, ROOT, machine, run_program
 
@@ -34,8 +35,8 @@ from groma.mapping.map import MapOptions, adjust_points, map_segments
 from groma.scene import Scene
 from groma.scene.line_intervals import one_line_per_interval
 
-#: Probabilities at which points of groma's curve are.
-LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+#: Probabilities at which points of groma's curve are, and numbers of images at which those of LIMAP's are.
+LEVELS, IMAGES = (0.0, 0.3, 0.5, 0.7, 0.8, 0.9), (3, 4, 5, 6, 8, 10)
 #: ``all``: every segment of a neighbour is a candidate. ``wide``: groma's matches of surroundings and points.
 MATCHING = ("all", "wide")
 
@@ -211,7 +212,7 @@ def row_of(task: Task, lines: LineSet) -> dict[str, object]:
     if task.source.edges is not None and task.source.box is not None:
         ends, edges = inside(lines.ends, task.source.box), inside(task.source.edges, task.source.box)
         row["inside"] = {"num_lines": len(ends), **_scores(task.source, ends, edges)}
-    if task.source.edges is not None and lines.contestant.endswith((", all", ", refined")):
+    if task.source.edges is not None and (lines.contestant == "groma, all" or lines.contestant.endswith(", refined")):
         row["curve"] = curve_of(task.source, lines)
     return row
 
@@ -220,7 +221,7 @@ def curve_of(source: LineScene, lines: LineSet) -> list[dict[str, object]]:
     """Scores of the lines of at least some probability, or seen in at least so many images."""
     of_images = lines.sure is None
     sure = lines.num_images if lines.sure is None else lines.sure
-    levels = range(3, 13) if of_images else LEVELS
+    levels = IMAGES if of_images else LEVELS
     curve: list[dict[str, object]] = []
     for level in levels:
         if (sure >= level).any():
@@ -322,13 +323,14 @@ def main() -> int:
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=", ".join(SCENES))
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the data sets")
     parser.add_argument("--python-limap", help="Python that has pylimap 2; without it groma runs alone")
+    parser.add_argument("--curves", type=Path, help="draw what is right over what is found, .svg")
     parser.add_argument("--matching", choices=MATCHING, help="one kind of matches; default: both")
     arguments = parser.parse_args()
     if unknown := {*arguments.scenes} - {*SCENES}:
         parser.error(f"no such scene: {', '.join(sorted(unknown))}")
     RESULTS.mkdir(exist_ok=True)
     CACHE.mkdir(parents=True, exist_ok=True)
-    texts = []
+    texts, results = [], []
     for name in arguments.scenes or SCENES:
         try:
             source = SCENES[name](arguments.data)
@@ -345,8 +347,11 @@ def main() -> int:
                 draw(task, lines, len(source.images) // 2, RESULTS / f"lines-{name}-{matching}-{lines.contestant}.png")
         result = {"scene": name, "thresholds": source.thresholds, "machine": machine(), "rows": rows}
         (RESULTS / f"lines-{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+        results.append(result)
         texts.append(table(source, rows))
         print("\n" + texts[-1], flush=True)
+    if arguments.curves:
+        arguments.curves.write_text(drawing([result for result in results if "curve" in result["rows"][1]]))
     return 0 if texts else 1
 
 

@@ -124,6 +124,17 @@ def test_photographs_in_shuffled_pieces_are_not_localized(place, localizer):
         assert localizer.localize(shuffled).pose.status != "localized", name
 
 
+def test_a_photograph_of_which_one_part_shows_the_place_is_doubted(place, localizer):
+    """Its left and right thirds are those of another photograph, as wrong a place as can be for what is seen there."""
+    image, other = (
+        cv2.imread(str(place / "queries" / name), cv2.IMREAD_GRAYSCALE) for name in (QUERIES[3], QUERIES[0])
+    )
+    assert localizer.localize(image).pose.status == "localized"
+    pieced = other.copy()
+    pieced[160:320, 160:480] = image[160:320, 160:480]
+    assert localizer.localize(pieced).pose.status != "localized"
+
+
 def test_the_mirror_image_of_descriptors_is_that_of_the_image(place):
     image = cv2.imread(str(place / "queries" / QUERIES[3]), cv2.IMREAD_GRAYSCALE)
     flipped = np.ascontiguousarray(image[:, ::-1])

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from groma._json import json_text
 from groma._typing import FloatArray
 from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
 from groma.adjustment.assemble import AssemblyOptions, assemble
@@ -24,6 +23,7 @@ from groma.adjustment.stages import with_loss
 from groma.adjustment.survey.attach import Surveyed
 from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
+from groma.bounded.json_text import json_text
 from groma.execution import beside
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene

@@ -59,7 +59,7 @@ class AngleGates:
         0.036,
         "rad",
         "that angles deviate which are nearly right",
-        "derived: the mean of the most and the layer, in logarithms",
+        "derived from the most and the layer: their geometric mean",
     )
     held: float = gate(1e-4, "rad", "by which right angles are held at least", "cost: conditioning of an adjustment")
     tried: int = gate(100, "deviations", "from the least to the most", "cost: each a twentieth larger than the last")
