@@ -2,10 +2,15 @@
 """Gravity, heights, distances, poses with covariance, held cameras: are predicted errors those that occur?
 
     python benchmarks/known_geometry.py --data DATA [--draws 30]
+    python benchmarks/known_geometry.py --landmarks [--draws 30]
 
 Cameras, points and who sees what are those of castle-P30 (``measurements.py castle``); pixels (0.3 px) and
 measurements are drawn anew each time. The squared error of a camera in units of its covariance is 3 on average if the
 covariance is right. Then the wrong phones (gravity 2 to 10 degrees off) that the test names, and the right ones.
+
+``--landmarks``: made blocks of eight cameras with points, lines and planes, three positions, twelve distances (5 mm)
+of cameras from lines and planes, and of lines from each other. Then one of the distances has an error: the
+share that the test finds, against the power that theory gives for its redundancy.
 """
 
 import argparse
@@ -13,13 +18,17 @@ from pathlib import Path
 
 import numpy as np
 from measurements import PIXEL, projected, spread, with_control, with_positions
+from scipy.stats import norm
 
 import groma
+from groma.adjustment.survey.records import GATES
 from groma.adjustment.survey.reliability import reliability
+from groma.adjustment.terms.objects import rows_by_kind
 from groma.geometry import quaternion, se3
 from groma.io import read_scene
 from groma.scene import CameraPoses, Distances, Held, KnownDirections, KnownPlanes, Scene
 from groma.scene.survey import UNKNOWN, Kind
+from groma.scene.synthetic.scenes import holistic
 
 #: Standard deviations: gravity (degrees), heights, distances, and of poses (position, degrees).
 GRAVITY, HEIGHT, DISTANCE, POSE = 0.5, 0.01, 0.005, (0.02, 0.3)
@@ -85,12 +94,80 @@ def drawn_scenes(truth: Scene, drawn: Scene, rng: np.random.Generator) -> dict[s
     }
 
 
+def with_landmark_distances(scene: Scene, centers: np.ndarray, rng: np.random.Generator) -> Scene:
+    """Return the scene with distances of its true lines and planes: kinds, rows, and where they are measured."""
+    kinds, rows, places, lengths = [], [], [], []
+    line, plane = rng.permutation(scene.num_lines), rng.permutation(scene.num_planes)
+    ends = scene.lines.segments
+    along = (ends[:, 1] - ends[:, 0]) / np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1, keepdims=True)
+    for k in range(4):
+        far, wide = ends[line[k], 0], scene.planes.hesse[plane[k % len(plane)]]
+        pairs = (
+            (Kind.IMAGE, k, Kind.LINE, line[k], centers[k]),
+            (Kind.IMAGE, k + 4, Kind.PLANE, plane[k % len(plane)], centers[k + 4]),
+            (Kind.LINE, line[k + 4], Kind.LINE, line[k], ends[line[k + 4]].mean(axis=0)),
+        )
+        for first, one, second, other, place in pairs:
+            apart = place - far
+            length = np.linalg.norm(apart - (apart @ along[line[k]]) * along[line[k]])
+            length = abs(wide[:3] @ place + wide[3]) if second == Kind.PLANE else length
+            kinds.append((first, second)), rows.append((one, other)), places.append(place), lengths.append(length)
+    (first, second), (one, other) = np.array(kinds).T, np.array(rows).T
+    measured = np.array(lengths) + rng.normal(size=len(lengths)) * DISTANCE
+    table = Distances(first, one, second, other, np.array(places), measured, np.full(len(lengths), DISTANCE))
+    return scene.replace(distances=table)
+
+
+def landmarks(draws: int) -> None:
+    """Print predicted against actual errors with distances of lines and planes, and gross errors found."""
+    told = groma.AdjustOptions(
+        loss="none", point_sigma_px=0.5, line_sigma_px=0.5, structure_sigma_px=0.02, check_lens=False
+    )
+    sizes, limit = np.array([0.0, 3.0, 4.0, 5.0, 6.0, 8.0]), norm.isf(GATES.level / 2)
+    found, theory, rows = np.zeros(len(sizes)), np.zeros(len(sizes)), {"3 positions": [], "with distances": []}
+    for draw in range(draws):
+        rng = np.random.default_rng(draw)
+        made = holistic(8, noise_px=0.5, seed=draw)
+        true = made.truth.cam_centers_in_world
+        placed = with_positions(made.truth, rng)
+        few = placed.replace(camera_positions=placed.camera_positions.take([0, 3, 6]))
+        known = with_landmark_distances(few, true, rng)
+        for name, scene in (("3 positions", few), ("with distances", known)):
+            result = groma.adjust(scene, told)
+            centers, off = result.uncertainty().centers, result.scene.cam_centers_in_world - true
+            squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(centers), off)
+            sigma = np.trace(centers, axis1=1, axis2=2).mean()
+            rows[name].append((squares.mean(), (off**2).sum(axis=1).mean(), sigma))
+        wrong, table = int(rng.integers(len(known.distances))), known.distances
+        groups = rows_by_kind(("frames", "lines", "planes"), table.first_kind, table.second_kind)
+        order = [row for _, rows_ in groups for row in rows_.tolist()]
+        for k, size in enumerate(sizes):
+            distance = known.distances.distance.copy()
+            distance[wrong] += size * DISTANCE
+            result = groma.adjust(known.replace(distances=known.distances.replace(distance=distance)), told)
+            tests = [one for one in reliability(result.scene, result.problem).measurements if one.kind == "distance"]
+            one = tests[order.index(wrong)]
+            mean = size * np.sqrt(one.redundancy)
+            found[k] += one.is_suspect
+            theory[k] += norm.sf(limit - mean) + norm.cdf(-limit - mean)
+    for name, values in rows.items():
+        ratio, off, sigma = np.mean(values, axis=0)
+        print(f"{name}: NEES {ratio:.2f} (3), rms error {1e3 * off**0.5:.1f}, predicted {1e3 * sigma**0.5:.1f}")
+    print("size/sigma  found  theory")
+    for row in zip(sizes, found / draws, theory / draws, strict=True):
+        print("{:10.1f}  {:5.2f}  {:6.3f}".format(*row))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--draws", type=int, default=30)
     parser.add_argument("--points", type=int, default=2000, help="points of the castle that take part")
+    parser.add_argument("--landmarks", action="store_true", help="distances of lines and planes, in made blocks")
     arguments = parser.parse_args()
+    if arguments.landmarks:
+        landmarks(arguments.draws)
+        return
     truth = read_scene(arguments.data / "strecha_castle_p30" / "sparse_gt")
     thinned = np.random.default_rng(0).permutation(truth.num_points) < arguments.points
     truth = truth.keep(points=thinned).replace(keypoints=type(truth.keypoints)())

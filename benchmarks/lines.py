@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Map the lines of posed images with groma and LIMAP, from the same segments and the same matches.
 
-    python benchmarks/lines.py [SCENE ...] [--data DIR] [--python-limap PYTHON]
+    python benchmarks/lines.py [SCENE ...] [--data DIR] [--python-limap PYTHON] [--curves SVG]
 
 Without a Python that has pylimap 2 groma runs alone. Scenes whose data is not in the folder are left out.
 """
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from _line_curves import drawing
 from _line_scenes import LIMAP_MIN_LENGTH, MIN_LENGTH, NUM_NEIGHBORS, SCENES, LineScene
 from _workshop import CACHE, CONTESTANTS, RESULTS, ROOT, machine, run_program
 
@@ -28,11 +29,14 @@ from groma.features.matches import LineMatches
 from groma.geometry import quaternion, segment2
 from groma.mapping.checkpoints import Stages
 from groma.mapping.lines.build import MapLinesOptions, map_lines, segment_matches
+from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
 from groma.mapping.lines.neighbors import covisible_neighbors
 from groma.mapping.map import MapOptions, adjust_points, map_segments
 from groma.scene import Scene
 from groma.scene.line_intervals import one_line_per_interval
 
+#: Probabilities at which points of groma's curve are.
+LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 #: ``all``: every segment of a neighbour is a candidate. ``wide``: groma's matches of surroundings and points.
 MATCHING = ("all", "wide")
 
@@ -47,11 +51,21 @@ class LineSet:
     #: (T, 3) line, image, segment.
     track: np.ndarray
     seconds: float = float("nan")
+    #: (L,) what orders the lines from doubtful to sure: groma's probability; None: the number of images.
+    sure: np.ndarray | None = None
 
     @property
     def num_images(self) -> np.ndarray:
         pairs = np.unique(self.track[:, :2], axis=0)
         return np.bincount(pairs[:, 0].astype(int), minlength=len(self.ends))
+
+    def keep(self, kept: np.ndarray) -> LineSet:
+        """Return some of the lines."""
+        new = np.cumsum(kept) - 1
+        track = self.track[kept[self.track[:, 0]]]
+        track = np.column_stack([new[track[:, 0]], track[:, 1:]])
+        sure = None if self.sure is None else self.sure[kept]
+        return replace(self, ends=self.ends[kept], track=track, sure=sure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +108,10 @@ def options_of(scene: str) -> MapLinesOptions:
 
 # --------------------------------------------------------------------------------------------------------- contestants
 def run_groma(task: Task) -> list[LineSet]:
-    """Lines as mapped, and after the joint adjustment of everything but the exact poses; then the same of fewer."""
+    """Lines as mapped, after the joint adjustment of everything but the exact poses, and the probable ones of them.
+
+    Then the same with ``selective`` options.
+    """
     return [
         *_run_groma(task, "groma", task.options),
         *_run_groma(task, "groma, selective", MapLinesOptions.selective(task.options.min_length))[1:],
@@ -102,7 +119,7 @@ def run_groma(task: Task) -> list[LineSet]:
 
 
 def _run_groma(task: Task, name: str, options: MapLinesOptions) -> list[LineSet]:
-    settings = MapOptions(lines=options, refine_poses=False, threads=1)
+    settings = MapOptions(lines=options, refine_poses=False, threads=1, min_confidence=0.0)
     matches = task.matches or None
     with tempfile.TemporaryDirectory() as work, Stages(Path(work), task.source.name, settings) as stages:
         points = stages.run(adjust_points, task.source.scene)
@@ -118,7 +135,9 @@ def _run_groma(task: Task, name: str, options: MapLinesOptions) -> list[LineSet]
         result = map_segments(points, task.segments, matches, stages)
         seconds = time.process_time() - start
     scene = one_line_per_interval(result.scene)
-    return [mapped, LineSet(name, task.matching, scene.lines.segments, _track(scene, task.segments), seconds)]
+    track, sure = _track(scene, task.segments), scene.lines.confidence
+    every = LineSet(f"{name}, all", task.matching, scene.lines.segments, track, seconds, sure)
+    return [mapped, every, replace(every.keep(sure >= DEFAULT_CONFIDENCE), contestant=name)]
 
 
 def _track(scene: Scene, segments: list[Segments]) -> np.ndarray:
@@ -193,7 +212,22 @@ def row_of(task: Task, lines: LineSet) -> dict[str, object]:
     if task.source.edges is not None and task.source.box is not None:
         ends, edges = inside(lines.ends, task.source.box), inside(task.source.edges, task.source.box)
         row["inside"] = {"num_lines": len(ends), **_scores(task.source, ends, edges)}
+    if task.source.edges is not None and lines.contestant.endswith((", all", ", refined")):
+        row["curve"] = curve_of(task.source, lines)
     return row
+
+
+def curve_of(source: LineScene, lines: LineSet) -> list[dict[str, object]]:
+    """Scores of the lines of at least some probability, or seen in at least so many images."""
+    of_images = lines.sure is None
+    sure = lines.num_images if lines.sure is None else lines.sure
+    levels = range(3, 13) if of_images else LEVELS
+    curve: list[dict[str, object]] = []
+    for level in levels:
+        if (sure >= level).any():
+            scores = _scores(source, lines.ends[sure >= level], source.edges)
+            curve.append({"at_least": level, "num_lines": int((sure >= level).sum()), **scores})
+    return curve
 
 
 def _scores(source: LineScene, ends: np.ndarray, edges: np.ndarray) -> dict[str, list[float]]:
@@ -289,13 +323,14 @@ def main() -> int:
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=", ".join(SCENES))
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the data sets")
     parser.add_argument("--python-limap", help="Python that has pylimap 2; without it groma runs alone")
+    parser.add_argument("--curves", type=Path, help="draw what is right over what is found, .svg")
     parser.add_argument("--matching", choices=MATCHING, help="one kind of matches; default: both")
     arguments = parser.parse_args()
     if unknown := {*arguments.scenes} - {*SCENES}:
         parser.error(f"no such scene: {', '.join(sorted(unknown))}")
     RESULTS.mkdir(exist_ok=True)
     CACHE.mkdir(parents=True, exist_ok=True)
-    texts = []
+    texts, results = [], []
     for name in arguments.scenes or SCENES:
         try:
             source = SCENES[name](arguments.data)
@@ -312,8 +347,11 @@ def main() -> int:
                 draw(task, lines, len(source.images) // 2, RESULTS / f"lines-{name}-{matching}-{lines.contestant}.png")
         result = {"scene": name, "thresholds": source.thresholds, "machine": machine(), "rows": rows}
         (RESULTS / f"lines-{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+        results.append(result)
         texts.append(table(source, rows))
         print("\n" + texts[-1], flush=True)
+    if arguments.curves:
+        arguments.curves.write_text(drawing([result for result in results if "curve" in result["rows"][1]]))
     return 0 if texts else 1
 
 

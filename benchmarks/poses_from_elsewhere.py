@@ -127,6 +127,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--draws", type=int, default=3)
+    parser.add_argument("--first", type=int, default=0, help="Seed of the first draw, to add draws to others.")
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
     parser.add_argument("--no-lines", action="store_true", help="End with the adjustment of points.")
     parser.add_argument("--work", type=Path, help="Keep features and matches here, a folder for each scene.")
@@ -136,8 +137,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as own:
         for folder in told.scenes:
             work = (told.work or Path(own)) / folder.name
+            seeds = range(told.first, told.first + told.draws)
             for case in told.cases:
-                found = [draw(folder, work, CASES[case], seed, not told.no_lines) for seed in range(told.draws)]
+                found = [draw(folder, work, CASES[case], seed, not told.no_lines) for seed in seeds]
                 tell(folder.name, case, found)
 
 

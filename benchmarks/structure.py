@@ -2,32 +2,40 @@
 """Which relations of mapped lines and points are found, and which of those found are right, on rendered scenes.
 
     python benchmarks/structure.py [SCENE ...] [--cache FOLDER]
+    python benchmarks/structure.py --held [SCENE ...]
 
 The faces of these scenes are known, and so are their edges: which lie in one plane, which are parallel, which meet. A
 mapped line stands for the edge that it lies on; lines that are no edges of the object are left out. Recall is over all
 true pairs of usable lines and points with what enough of them share: a plane of ten points or segment ends, a direction
 of four lines. Maps are kept in the cache, without their structure.
+
+With --held: what relations bring. The cameras are free, with the exact ones as the start; root mean square of the
+centres after the best similarity, of the ends of true edges from their lines, and of the angles between planes
+and true ones.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from _renderings import BoxSettings, RenderedScene, render_boxes
 from _workshop import CACHE
 
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.evaluation.alignment import align_poses
 from groma.features import LsdDetector
 from groma.io import read_archive, write_archive
 from groma.mapping.checkpoints import Stages
 from groma.mapping.lines.confidence import with_confidence
 from groma.mapping.map import MapOptions, adjust_points, find_lines
-from groma.mapping.noise.observations import with_point_noise
+from groma.mapping.noise.observations import line_end_correlation, noise_px, with_point_noise
 from groma.mapping.structure.find import StructureOptions, find_structure
-from groma.scene import Scene
+from groma.mapping.structure.flatness import surface_noise_px
+from groma.scene import Relations, Scene
 
 _SMALL = {"width": 640, "height": 480, "focal": 560.0, "num_images": 16}
 _FACADE = {"num_boxes": 3, "num_panels": 40, "cameras": "front", **_SMALL}
@@ -46,7 +54,12 @@ REPORTED_ON = {
     "facade 812, rough": BoxSettings(seed=812, texture=8.0, rough=0.015, **_FACADE),
     "facade 813, wide": BoxSettings(seed=813, texture=8.0, rough=0.005, **{**_FACADE, "focal": 420.0}),
 }
-KINDS = ("line_along_direction", "line_on_plane", "point_on_plane", "lines_meeting")
+KINDS = ("line_along_direction", "line_on_plane", "point_on_plane", "lines_meeting", "parallel", "right_angles")
+#: Relations of planes and directions, and the tables they are between.
+ANGLES = {
+    "parallel": ("parallel_planes", "plane_across_direction", "parallel_directions"),
+    "right_angles": ("perpendicular_planes", "plane_along_direction", "perpendicular_directions"),
+}
 #: Distances from an edge over the distance from the cameras, up to which a line stands for it.
 NEAR = 0.0025
 #: Angles and distances of true structure, radians and scene units, that are none.
@@ -66,6 +79,8 @@ class Truth:
     point_in_plane: np.ndarray
     #: (L,) number of the direction, -1 for none.
     direction: np.ndarray
+    #: (K, 3) normals of the planes.
+    normals: np.ndarray
     #: (M, 2) lines that meet.
     meeting: np.ndarray
 
@@ -107,7 +122,7 @@ def truth_of(rendered: RenderedScene, scene: Scene) -> Truth:
     point[face >= 0] = rendered.plane_of_face[face[face >= 0]][:, None] == faces
     point &= (np.bincount(scene.point_observations.point_idx, minlength=scene.num_points) >= 3)[:, None]
     enough = point.sum(axis=0) + 2 * inside.sum(axis=0) >= 10
-    return Truth(own, inside & enough, point & enough, direction, _meeting(scene, own))
+    return Truth(own, inside & enough, point & enough, direction, normals, _meeting(scene, own))
 
 
 def _edges_of_faces(rendered: RenderedScene) -> tuple[np.ndarray, np.ndarray]:
@@ -172,10 +187,7 @@ def counts(truth: Truth, scene: Scene) -> dict[str, tuple[int, int, int]]:
     few = int((right & ~common[line]).sum())  # right, though fewer than are asked for
     result["line_along_direction"] = int(right.sum()) - few, int(judged.sum()) - few, int(common.sum())
     on_plane = {"line_on_plane": (truth.line_in_plane, known), "point_on_plane": (truth.point_in_plane, None)}
-    votes = np.zeros((scene.num_planes, truth.line_in_plane.shape[1]), int)
-    for name, (inside, _) in on_plane.items():
-        np.add.at(votes, getattr(relations, name)[:, 1], inside[getattr(relations, name)[:, 0]])
-    true_plane = votes.argmax(axis=1) if len(votes) else np.zeros(0, int)
+    true_plane, normals = _true_planes(truth, scene)
     for name, (inside, sure) in on_plane.items():
         mark, plane = getattr(relations, name).T
         judged = np.ones(len(mark), bool) if sure is None else sure[mark]
@@ -186,7 +198,63 @@ def counts(truth: Truth, scene: Scene) -> dict[str, tuple[int, int, int]]:
     found, true = (np.sort(pairs, axis=1) for pairs in (relations.lines_meeting[known_pairs], truth.meeting))
     right = (found[:, None] == true[None]).all(axis=2).any(axis=1) if len(true) else np.zeros(len(found), bool)
     result["lines_meeting"] = int(right.sum()), len(found), len(true)
+    way = truth.edges[:, 1] - truth.edges[:, 0]
+    vectors = np.concatenate([normals, np.where((kind >= 0)[:, None], way[kind], np.nan)])
+    return result | _angle_counts(vectors, scene)
+
+
+def _true_planes(truth: Truth, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Which true plane most of what lies on each plane is on, and its normal; NaN where nothing is on a true one."""
+    votes = np.zeros((scene.num_planes, truth.line_in_plane.shape[1]), int)
+    for name, inside in (("line_on_plane", truth.line_in_plane), ("point_on_plane", truth.point_in_plane)):
+        np.add.at(votes, getattr(scene.relations, name)[:, 1], inside[getattr(scene.relations, name)[:, 0]])
+    best = votes.argmax(axis=1) if len(votes) else np.zeros(0, int)
+    return best, np.where((votes.max(axis=1, initial=0) > 0)[:, None], truth.normals[best], np.nan)
+
+
+def _angle_counts(vectors: np.ndarray, scene: Scene) -> dict[str, tuple[int, int, int]]:
+    """The same of pairs of planes and directions, the first (N, 3) of which stand for these true vectors."""
+    vectors = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    cosine, result = np.abs(vectors @ vectors.T), {}
+    is_true = {"parallel": cosine > np.cos(PARALLEL), "right_angles": cosine < np.sin(PARALLEL)}
+    first, num = {"planes": 0, "directions": scene.num_planes}, len(vectors)
+    for name, kinds in ANGLES.items():
+        given = [np.zeros((0, 2), int)]
+        for item in fields(Relations):
+            if item.name in kinds:
+                given.append(getattr(scene.relations, item.name) + [first[table] for table in item.metadata["refers"]])
+        pairs = np.concatenate(given)
+        pairs = pairs[(pairs < num).all(axis=1)]
+        judged = pairs[np.isfinite(cosine[pairs[:, 0], pairs[:, 1]])]
+        right = is_true[name][judged[:, 0], judged[:, 1]]
+        result[name] = int(right.sum()), len(judged), int(np.triu(is_true[name], 1).sum())
     return result
+
+
+def held(rendered: RenderedScene, scene: Scene) -> dict[str, tuple[float, ...]]:
+    """Errors of centres, line ends (thousandths of a scene unit) and normals (mrad) with more and more relations."""
+    exact, truth, found = rendered.scene, truth_of(rendered, scene), find_structure(scene, StructureOptions())
+    edges, normals = truth.edges, _true_planes(truth, found)[1]
+    is_plane = np.isfinite(normals[:, 0])
+    known = np.flatnonzero(~np.isnan(edges[:, 0, 0]))
+    angles, off = {kind: [] for kinds in ANGLES.values() for kind in kinds}, {}
+    chosen = {"no relations": Relations(), "without angles": found.relations.take(**angles), "all": found.relations}
+    end_correlation = line_end_correlation(scene)
+    options = AdjustOptions(
+        point_sigma_px=noise_px(scene, "points"), line_sigma_px=noise_px(scene, "lines", end_correlation),
+        line_end_correlation=end_correlation, loss="cauchy", loss_scale=4.0, threads=1, check_lens=False,
+        structure_sigma_px=surface_noise_px(found, StructureOptions()),
+    )  # fmt: skip
+    for name, relations in chosen.items():
+        adjusted = adjust(found.replace(relations=relations), options).scene
+        adjusted = adjusted.transformed(align_poses(adjusted.cam_from_world, exact.cam_from_world))
+        moment, way = adjusted.lines.plucker[known, None, :3], adjusted.lines.plucker[known, None, 3:]
+        far = np.linalg.norm(np.cross(edges[known], way) - moment, axis=2)
+        shift = np.linalg.norm(adjusted.cam_centers_in_world - exact.cam_centers_in_world, axis=1)
+        tilt = np.linalg.norm(np.cross(adjusted.planes.hesse[is_plane, :3], normals[is_plane]), axis=1)
+        errors = (shift, far) if name == "no relations" else (shift, far, tilt)
+        off[name] = tuple(1e3 * float(np.sqrt(np.mean(one**2))) for one in errors)
+    return off
 
 
 def _usual(labels: np.ndarray) -> int:
@@ -200,10 +268,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="all by default; also: chosen, reported")
     parser.add_argument("--cache", type=Path, default=CACHE / "structure")
+    parser.add_argument("--held", action="store_true", help="what relations bring to cameras and lines")
     given = parser.parse_args()
     everything = {**CHOSEN_ON, **REPORTED_ON}
     groups = {"chosen": list(CHOSEN_ON), "reported": list(REPORTED_ON)}
     names = [name for one in given.scenes or groups for name in groups.get(one, [one])]
+    if given.held:
+        _print_held({name: everything[name] for name in names}, given.cache)
+        return
     print("Recall / precision, per cent (true ones)\n")
     print("| scene | " + " | ".join(kind.replace("_", " ") for kind in KINDS) + " |")
     print("|---" + "|---:" * len(KINDS) + "|")
@@ -214,6 +286,18 @@ def main() -> None:
         print(f"| {name} | " + " | ".join(_cell(found.get(kind, (0, 0, 0))) for kind in KINDS) + " |", flush=True)
         total = {kind: total[kind] + np.array(found.get(kind, (0, 0, 0))) for kind in KINDS}
     print("| all | " + " | ".join(_cell(total[kind]) for kind in KINDS) + " |")
+
+
+def _print_held(scenes: dict[str, BoxSettings], cache: Path) -> None:
+    print("Root mean square of centres, of ends of edges from their lines, thousandths, and of normals, mrad\n")
+    for number, (name, settings) in enumerate(scenes.items()):
+        off = held(*mapped(name, settings, cache))
+        if number == 0:
+            print("| scene | " + " | ".join(off) + " |\n|---" + "|---:" * len(off) + "|")
+        print(
+            f"| {name} | " + " | ".join(", ".join(f"{one:.3g}" for one in errors) for errors in off.values()) + " |",
+            flush=True,
+        )
 
 
 def _cell(count: tuple[int, int, int] | np.ndarray) -> str:

@@ -6,6 +6,7 @@
     python benchmarks/surveyed.py SCENE ... --subsets 10
     python benchmarks/surveyed.py SCENE ... --limits
     python benchmarks/surveyed.py SCENE ... --noise --rendered 1 2 3
+    python benchmarks/surveyed.py SCENE ... --deviations --rendered 1 2 3
 
 SCENE is a folder with ``images/``, a start ``sparse_inc/`` and the survey ``sparse_gt/``, both COLMAP models. Each
 scene is mapped once with the defaults of ``groma map``; its last adjustment is then repeated from the same start with
@@ -39,10 +40,15 @@ With ``--limits`` a row says how near the survey these photographs can come at a
 With ``--noise`` the last adjustment is repeated with one noise for all points, with each point's own, and with that and
 the errors that neighbours share, by points and by everything. ``--rendered`` adds rooms of boxes, rendered with these
 seeds and reconstructed from the pictures, whose cameras are known exactly.
+
+With ``--deviations`` the errors of the centres stand beside their standard deviations, as they follow from the noise,
+and by leaving out one landmark after the other, as ``groma map`` states them; a scene without ``sparse_inc`` starts at
+``sparse_gt``.
 """
 
 import argparse
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,6 +60,7 @@ from scipy.sparse.csgraph import connected_components
 
 import groma
 from groma.adjustment.assemble import AssemblyOptions, assemble, disassemble
+from groma.adjustment.misfit.jackknife import landmark_jackknife, observations_alone
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.uncertainty import position_sigma, uncertainty
 from groma.evaluation import evaluate_poses
@@ -66,6 +73,7 @@ from groma.mapping.unused import without_unused
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Relations, Scene
+from groma.solver.covariance.marginals import Covariances
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 
@@ -78,6 +86,8 @@ NOISES = [f"{kind}, {noise}" for kind in ("points", "all") for noise in ("one no
 SUBSETS = [*KINDS, "lines help", "planes help"]
 #: Points that an image of a subset shares with another at least, and images a scene needs for random subsets.
 SHARED_POINTS, MANY_IMAGES = 60, 10
+#: Centres: error, then stated deviations and those by leaving out landmarks, each root mean square and median.
+DEVIATIONS = ["error", "stated", "by landmarks", "errors in deviations: stated", "by landmarks"]
 LIMITS = ["one among surveyed", "at 2, 3, 5 sigma", "calibrated", "k1, k2", "gain", "tails"]
 #: Twice the logarithm of the likelihood that a result nearer the survey may cost.
 PRICES = (4.0, 9.0, 25.0)
@@ -179,8 +189,26 @@ def subsets(scene: Scene, count: int) -> list[np.ndarray]:
     return found
 
 
-def tell_rendered(seed: int) -> None:
-    """Print a row as :func:`tell_noise` for a rendered room of boxes."""
+def tell_deviations(name: str, truth: Scene, result: MapResult) -> None:
+    """Print a row: errors of the centres and their deviations (thousandths), stated and by leaving out landmarks."""
+    found = groma.adjust(result.before, replace(result.adjusted_with, gauge="free"))
+    problem, scores = found.problem, evaluate_poses(found.scene, truth)
+    assert problem is not None
+    alone = Covariances(observations_alone(problem), "inner", datum={"frames": [1, 1, 1, 0, 0, 0]})
+    row = {image: k for k, image in enumerate(truth.images.names)}
+    true = truth.cam_centers_in_world[[row[image] for image in found.scene.images.names]]
+    errors = np.linalg.norm(found.scene.transformed(scores.alignment).cam_centers_in_world - true, axis=1)
+    sigmas = [
+        scores.alignment.scale * position_sigma(one[found.scene.images.frame_idx, :3, :3])
+        for one in landmark_jackknife(alone)
+    ]
+    cells = [f"{1e3 * np.sqrt(np.mean(x**2)):.2f} / {1e3 * np.median(x):.2f}" for x in (errors, *sigmas)]
+    cells += [f"{np.sqrt(np.mean((errors / sigma) ** 2)):.2f}" for sigma in sigmas]
+    print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
+def tell_rendered(seed: int, tell: Callable[[str, Scene, MapResult], None], options: MapOptions) -> None:
+    """Print a row for a rendered room of boxes, whose cameras are known exactly."""
     settings = BoxSettings(seed=seed, num_images=30, num_boxes=10, texture=25.0, blotches=400, noise=3.0)
     room = render_boxes(settings)
     camera = (settings.focal, settings.focal, settings.width / 2, settings.height / 2)
@@ -189,8 +217,10 @@ def tell_rendered(seed: int) -> None:
         images.mkdir()
         for name, image in zip(room.scene.images.names, room.images, strict=True):
             cv2.imwrite(str(images / name), image)
-        result = map_images(images, Path(work) / "map", None, MapOptions(camera_model="PINHOLE", camera_params=camera))
-    tell_noise(f"boxes {seed}", room.scene, result)
+        result = map_images(
+            images, Path(work) / "map", None, replace(options, camera_model="PINHOLE", camera_params=camera)
+        )
+    tell(f"boxes {seed}", room.scene, result)
 
 
 def tell_limits(folder: Path, survey: Scene, result: MapResult) -> None:
@@ -294,6 +324,7 @@ def main() -> None:
     parser.add_argument("--subsets", type=int, metavar="N", help="the same over so many subsets of the images")
     parser.add_argument("--limits", action="store_true", help="how near the survey these photographs can come")
     parser.add_argument("--noise", action="store_true", help="one noise for all, each point's own, shared errors")
+    parser.add_argument("--deviations", action="store_true", help="errors against the deviations that maps state")
     parser.add_argument("--rendered", nargs="+", type=int, metavar="SEED", default=[], help="rooms of boxes too")
     arguments = parser.parse_args()
     print("centres: rms / largest, thousandths of the survey's unit; rotations: mean, degrees\n")
@@ -306,23 +337,29 @@ def main() -> None:
         columns = LIMITS
     if arguments.noise or arguments.rendered:
         columns = NOISES
+    if arguments.deviations:
+        columns = DEVIATIONS
+    # All lines take part in the adjustment; the improbable ones are left out after it.
+    options = MapOptions(min_confidence=0.0) if arguments.deviations else MapOptions()
+    tell = tell_deviations if arguments.deviations else tell_noise
     print("| scene | " + " | ".join(columns) + " |\n|---|" + "--:|" * len(columns))
     for folder in arguments.scenes:
-        start, survey = groma.read_scene(folder / "sparse_inc"), groma.read_scene(folder / "sparse_gt")
+        survey = groma.read_scene(folder / "sparse_gt")
+        start = groma.read_scene(folder / "sparse_inc") if (folder / "sparse_inc").is_dir() else survey
         with tempfile.TemporaryDirectory() as work:
-            result = map_images(folder / "images", work, start, MapOptions())
+            result = map_images(folder / "images", work, start, options)
         if arguments.scales:
             tell_scales(folder, survey, result, arguments.scales)
         elif arguments.subsets:
             tell_subsets(folder, survey, result, arguments.subsets)
-        elif arguments.noise or arguments.rendered:
-            tell_noise(folder.name, survey, result)
+        elif arguments.deviations or arguments.noise or arguments.rendered:
+            tell(folder.name, survey, result)
         elif arguments.limits:
             tell_limits(folder, survey, result)
         else:
             tell_kinds(folder, start, survey, result)
     for seed in arguments.rendered:
-        tell_rendered(seed)
+        tell_rendered(seed, tell, options)
 
 
 if __name__ == "__main__":

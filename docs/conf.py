@@ -30,6 +30,7 @@ extensions = [
     "_figures",
     "_formulas",
     "_navigation",
+    "_pose_conventions",
     "_reference",
     "_segment_figures",
     "_thresholds",

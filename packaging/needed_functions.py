@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from groma import _numba_cache
+from groma._kernels import cache as kernel_cache
 from groma.cli.main import run
 from groma.compilation.needed import PLACE, Entry, function, read_type
 
@@ -98,9 +98,9 @@ def record(work: str) -> list[Entry]:
     """Do some work and return what it called; in a process that compiles nothing and has done nothing before."""
     with tempfile.TemporaryDirectory() as folder:
         WORK[work](Path(folder))
-    if _numba_cache.counts.compiled:
+    if kernel_cache.counts.compiled:
         raise RuntimeError(f"Functions had to be compiled, which others than Python call; record {work!r} once more.")
-    used = _numba_cache.used_functions()
+    used = kernel_cache.used_functions()
     own = [entry for entry in used if entry[0].startswith("groma.") and function(*entry[:2]) is not None]
     return [entry for entry in own if all(map(_is_readable, entry[2]))]
 

@@ -34,13 +34,13 @@ BASELINES = {"x86-64-v2": _V2, "x86-64-v3": f"{_V2},+avx,+avx2,+bmi,+bmi2,+f16c,
 COMPILE = """
 import json
 from numba.core.registry import cpu_target
-from groma import _numba_cache
+from groma._kernels import cache as kernel_cache
 from groma.compilation import needed
 from groma.compilation.ahead import compile_ahead
 wanted = {(module, name) for work in needed.works() for module, name, _ in needed.needed(work)}
 for work in needed.works():
     compile_ahead(work)
-used = zip(_numba_cache.used_paths(), _numba_cache.used_functions())
+used = zip(kernel_cache.used_paths(), kernel_cache.used_functions())
 files = [(str(path), module) for path, (module, name, _) in used if (module, name) in wanted]
 print(json.dumps([cpu_target.target_context.codegen().magic_tuple(), files]))
 """

@@ -2,7 +2,7 @@
 """Settings that hold for every test: the kernel cache, hypothesis, the data beside the checkout.
 
 Compiled kernels go to a folder of the checkout rather than beside the sources. Edits are noticed there as anywhere
-(:mod:`groma._numba_cache`). The variable is set before Numba is imported, which reads it then.
+(:mod:`groma._kernels.cache`). The variable is set before Numba is imported, which reads it then.
 """
 
 import os

@@ -15,7 +15,8 @@ import pytest
 from numba.core import caching
 
 import groma
-from groma import _numba_cache, _numba_digest
+from groma._kernels import cache as kernel_cache
+from groma._kernels import digest as kernel_digest
 
 pytestmark = [
     pytest.mark.kernels,
@@ -46,7 +47,7 @@ def total(values):
 PROGRAM = """
 import numpy as np
 from groma import cameras
-from groma._numba_cache import counts
+from groma._kernels.cache import counts
 rng = np.random.default_rng(0)
 points = rng.uniform([-1, -1, 2], [1, 1, 5], (100, 3))
 parts = []
@@ -66,13 +67,13 @@ def fresh(tmp_path, monkeypatch):
     path.write_text(SOURCE)
 
     def run(values=None):
-        before = _numba_cache.counts.compiled, _numba_cache.counts.loaded, _numba_cache.counts.unsaved
+        before = kernel_cache.counts.compiled, kernel_cache.counts.loaded, kernel_cache.counts.unsaved
         spec = importlib.util.spec_from_file_location("cached_sample", path)
         module = importlib.util.module_from_spec(spec)
         monkeypatch.setitem(sys.modules, "cached_sample", module)
         spec.loader.exec_module(module)
         result = module.total(np.ones(3) if values is None else values)
-        after = _numba_cache.counts.compiled, _numba_cache.counts.loaded, _numba_cache.counts.unsaved
+        after = kernel_cache.counts.compiled, kernel_cache.counts.loaded, kernel_cache.counts.unsaved
         return result, *(b - a for a, b in zip(before, after, strict=True))
 
     run.path = path
@@ -101,7 +102,7 @@ def test_other_argument_types_have_files_of_their_own(fresh):
 def test_an_upgrade_compiles_again_and_leaves_nothing_behind(fresh, monkeypatch, tmp_path):
     fresh()
     files = _files(tmp_path)
-    monkeypatch.setattr(_numba_digest, "environment", lambda: "another version")
+    monkeypatch.setattr(kernel_digest, "environment", lambda: "another version")
     assert fresh()[1] > 0
     assert _files(tmp_path) == files
     assert fresh()[1] == 0
@@ -140,18 +141,18 @@ def test_a_read_only_installation_uses_the_folder_of_the_user(fresh, monkeypatch
     assert fresh()[1] > 0
     assert _files(home)
     assert fresh()[1] == 0
-    assert home in _numba_cache.folder().parents
+    assert home in kernel_cache.folder().parents
 
 
 def test_where_nothing_can_be_written_all_still_runs(fresh, monkeypatch):
     for locator in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
         monkeypatch.setattr(locator, "ensure_cache_path", _refuse)
     assert fresh() == (6.0, 0, 0, 0)
-    assert _numba_cache.folder() is None
+    assert kernel_cache.folder() is None
 
 
 def test_a_full_disk_costs_time_only(fresh, monkeypatch, tmp_path):
-    monkeypatch.setattr(_numba_cache.os, "replace", _refuse)
+    monkeypatch.setattr(kernel_cache.os, "replace", _refuse)
     result, compiled, _, unsaved = fresh()
     assert (result, compiled) == (6.0, 0)
     assert unsaved > 0
@@ -189,7 +190,7 @@ def test_four_processes_at_once_then_another_processor(tmp_path):
 ONE_PIXEL_EACH = """
 import numpy as np
 from groma import cameras
-from groma._numba_cache import counts
+from groma._kernels.cache import counts
 for name, params in (("PINHOLE", [500, 480, 320, 240]), ("RADIAL", [500, 320, 240, -0.1, 0.02])):
     before = counts.compiled
     pixel = cameras.model(name).project(np.array(params, dtype=float), np.array([[1.0, 2.0, 4.0]]))

@@ -19,7 +19,8 @@ from numba.core.dispatcher import Dispatcher
 from numba.extending import overload
 
 import groma
-from groma import _numba_cache, _numba_digest
+from groma._kernels import cache as kernel_cache
+from groma._kernels import digest as kernel_digest
 from groma.cameras import dispatch as _dispatch
 
 pytestmark = [
@@ -157,7 +158,7 @@ RESULTS = {"kernels.clip_all": 2.0, "loops.through_two": 4.0, "loops.through_mod
 
 
 def _content(function, kinds=()):
-    return _numba_digest.dependence(function, kinds).content
+    return kernel_digest.dependence(function, kinds).content
 
 
 def _made(source, **names):
@@ -180,13 +181,13 @@ def sample(tmp_path, monkeypatch):
     for name, text in (*texts.items(), ("dispatch", dispatch)):
         (folder / f"{name}.py").write_text(text)
     compiled = []
-    save = _numba_cache._Files.save
+    save = kernel_cache._Files.save
 
     def record(files, key, data):
         compiled.append(files._stem.partition("-")[0])
         save(files, key, data)
 
-    monkeypatch.setattr(_numba_cache._Files, "save", record)
+    monkeypatch.setattr(kernel_cache._Files, "save", record)
 
     def edit(name, old, new):
         path = folder / f"{name}.py"
@@ -360,7 +361,7 @@ def test_what_cannot_be_followed_stands_for_its_package(sample):
     (sample.folder / "odd.py").write_text("class Odd: pass\nodd = Odd()\ndef use(): return odd")
 
     def content():
-        _numba_digest._stamp.cache_clear()
+        kernel_digest._stamp.cache_clear()
         return _content(sample.load("odd").use)
 
     before = content()
@@ -370,9 +371,9 @@ def test_what_cannot_be_followed_stands_for_its_package(sample):
 
 
 def test_versions_and_settings_count(monkeypatch):
-    before = _numba_digest.environment()
+    before = kernel_digest.environment()
     monkeypatch.setattr(numba.config, "BOUNDSCHECK", 1)
-    assert _numba_digest.environment() != before
+    assert kernel_digest.environment() != before
 
 
 def test_all_of_groma_can_be_followed():
@@ -385,4 +386,4 @@ def test_all_of_groma_can_be_followed():
     modules = [vars(module) for name, module in list(sys.modules.items()) if name.partition(".")[0] == "groma"]
     functions = [value for names in modules for value in names.values() if isinstance(value, Dispatcher)]
     assert functions
-    assert not [f.__name__ for f in functions if _numba_digest._known_reach(f).is_opaque]
+    assert not [f.__name__ for f in functions if kernel_digest._known_reach(f).is_opaque]

@@ -10,7 +10,8 @@ import time
 import numba
 import pytest
 
-from groma import _numba_cache, _numba_turns
+from groma._kernels import inner as kernel_inner
+from groma._kernels import turns as kernel_turns
 
 pytestmark = [
     pytest.mark.kernels,
@@ -22,8 +23,8 @@ NAME, OTHER = "0123456789abcdef", "1123456789abcdef"
 HOLDER = """
 import sys
 from pathlib import Path
-from groma import _numba_turns
-print(_numba_turns.take(Path(sys.argv[1]), sys.argv[2]), flush=True)
+from groma._kernels import turns as kernel_turns
+print(kernel_turns.take(Path(sys.argv[1]), sys.argv[2]), flush=True)
 sys.stdin.read()
 """
 
@@ -40,38 +41,38 @@ def holder(tmp_path):
 
 
 def test_one_process_has_the_turn_until_it_ends(tmp_path, holder):
-    assert not _numba_turns.take(tmp_path, NAME)
-    assert _numba_turns.take(tmp_path, OTHER)  # another function
+    assert not kernel_turns.take(tmp_path, NAME)
+    assert kernel_turns.take(tmp_path, OTHER)  # another function
     holder.kill()
     holder.wait()
-    assert _numba_turns.take(tmp_path, NAME)
-    _numba_turns.give_back(tmp_path, NAME)
+    assert kernel_turns.take(tmp_path, NAME)
+    kernel_turns.give_back(tmp_path, NAME)
 
 
 def test_waiting_ends_when_the_function_is_there(tmp_path, holder):
     answers = iter([False, False, True])
-    _numba_turns.wait(tmp_path, NAME, lambda: next(answers))
+    kernel_turns.wait(tmp_path, NAME, lambda: next(answers))
     assert next(answers, None) is None
-    assert not _numba_turns.take(tmp_path, NAME)
+    assert not kernel_turns.take(tmp_path, NAME)
 
 
 def test_waiting_has_an_end(tmp_path, holder, monkeypatch):
-    monkeypatch.setattr(_numba_turns, "_PATIENCE", 0.05)
+    monkeypatch.setattr(kernel_turns, "_PATIENCE", 0.05)
     began = time.monotonic()
-    _numba_turns.wait(tmp_path, NAME, lambda: False)
+    kernel_turns.wait(tmp_path, NAME, lambda: False)
     assert time.monotonic() - began >= 0.05
 
 
 def test_where_files_cannot_be_locked_nobody_waits(tmp_path):
-    assert _numba_turns.take(tmp_path / "nowhere", NAME)
-    _numba_turns.give_back(tmp_path / "nowhere", NAME)
+    assert kernel_turns.take(tmp_path / "nowhere", NAME)
+    kernel_turns.give_back(tmp_path / "nowhere", NAME)
 
 
 PROGRAM = """
 import sys, time
 import numpy as np
 from groma.compiled import loop
-from groma._numba_cache import counts
+from groma._kernels.cache import counts
 
 @loop
 def total(values):
@@ -104,9 +105,9 @@ def test_what_does_not_compile_keeps_no_turn(tmp_path, monkeypatch):
         return x.nothing_of_this_name
 
     given = []
-    monkeypatch.setattr(_numba_turns, "give_back", lambda folder, name: given.append(name))
+    monkeypatch.setattr(kernel_turns, "give_back", lambda folder, name: given.append(name))
     compiled = loop(wrong)
     with pytest.raises(numba.TypingError):
         compiled(1.0)
     assert len(given) == 1
-    assert _numba_cache._depth == 0
+    assert not kernel_inner.is_inside()

@@ -5,7 +5,7 @@
 always inlined into the loops that call it.
 ``@loop`` marks the walk over a batch that calls a kernel by its module-level name.
 
-Both release the GIL and are cached on disk by :mod:`groma._numba_cache`. Division by zero gives inf or NaN, as in
+Both release the GIL and are cached on disk by :mod:`groma._kernels.cache`. Division by zero gives inf or NaN, as in
 NumPy. Reassociation and fused multiply-add are allowed; NaN and infinity keep their meaning.
 """
 
@@ -16,9 +16,11 @@ from typing import Any
 
 from numba import njit
 
-from groma._numba_cache import keep_on_disk
+from groma._kernels.cache import keep_on_disk
+from groma._kernels.inner import Pipeline
 
 _OPTIONS = {
+    "pipeline_class": Pipeline,
     "nogil": True,
     "no_cfunc_wrapper": True,  # for callers in C, of which there are none
     "error_model": "numpy",

@@ -159,7 +159,7 @@ def test_a_map_is_made_near_the_origin_in_a_usual_unit_and_moved_back(tmp_path, 
 
     def mapped(points, *others):
         seen.append(points)
-        return MapResult(near.scene, points, start, near.report, OPTIONS, {}, "", {}, ())
+        return MapResult(near.scene, points, start, near.scene, near.report, OPTIONS, {}, "", {}, ())
 
     monkeypatch.setattr(mapping, "map_segments", mapped)
     for name in start.images.names:

@@ -10,7 +10,8 @@ import groma
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.rescue.clusters import settle_clusters
 from groma.problem.residuals import squared_norms
-from groma.scene import Relations, synthetic
+from groma.scene import Distances, Relations, synthetic
+from groma.scene.survey import Kind
 
 pytestmark = pytest.mark.kernels
 
@@ -82,6 +83,22 @@ def test_a_point_on_two_lines_makes_them_one_cluster(scenes):
     unmoved = (better.variables["lines"].state == problem.variables["lines"].state).all(axis=1)
     assert np.flatnonzero(~unmoved).tolist() == [BAD, BAD + 1]
     assert _cost(better) < _cost(problem)
+
+
+def test_what_ties_a_cluster_to_lines_outside_of_it_stays_out(scenes):
+    """A width between two lines of which one is turned: the other is not in its cluster, and has to stay."""
+    truth, wrong, _ = scenes
+    others = [BAD + 1, BAD + 2]
+    places = truth.lines.segments[others].mean(axis=1)
+    lengths = np.linalg.norm(places - truth.lines.segments[BAD].mean(axis=0), axis=1)
+    kinds = np.full(2, Kind.LINE)
+    widths = Distances(kinds, np.array(others), kinds, np.full(2, BAD), places, lengths, np.full(2, 0.01))
+    problem = _problem(wrong.replace(distances=widths))
+    assert any(factor.type_name == "distance" for factor in problem.factors)
+    better, moved = settle_clusters(wrong, problem)
+    assert moved.tolist() == [BAD]
+    unmoved = (better.variables["lines"].state == problem.variables["lines"].state).all(axis=1)
+    assert np.flatnonzero(~unmoved).tolist() == [BAD]
 
 
 @pytest.mark.slow

@@ -193,6 +193,64 @@ def test_exchanged_longitudes_and_latitudes_are_told(truth_and_start):
     refused(truth, "longitude and latitude exchanged", positions=replace(right, coordinates=degrees[:, [1, 0, 2]]))
 
 
+def test_exchanged_longitudes_and_latitudes_of_control_points_are_told(truth_and_start):
+    truth, _ = truth_and_start
+    points, _ = control_file(truth, np.random.default_rng(5))
+    east, north, up = points.places.coordinates.T * 10
+    degrees = np.column_stack([13.4 + east / 67700, 52.5 + north / 111270, up])
+    for order in ([0, 1, 2], [1, 0, 2]):
+        places = replace(places_of(points.places.names, degrees[:, order], 1.0, "EPSG:4326"))
+        given = {"control": replace(points, places=places), "control_sigma": (1.0,)}
+        if order[0] == 0:
+            assert with_survey(truth, Survey(**given)).alignment.scatter < 0.5
+        else:
+            refused(truth, "longitude and latitude exchanged", **given)
+
+
+def test_units_that_contradict_each_other_are_told(truth_and_start):
+    """Feet among metres, heights in feet, millimetres of a tape: no noise, but a factor that people know."""
+    truth, _ = truth_and_start
+    rng = np.random.default_rng(5)
+    given, (points, xyz) = measured_positions(truth, rng), control_file(truth, rng)
+    feet = replace(points, places=replace(points.places, coordinates=points.places.coordinates / 0.3048))
+    stated = {"positions": given, "control_sigma": (1.0,)}
+    refused(truth, "positions are 0.30.* look like metres, the latter like feet", control=feet, **stated)
+    heights = given.coordinates * [1.0, 1.0, 1.0 / 0.3048]
+    refused(
+        truth, "if their heights are in feet and the rest is in metres", positions=replace(given, coordinates=heights)
+    )
+    lower = given.coordinates * [1.0 / 0.3048, 1.0 / 0.3048, 1.0]
+    refused(
+        truth, "if their heights are in metres and the rest is in feet", positions=replace(given, coordinates=lower)
+    )
+    apart = np.linalg.norm(xyz[[1, 3]] - xyz[[0, 2]], axis=1)
+    tape = DistancesFile(("p0", "p2"), ("p1", "p3"), 1000.0 * apart, np.ones(2), "tape.csv")
+    words = "measured distances are .* the former look like millimetres, the latter like metres"
+    refused(truth, words, control=points, control_sigma=(1.0,), distances=tape)
+    refused(
+        truth, words, control=points, distances=replace(tape, second=("p1", "p3"), distance=990.0 * apart), **stated
+    )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bad_heights_are_no_other_unit(truth_and_start, seed):
+    """Heights that are pure noise, as of photographs with GPS, would fit better the smaller they are made."""
+    truth, _ = truth_and_start
+    given = measured_positions(truth, np.random.default_rng(seed))
+    noise = np.random.default_rng(seed).normal(size=(8, 3)) * [0.02, 0.02, 1.0]
+    with_survey(truth, Survey(positions=replace(given, coordinates=given.coordinates + noise)))
+
+
+def test_lengths_that_are_only_wrong_are_no_other_unit(truth_and_start):
+    """A factor of two is a gross error, which the tests name; one unit alone cannot be wrong."""
+    truth, _ = truth_and_start
+    rng = np.random.default_rng(5)
+    given, (points, xyz) = measured_positions(truth, rng), control_file(truth, rng)
+    wrong = DistancesFile(("p0",), ("p1",), 2.0 * np.linalg.norm(xyz[1:2] - xyz[0], axis=1), np.ones(1), "tape.csv")
+    with_survey(truth, Survey(positions=given, control=points, control_sigma=(1.0,), distances=wrong))
+    with_survey(truth, Survey(positions=replace(given, coordinates=given.coordinates / 0.3048)))
+
+
 def test_images_that_are_not_there_are_told(truth_and_start):
     truth, _ = truth_and_start
     given = measured_positions(truth, np.random.default_rng(5))

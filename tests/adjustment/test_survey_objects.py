@@ -12,6 +12,7 @@ from _survey import ELSEWHERE, SIGMA, control, control_file, made, measured_posi
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.survey.attach import with_survey
 from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.place import settled
@@ -87,6 +88,16 @@ def gravity_file(scene, rng, sigma_deg=0.5, world=DOWN):
     seen = quaternion.rotate(quaternion.exp(rng.normal(size=(len(turn), 3)) * np.radians(sigma_deg)), seen)
     count = len(seen)
     return DirectionsFile(scene.images.names, seen, np.tile(DOWN, (count, 1)), np.full(count, sigma_deg), "imu.txt")
+
+
+def test_what_a_ring_of_distances_determines_is_said(truth):
+    """Every control point is tied to another one: none can be eliminated on its own."""
+    start = truth.points_only()
+    xyz, ends = truth.control_points.xyz, np.arange(4)
+    lengths = np.linalg.norm(xyz[(ends + 1) % 4] - xyz, axis=1)
+    ring = Distances.between(Kind.CONTROL_POINT, ends, (ends + 1) % 4, lengths, np.full(4, 1e-3))
+    found = diagnose_scene(start.replace(distances=ring))
+    assert found.num_free_motions == 6 and found.num_unobservable_directions == 0
 
 
 def test_gravity_turns_a_scene_and_holds_it(truth):

@@ -8,8 +8,8 @@ import _comparison as compare
 import numpy as np
 import pytest
 
-from groma import _numba_cache
 from groma._counted import counted
+from groma._kernels import cache as kernel_cache
 from groma.cli.main import run
 from groma.cli.shared.sentences import spent
 from groma.compilation.time import Compilation, compilation_time
@@ -193,7 +193,7 @@ def test_compilation_is_measured():
 def test_compiling_is_told_from_loading(monkeypatch):
     for name, told in (("loaded", False), ("compiled", True), ("unsaved", True)):
         with compilation_time() as compilation:
-            monkeypatch.setattr(_numba_cache.counts, name, getattr(_numba_cache.counts, name) + 1)
+            monkeypatch.setattr(kernel_cache.counts, name, getattr(kernel_cache.counts, name) + 1)
         assert compilation.compiled == told
 
 

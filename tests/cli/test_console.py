@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from groma.cli.main import run
 from groma.cli.shared import progress as _progress
 from groma.cli.shared import style
 from groma.cli.shared.console import Console
@@ -133,6 +134,19 @@ def test_sentences_are_broken_between_words_on_a_terminal_only(monkeypatch, caps
     monkeypatch.setattr(sys.stdout, "isatty", lambda: False, raising=False)
     console.say(sentence)
     assert capsys.readouterr().out == sentence + "\n"
+
+
+def test_errors_are_broken_like_sentences_and_stay_one_line_in_a_pipe(monkeypatch, capsys, tmp_path):
+    wrong = tmp_path / "notes.md"
+    wrong.write_text("# Notes\n")
+    assert run(["adjust", str(wrong)]) == 1
+    (one,) = capsys.readouterr().err.splitlines()
+    assert one.startswith("groma: ") and "it begins with '# Notes" in one
+    be_terminal(monkeypatch)
+    assert run(["adjust", str(wrong)]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) > 1 and " ".join(" ".join(lines).split()) == one
+    assert all(len(line) <= 80 or str(wrong) in line for line in lines)
 
 
 @pytest.mark.parametrize(

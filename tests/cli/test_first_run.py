@@ -5,13 +5,14 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numba
 import pytest
 
 import groma
-from groma._numba_cache import Counts
+from groma._kernels.cache import Counts
 from groma.cli.main import run
 from groma.compilation import ahead, needed
 from groma.scene import synthetic
@@ -59,19 +60,21 @@ def test_types_are_read_as_numba_writes_them():
 def started(monkeypatch):
     """Processes that would be started."""
     calls = []
-    monkeypatch.setattr(ahead.Ahead, "_start", lambda self: calls.append(self._work))
+    monkeypatch.setattr(ahead.Ahead, "_start", lambda self, count: calls.append((self._work, count)))
     monkeypatch.setenv(ahead.VARIABLE, "3")
     return calls
 
 
-def test_processes_start_once_more_is_missing_than_there(started):
+@pytest.mark.parametrize("can_fork", [True, False])
+def test_processes_start_once_more_is_missing_than_there(started, monkeypatch, can_fork):
+    monkeypatch.setattr(ahead, "CAN_FORK", can_fork)
     said = []
     expected = ahead.Ahead("adjust", lambda: said.append("compiling"))
     expected(Counts(missed=1, loaded=5))
     assert not said and not started
     expected(Counts(missed=6, loaded=5))
     expected(Counts(missed=7, loaded=5))
-    assert said == ["compiling"] and started == ["adjust"] * 3
+    assert said == ["compiling"] and started == ([("adjust", 3)] if can_fork else [("adjust", 1)] * 3)
 
 
 @pytest.mark.parametrize(("threads", "count"), [(1, 0), (2, 2), (None, 2), (5, 2)])
@@ -90,8 +93,9 @@ def test_nothing_is_said_before_arguments_are_checked(tmp_path, capsys, started)
 
 COMPILE_AHEAD = """
 import sys
+import time
 from pathlib import Path
-from groma._numba_cache import counts
+from groma._kernels.cache import counts
 from groma.compilation import needed
 from groma.compilation.ahead import compile_ahead
 needed.PLACE = Path(sys.argv[1])
@@ -110,6 +114,24 @@ def test_what_is_listed_is_compiled_once(tmp_path):
     found = [subprocess.run(call, capture_output=True, text=True, check=True, env=environment) for _ in range(2)]
     assert int(found[0].stdout) >= 1
     assert int(found[1].stdout) == 0
+
+
+@pytest.mark.skipif(not ahead.CAN_FORK, reason="processes are not forked")
+@pytest.mark.parametrize("ends", ["after a moment", "at once"])
+def test_all_processes_end_with_the_command(tmp_path, ends):
+    """The one that was started and the one that it has forked: nothing of their group is left."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    call = [sys.executable, "-W", "ignore", "-m", "groma.compilation.ahead", "pose graph", "2"]
+    with subprocess.Popen(call, stdin=subprocess.PIPE, env=environment, start_new_session=True) as process:
+        assert process.stdin is not None
+        while ends != "at once" and not list(tmp_path.rglob("*.nbc")):
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.stdin.close()
+        assert process.wait() == 0
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)
+    assert not list(tmp_path.rglob("*.tmp"))
 
 
 @pytest.mark.slow

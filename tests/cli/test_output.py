@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from groma._json import plain
+from groma.bounded.json_text import plain
 from groma.cli.shared.output import atomic_output, check_json, check_output, check_outputs, write_json
 from groma.errors import OutputError
 

@@ -139,7 +139,7 @@ def test_a_map_is_in_the_frame_of_its_measurements(tmp_path, monkeypatch):
 
     def mapped(points, *others):
         seen.append(points)
-        return MapResult(points, points, points, near.report, AdjustOptions(point_sigma_px=0.5), {}, "", {}, ())
+        return MapResult(points, points, points, points, near.report, AdjustOptions(point_sigma_px=0.5), {}, "", {}, ())
 
     monkeypatch.setattr(mapping, "map_segments", mapped)
     for name in truth.images.names:

@@ -13,7 +13,8 @@ import numba
 import numpy as np
 import pytest
 
-from groma import _numba_cache, cameras
+from groma import cameras
+from groma._kernels import cache as kernel_cache
 from groma.cli.main import run
 from groma.compilation import runs as _warmup_runs
 from groma.compilation import warmup as _warmup
@@ -34,7 +35,7 @@ def made(monkeypatch, tmp_path):
 
         yield "one", work
 
-    monkeypatch.setattr(_numba_cache, "folder", lambda: tmp_path)
+    monkeypatch.setattr(kernel_cache, "folder", lambda: tmp_path)
     monkeypatch.setattr(_warmup_runs, "RUNS", {part: lambda part=part: steps(part) for part in _warmup.PARTS})
     return names
 
@@ -62,7 +63,7 @@ def test_one_part_is_made_alone(made, tmp_path):
 def test_a_removed_file_is_noticed(made, monkeypatch, tmp_path):
     kept = tmp_path / "compiled.nbc"
     kept.write_bytes(b"")
-    monkeypatch.setattr(_numba_cache, "used_files", lambda: [kept])
+    monkeypatch.setattr(kernel_cache, "used_files", lambda: [kept])
     assert run(["warmup", "map"]) == 0
     assert run(["warmup", "map"]) == 0
     assert made == ["map"]
@@ -73,12 +74,12 @@ def test_a_removed_file_is_noticed(made, monkeypatch, tmp_path):
 
 def test_another_version_is_not_ready(made, monkeypatch):
     assert run(["warmup", "map"]) == 0
-    monkeypatch.setattr(_numba_cache, "source_stamp", lambda: "another version")
+    monkeypatch.setattr(kernel_cache, "source_stamp", lambda: "another version")
     assert not _warmup.is_ready("map")
 
 
 def test_where_nothing_is_kept_it_says_so(made, monkeypatch, capsys):
-    monkeypatch.setattr(_numba_cache, "folder", lambda: None)
+    monkeypatch.setattr(kernel_cache, "folder", lambda: None)
     assert run(["warmup", "map"]) == 1
     assert "NUMBA_CACHE_DIR" in capsys.readouterr().err
     assert not made
@@ -97,7 +98,7 @@ def test_the_models_and_factors_that_are_compiled_for_exist():
 COMMAND_AFTER = """
 import sys
 from groma.cli.main import run
-from groma._numba_cache import counts
+from groma._kernels.cache import counts
 assert run(sys.argv[1:]) == 0
 print("COMPILED", counts.compiled)
 """

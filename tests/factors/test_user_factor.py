@@ -185,7 +185,7 @@ def test_declarations_are_checked():
 
 PROGRAM = """
 import numpy as np
-from groma._numba_cache import counts
+from groma._kernels.cache import counts
 from groma.factors.checks.check import _ambients, _block_sizes, _linearize, _residuals
 from groma.factors.user import factor
 

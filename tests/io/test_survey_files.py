@@ -120,6 +120,14 @@ def test_geographic_and_projected_places_meet():
     assert common_frame([line], "utm")[1].system == "EPSG:32632"
 
 
+def test_marks_of_points_without_a_place_say_nothing_of_the_frame():
+    marks, known = places([[np.nan] * 3] * 2), places([[600000.0, 5400000.0, 7.0]] * 2, "EPSG:32632")
+    (xyz, none), frame = common_frame([known, marks])
+    assert frame.system == "EPSG:32632" and np.array_equal(xyz, known.coordinates) and np.isnan(none).all()
+    (none,), frame = common_frame([marks])
+    assert frame.description == "the frame of the scene" and np.isnan(none).all()
+
+
 def test_without_pyproj_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyproj", None)
     with pytest.raises(InputError, match=r'pip install "groma\[geo\]"'):

@@ -102,6 +102,20 @@ def test_matches_that_a_start_misses_are_gathered():
     assert max(world.errors(found.pose)) < 0.02
 
 
+def test_matches_gathered_around_a_start_all_have_a_pull():
+    """Exact lines that a start is off from by more than their noise, among a few that are wrong by as much."""
+    rng = np.random.default_rng(61)
+    world = make_world(rng, points=0, lines=60)
+    world.segments2d[:10] += rng.normal(0.0, 4.0, (10, 2, 2))
+    lines = Matches(segments2d=world.segments2d, segments3d=world.segments3d).with_sigma(0.2)
+    start = se3.compose(se3.exp(np.array([[0.0, 0.0, 0.0, 0.005, -0.008, 0.0]])), world.pose[None])[0]
+    errors = max_errors(lines)
+    assert (fitted(CAMERA, lines, start, errors).lines.square > (errors[1] / 0.2) ** 2).mean() > 0.5
+    found = refine(CAMERA, lines, start, errors, gathered=True)
+    assert max(world.errors(found.pose)) < 1e-5
+    assert found.line_inliers[10:].all()
+
+
 def test_most_matches_may_be_wrong():
     rng = np.random.default_rng(7)
     for seed in range(5):

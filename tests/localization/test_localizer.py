@@ -3,6 +3,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -19,6 +20,8 @@ from groma.localization.localizer import LocalizeOptions, Localizer
 from groma.localization.map_index import read_index
 from groma.localization.matching import match_descriptors
 from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.hypotheses import max_errors
+from groma.localization.pose.refinement import fitted
 from groma.localization.pose.verdict import Evidence, Verdict, doubted_if_mirrored
 from groma.localization.retrieval import VladRetrieval
 
@@ -67,6 +70,21 @@ def test_frames_between_those_of_the_map_are_placed(place, localizer):
         assert angle < 4.0, name
 
 
+def test_poses_are_as_uncertain_as_the_map_is_wrong(place, localizer):
+    """The part of the map's error grows with it, and does not fall below it however many matches there are."""
+    name = sorted(QUERIES)[0]
+    found = localizer.localize(place / "queries" / name).pose
+    plain = replace(found.matches, shared_error=0.0)
+    fit = fitted(found.camera, plain, found.cam_from_world, max_errors(plain))
+    noise = fit.covariance(plain)
+    for wrong in (1e-3, 1e-2):
+        grown = fit.covariance(replace(plain, shared_error=wrong)) - noise
+        assert np.linalg.eigvalsh(grown).min() > 0.0
+        # One match in each of at most 48 cells, each off by so much: no axis is known better than by their mean.
+        assert np.sqrt(np.linalg.eigvalsh(grown[3:, 3:]).min()) > wrong / np.sqrt(2.0 * 48.0)
+    assert found.matches.shared_error == localizer.index.shared_error[int(len(found.line_inliers) > 0)]
+
+
 def test_arrays_and_files_are_alike(place, localizer):
     path = place / "queries" / QUERIES[3]
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -106,6 +124,17 @@ def test_photographs_in_shuffled_pieces_are_not_localized(place, localizer):
         assert localizer.localize(shuffled).pose.status != "localized", name
 
 
+def test_a_photograph_of_which_one_part_shows_the_place_is_doubted(place, localizer):
+    """Its left and right thirds are those of another photograph, as wrong a place as can be for what is seen there."""
+    image, other = (
+        cv2.imread(str(place / "queries" / name), cv2.IMREAD_GRAYSCALE) for name in (QUERIES[3], QUERIES[0])
+    )
+    assert localizer.localize(image).pose.status == "localized"
+    pieced = other.copy()
+    pieced[160:320, 160:480] = image[160:320, 160:480]
+    assert localizer.localize(pieced).pose.status != "localized"
+
+
 def test_the_mirror_image_of_descriptors_is_that_of_the_image(place):
     image = cv2.imread(str(place / "queries" / QUERIES[3]), cv2.IMREAD_GRAYSCALE)
     flipped = np.ascontiguousarray(image[:, ::-1])
@@ -134,6 +163,7 @@ def test_the_index_is_kept_and_made_anew_for_another_map(place, localizer):
     again = Localizer(place / "map.npz")  # the images are where they were
     assert path.stat().st_mtime_ns == before
     assert np.array_equal(again.index.xyz, localizer.index.xyz)
+    assert np.array_equal(again.index.shared_error, localizer.index.shared_error)
     assert read_index(path, "of another map") is None
     other = place / "damaged.npz"
     other.write_bytes(path.read_bytes()[:5000])
@@ -208,7 +238,7 @@ def test_command(place, tmp_path, capsys):
     assert sorted(told) == sorted([*QUERIES, "bad.jpg", "black.png"])
     keys = {
         "status", "qvec", "tvec", "center", "center_sigma", "rotation_sigma_deg", "num_point_inliers",
-        "num_line_inliers", "seconds", "sentence",
+        "num_line_inliers", "seconds", "sentence", "shared_error_deg",
     }  # fmt: skip
     assert all(set(entry) == keys for entry in told.values())
     assert told["bad.jpg"]["status"] == told["black.png"]["status"] == "failed"

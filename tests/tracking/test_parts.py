@@ -24,7 +24,7 @@ from groma.tracking.map.landmarks import ALIVE, DEAD, LineTable, PlaneTable, Poi
 from groma.tracking.map.lines import assign, carried, line_ends
 from groma.tracking.map.planes import add_planes, assign_planes, merge_planes
 from groma.tracking.map.triangulation import triangulate
-from groma.tracking.pose.estimate import MapView, estimate_pose
+from groma.tracking.pose.estimate import LOSSES, MapView, estimate_pose, rough_pose
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import pose_from_matches
 
@@ -76,6 +76,19 @@ def test_pose_from_points_with_outliers():
     assert not found.points[:40].any()
     assert found.points[40:].mean() > 0.95
     assert found.weak == ()
+
+
+def test_from_a_rough_pose_the_last_loss_leads_to_the_same_minimum():
+    """Points with wrong matches among them, from 5 cm and 3 degrees away."""
+    table, measured = _points(np.random.default_rng(3), 150)
+    measured.pixel[:40] += np.random.default_rng(4).uniform(10, 60, (40, 2))
+    view, empty = MapView(table, LineTable(), PlaneTable()), Measurements.empty()
+    told = CAMERA, view, Measurements(measured, empty.lines, empty.planes), IDENTITY, WIDE
+    rough = rough_pose(*told, IDENTITY)
+    assert np.abs(se3.log(se3.compose(rough[None], se3.inverse(TRUE[None])))).max() < 0.01
+    found, whole = estimate_pose(*told, rough, LOSSES[-1:]), estimate_pose(*told)
+    np.testing.assert_allclose(found.pose, whole.pose, atol=1e-4)
+    np.testing.assert_array_equal(found.points, whole.points)
 
 
 def test_points_weigh_by_their_own_noise():

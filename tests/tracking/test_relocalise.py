@@ -59,6 +59,19 @@ def test_a_pose_is_proposed_where_three_matches_of_four_are_wrong():
     assert found >= 9
 
 
+def test_what_agrees_in_one_cell_of_the_image_is_no_pose():
+    """Twelve right matches within ten pixels count once; spread over the image they are enough."""
+    rng = np.random.default_rng(5)
+    for spread, is_found in ((10.0, False), (400.0, True)):
+        middle = np.array([325.0, 245.0])
+        right = middle + spread * (rng.random((12, 2)) - 0.5)
+        pixel = np.concatenate([right, rng.uniform((0, 0), (640, 480), (20, 2))])
+        places = CAMERA.bearings(pixel) * rng.uniform(1.5, 4.0, (32, 1))
+        places[12:] = places[12:][rng.permutation(20)]
+        found = pose_from_matches(CAMERA, places, pixel)
+        assert (found is not None) == is_found
+
+
 def test_depths_are_medians_of_what_is_known_and_alike():
     rng = np.random.default_rng(2)
     image = (2.0 + 0.01 * rng.normal(size=(60, 80))).astype(np.float32)

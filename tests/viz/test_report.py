@@ -18,11 +18,13 @@ from groma.errors import InputError, OutputError
 from groma.io import write_scene
 from groma.scene import Directions, Relations, Scene
 from groma.scene.synthetic.scenes import holistic
+from groma.viz.drawable import drawable
 from groma.viz.pictures import jpeg_address
 from groma.viz.report import images as _page_images
 from groma.viz.report import kept as _page_kept
 from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.saved import saved_report
+from groma.viz.report.tables import number_tables
 
 REPORT = SimpleNamespace(
     history=[
@@ -179,6 +181,17 @@ def test_tables_of_planes_and_directions(tmp_path):
     assert "<h2>Directions</h2>" in text and "53.1°" in text and ">to 7<" in text
 
 
+def test_a_table_of_relations(tmp_path):
+    """Of every kind that there is, held by the adjustment or not; and kinds that were all given up."""
+    scene = exact_scene().replace(relations=Relations(point_on_plane=[[0, 0]], lines_meeting=[[0, 1], [1, 2]]))
+    outcomes = {"point_on_plane": {"held": 1, "dropped": 4}, "line_on_plane": {"held": 0, "dropped": 3}}
+    text = number_tables(scene, None, drawable(scene), REPORT.to_dict() | {"relations": outcomes})
+    rows = re.findall(r"<tr><td>([a-z ]+)</td><td>(\d*)</td><td>(\d*)</td><td>(\d*)</td></tr>", text)
+    assert rows == [("point on plane", "1", "1", "4"), ("line on plane", "0", "0", "3"), ("lines meeting", "2", "", "")]
+    bare = exact_scene().replace(relations=Relations())
+    assert "<h2>Relations</h2>" not in number_tables(bare, None, drawable(bare), None)
+
+
 def test_what_became_of_the_segments(tmp_path):
     outcomes = {"mapped": 60, "few_images": 40, "of_a_kind_to_come": 1, "outlier": 0}
     text = write_page(tmp_path, None, exact_scene(), contents=PageContents(outcomes, "4 lines from <60> segments."))
@@ -262,7 +275,7 @@ def test_what_the_data_determine(tmp_path):
     text = write_page(tmp_path, None, exact_scene(), saved_report(tmp_path))
     assert "is-problem" in text and "point on plane" in text and "5,678" in text
     text = write_page(tmp_path, None, exact_scene(), REPORT)
-    assert "What the data determine" not in text and "Relations" not in text
+    assert "What the data determine" not in text and "5,678" not in text
 
 
 def test_the_first_image_is_the_one_with_most_lines(tmp_path):

@@ -5,6 +5,7 @@ Needs Chromium and Playwright (its Python package; the browser is that of the sy
 """
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,7 +48,9 @@ def browser():
 
 @pytest.fixture(scope="module")
 def scene():
-    return exact_scene()
+    """Two of its lines are said to meet."""
+    exact = exact_scene()
+    return exact.replace(relations=replace(exact.relations, lines_meeting=np.array([[1, 3]])))
 
 
 @pytest.fixture(scope="module")
@@ -174,6 +177,27 @@ def test_links_lead_from_a_line_to_its_plane_and_back(opened, scene):
     assert page.evaluate("chosen.kind") == "plane"
     page.click(f"#about dl >> text=line {scene.lines.ids[0]}")
     assert page.evaluate("[chosen.kind, chosen.index]") == ["line", 0]
+
+
+def test_a_junction_lights_up_both_lines(opened, scene):
+    page = opened()
+    assert page.evaluate("shown.junctions") is False
+    assert page.locator("#layers >> text=Junctions").count() == 1
+    place = page.evaluate("place('junctions', 0)") + np.array(page.evaluate("data.offset"))
+    lines = scene.lines.plucker[[1, 3]]
+    far = np.linalg.norm(np.cross(place, lines[:, 3:]) - lines[:, :3], axis=1)
+    assert far[0] == pytest.approx(far[1], abs=1e-5)
+    _only(page, "junctions")
+    page.evaluate("place => { eye.pivot = place; draw(); }", _in_page(page, place))
+    _click(page, place)
+    ids = scene.lines.ids
+    assert page.inner_text("#about h3").startswith(f"Junction of lines {ids[1]} and {ids[3]}")
+    assert page.evaluate("[lit.lines, lit.entries]") == [[1, 3], [0, 1]]
+    assert float(_measured(page)["Distance between them"]) == pytest.approx(far.sum(), rel=1e-3)
+    page.evaluate("() => { paint(); drawImage(); }")
+    assert page.evaluate(ORANGE, "scene") > 50
+    page.click(f"#about dl >> text=line {ids[3]}")
+    assert _measured(page)["Meets"] == f"line {ids[1]}"
 
 
 def test_search_by_name(opened, scene):

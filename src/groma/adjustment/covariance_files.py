@@ -26,9 +26,9 @@ from typing import Any
 
 import numpy as np
 
-from groma._json import json_text
 from groma._typing import FloatArray
 from groma.adjustment.uncertainty import SceneUncertainty
+from groma.bounded.json_text import json_text
 from groma.errors import InputError
 from groma.io import atomic_output
 from groma.scene import Scene

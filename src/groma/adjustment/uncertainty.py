@@ -163,11 +163,15 @@ def _uncertainty(
     )
 
 
-def pose_uncertainty(scene: Scene, problem: Problem, sigma0: float = 1.0, gauge: str = "auto") -> dict[str, Any] | None:
+def pose_uncertainty(
+    scene: Scene, problem: Problem, sigma0: float = 1.0, gauge: str = "auto", by_landmarks: bool = False
+) -> dict[str, Any] | None:
     """Return how well the cameras alone are known: ``gauge``, ``sigma0``, ``center`` and ``rotation_deg``.
 
     The entries are those of :meth:`SceneUncertainty.to_dict`; for the parameters see :func:`uncertainty`. None where
-    all cameras are held, or are not determined.
+    all cameras are held, or are not determined. ``by_landmarks`` multiplies the deviations, in place of by ``sigma0``,
+    by what leaving out one landmark after the other tells
+    (:mod:`groma.adjustment.misfit.jackknife`); the entry ``factor`` is the median of that.
     """
     if "frames" not in problem.variables or _free_cameras(problem) == 0:
         return None
@@ -177,15 +181,28 @@ def pose_uncertainty(scene: Scene, problem: Problem, sigma0: float = 1.0, gauge:
         problem = at_places_of(problem, scene)
     try:
         gauge, covariances = _covariances(scene, AssemblyOptions(), gauge, problem)
-        poses = covariances.of_coordinates("frames") * sigma0**2
+        poses = covariances.of_coordinates("frames") * (1.0 if by_landmarks else sigma0**2)
+        factors = _landmark_factors(scene, covariances.problem, gauge) if by_landmarks else None
     except ProblemError:
         return None
-    return {
-        "gauge": gauge,
-        "sigma0": sigma0,
-        "center": _summary(position_sigma(poses[:, :3, :3])),
-        "rotation_deg": _summary(np.rad2deg(position_sigma(poses[:, 3:, 3:]))),
-    }
+    center, turn = position_sigma(poses[:, :3, :3]), position_sigma(poses[:, 3:, 3:])
+    found: dict[str, Any] = {"gauge": gauge, "sigma0": sigma0}
+    if factors is not None:
+        center, turn = center * factors[:, 0], turn * factors[:, 1]
+        found["factor"] = float(np.median(factors))
+    return {**found, "center": _summary(center), "rotation_deg": _summary(np.rad2deg(turn))}
+
+
+def _landmark_factors(scene: Scene, problem: Problem, gauge: str) -> FloatArray:
+    """By what the deviations (F, 2) of centres and rotations are larger when landmarks are left out one by one."""
+    from groma.adjustment.misfit.jackknife import landmark_jackknife, observations_alone
+
+    covariances = _covariances(scene, AssemblyOptions(planes=False), gauge, observations_alone(problem))[1]
+    stated, found = landmark_jackknife(covariances)
+    sigma = [
+        np.column_stack([position_sigma(one[:, :3, :3]), position_sigma(one[:, 3:, 3:])]) for one in (stated, found)
+    ]
+    return np.divide(sigma[1], sigma[0], out=np.ones_like(sigma[0]), where=sigma[0] > 0.0)
 
 
 def _covariances(

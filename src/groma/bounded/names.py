@@ -13,6 +13,10 @@ from pathlib import Path
 from groma.bounded.text import shown
 from groma.errors import FileFormatError
 
+#: Endings of the names of images and videos, in lower case.
+IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+
 
 def stays_inside(name: str) -> bool:
     """Whether a name, taken as a path in some folder, can only mean something in that folder."""
@@ -43,4 +47,4 @@ def outside(names: Iterable[str]) -> list[str]:
     return [name for name in names if not stays_inside(name)]
 
 
-__all__ = ["listed_file", "outside", "stays_inside"]
+__all__ = ["IMAGES", "VIDEOS", "listed_file", "outside", "stays_inside"]

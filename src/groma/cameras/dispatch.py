@@ -28,8 +28,8 @@ from collections.abc import Callable
 
 from numba.extending import overload
 
+from groma._kernels.digest import ByLength
 from groma._numba import kernel
-from groma._numba_digest import ByLength
 
 # --------------------------------------------------------------------------------------------------------- Kernels
 # Kernels by length of the tag. Filled by set_kernels. Compiled code on disk depends on the kernels that it was compiled

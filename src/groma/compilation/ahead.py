@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compile what a command needs in processes beside it, while it goes on.
 
-A command says what kind of work it does. Nothing happens until it has to compile: then as many processes as there are
-cores go through the list of what such work calls (:mod:`groma.compilation.needed`), in the order in which it is called,
-and leave out what is there or is being compiled (:mod:`groma._numba_turns`). The command finds the functions on disk
-when it gets to them, or waits for the process that is at it. The processes end with the command.
+A command says what kind of work it does. Nothing happens until it has to compile: then a process is started, which
+makes the compiler ready and, where the system can, forks until there are as many as cores. They go through the list of
+what such work calls (:mod:`groma.compilation.needed`), in the order in which it is called, and leave out what is there
+or is being compiled (:mod:`groma._kernels.turns`). The command finds the functions on disk when it gets to them, or
+waits for the process that is at it. The processes end with the command.
 """
 
 from __future__ import annotations
@@ -16,12 +17,19 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
+from typing import Any
 
-from groma import _numba_cache
+from groma._kernels import cache as kernel_cache
+from groma.compilation.needed import IMPORTS, function, needed
 
 #: How many processes, if the user says so; 0 for none.
 VARIABLE = "GROMA_COMPILE_PROCESSES"
 _MOST = 8
+#: Whether a process that has imported everything can become several: half a second of work each. Elsewhere than on
+#: Linux, libraries of the system may not survive it.
+CAN_FORK = sys.platform == "linux"
+#: Linear algebra starts no threads, which a fork would lose.
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
 class Ahead:
@@ -32,20 +40,22 @@ class Ahead:
         self._running: list[subprocess.Popen[bytes]] = []
         self._is_started = False
 
-    def __call__(self, counts: _numba_cache.Counts) -> None:
+    def __call__(self, counts: kernel_cache.Counts) -> None:
         """Hear that a function is missing."""
         if self._is_started or counts.missed <= counts.loaded:
             return
         self._is_started = True
         self._announce()
-        for _ in range(_count(self._threads)):
-            self._start()
+        count = _count(self._threads)
+        for _ in range(min(count, 1) if CAN_FORK else count):
+            self._start(count if CAN_FORK else 1)
 
-    def _start(self) -> None:
-        call = [sys.executable, "-W", "ignore", "-m", "groma.compilation.ahead", self._work]
-        quiet = subprocess.DEVNULL
+    def _start(self, count: int) -> None:
+        """Start a process that becomes several."""
+        call = [sys.executable, "-W", "ignore", "-m", "groma.compilation.ahead", self._work, str(count)]
+        quiet, alone = subprocess.DEVNULL, {**os.environ, **ONE_THREAD}
         try:
-            self._running.append(subprocess.Popen(call, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet))
+            self._running.append(subprocess.Popen(call, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, env=alone))
         except OSError:
             pass  # the command compiles alone
 
@@ -61,15 +71,15 @@ class Ahead:
 
 def expect(work: str, announce: Callable[[], None], threads: int | None = None) -> None:
     """Let processes help with what some work needs, if it comes to that; ``announce`` is called then."""
-    _numba_cache.on_miss[:] = [Ahead(work, announce, threads)]
+    kernel_cache.on_miss[:] = [Ahead(work, announce, threads)]
 
 
 def end() -> None:
     """End the processes; nothing more is expected."""
-    for ahead in _numba_cache.on_miss:
+    for ahead in kernel_cache.on_miss:
         if isinstance(ahead, Ahead):
             ahead.stop()
-    _numba_cache.on_miss.clear()
+    kernel_cache.on_miss.clear()
 
 
 def _count(threads: int | None) -> int:
@@ -80,18 +90,36 @@ def _count(threads: int | None) -> int:
     return int(said) if said.isdigit() else wanted if wanted > 1 else 0
 
 
-def _end_with_the_command() -> None:
-    """End at once when the input does, but not in the middle of a file."""
+def _end_with_the_command(forked: list[int]) -> None:
+    """End at once when the input does, but not in the middle of a file, and after the processes that were forked."""
     sys.stdin.buffer.read()
-    with _numba_cache.writing:
+    with kernel_cache.writing:
+        _wait_for(forked)
         os._exit(0)
+
+
+def _wait_for(forked: list[int]) -> None:
+    for process in forked:
+        with suppress(ChildProcessError):  # waited for by the other thread
+            os.waitpid(process, 0)
+
+
+def make_ready(work: str) -> None:
+    """Import what some work imports, and what the compiler does at its first use."""
+    from numba.core.registry import cpu_target as target
+
+    cpu_target: Any = target
+    if work in IMPORTS:
+        import_module(IMPORTS[work])
+    for module, name, _ in needed(work):
+        function(module, name)
+    cpu_target.typing_context.refresh()
+    cpu_target.target_context.refresh()
 
 
 def compile_ahead(work: str) -> None:
     """Compile what some work calls, other than what is there or is being compiled."""
     from numba.core.registry import cpu_target
-
-    from groma.compilation.needed import IMPORTS, function, needed
 
     if work in IMPORTS:
         import_module(IMPORTS[work])
@@ -102,6 +130,22 @@ def compile_ahead(work: str) -> None:
                 compiled.compile(kinds)
 
 
+def main(work: str, count: int) -> None:
+    """Compile in this process and others like it, until all is there or the input ends."""
+    forked: list[int] = []
+    if count > 1:
+        make_ready(work)
+    while len(forked) + 1 < count:
+        process = os.fork()
+        if process == 0:
+            forked = []
+            break
+        forked.append(process)
+    threading.Thread(target=_end_with_the_command, args=(forked,), daemon=True).start()
+    compile_ahead(work)
+    _wait_for(forked)
+    os._exit(0)
+
+
 if __name__ == "__main__":
-    threading.Thread(target=_end_with_the_command, daemon=True).start()
-    compile_ahead(sys.argv[1])
+    main(sys.argv[1], int(sys.argv[2]))

@@ -20,7 +20,7 @@ def compilation_time() -> Iterator[Compilation]:
     """Measure what goes into compiled code inside a ``with`` block; the value is filled at its end."""
     from numba.core import event
 
-    from groma._numba_cache import counts
+    from groma._kernels.cache import counts
 
     found, before = Compilation(), counts.compiled + counts.unsaved + counts.missed
     # Numba holds its lock for as long as it compiles or loads, in every thread.

@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from groma import _numba_cache
+from groma._kernels import cache as kernel_cache
 from groma.compilation import runs
 from groma.errors import InputError, OutputError
 
@@ -25,8 +25,8 @@ PARTS = ("adjust", "map", "track")
 
 
 def _list_of(part: str) -> Path | None:
-    folder = _numba_cache.folder()
-    return None if folder is None else folder / f"warm-{part}-{_numba_cache.environment_digest()[:16]}.json"
+    folder = kernel_cache.folder()
+    return None if folder is None else folder / f"warm-{part}-{kernel_cache.environment_digest()[:16]}.json"
 
 
 def is_ready(part: str) -> bool:
@@ -67,7 +67,7 @@ def warm_up(
     OutputError
         If compiled functions can be kept nowhere.
     """
-    began, before = time.perf_counter(), asdict(_numba_cache.counts)
+    began, before = time.perf_counter(), asdict(kernel_cache.counts)
     if unknown := {*parts} - {*PARTS}:
         raise InputError(f"There is nothing to compile for {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}.")
     if not place():
@@ -78,7 +78,7 @@ def warm_up(
     missing = [part for part in wanted if again or not is_ready(part)]
     for part in missing:
         _run(part, progress or (lambda name, done, total: None), before["unsaved"])
-    counts = {name: count - before[name] for name, count in asdict(_numba_cache.counts).items()}
+    counts = {name: count - before[name] for name, count in asdict(kernel_cache.counts).items()}
     seconds = time.perf_counter() - began
     return {"parts": wanted, "run": missing, **counts, "seconds": seconds, "folder": place()}
 
@@ -92,15 +92,15 @@ def _run(part: str, progress: Callable[[str, int, int], None], unsaved: int) -> 
             warnings.simplefilter("ignore")  # what tiny scenes lack is not the user's business
             step()
     path = _list_of(part)
-    if path is not None and _numba_cache.counts.unsaved == unsaved:
+    if path is not None and kernel_cache.counts.unsaved == unsaved:
         draft = path.with_suffix(f".{uuid.uuid4().hex[:16]}.tmp")
-        draft.write_text(json.dumps([str(file) for file in _numba_cache.used_files()]))
+        draft.write_text(json.dumps([str(file) for file in kernel_cache.used_files()]))
         os.replace(draft, path)
 
 
 def place() -> str:
     """Return the folder with what is compiled, for the user; empty where there is none."""
-    folder = _numba_cache.folder()
+    folder = kernel_cache.folder()
     return "" if folder is None else str(folder.parent)
 
 

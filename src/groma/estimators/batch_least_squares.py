@@ -38,8 +38,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba.extending import overload
 
+from groma._kernels.digest import ByLength
 from groma._numba import kernel, loop
-from groma._numba_digest import ByLength
 from groma._simd import width
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError

@@ -43,8 +43,8 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numba.extending import overload
 
+from groma._kernels.digest import ByLength
 from groma._numba import exact_kernel, kernel, loop
-from groma._numba_digest import ByLength
 from groma._typing import FloatArray
 from groma.errors import InputError, did_you_mean
 

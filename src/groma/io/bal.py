@@ -28,12 +28,12 @@ from groma.bounded.content import read_content
 from groma.errors import FileFormatError, InputError, OutputError
 from groma.geometry import quaternion
 from groma.io.atomic import atomic_output
+from groma.io.pose_conventions import BAL, FLIP
 from groma.io.reading import existing, reading
 from groma.io.registry import HEAD_BYTES, SceneFormat, register_format
 from groma.scene import Cameras, PointObservations, Points, Scene
 
-_FLIP = np.array([1.0, -1.0, -1.0])
-#: The rotation by pi about x, which is ``diag(1, -1, -1)``.
+#: The rotation by pi about x, which is :data:`FLIP`.
 _FLIP_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 _KIND = "BAL file"
 
@@ -90,7 +90,7 @@ def write_bal(scene: Scene, path: str | os.PathLike[str], force: bool = False) -
     pixel = (seen.pixel - principal_point[seen.image_idx]) * [1, -1]
     poses = scene.cam_from_world
     rotation = quaternion.log(quaternion.multiply(_FLIP_QUATERNION, poses[:, :4]))
-    numbers = np.hstack([rotation, poses[:, 4:] * _FLIP, params]).ravel().tolist() + scene.points.xyz.ravel().tolist()
+    numbers = np.hstack([rotation, poses[:, 4:] * FLIP, params]).ravel().tolist() + scene.points.xyz.ravel().tolist()
     text = io.StringIO()
     text.write(f"{scene.num_images} {scene.num_points} {len(seen)}\n")
     rows = zip(seen.image_idx.tolist(), seen.point_idx.tolist(), *pixel.T.tolist(), strict=True)
@@ -210,8 +210,8 @@ def _scene(image_idx: IntArray, point_idx: IntArray, pixel: FloatArray, camera: 
         raise FileFormatError(
             f"Camera {int(angle.argmax())} is turned by {angle.max():.3g} rad; not a rotation vector."
         )
-    turned = quaternion.multiply(_FLIP_QUATERNION, quaternion.exp(camera[:, :3]))
-    turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    poses = BAL.cam_from_world(camera[:, :3], camera[:, 3:6])
+    poses[:, :4] /= np.linalg.norm(poses[:, :4], axis=1, keepdims=True)
     cameras = Cameras(
         ids=np.arange(count) + 1,
         models=("BAL",) * count,
@@ -223,7 +223,7 @@ def _scene(image_idx: IntArray, point_idx: IntArray, pixel: FloatArray, camera: 
         cameras,
         [f"{index:05d}" for index in range(count)],
         np.arange(count),
-        np.hstack([turned, camera[:, 3:6] * _FLIP]),
+        poses,
         points=Points.at(xyz),
         point_observations=PointObservations.numbered(image_idx, point_idx, pixel * [1, -1]),
     )

@@ -37,6 +37,7 @@ from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError
 from groma.geometry import quaternion
 from groma.io.atomic import atomic_output
+from groma.io.pose_conventions import G2O
 from groma.io.reading import existing, reading
 from groma.scene.pose_graph import GraphPoses, Motions, PoseGraph
 
@@ -182,7 +183,7 @@ def _from_file_order(values: FloatArray, tag: str, path: Path) -> FloatArray:
     length = np.linalg.norm(values[:, 3:], axis=1)
     if (length < 1e-3).any():
         raise FileFormatError(f"{path}: {tag} number {int(length.argmin())} has a quaternion of length 0.")
-    return np.hstack([values[:, 3:] / length[:, None], values[:, :3]])
+    return np.hstack([G2O.quaternions(values[:, 3:] / length[:, None]), values[:, :3]])
 
 
 def _file_order(poses: FloatArray) -> FloatArray:

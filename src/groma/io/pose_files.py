@@ -33,6 +33,7 @@ from groma.bounded.text import read_lines
 from groma.errors import InputError
 from groma.geometry import se3
 from groma.io.g2o import looks_like_g2o, read_g2o
+from groma.io.pose_conventions import NAMED
 from groma.io.reading import existing, reading
 from groma.io.registry import HEAD_BYTES, formats, read_scene
 from groma.io.survey.rows import is_measured_poses, read_measured_poses
@@ -149,7 +150,7 @@ def _of_measured(place: Path, photographs: Sequence[str]) -> PosesOfPhotographs:
     given = read_measured_poses(place)
     found, said = _by_name(place, given.names, photographs)
     rows = [row for row, name in enumerate(found) if name is not None]
-    poses = se3.inverse(np.hstack([given.world_from_cam[rows, 3:], given.world_from_cam[rows, :3]]))
+    poses = NAMED.cam_from_world(given.world_from_cam[rows, 3:], given.world_from_cam[rows, :3])
     return _without_calibration([str(found[row]) for row in rows], poses, said)
 
 

@@ -113,7 +113,8 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
             return one.read(place)
     if place.is_dir() and (colmap := _FORMATS["colmap"].read) is not None:
         return colmap(place)  # it says what is missing in the folder
-    raise FileFormatError(f"{place} is not a scene: expected {_sources(readable)}; it begins with {head[:20]!r}.")
+    begin = head[:20].decode(errors="backslashreplace")
+    raise FileFormatError(f"{place} is not a scene: expected {_sources(readable)}; it begins with {begin!r}.")
 
 
 def write_scene(

@@ -27,8 +27,9 @@ import numpy.typing as npt
 from groma._typing import FloatArray, IntArray
 from groma.bounded.text import finite, read_lines
 from groma.errors import FileFormatError, InputError, ShapeError
-from groma.geometry import quaternion, se3
+from groma.geometry import se3
 from groma.io.atomic import atomic_output
+from groma.io.pose_conventions import EUROC, KITTI, TUM
 from groma.io.reading import existing, reading
 from groma.scene.table import Table, column
 
@@ -211,12 +212,12 @@ def _unit(path: Path, lines: IntArray, quaternions: FloatArray) -> FloatArray:
 
 def _read_tum(path: Path, rows: Rows) -> Trajectory:
     table, lines = _numbers(path, rows, 8)
-    return Trajectory(table[:, 0], np.hstack([_unit(path, lines, table[:, 4:]), table[:, 1:4]]))
+    return Trajectory(table[:, 0], np.hstack([TUM.quaternions(_unit(path, lines, table[:, 4:])), table[:, 1:4]]))
 
 
 def _read_euroc(path: Path, rows: Rows) -> Trajectory:
     table, lines = _numbers(path, rows, 8, more=True)
-    turned = _unit(path, lines, table[:, [5, 6, 7, 4]])
+    turned = EUROC.quaternions(_unit(path, lines, table[:, 4:]))
     return Trajectory(table[:, 0] * 1e-9, np.hstack([turned, table[:, 1:4]]))
 
 
@@ -229,7 +230,7 @@ def _read_kitti(path: Path, rows: Rows) -> Trajectory:
     bad = np.flatnonzero((np.abs(singular - 1.0).max(axis=1, initial=0.0) > 0.01) | (np.linalg.det(turned) < 0))
     if len(bad):
         raise FileFormatError(f"{path}, line {lines[bad[0]]}: the first three columns are not a rotation.")
-    poses = np.hstack([quaternion.from_matrix(turned), matrices[:, :, 3]])
+    poses = np.hstack([KITTI.quaternions(turned), matrices[:, :, 3]])
     return Trajectory(np.arange(len(table), dtype=float), poses)
 
 

@@ -40,6 +40,7 @@ class Candidates:
             query.segments.sigma[segment],
             index.point_covariance[there],
             index.line_covariance[line],
+            shared_error=float(index.shared_error[int(len(line) > 0)]),
         )
 
 

@@ -105,7 +105,8 @@ def in_world_of(result: MapResult, before: Scene) -> MapResult:
         return result
     now, then = np.array(both).T
     moved: Similarity = align_poses(result.scene.cam_from_world[now], before.cam_from_world[then])
-    return replace(result, scene=result.scene.transformed(moved), before=result.before.transformed(moved))
+    scenes = {name: getattr(result, name).transformed(moved) for name in ("scene", "before", "adjusted")}
+    return replace(result, **scenes)
 
 
 __all__ = ["ExtendedModel", "extended_model", "in_world_of"]

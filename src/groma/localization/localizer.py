@@ -19,8 +19,9 @@ from groma.features.images import GrayImage, to_gray
 from groma.gates import gate
 from groma.io import read_scene
 from groma.localization.candidates import Candidates, described_alike, found_near
+from groma.localization.expected import FoundAgain, nearest_images, parts_shown
 from groma.localization.features import DescribedImage, DescribedPoints, find_features, mirrored
-from groma.localization.landmarks import DescribedLandmarks, coarsest, counted_in, seen_in
+from groma.localization.landmarks import DescribedLandmarks, coarsest, seen_in
 from groma.localization.map_images import image_paths, images_in_summary
 from groma.localization.map_index import images_told, kept_index
 from groma.localization.pose.absolute_pose import UNKNOWN_LENS, AbsolutePose, PoseOptions, pose_from_matches
@@ -121,6 +122,7 @@ class Localizer:
         self._retrieval = VladRetrieval(self.index.vocabulary)
         upright = np.arange(len(self.index.xyz)) >= len(self.index.xyz) - self.scene.num_points
         self._landmarks = DescribedLandmarks.of(self.index, upright)
+        self._again = FoundAgain.of(self.scene, self.index, self.options.gates.near)
 
     def camera_of_map(self, width: int, height: int) -> QueryCamera | None:
         """The camera of the map for images of this size; None where there is none, or more than one."""
@@ -203,8 +205,7 @@ class Localizer:
         matched: Callable[[DescribedPoints, IntArray], Candidates],
     ) -> _Found:
         """The pose from matches of a part of a query, those that it guides to, and what mirrored points match."""
-        count = counted_in(self.index, images, found.points[:, 1])
-        near = images[np.argsort(-count, kind="stable")[: self.options.gates.near]]
+        near = nearest_images(self.index, images, found.points[:, 1], self.options.gates.near)
         last = [found]
 
         def guided(best: Refined) -> Matches:
@@ -219,8 +220,13 @@ class Localizer:
             points = mirrored(part.points, camera.width)
             return matched(points, self._alike(points)).matches(part.with_points(points), self.scene, self.index)
 
+        def expected(best: Refined) -> tuple[float, float]:
+            seen, agreeing = last[0].matches(query, self.scene, self.index), last[0].points[best.point_inliers, 1]
+            around = nearest_images(self.index, images, agreeing, self.options.gates.near)
+            return parts_shown(self.scene, self.index, self._again, around, best, seen, self.options.lines)
+
         matches = found.matches(part, self.scene, self.index)
-        pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, mirror)
+        pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, mirror, expected)
         return pose, last[0]
 
     def _alike(self, points: DescribedPoints) -> IntArray:

@@ -7,9 +7,8 @@ from collections import defaultdict
 from pathlib import Path
 
 from groma.bounded.documents import read_document
-from groma.bounded.names import stays_inside
+from groma.bounded.names import IMAGES, stays_inside
 from groma.errors import GromaError, InputError
-from groma.io.endings import IMAGES
 from groma.scene import Scene
 
 

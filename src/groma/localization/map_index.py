@@ -11,7 +11,7 @@ import hashlib
 import os
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 
@@ -29,6 +29,9 @@ from groma.features.matching.descriptor import describe
 from groma.features.segments import Segments
 from groma.io import atomic_output
 from groma.localization.features import Bytes, DescribedPoints, describe_places, find_points
+from groma.localization.pose.map_errors import SeenByImage, images_compared, shared_errors
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.matches import Matches
 from groma.localization.pose.records import landmark_covariances, residual_squares
 from groma.localization.retrieval import VladRetrieval
 from groma.localization.triangulation import triangulate_features
@@ -37,7 +40,7 @@ from groma.mapping.photographs import read_gray
 from groma.scene import Scene
 
 #: Of the layout of the file; another one is built anew.
-_VERSION = 1
+_VERSION = 2
 #: Images that the features of an image are matched with.
 _NEIGHBORS = 12
 
@@ -50,6 +53,7 @@ _FORMS = {
     **dict.fromkeys(("begin", "point", "segment_begin", "segment"), form("iu", None)),
     "pixel": form("f", None, 2), "descriptor": form("u", None, 128), "segment_descriptor": form("f", None, 72),
     "vocabulary": form("f", None, 128), "image": form("f", None, None),
+    "shared_error": form("f", 2),
 }  # fmt: skip
 
 Progress = Callable[[str, int, int], None]
@@ -76,12 +80,15 @@ class MapIndex:
     #: (K, 128) words, (I, K * 128) descriptions of images.
     vocabulary: npt.NDArray[np.float32]
     image: npt.NDArray[np.float32]
+    #: (2,) what landmarks in one part of an image are off by together, radians as seen from it: where poses come from
+    #: points alone, and from points and lines.
+    shared_error: FloatArray = field(default_factory=lambda: np.zeros(2))
 
     @property
     def is_whole(self) -> bool:
         """Whether the arrays fit each other; those of a damaged file need not."""
         count, images = len(self.point), len(self.begin) - 1
-        told = (self.xyz, self.pixel, self.segment_descriptor, self.vocabulary, self.image)
+        told = (self.xyz, self.pixel, self.segment_descriptor, self.vocabulary, self.image, self.shared_error)
         return (
             len(self.pixel) == len(self.descriptor) == count
             and len(self.segment_descriptor) == len(self.segment)
@@ -91,7 +98,7 @@ class MapIndex:
             and _divides(self.begin, count)
             and _divides(self.segment_begin, len(self.segment))
             and bool(((self.point >= 0) & (self.point < len(self.xyz))).all())
-            and bool((self.segment >= 0).all())
+            and bool((self.segment >= 0).all() and (self.shared_error >= 0.0).all())
             and all(np.isfinite(part).all() for part in told)
         )
 
@@ -163,21 +170,23 @@ def build_index(scene: Scene, files: Sequence[Path], say: Progress) -> MapIndex:
     pairs = np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)
     features = [one.features for one in found]
     made = triangulate_features(scene, features, pairs, partial(say, "placing the points of the map"))
-    own_covariance, line_covariance = _covariances(scene, "points"), _covariances(scene, "lines")
+    own_covariance, own_noise = _covariances(scene, "points")
+    line_covariance, line_noise = _covariances(scene, "lines")
     rows, offset = [], np.concatenate([[0], np.cumsum([len(one) for one in features])])
     known = np.isfinite(own_covariance[:, 0, 0])
-    points, pixels, descriptors = [], [], []
+    points, pixels, descriptors, sigmas = [], [], [], []
     for image, one in enumerate(found):
         point = made.point[offset[image] : offset[image + 1]]
         placed, own = point >= 0, known[one.point]
         points.append(np.concatenate([point[placed], one.point[own] + len(made.xyz)]))
         pixels.append(np.concatenate([one.features.pixels[placed], one.own.pixels[own]]))
         descriptors.append(np.concatenate([one.features.descriptors[placed], one.own.descriptors[own]]))
+        sigmas.append(np.concatenate([made.noise * one.features.sigma[placed], own_noise * one.own_sigma[own]]))
         rows.append(one.segment)
     if not sum(map(len, points)) and not scene.num_lines:
         raise InputError("Nothing in the images of the map can be described: no points, no lines. Pass another map.")
     retrieval = VladRetrieval.learned([one.descriptors for one in features])
-    return MapIndex(
+    index = MapIndex(
         np.concatenate([made.xyz, scene.points.xyz]),
         np.concatenate([made.covariance, np.nan_to_num(own_covariance)]),
         np.concatenate([[0], np.cumsum([len(part) for part in points])]),
@@ -191,6 +200,24 @@ def build_index(scene: Scene, files: Sequence[Path], say: Progress) -> MapIndex:
         retrieval.vocabulary,
         np.stack([retrieval.gather(one.descriptors) for one in features]),
     )
+    sigma = np.concatenate(sigmas)
+    seen = [_seen_by(scene, index, image, sigma, line_noise) for image in images_compared(scene.num_images).tolist()]
+    return replace(index, shared_error=shared_errors(seen, partial(say, "comparing images of the map with the rest")))
+
+
+def _seen_by(scene: Scene, index: MapIndex, image: int, sigma: FloatArray, line_noise: float) -> SeenByImage:
+    """What an image sees of a described map, with the noise (pixels) that landmarks were estimated with."""
+    own = slice(index.begin[image], index.begin[image + 1])
+    point, table = index.point[own], scene.line_observations
+    rows = np.flatnonzero(table.image_idx == image)
+    rows = rows[np.isfinite(index.line_covariance[table.line_idx[rows], 0, 0])]
+    line = table.line_idx[rows]
+    matches = Matches(
+        index.pixel[own], index.xyz[point], table.segment[rows].reshape(-1, 2, 2), scene.lines.segments[line],
+        sigma[own], line_noise * table.sigma[rows], index.point_covariance[point], index.line_covariance[line],
+    )  # fmt: skip
+    camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
+    return SeenByImage(camera, matches, scene.cam_from_world[image])
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,40 +225,41 @@ class _ImageOfMap:
     """What is described in one image of a map."""
 
     features: DescribedPoints
-    #: Places of points of the map, and which.
+    #: Places of points of the map, which, and their standard deviations in the map, pixels.
     own: DescribedPoints
     point: IntArray
+    own_sigma: FloatArray
     #: Rows of line observations, and their descriptors.
     segment: IntArray
     segment_descriptors: npt.NDArray[np.float32]
 
 
-def _seen_in(scene: Scene, image: int) -> tuple[FloatArray, IntArray, FloatArray, IntArray]:
-    """What an image sees of the map: pixels and numbers of points; ends and rows of segments."""
+def _seen_in(scene: Scene, image: int) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, IntArray]:
+    """What an image sees of the map: pixels, numbers and deviations of points; ends and rows of segments."""
     points, lines = scene.point_observations, scene.line_observations
     rows, segments = np.flatnonzero(points.image_idx == image), np.flatnonzero(lines.image_idx == image)
-    return points.pixel[rows], points.point_idx[rows], lines.segment[segments], segments
+    return points.pixel[rows], points.point_idx[rows], points.sigma[rows], lines.segment[segments], segments
 
 
-def _describe_image(work: tuple[Path, FloatArray, IntArray, FloatArray, IntArray]) -> _ImageOfMap:
-    path, pixels, points, ends, rows = work
+def _describe_image(work: tuple[Path, FloatArray, IntArray, FloatArray, FloatArray, IntArray]) -> _ImageOfMap:
+    path, pixels, points, sigma, ends, rows = work
     image = read_gray(path)
     own, kept = describe_places(image, pixels)
     descriptors = describe(image, Segments.from_ends(ends)).astype(np.float32)
-    return _ImageOfMap(find_points(image), own, points[kept], rows, descriptors)
+    return _ImageOfMap(find_points(image), own, points[kept], sigma[kept], rows, descriptors)
 
 
-def _covariances(scene: Scene, kind: str) -> FloatArray:
-    """Covariances of the points or lines of a map with its poses held, at the noise that its residuals show."""
+def _covariances(scene: Scene, kind: str) -> tuple[FloatArray, float]:
+    """Covariances of the points or lines of a map with its poses held, and the noise that its residuals show."""
     count = len(getattr(scene, kind))
     other = {"points": "lines", "lines": "points"}[kind]
     alone = scene.keep(**{other: []}, planes=[], directions=[])
     table = alone.point_observations if kind == "points" else alone.line_observations
     if not count or not len(table):
-        return np.full((count, 6, 6) if kind == "lines" else (count, 3, 3), np.nan)
+        return np.full((count, 6, 6) if kind == "lines" else (count, 3, 3), np.nan), 1.0
     problem = assemble(alone, AssemblyOptions(refine_poses=False, point_chart="euclidean", gauge="free")).problem
     noise = noise_of(residual_squares(problem, kind, len(table)))
-    return landmark_covariances(problem, kind, count) * noise**2
+    return landmark_covariances(problem, kind, count) * noise**2, noise
 
 
 def kept_index(scene: Scene, files: Sequence[Path], path: Path | None, say: Progress) -> tuple[MapIndex, str]:

@@ -23,7 +23,7 @@ _FORMS = {
     **dict.fromkeys(("pose", "params"), form("f", None)),
     **dict.fromkeys(("point", "line"), form("iu", None)),
     "covariance": form("f", None, None), "size": form("iu", 2), "pixel": form("f", None, 2),
-    "segment": form("f", None, 4), "seconds": form("f"),
+    "segment": form("f", None, 4), "seconds": form("f"), "shared_error": form("f"),
 }  # fmt: skip
 
 
@@ -50,6 +50,8 @@ class PlacedImage:
     segment: FloatArray
     #: Seconds beside finding features.
     seconds: float
+    #: What parts of the map are off by, as seen from the camera, radians: part of the covariance.
+    shared_error: float = 0.0
 
     @property
     def is_whole(self) -> bool:
@@ -80,6 +82,7 @@ class PlacedImage:
                 entry["center_sigma"] = np.sqrt(np.diag(shift)).tolist()
                 entry["rotation_sigma_deg"] = float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]))))
         entry |= {"num_point_inliers": len(self.point), "num_line_inliers": len(self.line)}
+        entry["shared_error_deg"] = float(np.rad2deg(self.shared_error))
         return entry | {"seconds": self.seconds, "sentence": self.sentence}
 
     def write(self, path: Path, digest: str) -> None:
@@ -110,6 +113,7 @@ def placed(name: str, found: LocalizedImage) -> PlacedImage:
         found.line[lines],
         pose.matches.segments2d[lines].reshape(-1, 4),
         found.seconds,
+        pose.matches.shared_error,
     )
 
 
@@ -131,7 +135,7 @@ def read_placed(path: Path, digest: str) -> PlacedImage | None:
             values: dict[str, Any] = {name: members.read(name, check) for name, check in _FORMS.items()}
             for name in ("name", "status", "sentence", "model"):
                 values[name] = str(values[name])
-            values["seconds"] = float(values["seconds"])
+            values |= {name: float(values[name]) for name in ("seconds", "shared_error")}
             found = PlacedImage(**values)
             if found.model:
                 found.camera  # noqa: B018 - refuses a calibration that is none

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from groma._counted import counted
-from groma._json import json_text
+from groma.bounded.json_text import json_text
 from groma.io import atomic_output, write_scene
 from groma.localization.map_index import MapIndex
 from groma.localization.placed import PlacedImage

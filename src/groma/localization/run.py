@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from groma._log import logged_stages, logger_of
+from groma.bounded.names import IMAGES
 from groma.errors import GromaError, InputError
-from groma.io.endings import IMAGES
 from groma.localization.calibration import CalibrationChoice, calibration_of
 from groma.localization.localizer import Localizer
 from groma.localization.map_index import digest_of

@@ -9,7 +9,7 @@ out, the rest are joined to tracks, and each track gives a point.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -58,6 +58,8 @@ class PointMap:
     covariance: FloatArray
     #: (F,) of each feature of all images, in their order, its point; -1 for those that have none.
     point: IntArray
+    #: Noise of the features that residuals show, in units of what is stated.
+    noise: float = 1.0
 
 
 def triangulate_features(
@@ -147,7 +149,7 @@ class _Observed:
 def _points(scene: Scene, seen: _Observed, straight: FloatArray, count: int, gates: TriangulationGates) -> PointMap:
     """Points of tracks: nearest to their rays, then refined, twice, each time without what does not agree."""
     xyz = _nearest_to_rays(scene, seen, straight)
-    covariance = np.zeros((len(xyz), 3, 3))
+    covariance, scale = np.zeros((len(xyz), 3, 3)), 1.0
     bare = scene.keep(points=[], lines=[], planes=[], directions=[])
     for loss in (Cauchy(2.0), GemanMcClure(3.0)):
         good = np.isfinite(xyz).all(axis=1) & (np.bincount(seen.track, minlength=len(xyz)) > 1)
@@ -167,7 +169,7 @@ def _points(scene: Scene, seen: _Observed, straight: FloatArray, count: int, gat
         covariance = landmark_covariances(problem, "points", len(xyz)) * scale
         agrees = (squares > 0.0) & (squares <= chi_square_gate(gates.outlier, 2) * scale)
         seen = seen.take(agrees)
-    return _well_determined(scene, seen, xyz, covariance, count, gates)
+    return replace(_well_determined(scene, seen, xyz, covariance, count, gates), noise=float(np.sqrt(scale)))
 
 
 def _nearest_to_rays(scene: Scene, seen: _Observed, straight: FloatArray) -> FloatArray:

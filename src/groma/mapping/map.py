@@ -56,7 +56,7 @@ from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.photographs import check_images, check_number, image_files, image_reader, images_left_out
 from groma.mapping.read_rows import adjust_read_rows, mapped_as_measured, read_by_rows, taken_at_once
 from groma.mapping.refine_points import PointRefinementOptions, refine_points
-from groma.mapping.result import MapResult, result_of
+from groma.mapping.result import SCENES_OF_RESULT, MapResult, result_of
 from groma.mapping.start import start_of
 from groma.mapping.structure.find import StructureOptions, find_structure
 from groma.mapping.structure.flatness import surface_noise_px
@@ -241,8 +241,8 @@ def map_images(
     log_warnings("mapping", [sentence for sentence in result.warnings if sentence not in result.report.warnings])
     if near is None:
         return result
-    scene, start, before = (part.transformed(near.inverse()) for part in (result.scene, result.start, result.before))
-    return dataclasses.replace(result, scene=scene, start=start, before=before)
+    scenes = {name: getattr(result, name).transformed(near.inverse()) for name in SCENES_OF_RESULT}
+    return dataclasses.replace(result, **scenes)
 
 
 def map_segments(

@@ -16,11 +16,11 @@ from pathlib import Path
 import cv2
 
 from groma.bounded.images import decoded
+from groma.bounded.names import IMAGES, VIDEOS
 from groma.cameras import model as camera_model
 from groma.errors import FileFormatError, GromaError, InputError
 from groma.execution import map_work
 from groma.features.images import GrayImage, to_gray
-from groma.io.endings import IMAGES, VIDEOS
 from groma.scene import Scene
 
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"

@@ -148,6 +148,7 @@ def mapped_as_measured(result: MapResult, at_once: TakenAtOnce, stages: Stages[M
         scene=adjusted.scene,
         start=at_once.points,
         before=before,
+        adjusted=adjusted.scene,
         report=adjusted.report,
         explanation=" ".join([*motions.sentences(), result.explanation]),
         warnings=(*result.warnings, *motions.warnings()),

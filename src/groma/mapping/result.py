@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from groma._json import json_text
 from groma._typing import FloatArray
 from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
 from groma.adjustment.assemble import AssemblyOptions, assemble
@@ -24,6 +23,7 @@ from groma.adjustment.stages import with_loss
 from groma.adjustment.survey.attach import Surveyed
 from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
+from groma.bounded.json_text import json_text
 from groma.execution import beside
 from groma.factors.losses import GemanMcClure, Loss, loss
 from groma.io import atomic_output, write_geometry, write_scene
@@ -35,11 +35,15 @@ from groma.mapping.surveyed import reliability_of, survey_numbers
 from groma.mapping.unused import without_unused
 from groma.problem.problem import Problem
 from groma.scene import Scene
+from groma.scene.counts import num_relations
 from groma.solver.observability.diagnosis import Diagnosis, Finding
 from groma.viz.pictures import ImageFiles
 from groma.viz.report.page import PageContents, write_report
 from groma.viz.report.survey import survey_card
 from groma.viz.report.tables import contributions_card
+
+#: Fields of a result that are scenes of one frame.
+SCENES_OF_RESULT = ("scene", "start", "before", "adjusted")
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,8 @@ class MapResult:
     start: Scene
     #: The map before its last joint adjustment, with the same landmarks as ``scene``.
     before: Scene
+    #: ``scene`` with the lines that were left out after they had taken part in the adjustment.
+    adjusted: Scene
     #: Report of the last joint adjustment, and what it was told: noise, losses, what is estimated.
     report: AdjustReport
     adjusted_with: AdjustOptions
@@ -85,8 +91,9 @@ class MapResult:
         return replace(found, findings=(left, *others))
 
     def pose_uncertainty(self) -> dict[str, Any] | None:
-        """Return how well the cameras are known, at the noise that the observations show."""
-        return pose_uncertainty(self.scene, _problem_of(self.scene, self.adjusted_with), self.report.sigma0 or 1.0)
+        """Return how well the cameras are known, by leaving out one landmark after the other."""
+        problem = _problem_of(self.adjusted, self.adjusted_with)
+        return pose_uncertainty(self.adjusted, problem, self.report.sigma0 or 1.0, by_landmarks=True)
 
     def contributions(self, reference: Scene | None = None) -> tuple[Contribution, ...]:
         """Repeat the last adjustment by points alone, with lines, with planes: :func:`groma.contributions`."""
@@ -102,6 +109,7 @@ class MapResult:
             "line_confidence": _confidence_numbers(self.scene.lines.confidence),
             "num_planes": self.scene.num_planes,
             "num_directions": self.scene.num_directions,
+            "num_relations": num_relations(self.scene),
             "sigma_px": self.sigma_px,
             "segments": self.outcomes,
             "explanation": self.explanation,
@@ -231,6 +239,7 @@ def result_of(
         scene=scene,
         start=points,
         before=before,
+        adjusted=adjusted.scene,
         report=adjusted.report,
         adjusted_with=weighted,
         sigma_px={"points": weighted.point_sigma_px, "lines": weighted.line_sigma_px},
@@ -240,4 +249,4 @@ def result_of(
     )
 
 
-__all__ = ["MapResult", "last_loss", "result_of"]
+__all__ = ["SCENES_OF_RESULT", "MapResult", "last_loss", "result_of"]

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma.scene import Scene
+from groma.scene.survey import Kind
 
 #: Points that determine a plane, a line counting twice; lines that share a direction.
 _MIN_ON_PLANE, _MIN_ALONG = 3, 2
@@ -28,6 +29,7 @@ def without_unused(scene: Scene, *others: Scene) -> tuple[Scene, ...]:
     on_plane = np.bincount(on["point_on_plane"], minlength=scene.num_planes)
     on_plane += 2 * np.bincount(on["line_on_plane"], minlength=scene.num_planes)
     along = np.bincount(on["line_along_direction"], minlength=scene.num_directions)
+    along[scene.held.idx[scene.held.kind == Kind.DIRECTION]] += _MIN_ALONG  # such as the vertical
     kept = {
         "points": seen["point"],
         "lines": seen["line"],

@@ -40,6 +40,8 @@ def _check_objects(scene: Scene) -> None:
     """Raise where columns that refer to objects by kind point nowhere."""
     for name, column, kinds in object_references(type(scene)):
         table = getattr(scene, name)
+        if not len(table):
+            continue
         for number in np.unique(getattr(table, kinds)):
             rows = getattr(table, kinds) == number
             target = OBJECTS[number]

@@ -29,6 +29,12 @@ def sentence_of(scene: "Scene", geometry: bool = False) -> str:
     return ", ".join(said) or "nothing"
 
 
+def num_relations(scene: "Scene") -> dict[str, int]:
+    """Number of relations between landmarks, by kind; only kinds that there are."""
+    counts = {kind: len(getattr(scene.relations, kind)) for kind in scene.relations.kinds()}
+    return {kind: count for kind, count in counts.items() if count}
+
+
 def measurements_of(scene: "Scene") -> dict[str, int]:
     """Number of measurements besides those of points and lines in images, by kind; only kinds that there are."""
     counts = {
@@ -50,4 +56,4 @@ def measurements_of(scene: "Scene") -> dict[str, int]:
     return {name: count for name, count in counts.items() if count}
 
 
-__all__ = ["counts_of", "measurements_of", "sentence_of"]
+__all__ = ["counts_of", "measurements_of", "num_relations", "sentence_of"]

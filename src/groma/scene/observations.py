@@ -111,6 +111,14 @@ class Relations:
     parallel_planes: IntArray = column(np.int64, 2, refers=("planes", "planes"), optional=True)
     #: (R, 2) plane, plane.
     perpendicular_planes: IntArray = column(np.int64, 2, refers=("planes", "planes"), optional=True)
+    #: (R, 2) direction, direction.
+    parallel_directions: IntArray = column(np.int64, 2, refers=("directions", "directions"), optional=True)
+    #: (R, 2) direction, direction.
+    perpendicular_directions: IntArray = column(np.int64, 2, refers=("directions", "directions"), optional=True)
+    #: (R, 2) plane, direction: its normal is along the direction.
+    plane_across_direction: IntArray = column(np.int64, 2, refers=("planes", "directions"), optional=True)
+    #: (R, 2) plane, direction: it contains the direction.
+    plane_along_direction: IntArray = column(np.int64, 2, refers=("planes", "directions"), optional=True)
     #: (R,) standard deviations: distance from the plane, also of the ends of a line; angle; distance from the line.
     point_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="point_on_plane")
     line_on_plane_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="line_on_plane")
@@ -119,6 +127,10 @@ class Relations:
     lines_meeting_sigma: FloatArray = column(np.float64, fill=0.0, length=1, of="lines_meeting")
     parallel_planes_sigma: FloatArray = column(np.float64, fill=0.0, of="parallel_planes")
     perpendicular_planes_sigma: FloatArray = column(np.float64, fill=0.0, of="perpendicular_planes")
+    parallel_directions_sigma: FloatArray = column(np.float64, fill=0.0, of="parallel_directions")
+    perpendicular_directions_sigma: FloatArray = column(np.float64, fill=0.0, of="perpendicular_directions")
+    plane_across_direction_sigma: FloatArray = column(np.float64, fill=0.0, of="plane_across_direction")
+    plane_along_direction_sigma: FloatArray = column(np.float64, fill=0.0, of="plane_along_direction")
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -25,7 +25,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Self
+from functools import cache
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +48,7 @@ from groma.scene.similarity import Similarity
 from groma.scene.standing_alone import standing_alone
 from groma.scene.table import moved_table, new_index_of, references, rows_of
 
+SomeScene = TypeVar("SomeScene", bound="Scene")
 _IDENTITY = np.array([0, 0, 0, 1, 0, 0, 0.0])
 
 
@@ -138,7 +140,7 @@ class Scene:
         **tables
             Further tables of the scene, by field name.
         """
-        return cls(**standing_alone(cameras, names, camera_idx, cam_from_world), **tables)
+        return _nothing(cls).replace(**standing_alone(cameras, names, camera_idx, cam_from_world), **tables)
 
     @property
     def num_images(self) -> int:
@@ -388,3 +390,9 @@ class Scene:
                 first = new_index.get(name, np.arange(len(before)))
                 new_index[name] = np.append(new_index_of(kept, len(before)), -1)[first]
         return self.replace(**tables)
+
+
+@cache
+def _nothing(kind: type[SomeScene]) -> SomeScene:
+    """Return a scene without anything; many small scenes share its tables."""
+    return kind()

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from groma._counted import counted
-from groma._json import json_text
 from groma._log import log_warnings, logged_stages, logger_of
+from groma.bounded.json_text import json_text
 from groma.errors import GromaError, InputError
 from groma.evaluation.trajectory import TrajectoryScores, score_trajectory
 from groma.io import atomic_output, write_scene

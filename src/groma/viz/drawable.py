@@ -20,6 +20,8 @@ import numpy.typing as npt
 from groma import cameras
 from groma._typing import FloatArray, IntArray
 from groma.geometry import se3
+from groma.geometry.incidence import closest_points
+from groma.geometry.line3 import from_point_and_direction
 from groma.scene.patches import plane_patches
 
 if TYPE_CHECKING:
@@ -109,6 +111,13 @@ def drawable(scene: Scene) -> Drawable:
             np.linalg.norm(point_residuals, axis=1), points.point_idx, len(scene.points), empty=np.nan
         ),
     )
+
+
+def junctions(segments: FloatArray, pairs: IntArray) -> FloatArray:
+    """Places (J, 3) where pairs (J, 2) of lines through segments (L, 2, 3) meet: half-way where they are nearest."""
+    ends = segments[pairs]
+    lines = from_point_and_direction(ends[:, :, 0], ends[:, :, 1] - ends[:, :, 0])
+    return closest_points(lines[:, 0], lines[:, 1]).midpoint
 
 
 def rms_by_group(lengths: FloatArray, group: IntArray, size: int, empty: float = 0.0) -> FloatArray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from groma._typing import IntArray
 from groma.adjustment.parts.same import check_same_scene
+from groma.adjustment.terms.relations import ANGLES
 from groma.errors import InputError, OutputError
 from groma.io.archive import read_archive, write_archive
 from groma.scene import Scene
@@ -125,7 +126,8 @@ def num_ties_cut(scene: Scene, observations: int = PART_SIZE) -> int:
 
 def _without_what_counts_once(scene: Scene) -> Scene:
     """Return a scene without what is in the first part alone: it would count once per part."""
-    relations = scene.relations.take(lines_meeting=[], parallel_planes=[], perpendicular_planes=[])
+    once: dict[str, list[int]] = {kind: [] for kind in ("lines_meeting", *ANGLES)}
+    relations = scene.relations.take(**once)
     return scene.replace(relations=relations, **{name: type(getattr(scene, name))() for name in ONCE})
 
 

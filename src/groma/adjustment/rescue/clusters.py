@@ -98,9 +98,11 @@ def _indices(factor: Factor) -> dict[str, IntArray]:
 
 
 def _label_of(factor: Factor, cluster: dict[str, IntArray]) -> IntArray:
-    """Return the cluster of each factor, -1 for none."""
-    labels = [cluster[group][index] for group, index in _indices(factor).items() if group in cluster]
-    return np.max(labels, axis=0) if labels else np.full(len(factor), -1)
+    """Return the cluster of each factor; -1 for none, or if it ties a cluster to what is outside of it."""
+    labels = [cluster[ref.group][ref.index] for _, ref in factor.references() if ref.group in cluster]
+    if not labels:
+        return np.full(len(factor), -1)
+    return np.where(np.all(np.equal(labels, labels[0]), axis=0), labels[0], -1)
 
 
 def _ill_fitting(factors, labels: list[IntArray], count: int, variables: Mapping[str, Variables]) -> BoolArray:

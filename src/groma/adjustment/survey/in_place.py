@@ -19,6 +19,7 @@ from groma.adjustment.survey.names import rows_by_name
 from groma.adjustment.survey.similarity import GATES, RobustSimilarity, robust_similarity, upright
 from groma.adjustment.survey.tables import listed
 from groma.adjustment.survey.triangulate import triangulated
+from groma.adjustment.survey.units import check_lengths, check_places
 from groma.errors import InputError
 from groma.evaluation.alignment import camera_centers, pose_alignment
 from groma.io.survey import WorldFrame, common_frame
@@ -75,6 +76,7 @@ def placing(before: Scene, scene: Scene, survey: Survey, frame: WorldFrame, note
         _check_exchanged(scene, survey, source, None)
         raise
     _check_exchanged(scene, survey, source, fit)
+    _check_units(scene, source, target, fit)
     if fit.on_line and len(scene.camera_poses) > 1:
         fit = _by_orientations(scene, fit, source, target)
     elif fit.on_line:
@@ -130,15 +132,19 @@ def _is_there(scene: Scene, fit: RobustSimilarity) -> bool:
 
 def _check_exchanged(scene: Scene, survey: Survey, source: FloatArray, fit: RobustSimilarity | None) -> None:
     """Refuse longitudes and latitudes that fit much better the other way round, or only so."""
-    given = survey.positions
-    if given is None or not given.system.is_geographic or survey.control is not None or len(source) < 4:
+    both = (survey.positions, survey.control and survey.control.places)
+    groups = [group for group in both if group is not None]
+    if len(groups) != 1 or not groups[0].system.is_geographic or len(source) < 4:
         return
+    given = groups[0]
     swapped = replace(given, coordinates=given.coordinates[:, [1, 0, 2]])
-    if np.abs(swapped.coordinates[:, 1]).max() > 90.0 or len(source) != len(scene.camera_positions):
+    found = rows_by_name(given.names, scene.images.names) >= 0
+    if survey.positions is None:
+        found = np.isin(given.names, _correspondences(scene)[2])
+    if np.nanmax(np.abs(swapped.coordinates[:, 1])) > 90.0 or int(found.sum()) != len(source):
         return
-    xyz = common_frame([swapped])[0][0]
     try:
-        other = robust_similarity(source, xyz[rows_by_name(given.names, scene.images.names) >= 0])
+        other = robust_similarity(source, common_frame([swapped])[0][0][found])
     except InputError:
         return
     if fit is None or other.scatter * GATES.mirrored < fit.scatter:
@@ -148,8 +154,25 @@ def _check_exchanged(scene: Scene, survey: Survey, source: FloatArray, fit: Robu
         )
 
 
+def _check_units(scene: Scene, source: FloatArray, target: FloatArray, fit: RobustSimilarity) -> None:
+    """Refuse places, heights and distances that are in different units."""
+    positions = len(scene.camera_positions)
+    check_places(source, target, fit, positions, len(source) - positions - len(scene.camera_poses))
+    if len(ratios := _ratios(scene)):
+        check_lengths(float(np.median(ratios)) / fit.similarity.scale, "The measured distances", "the measured places")
+
+
 def _scaled(scene: Scene, notes: list[str]) -> Similarity:
     """Return the scaling of a scene to its measured distances."""
+    if not len(ratios := _ratios(scene)):
+        return Similarity()
+    similarity = Similarity(float(np.median(ratios)))
+    notes.append(f"The scene was scaled by {similarity.scale:.6g} to its measured distances.")
+    return similarity
+
+
+def _ratios(scene: Scene) -> FloatArray:
+    """Return by which factors measured distances differ from those of the scene, where it has them."""
     table = scene.distances
     points, _ = triangulated(scene, scene.marks, len(scene.control_points))
     places = {Kind.IMAGE: scene.cam_centers_in_world, Kind.CONTROL_POINT: points}
@@ -165,12 +188,7 @@ def _scaled(scene: Scene, notes: list[str]) -> Similarity:
         else:
             apart = abs(scene.planes.hesse[index] @ np.append(first, 1.0))
         ratios.append(table.distance[row] / apart if apart > 0.0 else np.nan)
-    usable = [ratio for ratio in ratios if np.isfinite(ratio)]
-    if not usable:
-        return Similarity()
-    similarity = Similarity(float(np.median(usable)))
-    notes.append(f"The scene was scaled by {similarity.scale:.6g} to its measured distances.")
-    return similarity
+    return np.array([ratio for ratio in ratios if np.isfinite(ratio)])
 
 
 __all__ = ["Placing", "placing"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +16,26 @@ from groma.factors.contract import Factor, Ref
 from groma.factors.relations.line_direction import LineDirection
 from groma.factors.relations.line_on_plane import SegmentOnPlane
 from groma.factors.relations.lines_meeting import LinesMeeting
-from groma.factors.relations.orthogonal import OrthogonalPlanes
-from groma.factors.relations.parallel import ParallelPlanes
+from groma.factors.relations.orthogonal import OrthogonalDirections, OrthogonalPlanes, PlaneParallelToDirection
+from groma.factors.relations.parallel import (
+    DirectionPair,
+    ParallelDirections,
+    ParallelPlanes,
+    PlanePerpendicularToDirection,
+)
 from groma.factors.relations.point_on_line import PointOnLine
 from groma.factors.relations.point_on_plane import PointOnPlane
 from groma.scene import Relations, Scene
 
+#: Angles between planes and directions, and the types of their factors.
+ANGLES: dict[str, type[DirectionPair]] = {
+    "parallel_planes": ParallelPlanes,
+    "perpendicular_planes": OrthogonalPlanes,
+    "parallel_directions": ParallelDirections,
+    "perpendicular_directions": OrthogonalDirections,
+    "plane_across_direction": PlanePerpendicularToDirection,
+    "plane_along_direction": PlaneParallelToDirection,
+}
 #: Types of the factors of relations, and the relation of the scene each stands for.
 RELATION_FACTORS = {
     "point_on_plane": "point_on_plane",
@@ -28,8 +43,7 @@ RELATION_FACTORS = {
     "line_direction": "line_along_direction",
     "point_on_line": "point_on_line",
     "lines_meeting": "lines_meeting",
-    "parallel_planes": "parallel_planes",
-    "orthogonal_planes": "perpendicular_planes",
+    **{factor.type_name: kind for kind, factor in ANGLES.items()},
 }
 
 
@@ -90,7 +104,7 @@ def metric_rows(draft: Draft, kind: str) -> IntArray:
         return np.zeros(0, np.int64)
     if kind == "lines_meeting":
         return np.arange(count if draft.options.meeting_lines else 0)
-    if draft.options.structure_form == "metric":
+    if draft.options.structure_form == "metric" or kind in ANGLES:
         return np.arange(count)
     return np.flatnonzero(draft.scene.relations.sigma(kind) > 0.0)
 
@@ -98,8 +112,7 @@ def metric_rows(draft: Draft, kind: str) -> IntArray:
 def _factors(draft: Draft) -> Iterator[Group]:
     """Yield the factors of the relations whose landmarks take part."""
     for kind, make in _MAKERS.items():
-        groups = next(item.metadata["refers"] for item in fields(Relations) if item.name == kind)
-        if set(groups) <= draft.variables.keys() and len(rows := metric_rows(draft, kind)):
+        if set(_groups(kind)) <= draft.variables.keys() and len(rows := metric_rows(draft, kind)):
             yield Group(make(draft, rows))
 
 
@@ -153,19 +166,20 @@ def _lines_along_directions(draft: Draft, rows: IntArray) -> Factor:
     )
 
 
-def _plane_pairs(factor: type[ParallelPlanes] | type[OrthogonalPlanes], kind: str) -> Callable[..., Factor]:
+def _angles(kind: str) -> Callable[[Draft, IntArray], Factor]:
     def make(draft: Draft, rows: IntArray) -> Factor:
-        first, second = getattr(draft.scene.relations, kind)[rows].T
-        sigma = draft.scene.relations.sigma(kind)[rows]
+        pairs, sigma = getattr(draft.scene.relations, kind)[rows], draft.scene.relations.sigma(kind)[rows]
         sigma = np.where(sigma > 0.0, sigma, draft.options.plane_angle_sigma)
-        return factor(
-            first=Ref("planes", first),
-            second=Ref("planes", second),
-            sqrt_information=1.0 / sigma,
-            loss=draft.relation_loss,
-        )
+        sides = zip(("first", "second"), _groups(kind), pairs.T, strict=True)
+        refs: dict[str, Any] = {side: Ref(group, index) for side, group, index in sides}
+        return ANGLES[kind](**refs, sqrt_information=1.0 / sigma, loss=draft.relation_loss)
 
     return make
+
+
+def _groups(kind: str) -> tuple[str, str]:
+    """Groups of landmarks that a relation is between."""
+    return next(item.metadata["refers"] for item in fields(Relations) if item.name == kind)
 
 
 _MAKERS: dict[str, Callable[[Draft, IntArray], Factor]] = {
@@ -174,7 +188,6 @@ _MAKERS: dict[str, Callable[[Draft, IntArray], Factor]] = {
     "lines_meeting": _lines_meeting,
     "line_on_plane": _lines_on_planes,
     "line_along_direction": _lines_along_directions,
-    "parallel_planes": _plane_pairs(ParallelPlanes, "parallel_planes"),
-    "perpendicular_planes": _plane_pairs(OrthogonalPlanes, "perpendicular_planes"),
+    **{kind: _angles(kind) for kind in ANGLES},
 }
 TERM = Term("relations", ("relations",), (), _factors, is_relation=True)

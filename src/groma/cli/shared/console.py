@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from groma.cli.shared.progress import Plan, Progress, Stages
-from groma.cli.shared.style import aligned, is_terminal, paint, terminal_width, wrapped
+from groma.cli.shared.style import Style, aligned, is_terminal, paint, terminal_width, wrapped
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -92,11 +92,16 @@ class Console:
 
 
 def warn(text: str) -> None:
-    """Print a warning on standard error; on a terminal it is broken between words."""
-    line = f"warning: {text}"
+    """Print a warning on standard error."""
+    complain("warning:", text, "yellow")
+
+
+def complain(what: str, text: str, style: Style) -> None:
+    """Print a sentence and what it is on standard error; on a terminal it is broken between words."""
+    line = f"{what} {text}"
     if is_terminal(sys.stderr):
-        line = wrapped(line, terminal_width()).replace("warning:", paint("warning:", "yellow", sys.stderr), 1)
+        line = wrapped(line, terminal_width()).replace(what, paint(what, style, sys.stderr), 1)
     print(line, file=sys.stderr, flush=True)
 
 
-__all__ = ["Console", "warn"]
+__all__ = ["Console", "complain", "warn"]

@@ -9,9 +9,8 @@ from typing import ParamSpec
 
 import typer
 
-from groma.cli.shared.console import warn
+from groma.cli.shared.console import complain, warn
 from groma.cli.shared.interrupt import PROCESS
-from groma.cli.shared.style import paint
 from groma.errors import GromaError
 from groma.plugins import load_plugins
 
@@ -75,5 +74,5 @@ def _fail(message: str, code: int) -> None:
     from groma.solver.reduce.mpi import started_as
 
     if started_as()[0] == 0:  # of processes that mpiexec started together, the first speaks
-        print(f"{paint('groma:', 'red', sys.stderr)} {' '.join(message.split())}", file=sys.stderr, flush=True)
+        complain("groma:", " ".join(message.split()), "red")
     raise typer.Exit(code) from None

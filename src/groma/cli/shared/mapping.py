@@ -100,6 +100,7 @@ def say_map(console: Console, result: MapResult, numbers: dict[str, Any], explai
         KINDS,
         describe_pose_uncertainty,
         describe_relations,
+        describe_structure,
         fit_table,
         say_contributions,
     )
@@ -107,6 +108,8 @@ def say_map(console: Console, result: MapResult, numbers: dict[str, Any], explai
     counts = {kind: getattr(result.scene, f"num_{kind}") for kind in KINDS}
     console.table(*fit_table(counts, result.report.inliers))
     for line in describe_pose_uncertainty(numbers.get("pose_uncertainty")):
+        console.say(line)
+    for line in describe_structure(numbers["num_relations"]):
         console.say(line)
     for line in describe_relations(result.report.relations):
         console.detail(line)

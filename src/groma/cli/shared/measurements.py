@@ -325,7 +325,7 @@ def say_survey(console: Console, numbers: dict[str, Any]) -> None:
             + f" (residual {one['residual']:.4g}, {abs(one['normalized']):.1f} standard deviations). Check it."
         )
     if len(suspects) > 5:
-        console.warn(f"{len(suspects) - 5} more measurements are probably wrong; the protocol lists them.")
+        console.warn(f"The protocol lists {len(suspects) - 5} more that are probably wrong.")
 
 
 __all__ = [

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from groma._json import json_text
+from groma.bounded.json_text import json_text
 from groma.errors import OutputError
 
 #: What the commands write into folders. A folder that holds anything else is not replaced by ``--force``.

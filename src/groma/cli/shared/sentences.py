@@ -105,6 +105,22 @@ def describe_pose_uncertainty(numbers: Mapping[str, Any] | None) -> list[str]:
     ]
 
 
+def describe_structure(relations: Mapping[str, int]) -> list[str]:
+    """Return how many angles are right, and at how many places lines meet; ``relations`` is ``num_relations``."""
+    parallel = ("parallel_planes", "parallel_directions", "plane_across_direction")
+    right = ("perpendicular_planes", "perpendicular_directions", "plane_along_direction")
+    parts = [
+        (sum(relations.get(kind, 0) for kind in kinds), words)
+        for kinds, words in (
+            (parallel, "parallel"),
+            (right, "at right angles (pairs of planes and directions)"),
+            (("lines_meeting",), "where lines meet"),
+        )
+    ]
+    said = ", ".join(f"{count:,} {words}" for count, words in parts if count)
+    return [f"Structure: {said}"] if said else []
+
+
 def describe_relations(relations: Mapping[str, Mapping[str, int]]) -> list[str]:
     """Return how many relations between landmarks of each kind hold, and how many the robust loss gave up."""
     return [

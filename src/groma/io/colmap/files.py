@@ -16,8 +16,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
+from groma.bounded.names import IMAGES
 from groma.errors import FileFormatError
-from groma.io.endings import IMAGES
 from groma.io.reading import existing
 
 _FILES = ("cameras", "images", "points3D")

@@ -27,7 +27,8 @@ from groma.bounded.text import read_lines, shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration
 from groma.io.interchange.centred import centred_scene, point_rows
-from groma.io.interchange.poses import FLIP, file_in, rigid, size_of_image
+from groma.io.interchange.poses import file_in, rigid, size_of_image
+from groma.io.pose_conventions import BUNDLER
 from groma.io.reading import existing, reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
@@ -74,7 +75,7 @@ def read_bundler(path: str | os.PathLike[str]) -> Scene:
         folder, names = _names(place, num_cameras)
         posed = np.flatnonzero(cameras[:, 0] != 0.0)
         used = cameras[posed]
-        poses = rigid(FLIP[:, None] * used[:, 3:12].reshape(-1, 3, 3), FLIP * used[:, 12:], place)
+        poses = rigid(used[:, 3:12].reshape(-1, 3, 3), used[:, 12:], place, BUNDLER)
         calibrations = [
             _calibration(tuple(lens), size_of_image(folder, names[row]))
             for row, lens in zip(posed.tolist(), used[:, :3].tolist(), strict=True)

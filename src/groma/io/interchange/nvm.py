@@ -28,10 +28,10 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.bounded.text import finite, read_text, shown, whole
 from groma.errors import FileFormatError
-from groma.geometry import quaternion
 from groma.io.interchange.calibration import Calibration, inverse_polynomial
 from groma.io.interchange.centred import PointRows, centred_scene, point_rows
 from groma.io.interchange.poses import rigid, size_of_image
+from groma.io.pose_conventions import NVM, NVM_MATRIX
 from groma.io.reading import existing, reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Scene
@@ -128,12 +128,11 @@ def _scene(model: _Model, turn: int, fixed: list[float], path: Path) -> Scene:
 def _poses(rotation: FloatArray, last: FloatArray, path: Path) -> FloatArray:
     """Return poses of matrices and translations, or of quaternions and centres."""
     if rotation.shape[1] == 9:
-        return rigid(rotation.reshape(-1, 3, 3), last, path)
+        return rigid(rotation.reshape(-1, 3, 3), last, path, NVM_MATRIX)
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
     if not ((length > 1e-3) & (length < 1e3)).all() or np.abs(last).max() > 1e100:
         raise FileFormatError(f"{path}: expected quaternions of length 1 and finite centres. Correct the file.")
-    turned = quaternion.from_wxyz(rotation / length)
-    return np.hstack([turned, -quaternion.rotate(turned, last)])
+    return NVM.cam_from_world(rotation / length, last)
 
 
 def _reach(focal: FloatArray, sizes: list[tuple[int, int]], rows: PointRows, path: Path) -> FloatArray:

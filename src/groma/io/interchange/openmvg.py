@@ -40,6 +40,7 @@ from groma.bounded.text import shown
 from groma.errors import FileFormatError
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, panorama, polynomial
 from groma.io.interchange.poses import file_in, points_table, rigid
+from groma.io.pose_conventions import OPENMVG
 from groma.io.reading import existing, reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import PointObservations, Scene
@@ -88,8 +89,7 @@ def read_openmvg(path: str | os.PathLike[str]) -> Scene:
             raise FileFormatError(f"{place} has no view with intrinsics and a pose. Was it saved after reconstruction?")
         rotation = table([extrinsics[view.pose].get("rotation") for view in views], (3, 3), f"{place}, rotation")
         center = table([extrinsics[view.pose].get("center") for view in views], (3,), f"{place}, center")
-        poses = rigid(rotation, np.zeros_like(center), place)
-        poses[:, 4:] = -np.einsum("nij,nj->ni", rotation, center)
+        poses = rigid(rotation, center, place, OPENMVG)
         if not np.isfinite(poses).all():
             raise FileFormatError(f"{place}: a camera centre is too far away. Correct the file.")
         keys = sorted(intrinsics)

@@ -37,9 +37,9 @@ from groma._typing import FloatArray, IntArray
 from groma.bounded.documents import begins_with, member, number, of_kind, read_document, size, table
 from groma.bounded.text import finite, read_text, shown
 from groma.errors import FileFormatError
-from groma.geometry import quaternion
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, panorama, polynomial
 from groma.io.interchange.poses import file_in, points_table
+from groma.io.pose_conventions import OPENSFM
 from groma.io.reading import existing, reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import PointObservations, Scene
@@ -145,7 +145,7 @@ def _reconstruction(one: dict[str, Any], tracks: dict[str, _Tracks], place: str)
         camera_table(list(cameras.values()), place),
         list(shots),
         camera_idx,
-        np.hstack([quaternion.exp(turn), shift]),
+        OPENSFM.cam_from_world(turn, shift),
         points=points_table(ids, xyz, color, place),
         point_observations=PointObservations.numbered(image_idx, point_idx, pixel),
     )

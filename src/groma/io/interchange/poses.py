@@ -13,11 +13,9 @@ from groma.bounded.content import READING
 from groma.bounded.images import image_size
 from groma.bounded.names import stays_inside
 from groma.errors import FileFormatError
-from groma.geometry import quaternion
+from groma.io.pose_conventions import PoseConvention
 from groma.scene import Points
 
-#: Axes of a camera that looks along -z with y up, seen from one that looks along z with y down: diag(1, -1, -1).
-FLIP = np.array([1.0, -1.0, -1.0])
 #: Largest deviation of a rotation matrix from an orthonormal one: files hold three digits at least.
 _ROTATION_SLIP = 5e-3
 #: Coordinates beyond this are no places; their squares leave the number range.
@@ -26,8 +24,10 @@ _LARGEST = 1e100
 _HEADER_BYTES = 1 << 17
 
 
-def rigid(rotation: FloatArray, translation: FloatArray, path: object) -> FloatArray:
-    """Return poses (N, 7) of rotation matrices (N, 3, 3) and translations (N, 3); the nearest rotations are taken.
+def rigid(rotation: FloatArray, place: FloatArray, path: object, convention: PoseConvention) -> FloatArray:
+    """Return poses (N, 7) of rotation matrices (N, 3, 3) and places (N, 3), as files of a kind hold them.
+
+    The nearest rotations are taken.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def rigid(rotation: FloatArray, translation: FloatArray, path: object) -> FloatA
     """
     if not len(rotation):
         return np.zeros((0, 7))
-    if max(np.abs(rotation).max(), np.abs(translation).max()) > _LARGEST:
+    if max(np.abs(rotation).max(), np.abs(place).max()) > _LARGEST:
         raise FileFormatError(f"{path}: the numbers of a pose are too large. Correct the file.")
     left, scale, right = np.linalg.svd(rotation)
     nearest = left @ right
@@ -53,7 +53,7 @@ def rigid(rotation: FloatArray, translation: FloatArray, path: object) -> FloatA
             f"{path}: expected right-handed axes; the matrix of image {int(turned.argmin()) + 1} mirrors. Turn the "
             "sign of one axis."
         )
-    return np.hstack([quaternion.from_matrix(nearest), translation])
+    return convention.cam_from_world(nearest, place)
 
 
 def points_table(ids: Sequence[int] | IntArray, xyz: FloatArray, color: FloatArray, path: object) -> Points:
@@ -96,4 +96,4 @@ def size_of_image(folder: Path, name: str) -> tuple[int, int]:
     return found if found is not None and 0 < min(found) and max(found) <= 10**6 else (0, 0)
 
 
-__all__ = ["FLIP", "checked_rows", "file_in", "points_table", "rigid", "size_of_image"]
+__all__ = ["checked_rows", "file_in", "points_table", "rigid", "size_of_image"]

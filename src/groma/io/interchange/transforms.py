@@ -41,18 +41,17 @@ from typing import Any
 import numpy as np
 
 from groma import cameras as camera_models
-from groma._typing import FloatArray
 from groma.bounded.documents import begins_with, member, number, of_kind, read_document, size, table
-from groma.bounded.names import listed_file
+from groma.bounded.names import IMAGES, listed_file
 from groma.bounded.text import shown
 from groma.errors import FileFormatError, InputError
 from groma.geometry import quaternion
 from groma.io.atomic import atomic_output
-from groma.io.endings import IMAGES
 from groma.io.interchange.calibration import Calibration, camera_table, fisheye, panorama, polynomial, shared
-from groma.io.interchange.poses import FLIP, file_in, points_table, rigid, size_of_image
+from groma.io.interchange.poses import file_in, points_table, rigid, size_of_image
 from groma.io.ply import write_ply
 from groma.io.ply_tables import read_ply_points
+from groma.io.pose_conventions import FLIP, TRANSFORMS
 from groma.io.reading import existing, reading
 from groma.io.registry import SceneFormat, register_format
 from groma.scene import Cameras, Points, Scene
@@ -116,17 +115,11 @@ def read_transforms(path: str | os.PathLike[str]) -> Transforms:
             camera_table(calibrations, place),
             names,
             np.array(camera_idx, np.int64),
-            _cam_from_world(matrices, place),
+            rigid(matrices[:, :3, :3], matrices[:, :3, 3], place, TRANSFORMS),
             points=_points(document, place),
         )
     known = {"frames", "ply_file_path", *INTRINSICS}
     return Transforms(scene, {name: value for name, value in document.items() if name not in known})
-
-
-def _cam_from_world(matrices: FloatArray, path: Path) -> FloatArray:
-    world_from_cam = rigid(matrices[:, :3, :3] * FLIP, matrices[:, :3, 3], path)
-    turned = quaternion.conjugate(world_from_cam[:, :4])
-    return np.hstack([turned, -quaternion.rotate(turned, world_from_cam[:, 4:])])
 
 
 def _name(frame: dict[str, Any], place: str) -> str:

@@ -7,8 +7,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+from groma.bounded.names import VIDEOS
 from groma.errors import InputError
-from groma.io.endings import VIDEOS
 from groma.io.reading import existing
 from groma.io.sequences._calibration import Calibration, CameraLike, calibration_of
 from groma.io.sequences._reader import Selection

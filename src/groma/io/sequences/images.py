@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from groma._counted import natural_key
+from groma.bounded.names import IMAGES
 from groma.bounded.text import finite, read_words
 from groma.errors import FileFormatError, InputError
-from groma.io.endings import IMAGES
 from groma.io.reading import reading
 from groma.io.sequences._calibration import Calibration, find_calibration, rectification
 from groma.io.sequences._reader import Entry, FileSequence, Selection, read_ahead, simple_sequence

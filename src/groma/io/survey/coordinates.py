@@ -130,6 +130,10 @@ def common_frame(groups: Sequence[Places], wanted: str | None = None) -> tuple[l
     InputError
         If systems cannot be joined, or longitude and latitude are exchanged.
     """
+    told = [group for group in groups if np.isfinite(group.coordinates).any()]
+    if len(told) < len(groups):  # marks of points whose place was not measured say nothing of the frame
+        found, frame = common_frame(told, wanted)
+        return [found.pop(0) if group in told else group.coordinates for group in groups], frame
     for group in groups:
         _check(group)
     names = sorted({group.system.name for group in groups})

@@ -27,6 +27,7 @@ from groma.localization.pose.verdict import (
     Verdict,
     doubted_if_in_pieces,
     doubted_if_mirrored,
+    doubted_if_missing,
     evidence_of,
     judge,
     median_distance,
@@ -171,6 +172,7 @@ def pose_from_matches(
     places: int = 1,
     guided: Callable[[Refined], Matches] | None = None,
     mirror: Callable[[], Matches] | None = None,
+    expected: Callable[[Refined], tuple[float, float]] | None = None,
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
 
@@ -186,6 +188,8 @@ def pose_from_matches(
     mirror : callable, optional
         Returns the matches of the mirror image of the photograph, by points: where they agree with a pose far better,
         the photograph was mirrored.
+    expected : callable, optional
+        Returns how many parts of the image show what a pose puts there, and how many show none of it.
     """
     options = options or PoseOptions()
     best = _best(camera, matches, options)
@@ -198,7 +202,7 @@ def pose_from_matches(
     if guided is not None and first.significant:
         used = guided(best)
         errors = _errors(used, options)
-        best = refine(best.camera, used, best.pose, errors, options.refine_lens)
+        best = refine(best.camera, used, best.pose, errors, options.refine_lens, gathered=True)
         own = fitted(best.camera, matches, best.pose, errors, options.refine_lens)
         first = evidence_of(own, matches, places)
     covariance = best.covariance(used)
@@ -207,6 +211,8 @@ def pose_from_matches(
     if verdict.status == "localized":
         beyond = VERDICT.distinct * max_errors(matches)[0]
         verdict = doubted_if_in_pieces(verdict, first.agree, cells_elsewhere(own, matches, beyond))
+    if expected is not None and verdict.status == "localized":
+        verdict = doubted_if_missing(verdict, *expected(best))
     if mirror is not None and verdict.status == "localized":
         verdict = _unless_mirrored(verdict, best, mirror(), matches, options)
     failed = verdict.status == "failed"

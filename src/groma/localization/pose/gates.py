@@ -62,6 +62,15 @@ class VerdictGates:
         5.0, "thresholds", "by which another pose moves what is seen, in the median", "derived from noise: well beyond"
     )
     beside: float = gate(0.125, "share", "of the longer side: cells as near are neighbours", "convention: an eighth")
+    parts: int = gate(
+        8, "parts", "per longer side: what is expected in one is to be seen in it", "chosen on the filing cabinet"
+    )
+    expected: float = gate(
+        3.0, "points", "expected in a part, for it to count", "derived from Poisson: none is seen once in twenty"
+    )
+    whole: float = gate(
+        0.99, "probability", "that more of what is expected is there than is missing", "chosen on the filing cabinet"
+    )
     bend: float = gate(
         0.15, "share", "of their distance, by which neighbours may be off differently",
         "derived from perspective: as between views 10 degrees apart",

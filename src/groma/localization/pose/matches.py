@@ -40,6 +40,8 @@ class Matches:
     #: (N, 3, 3) covariances of the points, and (M, 6, 6) of (moment, direction) of the lines with a unit direction.
     point_covariance: FloatArray = field(default_factory=lambda: _LEFT_OUT)
     line_covariance: FloatArray = field(default_factory=lambda: _LEFT_OUT)
+    #: What the landmarks that one cell of the image shows are off by together, seen from the camera, radians.
+    shared_error: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         points, lines = len(np.atleast_1d(self.points2d)), len(np.atleast_1d(self.segments2d))
@@ -79,7 +81,8 @@ class Matches:
     def take(self, points: IntArray | BoolArray, lines: IntArray | BoolArray) -> Matches:
         """The chosen matches of points and of lines."""
         chosen = {name: getattr(self, name)[points] for name in _OF_POINTS}
-        return Matches(**chosen, **{name: getattr(self, name)[lines] for name in _OF_LINES})
+        chosen |= {name: getattr(self, name)[lines] for name in _OF_LINES}
+        return Matches(**chosen, shared_error=self.shared_error)
 
     def with_sigma(self, sigma: float) -> Matches:
         """The same matches with one standard deviation for all, pixels."""

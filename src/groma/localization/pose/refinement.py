@@ -15,6 +15,14 @@ the image before it squares them (clustered sandwich),
 
 .. math:: H^{-1} \Big( \sum_{c} g_c g_c^\top \Big) H^{-1}, \qquad g_c = \sum_{i \in c} J_i^\top W_i r_i .
 
+What is wrong with the map itself, with the poses that its landmarks were found from, is common to all that a cell
+shows, and no number of matches averages it out. Where it is known to be :math:`\tau` radians as seen from the camera
+(:mod:`groma.localization.pose.map_errors`), the covariance grows by
+
+.. math:: \tau^2 \Big( \sum_c \frac{1}{n_c} \sum_{i \in c} \bar J_i^\top \bar J_i \Big)^{-1} ,
+
+that of a pose from one match a cell, with derivatives :math:`\bar J` in radians.
+
 Reference: K.-Y. Liang, S. Zeger, *Longitudinal data analysis using generalized linear models*, 1986, eq. (7).
 """
 
@@ -100,6 +108,28 @@ class Refined:
 
     def covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
         """(6, 6) covariance of the left twist; infinite where the matches do not determine the pose."""
+        noise = self.noise_covariance(matches, gates)
+        if matches.shared_error == 0.0 or not np.isfinite(noise).all():
+            return noise
+        return noise + matches.shared_error**2 * self.shared_covariance(matches, gates)
+
+    def shared_covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
+        """(6, 6) covariance of the left twist if what each cell shows is off by one radian, together."""
+        chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
+        J = np.concatenate([found.by_pose[kept] * np.sqrt(found.spread[kept, None, None]) for found, kept in chosen])
+        cell = self._cells(matches, gates)
+        J /= float(self.camera.kind.focal_length(self.camera.params))
+        information = np.einsum("n,nki,nkj->ij", 1.0 / np.bincount(cell)[cell], J, J)
+        scale = 1.0 / np.sqrt(np.diag(information))
+        return (np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))[:6, :6]
+
+    def _cells(self, matches: Matches, gates: RefinementGates) -> IntArray:
+        """Number the matches that agree by the cells of the image that they lie in."""
+        middle = matches.segments2d.mean(axis=1)[self.line_inliers]
+        return cells_of(np.concatenate([matches.points2d[self.point_inliers], middle]), self.camera, gates.cells)
+
+    def noise_covariance(self, matches: Matches, gates: RefinementGates = REFINEMENT) -> FloatArray:
+        """(6, 6) covariance of the left twist by the noise of image and landmarks alone."""
         chosen = ((self.points, self.point_inliers), (self.lines, self.line_inliers))
         J = np.concatenate([found.by_pose[kept] for found, kept in chosen])
         r = np.concatenate([found.value[kept] for found, kept in chosen])
@@ -111,8 +141,7 @@ class Refined:
             return np.full((6, 6), np.inf)
         pull, sigma = _pull(r, J.shape[2], gates)
         root = sigma * vectors / np.sqrt(values) / scale[:, None]
-        middle = matches.segments2d.mean(axis=1)[self.line_inliers]
-        cell = cells_of(np.concatenate([matches.points2d[self.point_inliers], middle]), self.camera, gates.cells)
+        cell = self._cells(matches, gates)
         count, dof = int(cell.max()) + 1, len(scale)
         gradient = np.zeros((count, dof))
         np.add.at(gradient, cell, np.einsum("nki,nk->ni", J @ (root / sigma), pull / sigma))
@@ -171,6 +200,7 @@ def refine(
     start: FloatArray,
     max_error: tuple[float, float],
     refine_lens: bool = False,
+    gathered: bool = False,
     gates: RefinementGates = REFINEMENT,
 ) -> Refined:
     """Fit a pose to what is near it, again to what is near then, until that stays the same; last with a narrow loss.
@@ -185,6 +215,8 @@ def refine(
         Matches of points and lines further from where a pose puts them, pixels, say nothing about pose and noise.
     refine_lens
         Estimate focal length and distortion, too.
+    gathered
+        The matches were looked for near the start, as far as it may be off: all of them are near at first.
     gates
         Numbers of the fit.
     """
@@ -197,7 +229,8 @@ def refine(
     for round_ in range(gates.rounds + 1):
         weighted = _with_landmarks(problem, matches)
         squares = residual_squares_of(weighted, matches)
-        before, near = near, (squares[0] <= limits[0], squares[1] <= limits[1])
+        wide = gathered and round_ == 0
+        before, near = near, (wide | (squares[0] <= limits[0]), wide | (squares[1] <= limits[1]))
         last = round_ == gates.rounds or (before is not None and all(map(np.array_equal, near, before)))
         loss = GemanMcClure(last_scale(_agreeing(squares, gates), gates)) if last else Cauchy(gates.wide_loss)
         solved = solve(with_loss(without_far(weighted, near), loss), options).problem

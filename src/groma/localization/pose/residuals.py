@@ -78,7 +78,7 @@ def residual_squares_of(problem: Problem, matches: Matches) -> tuple[FloatArray,
 
 def without_far(problem: Problem, near: tuple[BoolArray, BoolArray]) -> Problem:
     """Return a problem in which the matches that are not near, of points and of lines, have no weight."""
-    kept = dict(zip(("points", "lines"), near, strict=True))
+    kept: dict[str, BoolArray] = dict(zip(("points", "lines"), near, strict=True))
     return Problem(problem.variables, [_of_near(factor, kept) for factor in problem.factors])
 
 

@@ -15,6 +15,10 @@ reach of a search.
 explain, :math:`k_1` cells speak for the first and :math:`k_2` for the second. If both were equally good, each would
 fall to either with the same probability; the first is the right one with the probability that the sign test says.
 
+**The rest of the image.** What is to be seen under the pose is counted part by part of the image, by how often the map
+finds it again in its own images (:mod:`groma.localization.expected`). Where about as much is missing as is there, by
+the same test, a piece of the place is shown, or something that is like it.
+
 Reference: L. Moisan, B. Stival, *A probabilistic criterion to detect rigid point matches between two images and
 estimate the fundamental matrix*, 2004, eq. (9), for samples of three.
 """
@@ -159,6 +163,22 @@ def doubted_if_in_pieces(verdict: Verdict, agree: int, elsewhere: int, gates: Ve
     return Verdict("uncertain", 1.0 - gates.right, words)
 
 
+def doubted_if_missing(verdict: Verdict, shown: float, missing: float, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where about as much of what should be seen is missing as is there.
+
+    ``shown`` and ``missing`` are numbers of parts of the image, by what is expected in them.
+    """
+    from scipy.special import betainc
+
+    if missing < 1.0 or (shown > 0.0 and 2.0 * betainc(shown, missing + 1.0, 0.5) <= 1.0 - gates.whole):
+        return verdict
+    words = (
+        f"{verdict.sentence} But in {missing:.0f} of {shown + missing:.0f} parts of the image where this place has "
+        "points or lines none is seen: the photograph may show this place in a part only, or something like it."
+    )
+    return Verdict("uncertain", 1.0 - gates.right, words)
+
+
 def votes_of_a_rival(agree: int, gates: VerdictGates = VERDICT) -> int:
     """How many cells must agree with another place for it to make one with so many doubtful."""
     votes = np.arange(agree + 1)
@@ -238,7 +258,9 @@ __all__ = [
     "Evidence",
     "Status",
     "Verdict",
+    "doubted_if_in_pieces",
     "doubted_if_mirrored",
+    "doubted_if_missing",
     "evidence_of",
     "judge",
     "median_distance",

@@ -7,7 +7,7 @@ From a scene with poses, points and perhaps lines:
 2. planes in points and segments (:mod:`groma.estimators.plane_fit`), directions shared by lines
    (:mod:`groma.estimators.directions`), with covariances;
 3. relations, each a statistical test: point on plane, line on plane, line along direction, point on line, lines that
-   meet.
+   meet, planes and directions that are parallel or at right angles. Gravity, where it was measured, is a direction too.
 
 There are no tolerances in pixels or scene units; all tests use the covariances. Uncertain pairs are left out: a missing
 relation costs little, a wrong one bends the scene.
@@ -24,17 +24,19 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
-from groma.adjustment.terms.relations import lengths_per_pixel
+from groma.adjustment.terms.relations import ANGLES, lengths_per_pixel
 from groma.errors import InputError
-from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines, orthogonal_pairs
+from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines
 from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
 from groma.execution import together
 from groma.geometry.algebra import norm
 from groma.mapping.groups import num_distinct
 from groma.mapping.noise.landmarks import LineNoise, PointNoise, line_noise, point_noise
+from groma.mapping.structure.angles import Vector, angles_between, vertical_of
 from groma.mapping.structure.junctions import meetings
 from groma.mapping.structure.relations import Landmarks, Pairs, along_directions, on_lines, on_planes, spacings
-from groma.scene import Directions, Planes, Relations, Scene
+from groma.scene import Directions, Held, Planes, Relations, Scene
+from groma.scene.survey import Kind
 
 #: Related lines below which a direction is not one that lines share.
 _MIN_PARALLEL = 2
@@ -80,10 +82,6 @@ class Structure:
     planes: PlaneSet
     #: The directions as found, with covariance, in the order of the scene.
     directions: DirectionSet
-    #: (M, 2) pairs of planes whose normals are orthogonal within their uncertainty.
-    orthogonal_planes: IntArray
-    #: (M, 2) pairs (plane, direction) where the direction is parallel to the plane within the uncertainty.
-    directions_in_planes: IntArray
     #: Probability that each relation is no coincidence, by the names of :class:`groma.scene.Relations`.
     probability: dict[str, FloatArray]
     #: Standard deviations that the tests used, pixels; 0 where there is nothing of the kind.
@@ -141,6 +139,7 @@ def detect_structure(
     """
     options = options or StructureOptions()
     _check(options)
+    scene = scene.keep(planes=[], directions=[])
     report = progress or (lambda stage, done, total: None)
     level, least, least_line = options.level, options.min_probability, options.min_line_probability
     report("finding planes", 0, 1)
@@ -157,17 +156,14 @@ def detect_structure(
     directions, found["line_along_direction"] = _parallels(scene, marks, options, candidates)
     found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()
     found["lines_meeting"] = meetings(marks, level, least_line)
-    orthogonal, parallel = _orthogonal(planes, directions)
+    vertical = vertical_of(scene)
+    found |= angles_between(planes, directions, vertical, level)
     return Structure(
-        scene=scene.replace(
-            planes=Planes(np.arange(len(planes)) + 1, planes.planes),
-            directions=Directions(np.arange(len(directions)) + 1, directions.vectors),
-            relations=_relations(found, marks, options),
+        scene=_with_vertical(scene, vertical, directions, found).replace(
+            planes=Planes(np.arange(len(planes)) + 1, planes.planes), relations=_relations(found, marks, options)
         ),
         planes=planes,
         directions=directions,
-        orthogonal_planes=orthogonal,
-        directions_in_planes=parallel,
         probability={name: relation.probability for name, relation in found.items()},
         point_sigma_px=marks.point_noise.sigma_px if scene.num_points else 0.0,
         line_sigma_px=marks.line_noise.sigma_px if scene.num_lines else 0.0,
@@ -235,18 +231,18 @@ def _relations(found: dict[str, Pairs], marks: Landmarks, options: StructureOpti
     sigma["lines_meeting_sigma"] = missing * marks.line_pixel[first]
     along, crooked = found["line_along_direction"].pairs[:, 0], found["line_along_direction"].deviation
     turned = math.sqrt(2.0) * crooked * (marks.line_pixel / norm(marks.segments[:, 1] - marks.segments[:, 0]))[along]
+    sigma |= {f"{kind}_sigma": found[kind].deviation for kind in ANGLES}
     sigma["line_along_direction_sigma"] = (crooked > 0.0) * np.hypot(turned, options.directions.parallel_sigma)
     return Relations(**{kind: pairs.pairs for kind, pairs in found.items()}, **sigma)
 
 
-def _orthogonal(planes: PlaneSet, directions: DirectionSet) -> tuple[IntArray, IntArray]:
-    """Pairs of planes that are orthogonal, and pairs (plane, direction) that are parallel."""
-    pairs = orthogonal_pairs(
-        np.concatenate([planes.planes[:, :3], directions.vectors]),
-        np.concatenate([planes.covariance[:, :3, :3], directions.covariance]),
-    )
-    mixed = (pairs[:, 0] < len(planes)) & (pairs[:, 1] >= len(planes))
-    return pairs[pairs[:, 1] < len(planes)], pairs[mixed] - np.array([0, len(planes)])
+def _with_vertical(scene: Scene, vertical: Vector | None, directions: DirectionSet, found: dict[str, Pairs]) -> Scene:
+    """Return the scene with its directions; the vertical is one more, and held, where anything is related to it."""
+    vectors, held, number = directions.vectors, scene.held, len(directions)
+    if vertical is not None and any((found[kind].pairs[:, 1] == number).any() for kind in ANGLES if "dir" in kind):
+        vectors = np.vstack([vectors, vertical[0]])
+        held = Held(np.append(held.kind, Kind.DIRECTION), np.append(held.idx, number))
+    return scene.replace(directions=Directions(np.arange(len(vectors)) + 1, vectors), held=held)
 
 
 def _landmarks(scene: Scene, options: StructureOptions) -> Landmarks:

@@ -92,6 +92,7 @@ class Pairs:
     #: (M,) probability that the landmark is no clutter.
     probability: FloatArray
     #: (M,) deviation from the structure that is usual for such landmarks, pixels; 0 where their noise explains it.
+    #: Of pairs of planes and directions: that of the angle, radians.
     deviation: FloatArray
 
     @staticmethod

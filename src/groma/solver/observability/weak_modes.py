@@ -141,7 +141,7 @@ def _lone_landmarks(layout: Layout) -> dict[int, BoolArray]:
             off = slice(None) if a != b else rows != columns
             lone[a][rows[off]] = False
             lone[b][columns[off]] = False
-    return lone
+    return {c: blocks for c, blocks in lone.items() if blocks.any()}
 
 
 def _unknowns(layout: Layout, c: int, blocks: BoolArray) -> IntArray:

@@ -54,9 +54,10 @@ def turn_between(
     K = _matrix(camera, before.shape)
     dx, dy = _shift(before, now)
     shifted = so3.exp(np.array([[-dy / K[1, 1], dx / K[0, 0], 0.0]]))[0]
-    tried = [_align(_matrix(camera, first.shape), first, second, start, gates) for start in [*starts, shifted]]
-    best = max(tried, key=lambda one: one[1])[0]
-    return _align(K, before, now, best, gates)[0]
+    coarse = _matrix(camera, first.shape)
+    agree = [_align(coarse, first, second, start, gates, 1)[1] for start in [*starts, shifted]]
+    best = _align(coarse, first, second, [*starts, shifted][int(np.argmax(agree))], gates, gates.steps)[0]
+    return _align(K, before, now, best, gates, gates.steps)[0]
 
 
 def _matrix(camera: TrackCamera, shape: tuple[int, ...]) -> FloatArray:
@@ -78,9 +79,12 @@ def _shift(before: _SmallImage, now: _SmallImage) -> FloatArray:
 
 
 def _align(
-    K: FloatArray, before: _SmallImage, now: _SmallImage, start: FloatArray, gates: TurnGates
+    K: FloatArray, before: _SmallImage, now: _SmallImage, start: FloatArray, gates: TurnGates, steps: int
 ) -> tuple[FloatArray, float]:
-    """Gauss-Newton on the rotation; return the best one with the correlation of the images where they overlap."""
+    """Gauss-Newton on the rotation; return the best one with the correlation of the images where they overlap.
+
+    One step tells how well they agree at the start.
+    """
     height, width = now.shape
     inverse = np.linalg.inv(K)
     v, u = np.mgrid[0:height, 0:width].reshape(2, -1)
@@ -90,7 +94,7 @@ def _align(
     along_v = K[1, 1] * np.stack([-1.0 - y * y, x * y, x], axis=1)
     inside = np.ones(before.shape, np.uint8)
     turn, best, best_score = start, start, -np.inf
-    for _ in range(gates.steps):
+    for _ in range(steps):
         homography = K @ turn @ inverse
         moved = cv2.warpPerspective(before, homography, (width, height), flags=cv2.INTER_LINEAR)
         both = cv2.warpPerspective(inside, homography, (width, height), flags=cv2.INTER_NEAREST)

@@ -19,7 +19,7 @@ from groma._typing import BoolArray, FloatArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.stages import with_loss
 from groma.factors.contract import Factor
-from groma.factors.losses import Cauchy, GemanMcClure
+from groma.factors.losses import Cauchy, GemanMcClure, Loss
 from groma.problem.problem import Problem
 from groma.scene import PosePriors
 from groma.solver.options import SolverOptions
@@ -35,8 +35,8 @@ GATE = 3.5
 #: What counts as a well-known direction: share of the median depth, and radians.
 WEAK_SHARE, WEAK_ANGLE = 0.02, math.radians(1.0)
 #: Losses, one after the other, under held landmarks.
-_LOSSES = (Cauchy(1.5), GemanMcClure(3.0))
-_ASSEMBLY = replace(TRACKING, refine_landmarks=False, loss=_LOSSES[0])
+LOSSES: tuple[Loss, ...] = (Cauchy(1.5), GemanMcClure(3.0))
+_ASSEMBLY = replace(TRACKING, refine_landmarks=False, loss=LOSSES[0])
 _SOLVER = SolverOptions(
     max_iterations=8, function_tolerance=1e-3, initial_damping=1e-6, threads=1, eliminate=("frames",)
 )
@@ -75,6 +75,7 @@ def estimate_pose(
     predicted: FloatArray,
     prior_sigma: FloatArray,
     start: FloatArray | None = None,
+    losses: Sequence[Loss] = LOSSES,
 ) -> PoseEstimate:
     """Estimate cam_from_world of one frame.
 
@@ -88,7 +89,44 @@ def estimate_pose(
         Standard deviations of the prior: translation (scene units), rotation (radians).
     start : (7,), optional
         Where to start, if not at the prior.
+    losses : sequence of Loss, optional
+        Of the measurements, one after the other. From a :func:`rough_pose` the last one will do.
     """
+    problem = _problem_of(camera, view, measured, predicted, prior_sigma, start)
+    for loss in losses:
+        problem = solve(with_loss(problem, loss), _SOLVER).problem
+    every = problem.factors[:-1]  # all but the prior
+    pose = problem.variables["frames"].state[0]
+    kept = [
+        _agreeing(problem, [factor for factor in every if factor.type_name in names], len(table))
+        for names, table in zip(_TELLING, (measured.points, measured.lines, measured.planes), strict=True)
+    ]
+    information = pose_information(problem, every)
+    depth = _median_depth(view, measured, pose)
+    return PoseEstimate(pose, kept[0], kept[1], kept[2], information, weak_directions(information, depth))
+
+
+def rough_pose(
+    camera: TrackCamera,
+    view: MapView,
+    measured: Measurements,
+    predicted: FloatArray,
+    prior_sigma: FloatArray,
+    start: FloatArray,
+) -> FloatArray:
+    """Return a pose (7,) by measurements of which some are wrong, from where :func:`estimate_pose` may go on."""
+    problem = _problem_of(camera, view, measured, predicted, prior_sigma, start)
+    return solve(with_loss(problem, LOSSES[0]), _SOLVER)["frames"][0]
+
+
+def _problem_of(
+    camera: TrackCamera,
+    view: MapView,
+    measured: Measurements,
+    predicted: FloatArray,
+    prior_sigma: FloatArray,
+    start: FloatArray | None,
+) -> Problem:
     tables = (measured.points, measured.lines, measured.planes)
     # Each landmark in question is one of its own, numbered anew.
     image = [np.zeros(len(table), np.int64) for table in tables]
@@ -102,18 +140,7 @@ def estimate_pose(
         SeenPlanes(tables[2].index, _renumbered(tables[2]), image[2]),
         pose_priors=PosePriors(np.zeros(1, np.int64), predicted[None], prior_sigma[None]),
     )
-    problem = assemble(scene, _ASSEMBLY).problem
-    for loss in _LOSSES:
-        problem = solve(with_loss(problem, loss), _SOLVER).problem
-    every = problem.factors[:-1]  # all but the prior
-    pose = problem.variables["frames"].state[0]
-    kept = [
-        _agreeing(problem, [factor for factor in every if factor.type_name in names], len(table))
-        for names, table in zip(_TELLING, tables, strict=True)
-    ]
-    information = pose_information(problem, every)
-    depth = _median_depth(view, measured, pose)
-    return PoseEstimate(pose, kept[0], kept[1], kept[2], information, weak_directions(information, depth))
+    return assemble(scene, _ASSEMBLY).problem
 
 
 def _renumbered(table: Table) -> Table:
@@ -171,4 +198,4 @@ def _median_depth(view: MapView, measured: Measurements, pose: FloatArray) -> fl
     return float(np.median(depths)) if len(depths) else 1.0
 
 
-__all__ = ["GATE", "PoseEstimate", "estimate_pose", "pose_information", "weak_directions"]
+__all__ = ["GATE", "LOSSES", "PoseEstimate", "estimate_pose", "pose_information", "rough_pose", "weak_directions"]

@@ -9,25 +9,27 @@ with them, and the best are estimated from all that agrees: points, lines and pl
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.execution import map_in_threads
 from groma.geometry import se3
-from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
+from groma.localization.pose.gates import VERDICT
+from groma.localization.pose.hypotheses import propose, straightened
+from groma.localization.pose.matches import Matches
 from groma.tracking.frame.camera import TrackCamera, back, into
 from groma.tracking.frame.features import Descriptors, Features, FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
 from groma.tracking.gates import DEFAULT
-from groma.tracking.map.feature_points import match_features, points_of_features
+from groma.tracking.map.feature_points import match_descriptors, points_of_features
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.lines import FollowedSegments, assign, expected_segments
 from groma.tracking.map.planes import assign_planes
 from groma.tracking.map.points import PointTracks
 from groma.tracking.map.track_map import Keyframe, TrackMap
-from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
+from groma.tracking.pose.estimate import LOSSES, PoseEstimate, estimate_pose, rough_pose
 from groma.tracking.pose.near_matches import pair_near
 
 
@@ -93,14 +95,35 @@ def pose_from_matches(
     min_inliers: int = DEFAULT.finding.min_inliers,
     max_error: float = DEFAULT.finding.max_error,
 ) -> tuple[FloatArray, BoolArray] | None:
-    """Pose (7,) from places in the world and their pixels, and which agree; None where chance explains them as well."""
-    options, sigma = PoseOptions(max_error=max_error, look_for_rival=False), 0.5 * max_error
-    pose = estimate_absolute_pose(camera.query, pixel, places, sigma=(sigma, sigma), options=options).cam_from_world
+    """Pose (7,) from places in the world and their pixels, and which agree; None where chance explains them as well.
+
+    It is the best that few matches propose, fitted to those that agree; :func:`estimate_pose` weighs them.
+    """
+    straight = straightened(camera.query, Matches(pixel, places))
+    # A pose that fewer agree with is of no interest; it need not be looked for as long.
+    pose = propose(straight, (max_error, max_error), 0, min_inliers / max(len(pixel), 1))
     if pose is None:
         return None
     away = np.linalg.norm(camera.project(into(pose, places)) - pixel, axis=1)
     agree: BoolArray = away <= max_error  # what is behind the camera is NaN, and does not
-    return (pose, agree) if agree.sum() >= min_inliers else None
+    if agree.sum() < min_inliers or _log_alarms(camera, pixel, agree, max_error) > 0.0:
+        return None
+    return pose, agree
+
+
+def _log_alarms(camera: TrackCamera, pixel: FloatArray, agree: BoolArray, max_error: float) -> float:
+    """Natural logarithm of the number of poses that so much agrees with by chance: see the verdict of localisation.
+
+    What agrees in one cell of the image counts once.
+    """
+    cell = np.floor(pixel / (camera.width / VERDICT.cells)).astype(np.int64)
+    number = cell[:, 1] * (2 * VERDICT.cells) + cell[:, 0]
+    of, agreeing = len(np.unique(number)), len(np.unique(number[agree]))
+    if agreeing <= 3:
+        return math.inf
+    chance = min(math.pi * max_error**2 / (camera.width * camera.height) * len(pixel) / of, 0.5)
+    ways = math.comb(of, agreeing) * math.comb(agreeing, 3) * max(of - 3, 1)
+    return math.log(ways) + (agreeing - 3) * math.log(chance)
 
 
 @dataclass(frozen=True)
@@ -128,13 +151,19 @@ def find_pose(
 ) -> Found | None:
     """Find the pose of a frame near some keyframes; ``guesses`` are poses to be tried as well."""
     search = _Search(track_map, camera, data, known_features(track_map, camera, keyframes), predicted, prior_sigma)
-    if guesses:
-        near = map_in_threads(search.proposal_near, guesses)
-        best = search.best_of([*guesses, *(pose for pose in near if pose is not None)])
-        if best is not None and best.score >= data.options.gates.verification.strong:
-            # What repeats itself agrees with a wrong guess, too; what no guess suggests may agree with more.
-            keyframes = keyframes[:1]
-    return search.best_of([pose for pose in map(search.proposal, keyframes) if pose is not None])
+    gates = data.options.gates
+    strong = gates.verification.strong
+    best: Found | None = None
+    for guess in search.in_order(guesses):
+        near = search.proposal_near(guess)
+        best = search.best_of([guess] if near is None else [near, guess], most=1)
+        if best is not None and best.score >= strong:
+            break
+    if best is not None and best.score >= strong:
+        # What repeats itself agrees with a wrong guess, too; what no guess suggests may agree with more.
+        keyframes = keyframes[:1]
+    others = [search.proposal(keyframe, best) for keyframe in keyframes]
+    return search.best_of([pose for pose in others if pose is not None], gates.finding.max_refined)
 
 
 class _Search:
@@ -157,30 +186,46 @@ class _Search:
         pairs = self.near(guess, self.gates.search * self.camera.width)
         return self._from_pairs(self.known.places[pairs[:, 0]], pairs[:, 1])
 
-    def proposal(self, keyframe: Keyframe) -> FloatArray | None:
-        """Pose from all features that match those of one keyframe."""
-        first, second = match_features(keyframe.features, self.data.features, self.all_gates.features.max_bits)
-        places = feature_places(self.track_map, self.camera, keyframe, first)
+    def in_order(self, guesses: list[FloatArray]) -> list[FloatArray]:
+        """Guesses, those first that most features agree with."""
+        agree = np.array([len(self.near(guess, 3 * self.gates.near)) for guess in guesses])
+        return [guesses[k] for k in np.argsort(-agree, kind="stable")]
+
+    def proposal(self, keyframe: Keyframe, best: Found | None) -> FloatArray | None:
+        """Pose from features that match those of one keyframe, wherever they are.
+
+        Where a pose is there already, only what is left beside it is looked at, and only as long as more of that could
+        agree with another one.
+        """
+        first, second = keyframe.features, self.data.features
+        rows, columns = np.arange(len(first.pixel)), np.arange(len(second.pixel))
+        agreeing = 0
+        if best is not None:
+            mine = best.pairs[self.known.of[best.pairs[:, 0]] == self.known.keyframes.index(keyframe)]
+            agreeing = len(mine)
+            rows, columns = np.delete(rows, self.known.row[mine[:, 0]]), np.delete(columns, mine[:, 1])
+        if min(len(rows), len(columns)) <= agreeing:
+            return None
+        one, other = match_descriptors(
+            first.descriptor[rows], second.descriptor[columns], self.all_gates.features.max_bits
+        )
+        places = feature_places(self.track_map, self.camera, keyframe, rows[one])
         known = np.isfinite(places[:, 0])
-        return self._from_pairs(places[known], second[known])
+        if known.sum() <= agreeing:
+            return None
+        return self._from_pairs(places[known], columns[other[known]])
 
     def _from_pairs(self, places: FloatArray, second: IntArray) -> FloatArray | None:
         pixel = self.data.features.pixel[second]
         found = pose_from_matches(self.camera, places, pixel, self.gates.min_inliers, self.gates.max_error)
         return found[0] if found is not None else None
 
-    def best_of(self, starts: list[FloatArray]) -> Found | None:
-        """Refine the starts that most agrees with; return the best pose so far."""
-        planes, seen = self.track_map.planes, self.data.planes
-        judged = [len(self.near(start, 3 * self.gates.near)) for start in starts]
-        if seen:
-            gates = self.all_gates.planes
-            agreeing = [
-                len(assign_planes(planes, seen, start, gates.wide_angle, gates.wide_distance, gates)[0])
-                for start in starts
-            ]
-            judged = [one + self.gates.plane_weight * other for one, other in zip(judged, agreeing, strict=True)]
-        for k in np.argsort(-np.array(judged), kind="stable")[: self.gates.max_refined]:
+    def best_of(self, starts: list[FloatArray], most: int) -> Found | None:
+        """Refine the starts that most agrees with, and more than with the best pose so far; return the best then."""
+        judged = [self._agreeing(start) for start in starts]
+        for k in np.argsort(-np.array(judged), kind="stable")[:most]:
+            if self._best is not None and judged[k] <= self._agreeing(self._best.estimate.pose):
+                break
             if self._is_known(starts[k]):
                 continue
             found = self._refine(starts[k])
@@ -190,6 +235,17 @@ class _Search:
                 if self._best is None or found.score > self._best.score:
                     self._best = found
         return self._best
+
+    def _agreeing(self, pose: FloatArray) -> float:
+        """Features and planes that roughly agree with a pose."""
+        count = float(len(self.near(pose, 3 * self.gates.near)))
+        if not self.data.planes:
+            return count
+        gates = self.all_gates.planes
+        planes = assign_planes(
+            self.track_map.planes, self.data.planes, pose, gates.wide_angle, gates.wide_distance, gates
+        )
+        return count + self.gates.plane_weight * len(planes[0])
 
     def _is_known(self, start: FloatArray) -> bool:
         """Whether a start is as good as at a pose that was tried."""
@@ -218,9 +274,12 @@ class _Search:
             if len(pairs) + len(line_table) + len(planes) < 3:
                 return None
             view = replace(track_map.view, points=temporary)
-            measured = Measurements(table, line_table, planes)
-            estimate = estimate_pose(camera, view, measured, self.predicted, self.prior_sigma, pose)
-            pose = estimate.pose
+            around = (camera, view, Measurements(table, line_table, planes), self.predicted, self.prior_sigma, pose)
+            if factor == gates.rounds[-1]:
+                estimate = estimate_pose(*around, LOSSES[-1:])
+                pose = estimate.pose
+            else:
+                pose = rough_pose(*around)
         assert estimate is not None
         agree = pairs[estimate.points] if data.options.points else pairs[:0]
         counts = estimate.counts

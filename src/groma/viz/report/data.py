@@ -12,6 +12,7 @@ from groma._typing import FloatArray, IntArray
 from groma.scene.line_intervals import line_pieces
 from groma.scene.patches import PALETTE, patch_area, patch_groups
 from groma.viz import colours as _colours
+from groma.viz.drawable import junctions
 from groma.viz.framing import starting_view
 from groma.viz.pack import pack, pack_bytes, pack_whole
 from groma.viz.report.kept import Kept, places_of
@@ -29,6 +30,7 @@ def scene_data(
     """Return the states of a scene for the 3D view, the last one being the one that counts."""
     scene, after = scenes[-1], states[-1]
     offset = _middle(after)
+    meeting = kept.meeting(scene)
     owner = line_pieces(scene)[1]
     drawn = np.flatnonzero(places_of(kept.lines, scene.num_lines)[owner] >= 0)
     numbers = [line_statistics(one, shown) for one, shown in zip(scenes, states, strict=True)]
@@ -43,6 +45,7 @@ def scene_data(
                 "lines": pack(line_pieces(scene, shown.segments)[0][drawn] - offset),
                 "line_errors": pack(far),
                 "planes": pack(np.concatenate([*_patches_of(one, after), np.zeros((0, 3))]) - offset),
+                "junctions": pack(junctions(shown.segments, meeting) - offset),
                 "cameras": pack(_camera_axes(shown, offset)),
             }
             for one, shown, errors, far in zip(scenes, states, point_errors, line_errors, strict=True)
@@ -55,6 +58,7 @@ def scene_data(
         "directions": {"ids": pack_whole(scene.directions.ids)},
         "cameras": _cameras(scene),
         "relations": _relations(scene, kept),
+        "junctions": pack_whole(places_of(kept.lines, scene.num_lines)[meeting]),
         "covariances": None if covariances is None else _covariances(covariances, kept, offset),
         "view": {
             "pivot": (view.pivot - offset).tolist(),

@@ -36,6 +36,11 @@ class Kept:
     point_observations: IntArray
     line_observations: IntArray
 
+    def meeting(self, scene: Scene) -> IntArray:
+        """(J, 2) lines that meet, both in the page."""
+        pairs = scene.relations.lines_meeting
+        return pairs[_member(self.lines, scene.num_lines)[pairs].all(axis=1)]
+
 
 def kept(scene: Scene) -> Kept:
     """Choose what the page holds of a scene."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from groma._counted import counted
 from groma._typing import FloatArray, IntArray
+from groma.scene.counts import num_relations
 from groma.scene.patches import PALETTE, patch_area, patch_groups
 from groma.viz import colours as _colours
 from groma.viz.report import charts as _charts
@@ -136,13 +137,7 @@ def number_tables(scene: Scene, before: Drawable | None, after: Drawable, number
     """Return the tables of residuals, planes, directions, time and content."""
     text = _residual_table(before, after)
     text += _plane_table(scene, after) + _direction_table(scene)
-    if numbers is not None and numbers.get("relations"):
-        rows = [
-            [name.replace("_", " "), f"{outcome['held']:,}", f"{outcome['dropped']:,}"]
-            for name, outcome in numbers["relations"].items()
-        ]
-        caption = "What lies on what. Relations that the robust loss gave up are no longer in the scene."
-        text += table("Relations", caption, ["", "hold", "given up"], rows)
+    text += _relation_table(scene, {} if numbers is None else numbers.get("relations") or {})
     rows = [[name, f"{count:,}"] for name, count in counts_of(scene, after) if count]
     text += table("Scene", "What it holds.", ["", "number"], rows)
     if numbers is not None:
@@ -281,6 +276,22 @@ def _plane_table(scene: Scene, after: Drawable) -> str:
         f" The {len(order)} with most on them; {left:,} more are in the scene." if left else ""
     )
     return table("Planes", caption, ["plane", "points", "lines", "area", "distance"], rows, marks)
+
+
+def _relation_table(scene: Scene, outcomes: Mapping[str, Mapping[str, int]]) -> str:
+    """Return how many relations of each kind there are, and what became of those that an adjustment held."""
+    there = num_relations(scene)
+    became = {kind: [f"{outcome['held']:,}", f"{outcome['dropped']:,}"] for kind, outcome in outcomes.items()}
+    rows = [
+        [kind.replace("_", " "), f"{there.get(kind, 0):,}", *became.get(kind, ["", ""])]
+        for kind in scene.relations.kinds()
+        if kind in there or kind in became
+    ]
+    caption = (
+        "What lies on what, and which angles are right: how many there are, and how many of them the last adjustment "
+    )
+    caption += "held and gave up. What it gave up is no longer in the scene; lines that meet are held on request."
+    return table("Relations", caption, ["", "number", "held", "given up"], rows) if rows else ""
 
 
 def _direction_table(scene: Scene) -> str:

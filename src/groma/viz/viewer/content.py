@@ -21,7 +21,7 @@ from groma.scene.similarity import Similarity
 from groma.scene.upright import upward
 from groma.viz import colours as _colours
 from groma.viz.colours import Colours
-from groma.viz.drawable import drawable
+from groma.viz.drawable import drawable, junctions
 from groma.viz.statistics import LineStatistics, line_statistics
 
 if TYPE_CHECKING:
@@ -63,6 +63,9 @@ class ViewContent:
     #: K convex polygons (n, 3), and how many landmarks lie on each.
     patches: list[FloatArray]
     patch_members: IntArray
+    #: (J, 3) places where lines meet, and the two lines (J, 2) of each.
+    junctions: FloatArray
+    junction_lines: IntArray
     #: (D, 3) unit vectors, and how many lines follow each.
     directions: FloatArray
     direction_members: IntArray
@@ -93,6 +96,11 @@ class ViewContent:
             return LineColours(_colours.of_shared_directions(self.scene), meaning=meaning)
         meaning = "Red, blue and green along the three directions at right angles that most lines follow; others grey."
         return LineColours(_colours.of_lines(self.scene), meaning=meaning)
+
+    def lines_met(self, line: int) -> IntArray:
+        """Return the lines that a line meets."""
+        pairs = self.junction_lines
+        return np.unique(np.concatenate([pairs[pairs[:, 0] == line, 1], pairs[pairs[:, 1] == line, 0]]))
 
     def pick(self, origin: FloatArray, direction: FloatArray, tolerance: float, shown: BoolArray) -> int | None:
         """Return the line under a ray, or None.
@@ -143,6 +151,8 @@ def view_content(scene: Scene) -> ViewContent:
         segment_line=line,
         patches=[frame.points(patch) for patch in shown.patches],
         patch_members=shown.patch_members,
+        junctions=frame.points(junctions(shown.segments, scene.relations.lines_meeting)),
+        junction_lines=scene.relations.lines_meeting,
         directions=frame.directions(scene.directions.vectors),
         direction_members=np.bincount(
             scene.relations.line_along_direction[:, 1], minlength=scene.num_directions

@@ -66,10 +66,12 @@ def describe_line(content: ViewContent, line: int, images: ImageFiles | None = N
     top = residual_top(numbers)
     planes = scene.relations.line_on_plane
     on = ", ".join(str(scene.planes.ids[plane]) for plane in planes[planes[:, 0] == line, 1])
+    met = ", ".join(str(scene.lines.ids[other]) for other in content.lines_met(line))
     lines = [
         f"<b>Line {scene.lines.ids[line]}</b>: length {numbers.length[line]:.4g}, "
         f"{counted(int(numbers.num_images[line]), 'images')}, {_px(numbers.residual_px[line])} rms"
         + (f", on plane {on}" if on else "")
+        + (f", meets line {met}" if met else "")
     ]
     for row in order[thin(len(order), MAX_CROPS)]:
         lines.append(

@@ -37,6 +37,10 @@ _ORANGE = (255, 150, 30)
 _CAMERA = (60, 66, 74)
 _CAMERAS = (150, 156, 164)
 _MANY_CAMERAS = 100
+#: Colour of junctions, and their size over that of the scene.
+_JUNCTION, _JUNCTION_SIZE = (200, 40, 120), 0.008
+#: What is shown on request.
+_OFF_AT_FIRST = ("directions", "junctions")
 
 
 class SceneView:
@@ -61,7 +65,7 @@ class SceneView:
         #: Number of drawn cameras that have a photograph.
         self.num_pictures = 0
         self._lock = threading.RLock()
-        self._nodes: dict[str, list[Any]] = {"cameras": [], "planes": [], "directions": []}
+        self._nodes: dict[str, list[Any]] = {"cameras": [], "planes": [], "directions": [], "junctions": []}
         self._drawn_points: tuple[int, str] | None = None
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         server.gui.set_panel_label("groma")
@@ -75,6 +79,7 @@ class SceneView:
             self._add_cameras()
             self._add_planes()
             self._add_directions()
+            self._add_junctions()
             self.draw_points()
             self.draw_lines()
         server.scene.on_click()(self._clicked)
@@ -93,9 +98,10 @@ class SceneView:
                 "lines": scene.num_lines,
                 "planes": scene.num_planes,
                 "directions": scene.num_directions,
+                "junctions": len(content.junctions),
             }
             self.shown = {
-                name: gui.add_checkbox(name.capitalize(), name != "directions", visible=number > 0)
+                name: gui.add_checkbox(name.capitalize(), name not in _OFF_AT_FIRST, visible=number > 0)
                 for name, number in kinds.items()
             }
         with gui.add_folder("Lines", visible=scene.num_lines > 0):
@@ -278,6 +284,23 @@ class SceneView:
             )
         )
 
+    def _add_junctions(self) -> None:
+        """A dot where two lines meet."""
+        places = self.content.junctions
+        if len(places):
+            self._nodes["junctions"].append(
+                self.server.scene.add_point_cloud(
+                    "/junctions",
+                    places.astype(np.float32),
+                    np.tile(np.array(_JUNCTION, np.uint8), (len(places), 1)),
+                    point_size=_JUNCTION_SIZE * REACH,
+                    point_shape="diamond",
+                    point_shading="flat",
+                    precision="float32",
+                    visible=False,
+                )
+            )
+
     def _point_size(self) -> float:
         return 0.0005 * REACH * self.point_size.value
 
@@ -305,16 +328,21 @@ class SceneView:
             rows = np.flatnonzero(seen.line_idx == line)
             pieces = content.segments[content.segment_line == line]
             images = np.unique(seen.image_idx[rows])
+            met = np.isin(content.segment_line, content.lines_met(line))
             rays = np.stack(
                 [content.camera_centers[images], np.broadcast_to(pieces.mean(axis=(0, 1)), (len(images), 3))], axis=1
             )
             with self.server.atomic():
-                for name, places, width in (("line", pieces, self.line_width.value + 5.0), ("rays", rays, 1.0)):
+                for name, places, width, colour in (
+                    ("line", pieces, self.line_width.value + 5.0, _ORANGE),
+                    ("rays", rays, 1.0, _ORANGE),
+                    ("met", content.segments[met], self.line_width.value + 2.0, _JUNCTION),
+                ):
                     if len(places):
                         self.server.scene.add_line_segments(
                             f"/selection/{name}",
                             places.astype(np.float32),
-                            _ORANGE,
+                            colour,
                             thickness=width,
                             thickness_units="screen",
                         )

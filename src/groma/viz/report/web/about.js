@@ -18,13 +18,17 @@ function links(kind, list, most = 6) {
   const found = [...list].slice(0, most).flatMap((index, k) => k ? [", ", link({ kind, index })] : [link({ kind, index })]);
   return list.length > most ? [...found, ` and ${(list.length - most).toLocaleString("en")} more`] : found;
 }
+function gapAt(junction) { // twice the way from the place to the lines, which it is half-way between
+  const { at, along } = lineOf(linesOfJunction(junction)[0]), way = minus(place("junctions", junction), at);
+  return 2 * norm(plus(way, along, -dot(way, along)));
+}
 // Rows of a thing: name, and text or links; empty ones are left out.
 function facts({ kind, index: i }) {
   if (kind === "line") return [
     ["Length", number(lines.lengths[i])], ["Deviation", change(states[0].lineErrors[i], now.lineErrors[i]) + " rms"],
     ["Images", lines.images[i]], ["Confidence", lines.confidence[i] >= 0 ? number(+lines.confidence[i].toPrecision(3)) : ""],
     ["Direction", lines.direction[i] >= 0 ? link({ kind: "direction", index: lines.direction[i] }) : ""],
-    ["On planes", links("plane", planesOfLine(i))], ["Points on it", links("point", pointsOnLine(i))],
+    ["On planes", links("plane", planesOfLine(i))], ["Points on it", links("point", pointsOnLine(i))], ["Meets", links("line", linesMet(i))],
     ["Standard deviation", lineSigma(i)],
   ];
   if (kind === "point") return [
@@ -36,6 +40,10 @@ function facts({ kind, index: i }) {
   if (kind === "plane") return [
     ["Area", number(planes.areas[i])], ["Lines on it", links("line", linesOnPlane(i))], ["Points on it", pointsOnPlane(i).length.toLocaleString("en")],
     ["Standard deviation", planeSigma(i)],
+  ];
+  if (kind === "junction") return [
+    ["Lines", links("line", linesOfJunction(i))], ["Distance between them", number(gapAt(i))],
+    ["Position", place("junctions", i).map((x, k) => number(+(x + data.offset[k]).toPrecision(7))).join(", ")],
   ];
   if (kind === "direction") return [["Lines along it", links("line", linesAlong(i), 12)]];
   const entry = data.images[entryOfCamera[i]];

@@ -13,7 +13,7 @@ const i32 = text => new Int32Array(bytes(text).buffer);
 
 const states = data.states.map(s => ({
   points: f32(s.points), errors: f32(s.errors), lines: f32(s.lines), lineErrors: f32(s.line_errors),
-  planes: f32(s.planes), cameras: f32(s.cameras),
+  planes: f32(s.planes), cameras: f32(s.cameras), junctions: f32(s.junctions),
 }));
 const both = states.length === 2, last = states.length - 1, now = states[last];
 
@@ -27,6 +27,7 @@ const planes = { ids: i32(data.planes.ids), corners: data.planes.corners, colour
 planes.first = planes.corners.map((_, i) => planes.corners.slice(0, i).reduce((a, b) => a + b, 0));
 const cameras = { names: data.cameras.names, aspects: f32(data.cameras.aspects) };
 const directions = { ids: i32(data.directions.ids) };
+const junctionLines = i32(data.junctions); // the two lines of each
 const pieceLine = i32(data.pieces); // the line of each drawn piece
 
 const rows = f32(data.rows), rowPoint = i32(data.row_points), rowStep = 2 + 2 * states.length;
@@ -49,6 +50,7 @@ function pairs(text, firsts, seconds) {
 const [linesOnPlane, planesOfLine] = pairs(data.relations.line_on_plane, lines.ids.length, planes.ids.length);
 const [pointsOnPlane, planesOfPoint] = pairs(data.relations.point_on_plane, points.ids.length, planes.ids.length);
 const [pointsOnLine, linesOfPoint] = pairs(data.relations.point_on_line, points.ids.length, lines.ids.length);
+const junctionsOf = grouped(junctionLines, lines.ids.length, junctionLines.map((_, i) => i >> 1));
 const linesAlong = grouped(lines.direction, directions.ids.length);
 const piecesOf = grouped(pieceLine, lines.ids.length);
 const segmentsOf = grouped(segmentLine, lines.ids.length), rowsOf = grouped(rowPoint, points.ids.length);

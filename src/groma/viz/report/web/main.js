@@ -5,8 +5,8 @@ function switchBox(home, text, on, change) {
   box.onchange = () => change(box.checked);
   home.append(element("label", [box, text]), " ");
 }
-for (const [name, count] of [["points", points.ids.length], ["lines", lines.ids.length], ["planes", planes.ids.length], ["cameras", cameras.names.length]])
-  if (count) switchBox($("layers"), name[0].toUpperCase() + name.slice(1), true, on => { shown[name] = on; recolour(); });
+for (const [name, count] of [["points", points.ids.length], ["lines", lines.ids.length], ["planes", planes.ids.length], ["cameras", cameras.names.length], ["junctions", junctionLines.length]])
+  if (count) switchBox($("layers"), name[0].toUpperCase() + name.slice(1), shown[name], on => { shown[name] = on; recolour(); });
 for (const [name, text, there] of [["photo", "Photograph", anyPhoto], ["segments", "Segments", segments.length], ["projected", "3D segments", segments.length], ["points", "Residuals", rows.length]])
   if (there) switchBox($("image-layers"), text, layers[name], on => { layers[name] = on; drawImage(); });
 for (const [value, text] of pointModes) $("colour").add(new Option(text, value));

@@ -9,7 +9,7 @@ const PARALLEL = Math.cos(5 * Math.PI / 180); // lines and planes closer than th
 
 // The standard deviation of a place on a thing along a unit vector; null where it is not known.
 function variance({ kind, index, at }, along) {
-  if (!covariances) return null;
+  if (!covariances || kind === "junction") return null;
   if (kind === "point" || kind === "camera") {
     const found = symmetric(kind === "point" ? covariances.points : covariances.centers, index, 3);
     return found && quadratic(found, along);

@@ -2,7 +2,7 @@
 const canvas = $("scene"), marks = $("marks"), ink = marks.getContext("2d");
 const noWebgl = location.hash.includes("canvas"); // for tests and for graphics drivers that misbehave
 const renderer = (noWebgl ? null : webglRenderer(canvas)) || flatRenderer(canvas);
-const shown = { points: true, lines: true, planes: true, cameras: true };
+const shown = { points: true, lines: true, planes: true, cameras: true, junctions: false };
 let ratio = 1, view = viewOf(1, 1), pending = false, painted = -1;
 // While the view moves, only as many points and lines are drawn as there is time for; all of them once it rests.
 const SLOW = 30, QUICK = 20, REST = 180; // milliseconds
@@ -41,15 +41,23 @@ const span = text => Object.assign(document.createElement("span"), { textContent
 let marked = false; // clearing what is empty would have the browser compose the page anew
 function paintMarks() {
   if (marked) ink.clearRect(0, 0, marks.width, marks.height);
-  marked = !!(chosen || pointed || picks.length);
+  marked = !!(chosen || pointed || picks.length || shown.junctions);
   const middle = chosen && (chosen.kind === "line" || chosen.kind === "point") && view.project(...middleOf(chosen));
   if (middle) {
     ink.strokeStyle = colourOf("chosen"); ink.globalAlpha = 0.45; ink.lineWidth = ratio; ink.beginPath();
     for (const camera of lit.cameras) { const c = view.project(...cameraCenter(camera)); if (c) { ink.moveTo(c[0], c[1]); ink.lineTo(middle[0], middle[1]); } }
     ink.stroke(); ink.globalAlpha = 1;
   }
+  if (shown.junctions) for (let i = 0; i < junctionLines.length / 2; i++) diamond(i, 4);
+  if (chosen && chosen.kind === "junction") diamond(chosen.index, 7);
   if (pointed && !same(pointed, chosen)) outline(pointed);
   paintMeasure(ink, view, ratio);
+}
+function diamond(junction, size) {
+  const p = view.project(...place("junctions", junction)), r = size * ratio;
+  if (!p) return;
+  ink.strokeStyle = colourOf(size > 4 ? "chosen" : "ink"); ink.lineWidth = 1.5 * ratio; ink.beginPath();
+  ink.moveTo(p[0] - r, p[1]); ink.lineTo(p[0], p[1] - r); ink.lineTo(p[0] + r, p[1]); ink.lineTo(p[0], p[1] + r); ink.closePath(); ink.stroke();
 }
 function outline({ kind, index }) {
   ink.strokeStyle = colourOf("chosen"); ink.lineWidth = 3 * ratio; ink.lineCap = "round"; ink.beginPath();
@@ -58,6 +66,7 @@ function outline({ kind, index }) {
   if (kind === "camera") for (const ends of frustum(index)) stroke(...ends);
   if (kind === "plane") planeCorners(index).forEach((corner, k, all) => stroke(corner, all[(k + 1) % all.length]));
   if (kind === "point") { const p = view.project(...place("points", index)); if (p) ink.arc(p[0], p[1], 5 * ratio, 0, 7); }
+  if (kind === "junction") { diamond(index, 7); return; }
   ink.stroke();
 }
 
@@ -83,6 +92,10 @@ function hit(x, y, reach) {
   if (shown.points) for (let i = 0; i < points.ids.length; i++) {
     const p = view.project(mixed("points", 3 * i), mixed("points", 3 * i + 1), mixed("points", 3 * i + 2));
     if (p && Math.abs(p[0] - x) < reach && Math.abs(p[1] - y) < reach) offer(1.4 * Math.hypot(p[0] - x, p[1] - y), p[2], "point", i);
+  }
+  if (shown.junctions) for (let i = 0; i < junctionLines.length / 2; i++) { // before the ends of the lines, which are there too
+    const p = view.project(...place("junctions", i));
+    if (p && Math.hypot(p[0] - x, p[1] - y) < reach) offer(0.3 * Math.hypot(p[0] - x, p[1] - y) - 0.4 * reach, p[2], "junction", i);
   }
   if (shown.cameras) for (let i = 0; i < cameras.names.length; i++) {
     const c = view.project(...cameraCenter(i));

@@ -7,6 +7,8 @@ const mixed = (name, i) => {
 const place = (name, i) => [mixed(name, 3 * i), mixed(name, 3 * i + 1), mixed(name, 3 * i + 2)];
 const pieceEnds = i => [place("lines", 2 * i), place("lines", 2 * i + 1)];
 const planeCorners = i => Array.from({ length: planes.corners[i] }, (_, k) => place("planes", planes.first[i] + k));
+const linesOfJunction = i => [junctionLines[2 * i], junctionLines[2 * i + 1]];
+const linesMet = line => [...junctionsOf(line)].flatMap(linesOfJunction).filter(other => other !== line);
 const cameraCenter = i => place("cameras", 4 * i);
 
 // The eight strokes of a camera, as pairs of places.
@@ -33,10 +35,12 @@ function middleOf({ kind, index }) {
   if (kind === "point") return place("points", index);
   if (kind === "plane") return planeOf(index).at;
   if (kind === "camera") return cameraCenter(index);
+  if (kind === "junction") return place("junctions", index);
   return null;
 }
 function nameOf({ kind, index }) {
   if (kind === "camera") return cameras.names[index];
+  if (kind === "junction") return "junction of lines " + linesOfJunction(index).map(i => lines.ids[i]).join(" and ");
   return kind + " " + { line: lines, point: points, plane: planes, direction: directions }[kind].ids[index];
 }
 
@@ -48,6 +52,7 @@ function litBy(thing) {
   if (kind === "line") { lit.lines = [index]; lit.points = [...pointsOnLine(index)]; }
   if (kind === "point") lit.points = [index];
   if (kind === "plane") { lit.planes = [index]; lit.lines = [...linesOnPlane(index)]; lit.points = [...pointsOnPlane(index)]; }
+  if (kind === "junction") lit.lines = linesOfJunction(index);
   if (kind === "direction") lit.lines = [...linesAlong(index)];
   if (kind === "camera") {
     lit.cameras = [index];

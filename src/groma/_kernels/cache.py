@@ -7,7 +7,7 @@ be written, functions are compiled in every process; nothing fails.
 
 **When.** One file per function and argument types. It opens with a digest of all that it depends on: versions, the
 processor and its instructions, the argument types, the function and everything it calls, inlines or reads as a constant
-(:mod:`groma._numba_digest`). Numba's own cache compares the file of the function alone and would return old numbers
+(:mod:`groma._kernels.digest`). Numba's own cache compares the file of the function alone and would return old numbers
 after a kernel in another file was edited. Here an edit compiles what uses the edited kernel again, and nothing else. A
 file whose digest or checksum is wrong is compiled again and replaced, so that a cache shared by several versions or
 processors is never wrong.
@@ -18,7 +18,7 @@ the names of its kernels: two models that have the same number in two processes 
 **Several processes.** Files are written under another name and moved into place, so a reader finds a whole file or
 none. There is no index: Numba's own keeps one per function, and two processes that compile the same function for
 different types at the same moment can leave an entry there that names the other one's code. A function that another
-process compiles at the moment is waited for (:mod:`groma._numba_turns`).
+process compiles at the moment is waited for (:mod:`groma._kernels.turns`).
 """
 
 from __future__ import annotations
@@ -40,16 +40,20 @@ from typing import Any
 
 from llvmlite.binding import get_host_cpu_features, get_process_triple
 from numba.core import config, sigutils
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache
+from numba.core.caching import FunctionCache, NullCache
 from numba.core.registry import cpu_target
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
-from groma import _numba_digest, _numba_turns
+from groma._counted import counted
+from groma._kernels import digest as kernel_digest
+from groma._kernels import inner as kernel_inner
+from groma._kernels import turns as kernel_turns
 
 #: A file that contains one of these holds compiled code, or chooses it.
 _MARKS = (b"_numba import", b"njit(", b"numba.extending", b"llvmlite")
 _SUFFIX = ".nbc"
+_PACKAGE = Path(__file__).parents[1]
 #: Folder of the package with functions that were compiled ahead; only in wheels for one platform.
 SHIPPED = "_compiled_ahead"
 _DIGEST, _CHECKSUM = 64, 8
@@ -59,7 +63,7 @@ _DIGEST, _CHECKSUM = 64, 8
 def source_stamp() -> str:
     """Return a digest of all files of the package that hold compiled code; it changes if any compiled function does."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(_PACKAGE.rglob("*.py")):
         content = path.read_bytes()
         if any(mark in content for mark in _MARKS):
             digest.update(path.name.encode() + b"\0" + content)
@@ -85,8 +89,6 @@ counts = Counts()
 on_miss: list[Callable[[Counts], None]] = []
 #: Files that were written or found, and which function, for which argument types.
 _used: dict[Path, tuple[str, str, tuple]] = {}
-#: How many functions are being compiled: one inside the other.
-_depth = 0
 _lock = threading.Lock()
 #: Held while a file is written; a process that ends at once takes it first.
 writing = threading.Lock()
@@ -104,7 +106,7 @@ class _Shipped:
 @lru_cache(maxsize=1)
 def _shipped() -> _Shipped | None:
     """Return what came with the installation, if this processor has all that it was compiled for."""
-    place = Path(__file__).parent / SHIPPED
+    place = _PACKAGE / SHIPPED
     try:
         said = json.loads((place / "processor.json").read_text())
     except (OSError, ValueError):
@@ -199,11 +201,11 @@ def environment_digest() -> str:
     """Return a digest of all that compiled functions depend on besides themselves and their arguments."""
     target: Any = cpu_target.target_context
     processor = target.codegen().magic_tuple()
-    return _digest((_numba_digest.environment(), source_stamp(), processor))
+    return _digest((kernel_digest.environment(), source_stamp(), processor))
 
 
 class _Cache(FunctionCache):
-    _impl_class = CompileResultCacheImpl
+    _impl_class = kernel_inner.Results
 
     def __init__(self, function: Any, dispatcher: Any = None) -> None:
         super().__init__(function)
@@ -224,9 +226,10 @@ class _Cache(FunctionCache):
         kinds = repr(sig)
         if " at 0x" in kinds or "jitclass." in kinds:
             return None
-        found = _numba_digest.dependence(self._compiled, sigutils.normalize_signature(sig)[0])
-        content = _digest((_numba_digest.environment(), kinds, processor, found.content))
-        return _Key(_digest((kinds, processor, found.selected)), content)
+        found = kernel_digest.dependence(self._compiled, sigutils.normalize_signature(sig)[0])
+        content = _digest((kernel_digest.environment(), kinds, processor, found.content))
+        variant = "for linking" if kernel_inner.is_inside() else "for Python"
+        return _Key(_digest((kinds, processor, found.selected, variant)), content)
 
     def is_there(self, sig: Any, target_context: Any) -> bool:
         """Whether the function need not be compiled, or is being compiled by another process."""
@@ -234,9 +237,9 @@ class _Cache(FunctionCache):
         if key is None or self._cache_file.has(key):
             return True
         folder = Path(self.cache_path)
-        if not _numba_turns.take(folder, key.name):
+        if not kernel_turns.take(folder, key.name):
             return True
-        _numba_turns.give_back(folder, key.name)
+        kernel_turns.give_back(folder, key.name)
         return False
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -262,15 +265,15 @@ class _Cache(FunctionCache):
             data = place.load(self._key(sig, shipped.processor))
         if data is not None:
             return data
-        if _depth == 0:
+        if not kernel_inner.is_inside():
             counts.missed += 1
             for call in on_miss:
                 call(counts)
         folder = Path(self.cache_path)
-        _numba_turns.wait(folder, key.name, lambda: self._cache_file.has(key))
+        kernel_turns.wait(folder, key.name, lambda: self._cache_file.has(key))
         data = self._cache_file.load(key)
         if data is not None:
-            _numba_turns.give_back(folder, key.name)
+            kernel_turns.give_back(folder, key.name)
         return data
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -288,9 +291,11 @@ class _Cache(FunctionCache):
     def end_turn(self) -> None:
         """Let other processes compile what this one has compiled, or could not compile."""
         if self._turns and (name := self._turns.pop()) is not None:
-            _numba_turns.give_back(Path(self.cache_path), name)
+            kernel_turns.give_back(Path(self.cache_path), name)
 
     def _note(self, path: Path, sig: Any) -> None:
+        if kernel_inner.is_inside():
+            return
         with _lock:
             _used[path] = self._function.__module__, self._function.__qualname__, sigutils.normalize_signature(sig)[0]
 
@@ -316,18 +321,16 @@ def _watch(compiler: Any, cache: Any) -> None:
     compile_function = compiler.compile
 
     def compile_watched(*arguments: Any) -> Any:
-        global _depth
         collects = gc.isenabled()
         gc.disable()
-        _depth += 1
         try:
-            return compile_function(*arguments)
+            with kernel_inner.one_deeper():
+                return kernel_inner.completed(compile_function(*arguments))
         except BaseException:
             if isinstance(cache, _Cache):
                 cache.end_turn()
             raise
         finally:
-            _depth -= 1
             if collects:
                 gc.enable()
 
@@ -338,20 +341,17 @@ def keep_on_disk(dispatcher: Any) -> Any:
     """Let a compiled function be kept on disk where some folder can be written; return it."""
     if hasattr(dispatcher, "py_func"):  # a plain function without the compiler
         dispatcher._cache = _Unopened(dispatcher)
+        kernel_inner.tell_apart(dispatcher)
     return dispatcher
 
 
-def _probe() -> None:
-    """Stand for any compiled function of the package."""
-
-
 def folder() -> Path | None:
-    """Return the folder of compiled functions of this file's own package; None where none can be written.
+    """Return the folder of compiled functions of the package's own files; None where none can be written.
 
-    Those of sub-packages lie in folders of theirs, by the same rule.
+    Those of sub-packages lie in folders of theirs, by the same rule. ``counted`` stands for any function of these.
     """
     try:
-        return Path(_Cache(_probe).cache_path)
+        return Path(_Cache(counted).cache_path)
     except RuntimeError:
         return None
 

@@ -43,7 +43,7 @@ import numba
 import numpy as np
 from numba.core import config, types
 
-from groma._numba_parts import (
+from groma._kernels.parts import (
     MISSING,
     Part,
     contents,

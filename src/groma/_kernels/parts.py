@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One thing that compiled code uses: what it is by itself, and what it refers to; see :mod:`groma._numba_digest`."""
+"""One thing that compiled code uses: what it is by itself, and what it refers to; see :mod:`groma._kernels.digest`."""
 
 from __future__ import annotations
 

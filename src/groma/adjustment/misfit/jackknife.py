@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""How far the cameras move when one landmark after the other is left out.
+
+Covariances :math:`(J^\top J)^{-1}` hold where all errors are independent and of the size that was assumed. The segments
+of a bowed edge, of an outline that moves with the view, of a wrong track err together, and a camera may hang on a few
+of them. What a landmark contributes then shows in how far the cameras move without it. With the rows J of its
+observations, whitened, weighted by the loss and free of what the landmark itself takes up, their residuals r, and the
+covariance C of the cameras, they move in one step by
+
+.. math:: d = C\,J^\top (I - J C J^\top)^{-1} r,
+
+and the sum over all landmarks :math:`\sum d\,d^\top` is their covariance, however the errors of a landmark's
+observations depend on each other and whatever their size (the jackknife by groups; M. C. Paik, *Biometrika*, 1988, and
+for regressions D. V. Hinkley, *Technometrics*, 1977). With a robust loss the curvature of the cost is smaller than C
+says by the mean of :math:`\psi'/w` (P. J. Huber, *Robust Statistics*, 1981, section 7.6): d is divided by it.
+
+Errors that landmarks share with their neighbours, of a lens for example, are not contained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.factors.contract import Factor
+from groma.gates import gate
+from groma.problem.problem import Problem
+from groma.problem.residuals import jacobians_of, residuals_of
+from groma.solver.covariance.marginals import Covariances
+
+#: What is left out, one after the other, and what only relations refer to.
+_LANDMARKS, _STRUCTURE = ("points", "lines"), ("planes", "directions")
+#: Numbers in the largest arrays of one batch of landmarks.
+_BATCH = 2_000_000
+
+
+@dataclass(frozen=True)
+class JackknifeGates:
+    """What is believed of single landmarks."""
+
+    max_leverage: float = gate(
+        0.9,
+        "share",
+        "of an error that cameras follow at most: more tells nothing",
+        "derived from an error ten times as large",
+    )
+
+
+GATES = JackknifeGates()
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Observations (N) of one kind of landmark: whitened, weighted, of one size."""
+
+    landmark: IntArray
+    #: (N, k) numbers of the unknowns of cameras that each depends on; the last one stands for none.
+    columns: IntArray
+    #: (N, m, k) and (N, m, d) derivatives by them and by the landmark, and residuals (N, m).
+    by_camera: FloatArray
+    by_landmark: FloatArray
+    residual: FloatArray
+
+
+def observations_alone(problem: Problem) -> Problem:
+    """Return the problem without relations: each factor refers to one landmark at most, and to no plane."""
+    factors = []
+    for factor in problem.factors:
+        groups = [ref.group for _, ref in factor.references()]
+        if not {*groups} & {*_STRUCTURE} and sum(group in _LANDMARKS for group in groups) <= 1:
+            factors.append(factor)
+    used = {ref.group for factor in factors for _, ref in factor.references()}
+    return Problem({name: group for name, group in problem.variables.items() if name in used}, factors)
+
+
+def landmark_jackknife(covariances: Covariances) -> tuple[FloatArray, FloatArray]:
+    """Return covariances (F, 6, 6) of the frames as they are stated, and by leaving out landmarks.
+
+    Parameters
+    ----------
+    covariances : Covariances
+        Of :func:`observations_alone`, at its solution, with the loss it was solved with.
+    """
+    problem = covariances.problem
+    sizes = {name: group.manifold.dof for name, group in problem.variables.items() if name not in _LANDMARKS}
+    names, first = list(sizes), {}
+    every: list[tuple[str, int]] = []
+    for name in names:
+        first[name] = sum(sizes[other] for other, _ in every)
+        every += [(name, row) for row in range(len(problem.variables[name]))]
+    stated = np.pad(covariances.joint(every), (0, 1))
+    size, summed, curvature = len(stated), np.zeros_like(stated), np.zeros(2)
+    for kind in (kind for kind in _LANDMARKS if kind in problem.variables):
+        rows = [_rows_of(factor, kind, problem, first, size - 1, curvature) for factor in problem.factors]
+        together = _joined([one for one in rows if one is not None], size - 1)
+        for moved in _pulls(together, stated) if together is not None else ():
+            summed += moved.T @ moved
+    share = max(curvature[0] / max(curvature[1], 1e-300), 0.1)
+    found = stated @ summed @ stated / share**2
+    at = first["frames"] + sizes["frames"] * np.arange(len(problem.variables["frames"]))[:, None] + np.arange(6)
+    frames = problem.variables["frames"]
+    basis = frames.manifold.basis(frames.state)
+    blocks = [matrix[at[:, :, None], at[:, None, :]] for matrix in (stated, found)]
+    if basis is not None:
+        blocks = [basis @ block @ np.swapaxes(basis, 1, 2) for block in blocks]
+    return blocks[0], blocks[1]
+
+
+def _rows_of(
+    factor: Factor, kind: str, problem: Problem, first: dict[str, int], none: int, curvature: FloatArray
+) -> _Rows | None:
+    """Return the rows of a group of factors that observe landmarks of a kind; add to sums of psi' and weights."""
+    slot = next((slot.name for slot, ref in factor.references() if ref.group == kind), None)
+    if slot is None or len(factor) == 0:
+        return None
+    residual, blocks = residuals_of(factor, problem.variables), jacobians_of(factor, problem.variables)
+    information = np.asarray(factor.sqrt_information, dtype=np.float64)
+    whiten = information if information.ndim == 3 else information.reshape(-1, 1, 1) * np.eye(factor.residual_size)
+    whiten = np.broadcast_to(whiten, (len(factor), *whiten.shape[1:]))
+    residual = np.einsum("nij,nj->ni", whiten, residual)
+    square = np.einsum("ni,ni->n", residual, residual)
+    _, weight, bend = factor.loss.evaluate(square)
+    curvature += (weight + 2.0 * square * bend / factor.residual_size).sum(), weight.sum()
+    whiten = np.sqrt(weight)[:, None, None] * whiten
+    parts, columns = [], []
+    for one, ref in factor.references():
+        if one.name == slot:
+            continue
+        parts.append(whiten @ blocks[one.name])
+        dof = parts[-1].shape[2]
+        begin = first[ref.group] + dof * ref.index[:, None] if ref.group in first else np.full((len(factor), 1), none)
+        columns.append(begin + (np.arange(dof) if ref.group in first else np.zeros(dof, np.int64)))
+    by_landmark = whiten @ blocks[slot]
+    if problem.variables[kind].is_constant:
+        by_landmark = np.zeros_like(by_landmark)
+    landmark = next(ref.index for one, ref in factor.references() if one.name == slot)
+    return _Rows(
+        landmark, np.hstack(columns), np.concatenate(parts, axis=2), by_landmark, np.sqrt(weight)[:, None] * residual
+    )
+
+
+def _joined(parts: list[_Rows], none: int) -> _Rows | None:
+    """Rows of several groups of factors, filled up to one size, in the order of their landmarks."""
+    if not parts:
+        return None
+    rows = max(part.residual.shape[1] for part in parts)
+    width = max(part.columns.shape[1] for part in parts)
+
+    def filled(array: FloatArray, *to: int) -> FloatArray:
+        return np.pad(array, [(0, 0), *((0, size - have) for size, have in zip(to, array.shape[1:], strict=True))])
+
+    columns = [np.pad(p.columns, ((0, 0), (0, width - p.columns.shape[1])), constant_values=none) for p in parts]
+    landmark = np.concatenate([part.landmark for part in parts])
+    order = np.argsort(landmark, kind="stable")
+    return _Rows(
+        landmark[order],
+        np.concatenate(columns)[order],
+        np.concatenate([filled(part.by_camera, rows, width) for part in parts])[order],
+        np.concatenate([filled(part.by_landmark, rows, part.by_landmark.shape[2]) for part in parts])[order],
+        np.concatenate([filled(part.residual, rows) for part in parts])[order],
+    )
+
+
+def _pulls(rows: _Rows, stated: FloatArray) -> Iterator[FloatArray]:
+    """Yield for batches of landmarks what each pulls at the unknowns of cameras with (B, U)."""
+    begin = np.flatnonzero(np.r_[True, np.diff(rows.landmark) > 0])
+    count = np.diff(np.r_[begin, len(rows.landmark)])
+    for number in np.unique(count):
+        starts, wide = begin[count == number], int(number) * rows.columns.shape[1]
+        step = max(1, _BATCH // max(wide**2, len(stated)))
+        for some in range(0, len(starts), step):
+            taken = starts[some : some + step, None] + np.arange(number)
+            yield _pull(rows, taken, stated)
+
+
+def _pull(rows: _Rows, taken: IntArray, stated: FloatArray) -> FloatArray:
+    """Pulls (B, U) of landmarks that have the same number of observations, ``taken`` (B, n)."""
+    batch, number = taken.shape
+    high, wide = rows.by_camera.shape[1:]
+    columns = rows.columns[taken].reshape(batch, -1)
+    J = np.zeros((batch, number, high, number, wide))
+    each = np.arange(number)
+    J[:, each, :, each] = np.swapaxes(rows.by_camera[taken], 0, 1)
+    J = J.reshape(batch, number * high, number * wide)
+    own = rows.by_landmark[taken].reshape(batch, number * high, -1)
+    residual = rows.residual[taken].reshape(batch, -1, 1)
+    V = np.swapaxes(own, 1, 2) @ own
+    V += 1e-12 * (np.trace(V, axis1=1, axis2=2)[:, None, None] + 1e-300) * np.eye(V.shape[1])
+    along = own @ np.linalg.solve(V, np.swapaxes(own, 1, 2))
+    J, residual = J - along @ J, residual - along @ residual
+    leverage = J @ stated[columns[:, :, None], columns[:, None, :]] @ np.swapaxes(J, 1, 2)
+    shares, axes = np.linalg.eigh(leverage)
+    error = (np.swapaxes(axes, 1, 2) @ residual)[:, :, 0] / (1.0 - np.minimum(shares, GATES.max_leverage))
+    pull = (np.swapaxes(J, 1, 2) @ (axes @ error[:, :, None]))[:, :, 0]
+    flat = (columns + len(stated) * np.arange(batch)[:, None]).ravel()
+    sums = np.bincount(flat, pull.ravel(), batch * len(stated)).astype(np.float64, copy=False)
+    return sums.reshape(batch, len(stated))
+
+
+__all__ = ["GATES", "JackknifeGates", "landmark_jackknife", "observations_alone"]

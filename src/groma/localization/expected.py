@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""How much of what a pose says is in a photograph is there: part by part of the image, by points and lines of the map.
+
+A photograph that is put together of pieces, or shows another place that has something in common with the map, agrees
+with a pose in one part; elsewhere points and lines are to be seen by the map, and none is. Not all that could be seen
+is found again in any photograph. How often, the map knows from its own images: of the points that images near one of
+them see, and that its pose puts into it, it sees some itself, the more the more of the others do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import FloatArray, IntArray
+from groma.localization.landmarks import counted_in
+from groma.localization.map_index import MapIndex
+from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.gates import VERDICT, VerdictGates
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.refinement import Refined
+from groma.scene import Scene
+
+#: Images of a map that are asked how often points are found again, at most.
+_ASKED = 40
+#: Pieces that lines are cut into, to tell the parts that they cross.
+_PIECES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class FoundAgain:
+    """How often points of a map are found again, learned from its own images."""
+
+    #: (N + 1,) by the number of images near a photograph, of N, that see a point.
+    rate: FloatArray
+
+    @staticmethod
+    def of(scene: Scene, index: MapIndex, near: int) -> FoundAgain:
+        """Ask some images of a map what they see of what so many others near them see."""
+        count = len(index.image)
+        seen = [np.unique(index.point[index.begin[i] : index.begin[i + 1]]) for i in range(count)]
+        total = np.bincount(np.concatenate([*seen, np.zeros(0, np.int64)]), minlength=len(index.xyz))
+        asked, found = np.ones(near + 1), np.zeros(near + 1)
+        for image in np.unique(np.linspace(0, count - 1, min(count, _ASKED)).astype(int)).tolist():
+            others = np.delete(np.arange(count), image)
+            others = nearest_images(index, others, seen[image], near)
+            itself = np.zeros(len(index.xyz), bool)
+            itself[seen[image]] = True
+            point, times = _seen_by(index, others)
+            rows = total[point] - itself[point] >= 2  # points that are in the map without this image
+            camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
+            rows[rows] = camera.inside(camera.project(scene.cam_from_world[image], index.xyz[point[rows]]))
+            np.add.at(asked, times[rows], 1.0)
+            np.add.at(found, times[rows], itself[point[rows]])
+        return FoundAgain(found / asked)
+
+
+def nearest_images(index: MapIndex, images: IntArray, points: IntArray, count: int) -> IntArray:
+    """Return those of some images of a map that see most of some points."""
+    return images[np.argsort(-counted_in(index, images, points), kind="stable")[:count]]
+
+
+def parts_shown(
+    scene: Scene,
+    index: MapIndex,
+    again: FoundAgain,
+    near: IntArray,
+    best: Refined,
+    matches: Matches,
+    lines: bool = True,
+    gates: VerdictGates = VERDICT,
+) -> tuple[float, float]:
+    """Return how many parts of an image show what a pose puts there, and how many show none of it.
+
+    Parts count by what is expected in them, points and lines alike.
+
+    Parameters
+    ----------
+    scene, index, again
+        The map.
+    near
+        Its images near the photograph: what they see is expected.
+    best, matches
+        The pose, and what agrees with it.
+    lines
+        Whether lines were looked for.
+    gates
+        Size of the parts.
+    """
+    camera, side = best.camera, max(best.camera.width, best.camera.height) / gates.parts
+    ends = matches.segments2d[best.line_inliers]
+    shown = np.concatenate([matches.points2d[best.point_inliers], _along(ends, _PIECES)[0]])
+    point, times = _seen_by(index, near)
+    pixel = camera.project(best.pose, index.xyz[point])
+    expected = [(pixel, again.rate[times], gates.expected)]
+    if lines and scene.num_lines:
+        rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in near])
+        known = np.unique(scene.line_observations.line_idx[index.segment[rows]])
+        expected.append((*_lengths(camera, best.pose, scene.lines.segments[known]), 0.5 * side))
+    return _counted(camera, expected, shown, gates.parts)
+
+
+def _counted(
+    camera: QueryCamera, expected: list[tuple[FloatArray, FloatArray, float]], shown: FloatArray, parts: int
+) -> tuple[float, float]:
+    """Parts that show something and parts that do not; ``expected`` are places, weights, and how much makes a part."""
+    every = parts * parts
+    weight, counts = np.zeros(every), np.zeros(every, bool)
+    for pixel, amount, least in expected:
+        inside = camera.inside(pixel)
+        total = np.bincount(_part(pixel[inside], camera, parts), amount[inside], every)
+        weight += total / max(float(total.sum()), 1e-12)
+        counts |= total >= least
+    seen = np.zeros(every, bool)
+    seen[_part(shown[camera.inside(shown)], camera, parts)] = True
+    if not counts.any():
+        return 0.0, 0.0
+    missing = float(weight[counts & ~seen].sum() / weight[counts].sum() * counts.sum())
+    return float(counts.sum()) - missing, missing
+
+
+def _part(pixel: FloatArray, camera: QueryCamera, parts: int) -> IntArray:
+    """The part of an image that each pixel lies in, of so many per longer side."""
+    column, row = np.minimum(pixel * (parts / max(camera.width, camera.height)), parts - 1).astype(np.int64).T
+    return row * parts + column
+
+
+def _seen_by(index: MapIndex, images: IntArray) -> tuple[IntArray, IntArray]:
+    """Points of a map that some images see, and how many of them do."""
+    seen = [np.unique(index.point[index.begin[i] : index.begin[i + 1]]) for i in images.tolist()]
+    return np.unique(np.concatenate([*seen, np.zeros(0, np.int64)]), return_counts=True)
+
+
+def _along(ends: FloatArray, pieces: int) -> tuple[FloatArray, FloatArray]:
+    """Middles (n * pieces, k) of the pieces of segments (n, 2, k), and their borders (n, pieces + 1, k)."""
+    share = np.linspace(0.0, 1.0, pieces + 1)[None, :, None]
+    borders = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])
+    return (0.5 * (borders[:, 1:] + borders[:, :-1])).reshape(-1, ends.shape[-1]), borders
+
+
+def _lengths(camera: QueryCamera, pose: FloatArray, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Middles (n, 2) of the images of pieces of 3D segments, and the lengths (n,) of these images."""
+    borders = _along(ends, _PIECES)[1]
+    pixel = camera.project(pose, borders.reshape(-1, 3)).reshape(*borders.shape[:2], 2)
+    length = np.linalg.norm(pixel[:, 1:] - pixel[:, :-1], axis=2).ravel()
+    middle = (0.5 * (pixel[:, 1:] + pixel[:, :-1])).reshape(-1, 2)
+    return middle, np.nan_to_num(length)
+
+
+__all__ = ["FoundAgain", "nearest_images", "parts_shown"]

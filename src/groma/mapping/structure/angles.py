@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""Which planes and directions are parallel, and which are at right angles.
+
+The normal of a plane and a direction are unit vectors with a covariance alike, so all pairs among them are tried
+together. At a right angle :math:`x = u \cdot v` is normal, with :math:`u^\top\Sigma_v u + v^\top\Sigma_u v`; of
+parallel vectors the two components of v across u are, with :math:`B(\Sigma_u + \Sigma_v)B^\top`.
+
+Angles that are meant to be right deviate by t beyond that noise; of the others one half is nearly right, with a normal
+deviation of two degrees, and the other half is spread evenly. For each kind of pair, t and the share of those that are
+right are estimated together (:mod:`groma.estimators.membership`). An angle that is surely a little off is therefore no
+right one, and t has a bound: a house whose angles are all a degree off has no right angles, and none is forced on it.
+
+Many pairs are tried, so they are kept, the surest first, only as long as the expected share of wrong ones among them,
+the mean of :math:`1 - P`, stays small: the false discovery rate.
+
+An adjustment holds them with the upper end of the one-sigma interval of t, which is large where pairs are few or
+vectors uncertain. As n parallel planes have :math:`n(n-1)/2` pairs, the variance of a pair grows with the pairs that
+its two vectors are in: together they count as often as the deviation of one vector does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.estimators.directions import DirectionSet
+from groma.estimators.membership import Candidates, memberships
+from groma.estimators.plane_search import PlaneSet
+from groma.gates import chi_square_gate, gate
+from groma.geometry.algebra import perpendicular
+from groma.mapping.structure.relations import Pairs
+from groma.scene import Scene
+from groma.scene.survey import Kind
+
+#: Relations between planes and directions, by the number of directions in a pair: parallel, and at right angles.
+_KINDS = (
+    ("parallel_planes", "perpendicular_planes"),
+    ("plane_across_direction", "plane_along_direction"),
+    ("parallel_directions", "perpendicular_directions"),
+)
+#: Components of known directions that are the same.
+_SAME = 1e-6
+#: A unit vector and its covariance.
+Vector = tuple[FloatArray, FloatArray]
+
+
+@dataclass(frozen=True)
+class AngleGates:
+    """Which angles are right."""
+
+    layer: float = gate(
+        0.15, "rad", "around right angles and none, in which they are told from others", "chosen on synthetic rooms"
+    )
+    exact: float = gate(8.7e-4, "rad", "that angles deviate which count as exact", "convention: 0.05 degrees")
+    most: float = gate(8.7e-3, "rad", "that angles deviate which are meant to be right", "convention: half a degree")
+    nearly: float = gate(
+        0.036,
+        "rad",
+        "that angles deviate which are nearly right",
+        "derived from the most and the layer: their geometric mean",
+    )
+    held: float = gate(1e-4, "rad", "by which right angles are held at least", "cost: conditioning of an adjustment")
+    tried: int = gate(100, "deviations", "from the least to the most", "cost: each a twentieth larger than the last")
+    known: float = gate(
+        0.01, "rad", "standard deviation of an angle, above which it says nothing", "chosen on synthetic rooms"
+    )
+    wrong: float = gate(0.05, "share", "of wrong pairs to be expected among those kept", "convention: 5 %")
+
+
+@dataclass(frozen=True)
+class Angles:
+    """Pairs of unit vectors that are parallel or at right angles."""
+
+    #: (M, 2) numbers of the vectors, the smaller first.
+    pairs: IntArray
+    #: (M,) whether they are at right angles; the others are parallel.
+    right: BoolArray
+    #: (M,) probability that the pair is none by chance.
+    probability: FloatArray
+    #: (M,) standard deviation of the angle in an adjustment that holds all of them, radians.
+    sigma: FloatArray
+
+
+def angles_between(
+    planes: PlaneSet, directions: DirectionSet, vertical: Vector | None, level: float
+) -> dict[str, Pairs]:
+    """Find relations between planes and directions, by their names; deviations are radians.
+
+    The vertical, if it is known, has the number after the last direction.
+    """
+    vectors = [planes.planes[:, :3], directions.vectors, *([] if vertical is None else [vertical[0][None]])]
+    covariance = [
+        planes.covariance[:, :3, :3],
+        directions.covariance,
+        *([] if vertical is None else [vertical[1][None]]),
+    ]
+    is_direction = np.arange(sum(map(len, vectors))) >= len(planes)
+    found, num = right_angles(np.concatenate(vectors), np.concatenate(covariance), is_direction, level), len(planes)
+    of_kind, relations = (found.pairs >= num).sum(axis=1), {}
+    for number, names in enumerate(_KINDS):
+        for right, name in enumerate(names):
+            rows = (of_kind == number) & (found.right == bool(right))
+            pairs = found.pairs[rows] - num * (found.pairs[rows] >= num)
+            relations[name] = Pairs(pairs, found.probability[rows], found.sigma[rows])
+    return relations
+
+
+def vertical_of(scene: Scene) -> Vector | None:
+    """Return the direction that was measured in the cameras, if it is one and the same in all: gravity."""
+    table = scene.known_directions.take(scene.known_directions.kind == Kind.IMAGE)
+    if len(table) == 0 or np.abs(table.vector - table.vector[0]).max() > _SAME:
+        return None
+    vector, information = table.vector[0], float((table.sigma**-2.0).sum())
+    return vector, (np.eye(3) - np.outer(vector, vector)) / information
+
+
+def right_angles(
+    vectors: FloatArray, covariance: FloatArray, kind: BoolArray, level: float, gates: AngleGates = AngleGates()
+) -> Angles:
+    """Find parallel and perpendicular pairs.
+
+    Parameters
+    ----------
+    vectors : (N, 3) float64
+        Unit vectors; their signs have no meaning.
+    covariance : (N, 3, 3) float64
+        Their covariances, square radians.
+    kind : (N,) bool
+        Vectors of two kinds, planes and directions: pairs of other kinds deviate by other angles.
+    level : float
+        Level of the chi-square tests.
+    gates : AngleGates
+        What is right.
+    """
+    found, offset, variance, right = _near(vectors, covariance, gates)
+    if len(found) == 0:
+        return Angles(found, right, np.zeros(0), np.zeros(0))
+    live = np.column_stack([np.ones(len(found)), (~right).astype(np.float64)])
+    certain = (variance * live).max(axis=1) < gates.known**2
+    exact = variance + gates.exact**2 * live
+    family = 2 * kind[found].sum(axis=1) + right
+    even = np.where(right, 0.5 / gates.layer, 1.0 / (np.pi * gates.layer**2))
+    told = memberships(
+        Candidates(
+            owner=family,
+            offset=offset,
+            variance=exact,
+            unit=live,
+            clutter=0.5 * even + 0.5 * _normal(offset, exact + gates.nearly**2 * live),
+            counted=certain,
+            group=family,
+        ),
+        np.full(6, gates.most),
+    )
+    squared = (offset**2 / (exact + (told.deviation[family, None] * live) ** 2)).sum(axis=1)
+    passed = certain & (squared < np.where(right, *(chi_square_gate(1.0 - level, freedom) for freedom in (1, 2))))
+    order = np.flatnonzero(passed)[np.argsort(-told.probability[passed], kind="stable")]
+    wrong = np.cumsum(1.0 - told.probability[order]) / np.arange(1, len(order) + 1)
+    kept = np.sort(order[wrong <= gates.wrong])
+    times = np.bincount(found[kept].ravel(), minlength=len(vectors))
+    per_vector = max(len(kept) / max(np.count_nonzero(times), 1), 1.0)
+    deviation, axes = np.zeros(6), live > 0.0
+    for k in np.unique(family[kept]):
+        rows = kept[family[kept] == k]
+        deviation[k] = _upper_end(offset[rows][axes[rows]] ** 2, variance[rows][axes[rows]], per_vector, gates)
+    sigma = deviation[family[kept]] * np.sqrt(np.maximum(0.25 * times[found[kept]].sum(axis=1), 1.0))
+    return Angles(found[kept], right[kept], told.probability[kept], sigma)
+
+
+def _normal(offset: FloatArray, variance: FloatArray) -> FloatArray:
+    """Normal densities of offsets (M, 2) along independent axes."""
+    return np.exp(-0.5 * (offset**2 / variance).sum(axis=1)) / np.sqrt((2.0 * np.pi * variance).prod(axis=1))
+
+
+def _upper_end(squared: FloatArray, variance: FloatArray, pairs_per_vector: float, gates: AngleGates) -> float:
+    """Upper end of the confidence interval of t; pairs of few vectors tell less than as many independent ones."""
+    tried = np.geomspace(gates.held, gates.most, gates.tried)
+    total = variance + tried[:, None] ** 2
+    surprise = (np.log(total) + squared / total).sum(axis=1)
+    return float(tried[np.flatnonzero(surprise <= surprise.min() + pairs_per_vector)[-1]])
+
+
+def _near(
+    vectors: FloatArray, covariance: FloatArray, gates: AngleGates
+) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+    """Pairs near a right angle or none, offsets from it (M, 2) along the axes of their noise, variances there.
+
+    The second axis of right angles is none: an offset of zero with the density of one.
+    """
+    first, second = np.triu_indices(len(vectors), 1)
+    cosine = np.einsum("mi,mi->m", vectors[first], vectors[second])
+    right = np.abs(cosine) < np.sin(gates.layer)
+    near = np.flatnonzero(right | (np.abs(cosine) > np.cos(gates.layer)))
+    first, second, cosine, right = first[near], second[near], cosine[near], right[near]
+    one, other = vectors[first], vectors[second]
+    offset, variance = np.zeros((len(near), 2)), np.full((len(near), 2), 0.5 / np.pi)
+    offset[:, 0] = cosine
+    variance[:, 0] = np.einsum("mi,mij,mj->m", one, covariance[second], one)
+    variance[:, 0] += np.einsum("mi,mij,mj->m", other, covariance[first], other)
+    rows = np.flatnonzero(~right)
+    basis = np.stack(perpendicular(one[rows]), axis=1)
+    noise = basis @ (covariance[first[rows]] + covariance[second[rows]]) @ np.swapaxes(basis, 1, 2)
+    variance[rows], axes = np.linalg.eigh(noise)
+    offset[rows] = np.einsum("nab,nai,ni->nb", axes, basis, other[rows])
+    return np.column_stack([first, second]), offset, variance, right
+
+
+__all__ = ["AngleGates", "Angles", "right_angles"]

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a map says is in a photograph, part by part of the image: in a made map whose landmarks are all known."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from worlds import CAMERA, make_world
+
+from groma.geometry import se3
+from groma.localization.expected import FoundAgain, nearest_images, parts_shown
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.verdict import Verdict, doubted_if_missing
+from groma.scene import Cameras
+
+RIGHT = Verdict("localized", 1.0, "all agree.")
+
+
+def _index(seen, xyz, segments=None):
+    """An index of points (rows seen by each image) and of line observations (rows of each image)."""
+    segments = [[] for _ in seen] if segments is None else segments
+    return SimpleNamespace(
+        image=np.zeros((len(seen), 1)),
+        xyz=xyz,
+        begin=np.concatenate([[0], np.cumsum([len(rows) for rows in seen])]),
+        point=np.concatenate([np.asarray(rows, np.int64) for rows in seen]),
+        segment_begin=np.concatenate([[0], np.cumsum([len(rows) for rows in segments])]),
+        segment=np.concatenate([np.asarray(rows, np.int64) for rows in segments]),
+    )
+
+
+def _scene(world, images, lines):
+    table = Cameras(np.array([1]), (CAMERA.model,), CAMERA.params[None], np.array([640]), np.array([480]))
+    return SimpleNamespace(
+        cameras=table,
+        images=SimpleNamespace(camera_idx=np.zeros(images, int)),
+        cam_from_world=np.tile(world.pose, (images, 1)),
+        num_lines=lines,
+        lines=SimpleNamespace(segments=world.segments3d),
+        line_observations=SimpleNamespace(line_idx=np.arange(lines)),
+    )
+
+
+def _best(world, points, lines):
+    """A pose that some points and lines agree with."""
+    matches = Matches(world.points2d, world.points3d, world.segments2d, world.segments3d)
+    best = SimpleNamespace(camera=CAMERA, pose=world.pose, point_inliers=points, line_inliers=lines)
+    return best, matches
+
+
+def test_how_often_points_are_found_again_is_learned_from_the_map():
+    """Every image sees each point with a probability of its own: often seen ones are found again more often."""
+    rng = np.random.default_rng(0)
+    world = make_world(rng, points=4000, lines=1)
+    chance = np.where(np.arange(4000) < 2000, 0.9, 0.2)
+    seen = [np.flatnonzero(rng.random(4000) < chance) for _ in range(8)]
+    again = FoundAgain.of(_scene(world, 8, 0), _index(seen, world.points3d), 4)
+    assert again.rate[1] == pytest.approx(0.2, abs=0.05)
+    assert again.rate[4] == pytest.approx(0.9, abs=0.03)
+    assert again.rate[0] == 0.0
+
+
+def test_images_near_are_those_that_see_most():
+    index = _index([[0, 1], [0, 1, 2], [3]], np.zeros((4, 3)))
+    assert nearest_images(index, np.array([2, 0, 1]), np.array([1, 2]), 2).tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("lines", [False, True])
+def test_parts_of_the_image_without_what_is_expected_are_counted(lines):
+    """All of the map agrees in one half of the image, and nothing of it in the other."""
+    world = make_world(np.random.default_rng(1), points=600, lines=200)
+    seen, rows = [np.arange(600)] * 3, [np.arange(200)] * 3
+    index, scene = _index(seen, world.points3d, rows), _scene(world, 3, 200 if lines else 0)
+    again, near = FoundAgain(np.array([0.0, 0.2, 0.5, 0.9])), np.arange(3)
+    every = parts_shown(scene, index, again, near, *_best(world, np.ones(600, bool), np.ones(200, bool)), lines)
+    assert every[0] > 40 and every[1] < 0.5
+    left = world.points2d[:, 0] < 320
+    inside = (world.segments2d[:, :, 0] < 320).all(axis=1)
+    half = parts_shown(scene, index, again, near, *_best(world, left, inside & lines), lines)
+    assert sum(half) == pytest.approx(sum(every), abs=1e-9)
+    assert abs(half[0] - half[1]) < 0.2 * sum(half)
+    assert doubted_if_missing(RIGHT, *every) is RIGHT
+    assert doubted_if_missing(RIGHT, *half).status == "uncertain"
+
+
+def test_what_the_map_does_not_expect_is_no_evidence():
+    """Where the map has nothing, nothing is missing; landmarks that are seldom found again say little."""
+    world = make_world(np.random.default_rng(2), points=300, lines=1)
+    left = np.flatnonzero(world.points2d[:, 0] < 320)
+    index, scene = _index([left] * 2, world.points3d), _scene(world, 2, 0)
+    best = _best(world, np.isin(np.arange(300), left), np.zeros(1, bool))
+    shown, missing = parts_shown(scene, index, FoundAgain(np.array([0.0, 0.0, 0.8])), np.arange(2), *best)
+    assert shown > 15 and missing < 1.0
+    assert parts_shown(scene, index, FoundAgain(np.zeros(3)), np.arange(2), *best) == (0.0, 0.0)
+
+
+def test_as_much_missing_as_there_is_doubted_and_a_small_part_is_not():
+    assert doubted_if_missing(RIGHT, 10.0, 0.9) is RIGHT
+    assert doubted_if_missing(RIGHT, 30.0, 6.0) is RIGHT
+    doubted = doubted_if_missing(RIGHT, 8.0, 3.0)
+    assert doubted.status == "uncertain" and "3 of 11 parts" in doubted.sentence
+    assert doubted_if_missing(RIGHT, 0.0, 5.0).status == "uncertain"
+    # A person before a third of a place that is seen in many parts does not matter.
+    assert doubted_if_missing(RIGHT, 30.0, 12.0) is RIGHT
+
+
+def test_lines_behind_the_camera_are_not_expected():
+    world = make_world(np.random.default_rng(3), points=1, lines=40)
+    scene, index = _scene(world, 1, 40), _index([[]], world.points3d, [np.arange(40)])
+    best, matches = _best(world, np.zeros(1, bool), np.zeros(40, bool))
+    assert parts_shown(scene, index, FoundAgain(np.zeros(2)), np.arange(1), best, matches)[1] > 10
+    half_a_turn = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    best.pose = se3.compose(half_a_turn[None], world.pose[None])[0]
+    assert parts_shown(scene, index, FoundAgain(np.zeros(2)), np.arange(1), best, matches) == (0.0, 0.0)

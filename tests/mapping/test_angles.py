@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Parallel and perpendicular planes and directions: right angles are found, nearly right ones are left alone."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import groma
+from groma.adjustment.terms.relations import ANGLES
+from groma.geometry import quaternion, se3
+from groma.io import read_archive, write_archive
+from groma.mapping.structure.angles import AngleGates, right_angles, vertical_of
+from groma.mapping.structure.find import find_structure
+from groma.mapping.unused import without_unused
+from groma.scene import Directions, KnownDirections, Planes, Relations
+from groma.scene.survey import Kind
+from groma.scene.synthetic.scenes import corridor
+
+SIGMA = 8e-4
+X, Y, Z = np.eye(3)
+GATES = AngleGates()
+
+
+def found(vectors, seed=0, sigma=SIGMA):
+    """Angles among unit vectors that are seen with noise, with either sign, in a world that is turned."""
+    rng = np.random.default_rng(seed)
+    turn = quaternion.to_matrix(se3.exp(rng.normal(size=(1, 6)))[:, :4])[0]
+    noisy = np.asarray(vectors) @ turn.T + rng.normal(0.0, sigma, (len(vectors), 3))
+    noisy *= rng.choice([-1.0, 1.0], (len(vectors), 1)) / np.linalg.norm(noisy, axis=1, keepdims=True)
+    kind = np.zeros(len(noisy), bool)
+    return right_angles(noisy, sigma**2 * (np.eye(3) - noisy[:, :, None] * noisy[:, None, :]), kind, 0.99)
+
+
+def pairs(angles):
+    """Pairs at right angles and parallel ones."""
+    return (
+        {tuple(pair) for pair in angles.pairs[angles.right].tolist()},
+        {tuple(pair) for pair in angles.pairs[~angles.right].tolist()},
+    )
+
+
+def true_pairs(kinds):
+    """The same of vectors along axes with these numbers."""
+    every = [(a, b) for b in range(len(kinds)) for a in range(b)]
+    return {p for p in every if kinds[p[0]] != kinds[p[1]]}, {p for p in every if kinds[p[0]] == kinds[p[1]]}
+
+
+def aside(vectors, angle, rng):
+    """Unit vectors turned by angles about axes across them."""
+    across = np.cross(vectors, rng.normal(size=vectors.shape))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return np.cos(angle)[:, None] * vectors + np.sin(angle)[:, None] * across
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_room_has_all_its_right_angles(seed):
+    kinds = [0, 0, 1, 1, 2, 2, 0, 1]
+    angles = found(np.array([X, Y, Z])[kinds], seed)
+    right, parallel = pairs(angles)
+    true_right, true_parallel = true_pairs(kinds)
+    assert len(right) >= len(true_right) - 1 and right <= true_right
+    assert len(parallel) >= len(true_parallel) - 1 and parallel <= true_parallel
+    assert (angles.pairs[:, 0] < angles.pairs[:, 1]).all() and (angles.probability > 0.9).all()
+    # Seven pairs of a vector count as one deviation of it, which is at most about what vectors are uncertain by.
+    assert (GATES.held < angles.sigma / np.sqrt(7 / 2)).all() and angles.sigma.max() / np.sqrt(7 / 2) < 3.0 * SIGMA
+    assert angles.sigma[angles.right] == pytest.approx(np.full(len(right), angles.sigma[angles.right].mean()), rel=0.1)
+
+
+@pytest.mark.parametrize("degrees", [1.0, 3.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_an_angle_that_is_a_little_off_is_not_right(degrees, seed):
+    """A wing that stands askew: what belongs to the rest keeps its angles, and the wing its own."""
+    angle = np.deg2rad(degrees)
+    askew = np.cos(angle) * X + np.sin(angle) * Y
+    right, parallel = pairs(found(np.array([X, X, Y, Y, Z, Z, askew, askew]), seed))
+    true_right, true_parallel = true_pairs([0, 0, 1, 1, 2, 2])
+    assert right <= true_right | {(4, 6), (4, 7), (5, 6), (5, 7)} and len(right) >= 14
+    assert parallel <= true_parallel | {(6, 7)} and len(parallel) >= 3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_half_a_degree_is_not_forced(seed):
+    """What is related in spite of it has as much slack."""
+    angle = np.deg2rad(0.5)
+    askew = np.cos(angle) * X + np.sin(angle) * Y
+    angles = found(np.array([X, X, Y, Y, Z, Z, askew, askew]), seed)
+    wing = (angles.pairs >= 6).any(axis=1) & (angles.pairs < 4).any(axis=1)
+    assert (angles.sigma[wing] > 0.5 * angle).all()
+
+
+def test_a_house_that_is_nowhere_square_is_left_as_it_is():
+    """Angles of one to three degrees off: among 20 houses hardly one pair is right by chance."""
+    count = 0
+    for seed in range(20):
+        rng = np.random.default_rng(100 + seed)
+        off = np.deg2rad(rng.uniform(1.0, 3.0, 8))
+        count += len(found(aside(np.array([X, X, Y, Y, Z, Z, X, Y]), off, rng), seed).pairs)
+    assert count <= 0.03 * 20 * 28
+
+
+def test_directions_by_chance_have_no_right_angles():
+    count = 0
+    for seed in range(20):
+        vectors = np.random.default_rng(200 + seed).normal(size=(12, 3))
+        count += len(found(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), seed).pairs)
+    assert count <= 0.005 * 20 * 66
+
+
+def test_how_right_angles_are_is_estimated():
+    """Walls that deviate by a fifth of a degree are held by as much, not by what the most exact ones are."""
+    rng, kinds = np.random.default_rng(5), [0, 0, 0, 1, 1, 1, 2, 2, 2, 0, 1, 2]
+    off = np.abs(rng.normal(0.0, np.deg2rad(0.2), len(kinds)))
+    angles = found(aside(np.array([X, Y, Z])[kinds], off, rng), 5, 1e-4)
+    exact = found(np.array([X, Y, Z])[kinds], 5, 1e-4)
+    assert len(angles.pairs) > 0.85 * 66 and len(exact.pairs) == 66
+    assert np.deg2rad(0.15) < angles.sigma.mean() / np.sqrt(11 / 2) < np.deg2rad(0.4)
+    assert exact.sigma.max() / np.sqrt(11 / 2) < 3e-4
+
+
+def test_uncertain_vectors_and_few_say_nothing():
+    assert len(found(np.array([X, X, Y, Y, Z, Z]), sigma=0.02).pairs) == 0
+    assert len(found(np.zeros((0, 3))).pairs) == 0 and len(found(X[None]).pairs) == 0
+
+
+# ------------------------------------------------------------------------------------------------------------- Scenes
+@cache
+def walls():
+    """A corridor measured with noise, and its truth."""
+    made = corridor("small", seed=0)
+    plain = made.truth.replace(planes=Planes(), relations=Relations(), directions=Directions())
+    options = groma.AdjustOptions(refine_poses=False, loss="none", max_iterations=15)
+    return made.truth, groma.adjust(plain, options).scene
+
+
+def gravity(scene, sigma):
+    """The scene with the vertical of the world measured in its cameras."""
+    poses, count = scene.cam_from_world, scene.num_images
+    seen = quaternion.rotate(poses[:, :4], np.tile(Z, (count, 1)))
+    table = KnownDirections(
+        np.full(count, Kind.IMAGE), np.arange(count), np.tile(Z, (count, 1)), seen, np.full(count, sigma)
+    )
+    return scene.replace(known_directions=table)
+
+
+def off(scene):
+    """By relation: how far the angles of planes and directions are from right, radians."""
+    normals, vectors = scene.planes.hesse[:, :3], scene.directions.vectors
+    sides = {"planes": (normals, normals), "directions": (vectors, vectors), "plane": (normals, vectors)}
+    result = {}
+    for kind in ANGLES:
+        first, second = sides["plane" if kind.startswith("plane_") else kind.split("_")[1]]
+        one, other = getattr(scene.relations, kind).T
+        cosine = np.einsum("ni,ni->n", first[one], second[other])
+        is_right = kind.startswith("perpendicular") or kind == "plane_along_direction"
+        result[kind] = np.abs(cosine) if is_right else np.linalg.norm(np.cross(first[one], second[other]), axis=1)
+    return result
+
+
+def test_a_corridor_is_square():
+    _, scene = walls()
+    related = find_structure(scene)
+    kinds = related.relations
+    normals = np.abs(related.planes.hesse[:, :3]).argmax(axis=1)
+    right, parallel = true_pairs(normals)
+    assert {tuple(pair) for pair in kinds.perpendicular_planes.tolist()} <= right
+    assert {tuple(pair) for pair in kinds.parallel_planes.tolist()} <= parallel
+    assert len(kinds.perpendicular_planes) > 0.9 * len(right) and len(kinds.parallel_planes) > 0.9 * len(parallel)
+    assert kinds.perpendicular_directions.tolist() == [[0, 1], [0, 2], [1, 2]]
+    assert len(kinds.plane_across_direction) > 0.9 * related.num_planes
+    assert len(kinds.plane_along_direction) > 0.9 * 2 * related.num_planes
+    assert all((kinds.sigma(kind) >= GATES.held).all() for kind in ANGLES)
+
+
+@pytest.mark.parametrize("form", ["metric", "pixels"])
+def test_an_adjustment_holds_them_and_planes_come_nearer_to_the_truth(form):
+    _, scene = walls()
+    related = find_structure(scene)
+    options = groma.AdjustOptions(loss="none", structure_form=form)
+    bare = related.replace(relations=related.relations.take(**{kind: [] for kind in ANGLES}))
+    with_angles, without = (groma.adjust(one, options) for one in (related, bare))
+    for kind, outcome in with_angles.report.relations.items():
+        if kind in ANGLES:
+            assert outcome == {"held": len(getattr(related.relations, kind)), "dropped": 0}
+    tilt = [np.abs(np.sort(np.abs(one.scene.planes.hesse[:, :3]), axis=1)[:, :2]) for one in (with_angles, without)]
+    assert np.sqrt((tilt[0] ** 2).mean()) < 0.8 * np.sqrt((tilt[1] ** 2).mean())
+    before = off(without.scene.replace(relations=related.relations))
+    for kind, angle in off(with_angles.scene).items():
+        assert len(angle) == 0 or np.sqrt((angle**2).mean()) < 0.7 * np.sqrt((before[kind] ** 2).mean()), kind
+
+
+def test_the_vertical_is_a_direction():
+    """Gravity, measured in the cameras: floor and walls are related to it, and it keeps its place."""
+    _, scene = walls()
+    level = gravity(scene, 0.002)
+    vector, covariance = vertical_of(level)
+    assert vector.tolist() == [0.0, 0.0, 1.0]
+    assert np.diag(covariance) == pytest.approx([0.002**2 / scene.num_images] * 2 + [0.0])
+    related = find_structure(level)
+    number = related.num_directions - 1
+    assert related.directions.vectors[number].tolist() == [0.0, 0.0, 1.0]
+    assert (related.held.kind.tolist(), related.held.idx.tolist()) == ([Kind.DIRECTION], [number])
+    upright = np.abs(related.planes.hesse[:, :3]).argmax(axis=1) != 2
+    along, across = related.relations.plane_along_direction, related.relations.plane_across_direction
+    assert set(along[along[:, 1] == number, 0]) == set(np.flatnonzero(upright))
+    assert set(across[across[:, 1] == number, 0]) == set(np.flatnonzero(~upright))
+    adjusted = groma.adjust(related, groma.AdjustOptions(loss="none")).scene
+    assert adjusted.directions.vectors[number] == pytest.approx(Z, abs=1e-12)
+    assert without_unused(adjusted)[0].num_directions == related.num_directions  # no line is along it
+    again = find_structure(related)
+    assert len(again.held) == 1 and again.num_directions == related.num_directions
+    # Where cameras disagree about what is known, it is not the vertical.
+    table = level.known_directions
+    mixed = level.replace(known_directions=table.replace(vector=np.where(np.arange(len(table))[:, None] % 2, X, Z)))
+    assert vertical_of(mixed) is None and vertical_of(scene) is None
+
+
+def test_files_and_selections_keep_them(tmp_path):
+    _, scene = walls()
+    related = find_structure(scene)
+    write_archive(related, tmp_path / "scene.npz")
+    read = read_archive(tmp_path / "scene.npz").relations
+    for kind in ANGLES:
+        assert (getattr(read, kind) == getattr(related.relations, kind)).all()
+        assert (read.sigma(kind) == related.relations.sigma(kind)).all()
+    fewer = related.keep(directions=[1, 2], planes=np.arange(1, related.num_planes)).relations
+    assert fewer.perpendicular_directions.tolist() == [[0, 1]]
+    kept = related.relations.plane_across_direction
+    kept = kept[(kept > 0).all(axis=1)] - 1
+    assert (fewer.plane_across_direction == kept).all()

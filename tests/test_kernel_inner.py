@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Functions compiled for linking only: callable from Python all the same, in any order, thread and process, and with
+the numbers of Numba's own way."""
+
+import os
+import subprocess
+import sys
+import threading
+from itertools import pairwise
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+from groma import _numba
+from groma._kernels.inner import Pipeline, _NoMachineCode
+from groma.compiled import kernel, loop
+
+pytestmark = [
+    pytest.mark.kernels,
+    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
+]
+
+
+def _made(decorate_inner, decorate_outer):
+    """A kernel and a loop that calls it; new ones each time, not on disk before."""
+
+    @decorate_inner
+    def weighted(x, y):
+        if y == 0.0:
+            raise ValueError("nothing to divide by")
+        return (x + 0.1) * (x + 0.2) / y + (x - 0.3) / (y + 0.7)
+
+    @decorate_outer
+    def total(values):
+        found = 0.0
+        for k in range(values.shape[0] - 1):
+            found += weighted(values[k], values[k + 1])
+        return found
+
+    return weighted, total
+
+
+@pytest.fixture
+def pair(tmp_path, monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    return _made(kernel, loop)
+
+
+def _has_machine_code(function):
+    return [not isinstance(result.entry_point, _NoMachineCode) for result in function.overloads.values()]
+
+
+VALUES = np.linspace(0.5, 2.0, 37)
+
+
+def test_python_calls_what_a_loop_has_inlined(pair):
+    weighted, total = pair
+    total(VALUES)
+    assert _has_machine_code(weighted) == [False]
+    assert weighted(1.0, 2.0) == pytest.approx(1.1 * 1.2 / 2 + 0.7 / 2.7, rel=1e-15)
+    assert _has_machine_code(weighted) == [True]
+    with pytest.raises(ValueError, match="nothing to divide by"):
+        weighted(1.0, 0.0)
+
+
+def test_a_loop_inlines_what_python_has_called(pair):
+    weighted, total = pair
+    weighted(1.0, 2.0)
+    expected = sum(weighted(x, y) for x, y in pairwise(VALUES))
+    assert total(VALUES) == pytest.approx(expected, rel=1e-14)
+    assert _has_machine_code(weighted) == [True]
+
+
+def test_an_error_inside_is_raised(pair):
+    with pytest.raises(ValueError, match="nothing to divide by"):
+        pair[1](np.array([1.0, 0.0]))
+
+
+def test_functions_of_numba_alone_between(pair):
+    """They call kernels, and are called by loops."""
+    weighted, _ = pair
+
+    @numba.njit
+    def twice(x, y):
+        return 2.0 * weighted(x, y)
+
+    @loop
+    def both(values):
+        return twice(values[0], values[1]) + weighted(values[0], values[1])
+
+    values = np.array([1.0, 2.0])
+    once = 1.1 * 1.2 / 2 + 0.7 / 2.7
+    assert both(values) == pytest.approx(3 * once, rel=1e-15)
+    assert twice(1.0, 2.0) == pytest.approx(2 * once, rel=1e-15)
+    assert weighted(1.0, 2.0) == pytest.approx(once, rel=1e-15)
+
+
+def test_the_numbers_are_those_of_numba_alone(pair):
+    options = {name: option for name, option in _numba._OPTIONS.items() if option is not Pipeline}
+    _, plain = _made(numba.njit(**options, forceinline=True), numba.njit(**options))
+    for count in (2, 3, 8, 37):
+        assert pair[1](VALUES[:count].copy()).hex() == plain(VALUES[:count].copy()).hex()
+
+
+def test_a_thread_that_calls_while_another_one_compiles(pair):
+    weighted, total = pair
+    found = []
+    threads = [threading.Thread(target=lambda: found.append(weighted(1.0, 2.0))) for _ in range(4)]
+    threads.insert(2, threading.Thread(target=lambda: total(VALUES)))
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == [weighted(1.0, 2.0)] * 4
+
+
+PROGRAM = """
+import sys
+import numpy as np
+from groma.compiled import kernel, loop
+from groma._kernels.cache import counts
+
+@kernel
+def square(x):
+    return x * x
+
+@loop
+def total(values):
+    found = 0.0
+    for value in values:
+        found += square(value)
+    return found
+
+@loop
+def largest(values):
+    found = 0.0
+    for value in values:
+        found = max(found, square(value))
+    return found
+
+for name in sys.argv[1:]:
+    print({"total": lambda: total(np.ones(3)), "largest": lambda: largest(np.ones(3)), "square": lambda: square(2.0)}[name]())
+print(counts.compiled, counts.loaded)
+"""  # noqa: E501
+
+
+def test_another_process_links_what_this_one_has_kept(tmp_path):
+    path = tmp_path / "program.py"
+    path.write_text(PROGRAM)
+
+    def run(*names):
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        return subprocess.check_output([sys.executable, path, *names], text=True, env=environment).split()
+
+    assert run("total") == ["3.0", "2", "0"]  # the loop, and the kernel for it
+    assert run("largest") == ["1.0", "1", "1"]
+    assert run("square", "total") == ["4.0", "3.0", "1", "1"]
+    assert run("largest", "square", "total") == ["1.0", "4.0", "3.0", "0", "3"]
+    sizes = sorted(file.stat().st_size for file in Path(tmp_path).rglob("*.square-*.nbc"))
+    assert len(sizes) == 2 and sizes[0] < 0.7 * sizes[1]
