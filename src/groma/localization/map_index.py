@@ -29,8 +29,8 @@ from groma.features.matching.descriptor import describe
 from groma.features.segments import Segments
 from groma.io import atomic_output
 from groma.localization.features import Bytes, DescribedPoints, describe_places, find_points
-from groma.localization.pose.map_errors import SeenByImage, images_compared, shared_errors
 from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.map_errors import SeenByImage, images_compared, shared_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.records import landmark_covariances, residual_squares
 from groma.localization.retrieval import VladRetrieval
