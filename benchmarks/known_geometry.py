@@ -8,9 +8,9 @@ Cameras, points and who sees what are those of castle-P30 (``measurements.py cas
 measurements are drawn anew each time. The squared error of a camera in units of its covariance is 3 on average if the
 covariance is right. Then the wrong phones (gravity 2 to 10 degrees off) that the test names, and the right ones.
 
-``--landmarks``: made blocks of eight cameras with points, lines and planes, three positions, twelve distances (5 mm)
-of cameras from lines and planes, and of lines from each other. Then one of the distances has an error: the
-share that the test finds, against the power that theory gives for its redundancy.
+``--landmarks``: made blocks of twenty cameras with points, lines and planes, three positions, ten distances (5 mm) of
+cameras from lines and planes, and those of planes that are parallel. Then one of the distances has an error: the share
+that the test finds, against the power that theory gives for its redundancy.
 """
 
 import argparse
@@ -95,26 +95,27 @@ def drawn_scenes(truth: Scene, drawn: Scene, rng: np.random.Generator) -> dict[s
 
 
 def with_landmark_distances(scene: Scene, centers: np.ndarray, rng: np.random.Generator) -> Scene:
-    """Return the scene with distances of its true lines and planes: kinds, rows, and where they are measured."""
-    kinds, rows, places, lengths = [], [], [], []
-    line, plane = rng.permutation(scene.num_lines), rng.permutation(scene.num_planes)
-    ends = scene.lines.segments
+    """Return the scene with distances of its true lines and planes: of cameras, and of planes that are parallel."""
+    ends, normals, offsets = scene.lines.segments, scene.planes.hesse[:, :3], scene.planes.hesse[:, 3]
     along = (ends[:, 1] - ends[:, 0]) / np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1, keepdims=True)
-    for k in range(4):
-        far, wide = ends[line[k], 0], scene.planes.hesse[plane[k % len(plane)]]
-        pairs = (
-            (Kind.IMAGE, k, Kind.LINE, line[k], centers[k]),
-            (Kind.IMAGE, k + 4, Kind.PLANE, plane[k % len(plane)], centers[k + 4]),
-            (Kind.LINE, line[k + 4], Kind.LINE, line[k], ends[line[k + 4]].mean(axis=0)),
-        )
-        for first, one, second, other, place in pairs:
-            apart = place - far
-            length = np.linalg.norm(apart - (apart @ along[line[k]]) * along[line[k]])
-            length = abs(wide[:3] @ place + wide[3]) if second == Kind.PLANE else length
-            kinds.append((first, second)), rows.append((one, other)), places.append(place), lengths.append(length)
-    (first, second), (one, other) = np.array(kinds).T, np.array(rows).T
-    measured = np.array(lengths) + rng.normal(size=len(lengths)) * DISTANCE
-    table = Distances(first, one, second, other, np.array(places), measured, np.full(len(lengths), DISTANCE))
+    rows = []
+    for k, (line, plane) in enumerate(
+        zip(rng.permutation(scene.num_lines)[:5], rng.integers(len(normals), size=5), strict=True)
+    ):
+        apart = centers[k] - ends[line, 0]
+        rows.append((Kind.IMAGE, k, Kind.LINE, line, np.zeros(3), np.linalg.norm(np.cross(apart, along[line]))))
+        high = abs(normals[plane] @ centers[k + 5] + offsets[plane])
+        rows.append((Kind.IMAGE, k + 5, Kind.PLANE, plane, np.zeros(3), high))
+    for first in range(len(normals)):
+        for second in range(first + 1, len(normals)):
+            if abs(normals[first] @ normals[second]) > 1.0 - 1e-9:
+                on = scene.points.xyz[scene.relations.point_on_plane[scene.relations.point_on_plane[:, 1] == first, 0]]
+                place = on.mean(axis=0)
+                apart = abs(normals[second] @ place + offsets[second])
+                rows.append((Kind.PLANE, first, Kind.PLANE, second, place, apart))
+    first, one, second, other, places, lengths = (np.array(column) for column in zip(*rows, strict=True))
+    measured = lengths + rng.normal(size=len(lengths)) * DISTANCE
+    table = Distances(first, one, second, other, places, measured, np.full(len(lengths), DISTANCE))
     return scene.replace(distances=table)
 
 
@@ -123,14 +124,14 @@ def landmarks(draws: int) -> None:
     told = groma.AdjustOptions(
         loss="none", point_sigma_px=0.5, line_sigma_px=0.5, structure_sigma_px=0.02, check_lens=False
     )
-    sizes, limit = np.array([0.0, 3.0, 4.0, 5.0, 6.0, 8.0]), norm.isf(GATES.level / 2)
+    sizes, limit = np.array([0.0, 4.0, 5.0, 6.0, 8.0]), norm.isf(GATES.level / 2)
     found, theory, rows = np.zeros(len(sizes)), np.zeros(len(sizes)), {"3 positions": [], "with distances": []}
     for draw in range(draws):
         rng = np.random.default_rng(draw)
-        made = holistic(8, noise_px=0.5, seed=draw)
+        made = holistic(20, noise_px=0.5, seed=draw)
         true = made.truth.cam_centers_in_world
         placed = with_positions(made.truth, rng)
-        few = placed.replace(camera_positions=placed.camera_positions.take([0, 3, 6]))
+        few = placed.replace(camera_positions=placed.camera_positions.take([0, 7, 14]))
         known = with_landmark_distances(few, true, rng)
         for name, scene in (("3 positions", few), ("with distances", known)):
             result = groma.adjust(scene, told)

@@ -35,8 +35,8 @@ from groma.mapping.map import MapOptions, adjust_points, map_segments
 from groma.scene import Scene
 from groma.scene.line_intervals import one_line_per_interval
 
-#: Probabilities at which points of groma's curve are.
-LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+#: Probabilities at which points of groma's curve are, and numbers of images at which those of LIMAP's are.
+LEVELS, IMAGES = (0.0, 0.3, 0.5, 0.7, 0.8, 0.9), (3, 4, 5, 6, 8, 10)
 #: ``all``: every segment of a neighbour is a candidate. ``wide``: groma's matches of surroundings and points.
 MATCHING = ("all", "wide")
 
@@ -212,7 +212,7 @@ def row_of(task: Task, lines: LineSet) -> dict[str, object]:
     if task.source.edges is not None and task.source.box is not None:
         ends, edges = inside(lines.ends, task.source.box), inside(task.source.edges, task.source.box)
         row["inside"] = {"num_lines": len(ends), **_scores(task.source, ends, edges)}
-    if task.source.edges is not None and lines.contestant.endswith((", all", ", refined")):
+    if task.source.edges is not None and (lines.contestant == "groma, all" or lines.contestant.endswith(", refined")):
         row["curve"] = curve_of(task.source, lines)
     return row
 
@@ -221,7 +221,7 @@ def curve_of(source: LineScene, lines: LineSet) -> list[dict[str, object]]:
     """Scores of the lines of at least some probability, or seen in at least so many images."""
     of_images = lines.sure is None
     sure = lines.num_images if lines.sure is None else lines.sure
-    levels = range(3, 13) if of_images else LEVELS
+    levels = IMAGES if of_images else LEVELS
     curve: list[dict[str, object]] = []
     for level in levels:
         if (sure >= level).any():

@@ -2,13 +2,16 @@
 """Measurements of every kind beside photographs, with one gross error of each: the files, the command, the outcome.
 
     python benchmarks/measured_photographs.py SCENE [--work FOLDER] [--cases positions "poses and control" ...]
+    python benchmarks/measured_photographs.py SCENE --work FOLDER --picture docs/images/measured_fountain.jpg
 
 SCENE is a folder with ``images/``, a model ``sparse_inc/`` in a frame of its own and the survey ``sparse_gt/``. From
 the survey come the files that a user would have: positions (2 cm), poses (5 cm, 0.5 degrees), control points (5 mm,
 marks of half a pixel), gravity in the cameras (0.3 degrees), distances between control points (2 mm), heights of points
 on a plane (5 mm). Of the survey's axes that nearest to the tops of the images becomes z. Every case is one
 ``groma map``, once with good files and once with gross errors. A row says how far the centres are from the survey, as
-they are and after alignment (thousandths of a unit), check points, which gross errors were named, and what else was.
+they are and after alignment (thousandths of a unit), by how much the scale is off, how far the vertical is tilted
+(degrees) and how much too high the cameras are, check points, which gross errors were named, and what else was.
+``--picture`` draws what was measured, and what the test names, into a photograph of the case with everything.
 """
 
 import argparse
@@ -211,6 +214,47 @@ def row(out: Path, case: str, wrong: bool, parts: dict[str, str], truth: Truth) 
     return "| " + " | ".join(cells) + " |"
 
 
+def draw(scene: Path, out: Path, name: str, target: Path) -> None:
+    """Draw marks, distances and gravity of a map into a photograph, red where the test calls them wrong."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    found = read_scene(out / "scene.npz")
+    survey = json.loads((out / "summary.json").read_text())["survey"]
+    wrong = {f"{one['kind']} {one['name']}" for one in survey["measurements"] if one["is_suspect"]}
+    image = found.images.names.index(name)
+    pose, (fx, fy, cx, cy) = found.cam_from_world[image], found.cameras.params_of(found.images.camera_idx[image])
+    inside = quaternion.rotate(pose[None, :4], found.control_points.xyz) + pose[4:]
+    at = inside[:, :2] / inside[:, 2:] * [fx, fy] + [cx, cy] - 0.5
+    picture = Image.open(scene / "images" / name).convert("RGB")
+    picture = Image.blend(picture, Image.new("RGB", picture.size, "white"), 0.25)
+    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(30)
+    good, bad = "#0b5cad", "#d0281c"
+
+    def say(place: np.ndarray, text: str, colour: str) -> None:
+        pen.text(tuple(place), text, fill=colour, font=font, stroke_width=4, stroke_fill="white")
+
+    bars, points = found.distances, found.control_points.names
+    for first, second, length in zip(bars.first_idx, bars.second_idx, bars.distance, strict=True):
+        is_bad = f"distance {points[first]} to {points[second]}" in wrong
+        pen.line([tuple(at[first]), tuple(at[second])], fill=bad if is_bad else good, width=4)
+        say((at[first] + at[second]) / 2 + [8, -16], f"{length:.3f}", bad if is_bad else good)
+    marks = found.marks
+    for row in np.flatnonzero(marks.image_idx == image):
+        point, pixel = marks.point_idx[row], marks.pixel[row] - 0.5
+        colour = bad if f"mark {points[point]} in {name}" in wrong else good
+        u, v = pixel
+        pen.line([(u - 16, v), (u + 16, v)], fill=colour, width=4)
+        pen.line([(u, v - 16), (u, v + 16)], fill=colour, width=4)
+        pen.ellipse([*(at[point] - 9), *(at[point] + 9)], outline=colour, width=4)
+        say(pixel + np.array([16.0, 8.0]), points[point], colour)
+    down = found.known_directions.in_camera[found.known_directions.idx == image][0]
+    start, is_bad = np.array([80.0, 80.0]), f"known direction {name}" in wrong
+    end = start + 180.0 * down[:2] / np.linalg.norm(down[:2])
+    pen.line([tuple(start), tuple(end)], fill=bad if is_bad else "#2b7a2b", width=6)
+    say(end + np.array([12.0, -30.0]), "gravity", bad if is_bad else "#2b7a2b")
+    picture.resize((1152, 768), Image.Resampling.LANCZOS).save(target, quality=82)
+
+
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -218,7 +262,11 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="Keep files and maps here.")
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--picture", type=Path, help="Draw the case with everything, from --work, into a photograph.")
     told = parser.parse_args()
+    if told.picture:
+        draw(told.scene, told.work / "positions-control-gravity-distances-wrong", "0001.jpg", told.picture)
+        return
     truth = truth_of(read_scene(told.scene / "sparse_gt"))
     head = (
         "case | files | in place: rms / max | scale, tilt (degrees), height | aligned | check points | shown / stated"

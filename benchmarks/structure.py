@@ -54,6 +54,15 @@ REPORTED_ON = {
     "facade 812, rough": BoxSettings(seed=812, texture=8.0, rough=0.015, **_FACADE),
     "facade 813, wide": BoxSettings(seed=813, texture=8.0, rough=0.005, **{**_FACADE, "focal": 420.0}),
 }
+#: Scenes that were run once, after the last change of the search for directions.
+FRESH = {
+    "boxes 901": BoxSettings(seed=901, texture=10.0, **_SMALL),
+    "boxes 902, random views": BoxSettings(seed=902, texture=8.0, **{**_SMALL, "cameras": "random"}),
+    "boxes 903, round bodies": BoxSettings(seed=903, texture=12.0, **{**_SMALL, "num_boxes": 5, "num_round": 6}),
+    "boxes 904, wide": BoxSettings(seed=904, texture=8.0, **{**_SMALL, "focal": 420.0}),
+    "facade 911": BoxSettings(seed=911, texture=12.0, **_FACADE),
+    "facade 912, rough": BoxSettings(seed=912, texture=10.0, rough=0.012, **_FACADE),
+}
 KINDS = ("line_along_direction", "line_on_plane", "point_on_plane", "lines_meeting", "parallel", "right_angles")
 #: Relations of planes and directions, and the tables they are between.
 ANGLES = {
@@ -266,12 +275,12 @@ def _usual(labels: np.ndarray) -> int:
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="all by default; also: chosen, reported")
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="all by default; also: chosen, reported, fresh")
     parser.add_argument("--cache", type=Path, default=CACHE / "structure")
     parser.add_argument("--held", action="store_true", help="what relations bring to cameras and lines")
     given = parser.parse_args()
-    everything = {**CHOSEN_ON, **REPORTED_ON}
-    groups = {"chosen": list(CHOSEN_ON), "reported": list(REPORTED_ON)}
+    everything = {**CHOSEN_ON, **REPORTED_ON, **FRESH}
+    groups = {"chosen": list(CHOSEN_ON), "reported": list(REPORTED_ON), "fresh": list(FRESH)}
     names = [name for one in given.scenes or groups for name in groups.get(one, [one])]
     if given.held:
         _print_held({name: everything[name] for name in names}, given.cache)

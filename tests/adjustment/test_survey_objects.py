@@ -90,6 +90,21 @@ def gravity_file(scene, rng, sigma_deg=0.5, world=DOWN):
     return DirectionsFile(scene.images.names, seen, np.tile(DOWN, (count, 1)), np.full(count, sigma_deg), "imu.txt")
 
 
+def test_distances_of_objects_that_are_not_parallel_are_told(truth):
+    """Where on a line its distance from another one is measured, matters if these are not parallel."""
+    d = truth.lines.plucker[:, 3:] / np.linalg.norm(truth.lines.plucker[:, 3:], axis=1, keepdims=True)
+    angles = np.degrees(np.arccos(np.minimum(np.abs(d @ d[0]), 1.0)))
+    other = int(np.argmax(angles))
+    apart = abs(d[0] @ truth.planes.hesse[0, :3])
+    ids, plane = truth.lines.ids, f"plane:{truth.planes.ids[0]}"
+    given = DistancesFile((f"line:{ids[0]}",) * 2, (f"line:{ids[other]}", plane), np.ones(2), np.ones(2), "bars.csv")
+    notes = [note for note in with_survey(truth, Survey(distances=given)).notes if "from parallel" in note]
+    assert f"line:{ids[0]} and line:{ids[other]} are {angles[other]:.0f} degrees" in notes[0]
+    assert len(notes) == 1 + (np.degrees(np.arcsin(apart)) > 10.0)
+    marks = DistancesFile(("p0", "00001.png"), ("p1", plane), np.ones(2), np.ones(2), "bars.csv")
+    assert not any("parallel" in note for note in with_survey(truth, Survey(distances=marks)).notes)
+
+
 def test_what_a_ring_of_distances_determines_is_said(truth):
     """Every control point is tied to another one: none can be eliminated on its own."""
     start = truth.points_only()

@@ -18,8 +18,8 @@ from groma.io import read_scene, write_scene
 from groma.localization import extension
 from groma.localization.calibration import CalibrationChoice
 from groma.localization.extension import extended_model
+from groma.localization.joining.merging import GATES, _line_sigma, _one_to_one, _same_lines, merged_model
 from groma.localization.localizer import Localizer
-from groma.localization.merging import GATES, _line_sigma, _one_to_one, _same_lines, merged_model
 from groma.localization.posed_model import gather_photographs
 from groma.scene import Similarity
 

@@ -22,7 +22,7 @@ from groma.localization.candidates import Candidates, described_alike, found_nea
 from groma.localization.expected import FoundAgain, nearest_images, parts_shown
 from groma.localization.features import DescribedImage, DescribedPoints, find_features, mirrored
 from groma.localization.landmarks import DescribedLandmarks, coarsest, seen_in
-from groma.localization.map_images import image_paths, images_in_summary
+from groma.localization.map_images import OPTIONS, image_paths, images_in_summary
 from groma.localization.map_index import images_told, kept_index
 from groma.localization.pose.absolute_pose import UNKNOWN_LENS, AbsolutePose, PoseOptions, pose_from_matches
 from groma.localization.pose.camera import QueryCamera
@@ -247,10 +247,7 @@ def _folder(map_: object, images: str | os.PathLike[str] | None, index: Path | N
         told = images_in_summary(Path(str(map_)))
     if told is None:
         name = "The scene" if isinstance(map_, Scene) else str(map_)
-        raise InputError(
-            f"{name} does not tell where its photographs are. Pass their folder (--images; of groma merge --images-a "
-            "and --images-b)."
-        )
+        raise InputError(f"{name} does not tell where its photographs are. Pass their folder ({OPTIONS}).")
     return told
 
 

@@ -11,6 +11,9 @@ from groma.bounded.names import IMAGES, stays_inside
 from groma.errors import GromaError, InputError
 from groma.scene import Scene
 
+#: How the folder of a map's photographs is passed.
+OPTIONS = "--images; to groma merge --images-a and --images-b, to groma map --extend --map-images"
+
 
 def image_paths(scene: Scene, folder: Path) -> list[Path]:
     """Return the files of the images of a map: by name in a folder, else by the last part of the name below it.
@@ -21,7 +24,7 @@ def image_paths(scene: Scene, folder: Path) -> list[Path]:
         If a file is missing, or cannot be told from others.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder. Pass the photographs of the map with --images.")
+        raise InputError(f"{folder} is not a folder. Pass the photographs of the map: {OPTIONS}.")
     names = scene.images.names
     found = [folder / name if stays_inside(name) else Path() for name in names]
     missing = [row for row, path in enumerate(found) if not path.is_file()]
@@ -34,7 +37,7 @@ def image_paths(scene: Scene, folder: Path) -> list[Path]:
         if len(alike) != 1:
             raise InputError(
                 f"{len(missing)} of the {len(names)} images of the map are not in {folder}, for example "
-                f"{names[row]!r}. Pass the folder that their names begin in with --images."
+                f"{names[row]!r}. Pass the folder that their names begin in: {OPTIONS}."
             )
         found[row] = alike[0]
     return found

@@ -109,7 +109,7 @@ def _with_objects(scene: Scene, survey: Survey, notes: list[str]) -> Scene:
     scene = with_measured_points(scene, survey, notes)
     tables: dict[str, Any] = {}
     if survey.distances is not None:
-        tables["distances"] = distance_table(scene, survey.distances, survey.distance_sigma)
+        tables["distances"] = distance_table(scene, survey.distances, survey.distance_sigma, notes)
     if survey.planes is not None:
         tables["known_planes"] = plane_table(scene, survey.planes, survey.plane_sigma)
     if survey.directions is not None:

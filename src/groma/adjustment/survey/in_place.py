@@ -67,7 +67,7 @@ def placing(before: Scene, scene: Scene, survey: Survey, frame: WorldFrame, note
         return Placing(level(scene.transformed(scaled, measured=False), notes).after(scaled))
     if len(source) < 3:
         raise InputError(
-            f"The measurements place only {len(source)} cameras or control points of the scene; three are "
+            f"Of the cameras and control points of the scene the measurements place only {len(source)}; three are "
             "needed. Add positions, or control points that two images show."
         )
     try:

@@ -23,7 +23,9 @@ from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.names import nearest, rows_by_name
 from groma.adjustment.terms.objects import GROUPS
 from groma.errors import InputError
+from groma.gates import gate
 from groma.geometry import quaternion
+from groma.geometry.algebra import unit
 from groma.io.survey import DirectionsFile, DistancesFile, PlanesFile, PosesFile
 from groma.scene import (
     CameraPoses,
@@ -39,6 +41,18 @@ from groma.scene.survey import DIRECTED, LOCATED, UNKNOWN, Kind
 
 _LANDMARK = re.compile(r"(point|line|plane|direction):(\d+)")
 _KINDS = {"point": Kind.POINT, "line": Kind.LINE, "plane": Kind.PLANE, "direction": Kind.DIRECTION}
+
+
+@dataclass(frozen=True)
+class ObjectGates:
+    """What is said of measured objects."""
+
+    parallel_deg: float = gate(
+        10.0, "degrees", "from parallel, from which a distance of two lines or planes is doubtful", "cost: a sentence"
+    )
+
+
+GATES = ObjectGates()
 #: The median of a squared residual of two coordinates, in variances.
 _MEDIAN_SQUARE = 1.386
 
@@ -134,7 +148,7 @@ def with_measured_points(scene: Scene, survey: Survey, notes: list[str]) -> Scen
     )  # fmt: skip
 
 
-def distance_table(scene: Scene, given: DistancesFile, stated: float | None) -> Distances:
+def distance_table(scene: Scene, given: DistancesFile, stated: float | None, notes: list[str]) -> Distances:
     """Return the table of distances; the larger kind of each pair is the second."""
     sigma = _stated(given.sigma, stated, given.source, "its distances are", "--distance-sigma 0.001")
     one, two = (find(names, scene, given.source, LOCATED) for names in (given.first, given.second))
@@ -144,8 +158,24 @@ def distance_table(scene: Scene, given: DistancesFile, stated: float | None) -> 
     if (same := (first.kind == second.kind) & (first.idx == second.idx)).any():
         row = int(np.argmax(same))
         raise InputError(f"{given.source}: {given.first[row]} and {given.second[row]} are the same. Drop that line.")
+    for row, ends in enumerate(zip(first.kind, first.idx, second.kind, second.idx, strict=True)):
+        if (apart := _from_parallel(scene, *ends)) > GATES.parallel_deg:
+            notes.append(
+                f"{given.first[row]} and {given.second[row]} are {apart:.0f} degrees from parallel: their distance is "
+                "measured from the middle of the first that was mapped, which is no exact place. Measure between marks."
+            )
     anchor = np.array([_middle(scene, *ends) for ends in zip(first.kind, first.idx, strict=True)]).reshape(-1, 3)
     return Distances(first.kind, first.idx, second.kind, second.idx, anchor, given.distance, sigma)
+
+
+def _from_parallel(scene: Scene, kind: int, idx: int, other_kind: int, other_idx: int) -> float:
+    """Return by how many degrees two lines or planes are not parallel; zero for anything else."""
+    if kind not in (Kind.LINE, Kind.PLANE):
+        return 0.0
+    vectors = {Kind.LINE: scene.lines.plucker[:, 3:], Kind.PLANE: scene.planes.hesse[:, :3]}
+    one, two = (unit(vectors[Kind(of)][row]) for of, row in ((kind, idx), (other_kind, other_idx)))
+    cosine = abs(float(one @ two))
+    return float(np.degrees(np.arcsin(min(1.0, cosine)) if kind != other_kind else np.arccos(min(1.0, cosine))))
 
 
 def plane_table(scene: Scene, given: PlanesFile, stated: float | None) -> KnownPlanes:

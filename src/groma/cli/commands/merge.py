@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """``groma merge``: two maps of one place become one."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from groma._counted import counted
 from groma.cli.shared import options as _options
 
 
@@ -34,8 +36,8 @@ def merge(
     """Join two maps of one place.
 
     Photographs of B are localised in A, which matches points and lines of both; these give the motion between the two
-    worlds. All photographs are then mapped together, in the world of A. OUT is that of groma map; OUT.images holds
-    links to the photographs of both.
+    worlds. All photographs are then mapped together, in the world of A; lines of both maps that are not found anew are
+    kept. OUT is that of groma map; OUT.images holds links to the photographs of both.
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.console import Console
@@ -56,9 +58,14 @@ def merge(
     work = output.with_name(output.name + ".work")
     result = run_map(console, merged.folder, work, merged.scene, options)
     result = in_world_of(result, merged.map)
-    numbers = {**result.summary(), "merged": merged.sentence()}
+    anew = result.scene.num_lines
+    result = replace(result, **{name: merged.with_lines(getattr(result, name)) for name in ("scene", "before")})
+    kept = result.scene.num_lines - anew
+    numbers = {**result.summary(), "merged": merged.sentence(), "num_kept_lines": kept}
     title = f"Map of {first.absolute().name} and {second.absolute().name}"
     write_map(console, result, output, work, force, images=merged.folder, title=title, summary=numbers)
     say_map(console, result, numbers, explain=False)
+    if kept:
+        console.say(f"{counted(kept, 'lines')} of the two maps, not found anew, are kept as their images show them.")
     console.wrote_page(output)
     _output.write_json(json_target, numbers, force)

@@ -16,7 +16,7 @@ from groma.errors import InputError, OutputError
 if TYPE_CHECKING:
     from groma.cli.shared.console import Console
     from groma.localization.extension import ExtendedModel
-    from groma.localization.merging import MergedModel
+    from groma.localization.joining.merging import MergedModel
 
 _Made = TypeVar("_Made")
 Names = tuple[str, ...]
@@ -58,8 +58,8 @@ def merge_maps(
     following: Names,
 ) -> MergedModel:
     """Find how two maps lie to each other; return the model of both. ``following`` are the stages after that."""
+    from groma.localization.joining.merging import merged_model
     from groma.localization.localizer import Localizer, photographs_of
-    from groma.localization.merging import merged_model
 
     for one, where in zip(maps, images, strict=True):
         photographs_of(one, where)  # before minutes are spent on the other

@@ -22,6 +22,7 @@ from groma.estimators.motion.groups import Kind
 from groma.estimators.motion.matches import LandmarkMatches
 from groma.gates import gate
 from groma.geometry.so3 import hat
+from groma.localization.joining.kept_lines import segments_apart, with_lines_of
 from groma.localization.localizer import LocalizedImage, Localizer
 from groma.localization.map_index import Progress
 from groma.localization.placed import PlacedImage
@@ -57,14 +58,26 @@ class MergedModel:
     scene: Scene
     #: The folder with links to all of them.
     folder: Path
-    #: The first map.
-    map: Scene
+    #: The two maps, and what their images are called in the scene.
+    maps: tuple[Scene, Scene]
+    names: tuple[tuple[str, ...], tuple[str, ...]]
+    #: (n, 2) lines of the second map and of the first that are the same.
+    same_lines: IntArray
     #: first_from_second.
     motion: Motion
     #: Matched points and lines, and photographs that both maps have.
     num_points: int
     num_lines: int
     num_common: int
+
+    @property
+    def map(self) -> Scene:
+        """The first map."""
+        return self.maps[0]
+
+    def with_lines(self, scene: Scene, gates: MergeGates = GATES) -> Scene:
+        """Return what was mapped of the model, with lines of both maps that were not found anew."""
+        return with_lines_of(scene, self.maps, self.names, self.same_lines, gates.same_line)
 
     def sentence(self) -> str:
         """Say how the maps were joined."""
@@ -100,18 +113,24 @@ def merged_model(
         If the maps share no place that is recognised, or what they share does not determine the motion.
     """
     found = _found(first, second, say, gates)
-    matches = _matches(first, second, found, gates)
+    matches, same_lines = _matches(first, second, found, gates)
     motion = _motion(matches, kind, gates)
     moved = second.scene.transformed(Similarity.from_array(motion.similarity))
     poses = {image: _pose_of(moved, image, one) for image, one in found.items()}
-    known = {_digest(path) for path in first.files}
-    fresh = [row for row, path in enumerate(second.files) if _digest(path) not in known]
+    known = {_digest(path): row for row, path in enumerate(first.files)}
+    digests = [_digest(path) for path in second.files]
+    fresh = [row for row, digest in enumerate(digests) if digest not in known]
     placed = [_as_placed(moved, row, poses.get(row)) for row in fresh]
     paths = [*first.files, *(second.files[row] for row in fresh)]
     scene = with_photographs(first.scene, first.index, placed, paths, say)
     gather_photographs(folder, dict(zip(scene.images.names, paths, strict=True)))
-    common = len(second.files) - len(fresh)
-    return MergedModel(scene, folder, first.scene, motion, len(matches) - matches.num_lines, matches.num_lines, common)
+    place = {row: first.scene.num_images + number for number, row in enumerate(fresh)}
+    called = tuple(scene.images.names[place.get(row, known.get(digest, 0))] for row, digest in enumerate(digests))
+    return MergedModel(
+        scene, folder, (first.scene, second.scene), (first.scene.images.names, called),
+        same_lines[motion.line_inliers], motion, len(matches) - matches.num_lines, matches.num_lines,
+        len(second.files) - len(fresh),
+    )  # fmt: skip
 
 
 def _motion(matches: LandmarkMatches, kind: Kind, gates: MergeGates) -> Motion:
@@ -157,8 +176,8 @@ def _found(first: Localizer, second: Localizer, say: Progress, gates: MergeGates
 
 def _matches(
     first: Localizer, second: Localizer, found: dict[int, LocalizedImage], gates: MergeGates
-) -> LandmarkMatches:
-    """Points and lines of the second map (a) and of the first (b) that are the same."""
+) -> tuple[LandmarkMatches, IntArray]:
+    """Points and lines of the second map (a) and of the first (b) that are the same; and rows of the lines."""
     points, lines = Counter[tuple[int, int]](), Counter[tuple[int, int]]()
     for image, one in found.items():
         points.update(map(tuple, _same_points(second, image, one, gates).tolist()))
@@ -175,10 +194,11 @@ def _matches(
     )  # fmt: skip
     sure = np.isfinite(of_lines).all(axis=1) & (of_lines > 0).all(axis=1)
     good = np.isfinite(of_points).all(axis=1) & (of_points > 0).all(axis=1)
-    return LandmarkMatches.of(
+    matches = LandmarkMatches.of(
         segments[0][sure], segments[1][sure], a.xyz[pairs[good, 0]], b.xyz[pairs[good, 1]],
         (of_lines[sure], of_points[good]),
     )  # fmt: skip
+    return matches, line_pairs[sure]
 
 
 def _same_points(second: Localizer, image: int, found: LocalizedImage, gates: MergeGates) -> IntArray:
@@ -204,13 +224,7 @@ def _same_lines(second: Localizer, image: int, found: LocalizedImage, gates: Mer
     query = found.pose.matches.segments2d[inliers].reshape(-1, 2, 2)
     if not len(rows) or not len(query):
         return np.zeros((0, 2), np.int64)
-    ends = seen.segment[rows].reshape(-1, 2, 2)
-    step = ends[:, 1] - ends[:, 0]
-    length = np.linalg.norm(step, axis=1)
-    away = query[:, None] - ends[None, :, :1]
-    across = np.abs(away @ np.array([[0.0, -1.0], [1.0, 0.0]]) @ (step / length[:, None])[None, :, :, None])[..., 0]
-    along = (away.mean(axis=2) * step).sum(axis=-1) / length**2
-    off = np.where((along > 0) & (along < 1), across.max(axis=2), np.inf)
+    off = segments_apart(query.reshape(-1, 4), seen.segment[rows])
     nearest = off.argmin(axis=1)
     hit = np.flatnonzero(off[np.arange(len(query)), nearest] < gates.same_line)
     return np.column_stack([seen.line_idx[rows[nearest[hit]]], found.line[inliers[hit]]])
