@@ -22,8 +22,8 @@ def drawing(results: Sequence[Mapping], threshold: int = 1) -> str:
     Solid: share of lines of which any part is right. Dashed: share of their length. The dot is what groma keeps by
     default.
     """
-    rows = -(-len(results) // _COLUMNS)
-    width, height = _COLUMNS * (_SIZE + _GAP) + 20, rows * (_SIZE + _GAP + _HEAD) + 34
+    columns, rows = min(_COLUMNS, len(results)), -(-len(results) // _COLUMNS)
+    width, height = max(columns * (_SIZE + _GAP) + 20, 560.0), rows * (_SIZE + _GAP + _HEAD) + 34
     body = [_legend(height - 14)]
     for number, result in enumerate(results):
         left = 48 + (number % _COLUMNS) * (_SIZE + _GAP)

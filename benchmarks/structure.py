@@ -54,7 +54,7 @@ REPORTED_ON = {
     "facade 812, rough": BoxSettings(seed=812, texture=8.0, rough=0.015, **_FACADE),
     "facade 813, wide": BoxSettings(seed=813, texture=8.0, rough=0.005, **{**_FACADE, "focal": 420.0}),
 }
-#: Scenes that were run once, after the last change of the search for directions.
+#: Scenes that were run once, when nothing was changed any more.
 FRESH = {
     "boxes 901": BoxSettings(seed=901, texture=10.0, **_SMALL),
     "boxes 902, random views": BoxSettings(seed=902, texture=8.0, **{**_SMALL, "cameras": "random"}),

@@ -9,6 +9,8 @@ from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.consistency_scenes import drawn
 from groma.adjustment.misfit.jackknife import landmark_jackknife, observations_alone
 from groma.adjustment.uncertainty import pose_uncertainty
+from groma.scene import CameraPositions
+from groma.scene.survey import diagonal_covariance
 from groma.solver.covariance.marginals import Covariances
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
@@ -86,6 +88,18 @@ def test_relations_are_no_observations():
     result = groma.adjust(scene, groma.AdjustOptions(point_sigma_px=0.5, line_sigma_px=0.5))
     numbers = pose_uncertainty(result.scene, result.problem, by_landmarks=True)
     assert numbers["gauge"] == "held" and 0.6 < numbers["factor"] < 1.6
+
+
+def test_landmarks_do_not_tell_where_measurements_put_the_scene():
+    """With noise as stated, deviations in the frame of positions of 2 cm are those of least squares: centimetres."""
+    scene = drawn(8, 0.3, np.random.default_rng(4), relations=False)
+    rows, sigma = np.arange(3), np.full((3, 3), 0.02)
+    xyz = scene.cam_centers_in_world[:3] + np.random.default_rng(5).normal(size=(3, 3)) * 0.02
+    scene = scene.replace(camera_positions=CameraPositions(rows, xyz, diagonal_covariance(sigma)))
+    result = groma.adjust(scene, groma.AdjustOptions(loss="none", point_sigma_px=0.3, line_sigma_px=0.3))
+    plain, told = (pose_uncertainty(result.scene, result.problem, by_landmarks=by) for by in (False, True))
+    assert told == plain and told["gauge"] == "measured" and "factor" not in told
+    assert 0.005 < told["center"]["median"] < 0.05
 
 
 def test_with_a_lens_that_is_estimated_and_a_robust_loss():

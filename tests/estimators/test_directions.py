@@ -9,7 +9,6 @@ import pytest
 from groma.errors import InputError, ShapeError
 from groma.estimators.directions import (
     DirectionOptions,
-    agreeing,
     directions_from_lines,
     directions_from_normals,
     orthogonal_pairs,
@@ -161,32 +160,3 @@ def test_no_direction_among_lines_without_one(count, sigma):
         directions = unit(rng.normal(size=(count, 3)))
         spread = sigma * np.exp(rng.normal(0.0, 0.7, count))
         assert len(directions_from_lines(directions, spread[:, None, None] ** 2 * np.eye(3))) == 0
-
-
-def test_directions_of_a_second_search_follow_those_of_the_first():
-    """Exact lines first, then those of the rest that are less exact: labels, order and right angles of all."""
-    rng = np.random.default_rng(7)
-    turned = unit(FRAME[0] + 0.01 * FRAME[1])  # half a degree from the first
-    true = np.stack([FRAME[0], turned, FRAME[2]])
-    spread = np.repeat([2e-4, 2e-4, 6e-3], 8)
-    lines = unit(np.repeat(true, 8, axis=0) + spread[:, None] * rng.normal(size=(24, 3)))
-
-    def noise(sigma, rows):
-        return sigma**2 * (np.eye(3) - lines[rows, :, None] * lines[rows, None])
-
-    every = np.arange(24)
-    exact = directions_from_lines(lines, noise(2e-4, every), EXACT)
-    assert len(exact) == 2 and (exact.label[:16] >= 0).mean() > 0.8 and (exact.label[16:] == -1).all()
-    agree = agreeing(lines, noise(6e-3, every), exact.vectors, EXACT)
-    assert agree[:16].all() and not agree[16:].any()
-    # Half a degree is within the larger noise: searched with that alone, the two are one.
-    assert len(directions_from_lines(lines, noise(6e-3, every), EXACT)) == 2
-    rest = np.flatnonzero(~agree)
-    both = exact.followed_by(directions_from_lines(lines[rest], noise(6e-3, rest), EXACT), rest)
-    assert len(both) == 3 and angles(both.vectors, true).min(axis=0).max() < 6e-3
-    assert (both.label[:16] == exact.label[:16]).all() and (both.label[16:] == 2).mean() > 0.8
-    assert len(both.support) == len(both.covariance) == len(both.log10_false_alarms) == 3
-    assert both.orthogonal.tolist() == [[0, 2], [1, 2]]
-    assert not agreeing(lines, noise(6e-3, every), np.zeros((0, 3))).any()
-    none = exact.followed_by(directions_from_lines(lines[:0], noise(1.0, every[:0]), EXACT), every[:0])
-    assert len(none) == 2 and (none.label == exact.label).all()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs added to a map, and two maps joined: the embedded cabinet, by motion capture poses."""
 
+import json
 import shutil
 from collections import Counter
 from dataclasses import replace
@@ -20,8 +21,10 @@ from groma.localization.calibration import CalibrationChoice
 from groma.localization.extension import extended_model
 from groma.localization.joining.merging import GATES, _line_sigma, _one_to_one, _same_lines, merged_model
 from groma.localization.localizer import Localizer
+from groma.localization.pose.camera import QueryCamera
 from groma.localization.posed_model import gather_photographs
-from groma.scene import Similarity
+from groma.scene import LineObservations, Similarity
+from groma.scene.landmarks import Lines
 
 FRAMES = [f"{number:04d}.jpg" for number in range(24, 36)]
 HALVES = {"a": FRAMES[0::2], "b": FRAMES[1::2]}
@@ -219,6 +222,27 @@ def test_the_command_extends_a_map(place, truth, tmp_path, capsys):
     assert np.median(_off(scene, truth)) < 0.1
     assert Localizer(out).files[0].parent == tmp_path / "out.images"
     assert not (tmp_path / "out.queries").exists() and not (tmp_path / "out.work").exists()
+
+
+def test_the_command_joins_maps_and_keeps_lines(place, truth, tmp_path):
+    """The first map has a line that the photographs do not show: it is kept where it was."""
+    scene = read_scene(place / "a.npz")
+    middle = np.median(scene.points.xyz, axis=0)
+    ends = np.array([middle, middle + 0.1 * scene.points.xyz.std(axis=0)])
+    camera = QueryCamera.of(scene.cameras, 0)
+    segments = np.stack([camera.project(pose, ends).ravel() for pose in scene.cam_from_world])
+    images = np.flatnonzero(np.isfinite(segments).all(axis=1))
+    seen = LineObservations(images, np.zeros(len(images), int), segments[images], np.ones(len(images)))
+    write_scene(scene.replace(lines=Lines.through(ends[None]), line_observations=seen), tmp_path / "a.npz")
+    given = ["merge", tmp_path / "a.npz", place / "b.npz", "-o", tmp_path / "out"]
+    given += ["--images-a", place / "a", "--images-b", place / "b"]
+    assert run([*map(str, given), "--quiet"]) == 0
+    out = read_scene(tmp_path / "out" / "scene.npz")
+    assert sorted(out.images.names) == FRAMES
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["num_kept_lines"] == 1
+    kept = out.line_observations.line_idx == out.num_lines - 1
+    np.testing.assert_allclose(out.line_observations.segment[kept], segments[images])
+    assert np.abs(out.lines.segments[-1] - ends).max() < 0.2
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import pytest
 
 from groma.cli.main import run
 from groma.errors import InputError, OutputError
+from groma.execution import work_with
 from groma.io import read_scene
 from groma.io.colmap.sfm import PointModelOptions, reconstruct_points
 from groma.mapping import map as mapping
@@ -44,6 +45,43 @@ def test_stages_are_made_once_and_again_when_something_before_them_changes(tmp_p
     with Stages(tmp_path / "work", digest("other input"), 1) as stages:
         assert compare.equal(stages.run(make("a"), model), model)
     assert made[7:] == ["a", "a"]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_two_stages_beside_each_other_are_kept_like_two_after_each_other(tmp_path, model, workers):
+    """Whatever the number of threads; and where the one fails, the other is left at its next step."""
+    made, steps = [], []
+
+    def other(scene, options, say):
+        made.append("other")
+        while "fails" in options:
+            steps.append(say("other", 0, 1))
+        return scene
+
+    def main(scene, options, say):
+        made.append("main")
+        if "fails" in options:
+            raise InputError("as it was to be")
+        return scene
+
+    first, second = stage("other", SCENE)(other), stage("main", SCENE)(main)
+    for _ in range(2):
+        with work_with(workers), Stages(tmp_path / "work", "key", "usual") as stages:
+            assert all(
+                compare.equal(found, model) for found in stages.run_beside("other", (first, model), second, model)
+            )
+    with Stages(tmp_path / "work", "key", "usual") as stages:
+        stages.run(first, model)
+        stages.run(second, model)
+    assert sorted(made) == ["main", "other"]
+    if workers > 1:
+        with (
+            work_with(workers),
+            Stages(tmp_path / "else", "key", "fails") as stages,
+            pytest.raises(InputError, match="as it was to be"),
+        ):
+            stages.run_beside("other", (first, model), second, model)
+        assert not has_stages(tmp_path / "else")
 
 
 def test_two_runs_in_one_folder_are_refused(tmp_path):

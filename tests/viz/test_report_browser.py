@@ -333,3 +333,28 @@ def test_hands_turn_move_and_bring_the_view_back(opened):
     page.wait_for_function("eye.distance > data.view.distance")
     page.click("#home")
     assert page.evaluate("eye") == before
+
+
+#: Frames of a scene that takes so many milliseconds when all of it is drawn, on a screen of 60 Hz: which share of the
+#: frames is late, and how much of the scene they show.
+FRAMES = """cost => {
+  const tick = 1000 / 60;
+  let now = 0, late = 0, drawn = 0;
+  lastFrame = -Infinity; clearTimeout(rest);
+  for (let i = 0; i < 360; i++) {
+    frame(now);
+    const ticks = Math.max(1, Math.ceil(cost * share / tick));
+    now += ticks * tick;
+    if (i >= 60) { late += (ticks > 1) / 300; drawn += share / 300; }
+  }
+  return [late, drawn];
+}"""
+
+
+def test_frames_come_in_time_and_show_what_there_is_time_for(opened):
+    page = opened()
+    assert page.evaluate(FRAMES, 10) == [0, pytest.approx(1)]
+    for cost in (25, 60, 200):
+        late, drawn = page.evaluate(FRAMES, cost)
+        assert late < 0.15
+        assert drawn > 0.65 * 16.7 / cost

@@ -171,8 +171,10 @@ def pose_uncertainty(
     The entries are those of :meth:`SceneUncertainty.to_dict`; for the parameters see :func:`uncertainty`. None where
     all cameras are held, or are not determined. ``by_landmarks`` multiplies the deviations, in place of by ``sigma0``,
     by what leaving out one landmark after the other tells
-    (:mod:`groma.adjustment.misfit.jackknife`); the entry ``factor`` is the median of that.
+    (:mod:`groma.adjustment.misfit.jackknife`); the entry ``factor`` is the median of that. Not where other instruments
+    measured the frame: landmarks do not tell how well they did.
     """
+    by_landmarks = by_landmarks and not scene.is_tied
     if "frames" not in problem.variables or _free_cameras(problem) == 0:
         return None
     near = local_frame(scene)

@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from groma._typing import BoolArray, FloatArray, IntArray
+from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.estimators._chance import chi_square_quantile, log10_poisson_tail
 from groma.estimators._direction_features import Parallel, Perpendicular, crossings
@@ -113,17 +113,6 @@ class DirectionSet:
 
     def __len__(self) -> int:
         return len(self.vectors)
-
-    def followed_by(self, other: DirectionSet, rows: IntArray) -> DirectionSet:
-        """Return these directions and others that were found in some (n,) of the features, which count there."""
-        label = self.label.copy()
-        label[rows] = np.where(other.label >= 0, other.label + len(self), label[rows])
-        columns = {
-            name: np.concatenate([getattr(self, name), getattr(other, name)])
-            for name in ("vectors", "covariance", "support", "log10_false_alarms")
-        }
-        pairs = orthogonal_pairs(columns["vectors"], columns["covariance"])
-        return DirectionSet(**columns, label=label, orthogonal=pairs)
 
 
 # -------------------------------------------------------------------------------------------------------------- Public
@@ -218,17 +207,6 @@ def directions_from_lines(
     if candidates is not None:
         tried = np.concatenate([tried, unit(vectors(candidates, 3, "candidates"))])
     return _search(features, options, groups, tried)
-
-
-def agreeing(
-    directions: FloatArray, covariance: FloatArray, shared: FloatArray, options: DirectionOptions | None = None
-) -> BoolArray:
-    """Whether 3D lines (N,) agree with any of some directions (D, 3); parameters as for directions_from_lines."""
-    options = options or DirectionOptions()
-    if len(shared) == 0 or len(directions) == 0:
-        return np.zeros(len(directions), bool)
-    features = Parallel.of(unit(directions), covariance, options.parallel_sigma)
-    return features.squared(shared).min(axis=0) < chi_square_quantile(options.level, features.freedom)
 
 
 def orthogonal_pairs(
@@ -392,7 +370,6 @@ def _refine(pool: Perpendicular | Parallel, start: FloatArray, gate: float) -> t
 __all__ = [
     "DirectionOptions",
     "DirectionSet",
-    "agreeing",
     "directions_from_lines",
     "directions_from_normals",
     "orthogonal_pairs",

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
@@ -20,6 +21,7 @@ from typing import IO, Any, Generic, Self, TypeVar
 import numpy as np
 
 from groma.errors import FileFormatError, OutputError
+from groma.execution import beside, num_threads
 from groma.mapping.checkpoint_files import FileKind
 from groma.mapping.folder_lock import LOCK, lock_folder
 
@@ -142,15 +144,62 @@ class Stages(Generic[_Options]):
         tag : str
             Ends the name, of a stage that is done more than once.
         """
-        name, kind = stage.name + tag, stage.kind
+        return self._kept(stage, self._place_of(stage, given, tag), values, self.say)
+
+    def run_beside(
+        self, words: str, aside: tuple[Stage[_Options, Any], Any], stage: Stage[_Options, _Result], *values: Any,
+        given: object = None,
+    ) -> tuple[Any, _Result]:  # fmt: skip
+        """Return the results of two stages, of which neither needs the other's.
+
+        The first, which is given with its value, is done in a thread of this process where there are several, and is
+        said with some words when it begins; where there is one, it is done before the other.
+        """
+        places = self._place_of(aside[0], None, ""), self._place_of(stage, given, "")
+        if num_threads() < 2:
+            first = self._kept(aside[0], places[0], aside[1:], self.say)
+            return first, self._kept(stage, places[1], values, self.say)
+        if not places[0].exists():
+            self.say(words, 0, 1)
+        found: list[Any] = []
+        is_left = threading.Event()
+
+        def go_on(doing: str, done: int, total: int) -> None:
+            if is_left.is_set():
+                raise KeyboardInterrupt
+
+        def do_aside() -> None:
+            found.append(self._kept(aside[0], places[0], aside[1:], go_on))
+
+        with beside(do_aside):
+            try:
+                result = self._kept(stage, places[1], values, self.say)
+            except BaseException:
+                is_left.set()
+                raise
+        return found[0], result
+
+    def _place_of(self, stage: Stage[_Options, Any], given: object, tag: str) -> Path:
+        """Return the file of the next stage."""
+        name = stage.name + tag
         self._key = digest(self._key, name, stage.depends(self.options), given)
-        path = self.folder / f"{name}-{self._key[:_KEY_LENGTH]}.npz"
+        return self.folder / f"{name}-{self._key[:_KEY_LENGTH]}.npz"
+
+    def _kept(
+        self,
+        stage: Stage[_Options, _Result],
+        path: Path,
+        values: tuple[Any, ...],
+        say: Callable[[str, int, int], None],
+    ) -> _Result:
+        """Return what a file holds, or make it."""
+        kind, name = stage.kind, path.stem[: -_KEY_LENGTH - 1]
         if path.exists():
             # A file that cannot be read was damaged by somebody else: it is made again.
             with suppress(FileFormatError):
                 return kind.read(path)
             path.unlink()
-        made = stage(*values, self.options, self.say)
+        made = stage(*values, self.options, say)
         try:
             kind.write(made, path)
         except OSError as error:

@@ -210,7 +210,12 @@ def map_images(
     with one_blas_thread(), work_with(options.threads), Stages(Path(work), key, options, say) as stages:
         placed = start_of(folder, names, model, stages)
         start = placed.scene
-        points = stages.run(adjust_read_rows if read_by_rows(start, options, depth) else adjust_points, start)
+        by_rows, segments = read_by_rows(start, options, depth), None
+        if by_rows or options.refine_intrinsics or options.refine_points or survey or depth is not None:
+            points = stages.run(adjust_read_rows if by_rows else adjust_points, start)
+        else:  # the cameras stay as they are, and more is not needed to find segments
+            found = (find_segments, folder, start, line_matches)
+            points, segments = stages.run_beside("adjusting points", (adjust_points, start), *found, given=line_matches)
         if options.refine_points:
             points = stages.run(measure_points, folder, points)
         in_place = tied(start, points, survey) if survey else None
@@ -220,7 +225,8 @@ def map_images(
         depths = None if depth is None else with_depths(start, points, near, depth, stages)
         if depths is not None:
             start, points, near = depths.start, depths.points, depths.near
-        segments = stages.run(find_segments, folder, points, line_matches, given=line_matches)
+        if segments is None:
+            segments = stages.run(find_segments, folder, points, line_matches, given=line_matches)
         matches = matches_for(options, folder, points, segments, line_matches)
         beside = None
         if depths is not None and depth is not None:

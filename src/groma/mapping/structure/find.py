@@ -26,7 +26,7 @@ from groma._typing import FloatArray, IntArray
 from groma.adjustment.assembly_options import SURFACE_SIGMA_PX
 from groma.adjustment.terms.relations import ANGLES, lengths_per_pixel
 from groma.errors import InputError
-from groma.estimators.directions import DirectionOptions, DirectionSet, agreeing, directions_from_lines
+from groma.estimators.directions import DirectionOptions, DirectionSet, directions_from_lines
 from groma.estimators.plane_search import PlaneOptions, PlaneSet, find_planes
 from groma.execution import together
 from groma.geometry.algebra import norm
@@ -147,13 +147,13 @@ def detect_structure(
     on_line = on_lines(marks, level, least)
     planes = _planes_in(marks, on_line, options, partial(report, "finding planes"))
     report("finding directions", 0, 1)
-    directions, along = _parallels(scene, marks, options, candidates)
+    directions = _directions_in(scene, marks, options, candidates, options.surface_sigma_px)
     report("finding what lies on what", 0, 1)
     point_on_plane, line_on_plane = on_planes(marks, planes, level, (least, least_line))
     support = point_on_plane.counts(len(planes)) + 2 * line_on_plane.counts(len(planes))
     planes, new = _only(planes, support >= (options.planes.min_support + 1) // 2)
     found = {"point_on_plane": point_on_plane.renumbered(new), "line_on_plane": line_on_plane.renumbered(new)}
-    found["line_along_direction"] = along
+    directions, found["line_along_direction"] = _parallels(scene, marks, options, candidates)
     found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()
     found["lines_meeting"] = meetings(marks, level, least_line)
     vertical = vertical_of(scene)
@@ -199,28 +199,24 @@ def _planes_in(
 
 
 def _directions_in(
-    scene: Scene, marks: Landmarks, options: StructureOptions, candidates: FloatArray | None
+    scene: Scene, marks: Landmarks, options: StructureOptions, candidates: FloatArray | None, deviation_px: float
 ) -> DirectionSet:
-    """Directions that usable lines share within their own noise; then, in the rest, those of lines that are less exact.
-
-    Directions that are near to each other stay apart that way, and noisier lines still find theirs.
-    """
+    """Directions that usable lines share."""
     lines = np.flatnonzero(marks.line_usable)
-    vectors, length = scene.lines.plucker[lines, 3:], norm(marks.segments[:, 1] - marks.segments[:, 0])
-    rough = marks.own_line_noise.widened(options.surface_sigma_px * marks.line_pixel).directions(length)[lines]
-    own = marks.own_line_noise.directions(length)[lines]
-    exact = directions_from_lines(vectors, own, options.directions, candidates)
-    rest = np.flatnonzero(~agreeing(vectors, rough, exact.vectors, options.directions))
-    return exact.followed_by(directions_from_lines(vectors[rest], rough[rest], options.directions, candidates), rest)
+    noise = marks.own_line_noise.widened(deviation_px * marks.line_pixel)
+    turning = noise.directions(norm(marks.segments[:, 1] - marks.segments[:, 0]))
+    return directions_from_lines(scene.lines.plucker[lines, 3:], turning[lines], options.directions, candidates)
 
 
 def _parallels(
     scene: Scene, marks: Landmarks, options: StructureOptions, candidates: FloatArray | None
 ) -> tuple[DirectionSet, Pairs]:
-    """Directions and lines along them."""
-    directions = _directions_in(scene, marks, options, candidates)
+    """Directions and lines along them, sought twice: how exactly lines are parallel is known after the first time."""
     sigma, level, least = options.directions.parallel_sigma, options.level, options.min_line_probability
-    along = along_directions(marks, directions, sigma, level, least)
+    directions = _directions_in(scene, marks, options, candidates, options.surface_sigma_px)
+    _, deviation = along_directions(marks, directions, sigma, level, least)
+    directions = _directions_in(scene, marks, options, candidates, deviation)
+    along, _ = along_directions(marks, directions, sigma, level, least)
     directions, new = _only_directions(directions, along.counts(len(directions)) >= _MIN_PARALLEL)
     return directions, along.renumbered(new)
 

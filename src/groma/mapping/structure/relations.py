@@ -223,11 +223,11 @@ def along_directions(
     level: float,
     least: float,
     gates: RelationGates = RelationGates(),
-) -> Pairs:
-    """Lines along directions, at most one direction for each line."""
+) -> tuple[Pairs, float]:
+    """Lines along directions, at most one direction for each line; and how far the ends of lines deviate, pixels."""
     rows, num = np.flatnonzero(marks.line_usable), len(found)
     if len(rows) == 0 or num == 0:
-        return Pairs.none()
+        return Pairs.none(), 0.0
     length = norm(marks.segments[:, 1] - marks.segments[:, 0])
     own = marks.own_line_noise.directions(length)[rows]
     basis = np.stack(perpendicular(unit(marks.segments[rows, 1] - marks.segments[rows, 0])), axis=1)
@@ -258,7 +258,7 @@ def along_directions(
     squared = (offset**2 / (variance + ((told.deviation[owner] * per_pixel) ** 2)[:, None])).sum(axis=1)
     passed = (squared < chi_square_gate(1.0 - level, 2)) & (told.probability > least)
     pairs = Pairs(np.column_stack([rows[at], owner]), told.probability, told.deviation[owner]).take(passed)
-    return _best_of_competing(pairs, np.ones((num, num), bool), num)
+    return _best_of_competing(pairs, np.ones((num, num), bool), num), float(told.deviation[0])
 
 
 def on_lines(marks: Landmarks, level: float, least: float, gates: RelationGates = RelationGates()) -> Pairs:

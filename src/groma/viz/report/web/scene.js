@@ -4,16 +4,23 @@ const noWebgl = location.hash.includes("canvas"); // for tests and for graphics 
 const renderer = (noWebgl ? null : webglRenderer(canvas)) || flatRenderer(canvas);
 const shown = { points: true, lines: true, planes: true, cameras: true, junctions: false };
 let ratio = 1, view = viewOf(1, 1), pending = false, painted = -1;
-// While the view moves, only as many points and lines are drawn as there is time for; all of them once it rests.
-const SLOW = 30, QUICK = 20, REST = 180; // milliseconds
-let share = 1, lastFrame = -Infinity, rest = 0;
+// While the view moves, only as many points and lines are drawn as there is time for; all of them once it rests. What was
+// too much for a frame is tried again slowly, so that not every other frame is late.
+const FRAME = 1000 / 60, SLOW = 1.3 * FRAME, LEAST = 0.02, REST = 180; // milliseconds
+let share = 1, roof = 1, lastFrame = -Infinity, rest = 0;
 
 function draw() { if (!pending) { pending = true; requestAnimationFrame(frame); } }
 function frame(time) {
   pending = false;
   const took = time - lastFrame;
   lastFrame = time;
-  if (took < 1000) share = Math.max(0.02, Math.min(1, share * (took > SLOW ? Math.max(0.3, SLOW / took) : took < QUICK ? 1.3 : 1)));
+  if (took > SLOW && took < 1000) {
+    roof = Math.max(LEAST, 0.9 * share);
+    share = Math.max(LEAST, share * Math.max(0.3, 0.9 * FRAME / took));
+  } else if (took <= SLOW) {
+    roof = Math.min(1, 1.01 * roof);
+    share = Math.min(roof, 1.1 * share);
+  }
   paint(share);
   clearTimeout(rest);
   if (share < 1) rest = setTimeout(() => { paint(1); lastFrame = -Infinity; }, REST);
