@@ -115,7 +115,7 @@ def _maps(work: Path) -> Iterator[Made]:
     count = np.array([0, 3, 5])
     shapes = {
         "xyz": (4, 3), "point_covariance": (4, 3, 3), "pixel": (5, 2), "line_covariance": (2, 6, 6),
-        "segment_descriptor": (5, 72), "vocabulary": (2, 128), "image": (2, 256),
+        "segment_descriptor": (5, 72), "vocabulary": (2, 128), "image": (2, 256), "shared_error": (2,),
     }  # fmt: skip
     arrays = {name: rng.uniform(0.0, 9.0, shape) for name, shape in shapes.items()}
     for name in ("segment_descriptor", "vocabulary", "image"):
