@@ -135,7 +135,8 @@ def read_placed(path: Path, digest: str) -> PlacedImage | None:
             values: dict[str, Any] = {name: members.read(name, check) for name, check in _FORMS.items()}
             for name in ("name", "status", "sentence", "model"):
                 values[name] = str(values[name])
-            values |= {name: float(values[name]) for name in ("seconds", "shared_error")}
+            for name in ("seconds", "shared_error"):
+                values[name] = float(values[name])
             found = PlacedImage(**values)
             if found.model:
                 found.camera  # noqa: B018 - refuses a calibration that is none
