@@ -69,8 +69,6 @@ def _matched(
         threshold=gates.start.max_error,
     )  # fmt: skip
     rows = np.flatnonzero(good)[np.asarray(agree).ravel() > 0]
-    if len(rows) < gates.rectification.min_pairs:
-        rows = rows[:0]
     return first[rows], second[rows], there[rows]
 
 

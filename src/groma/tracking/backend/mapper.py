@@ -275,8 +275,7 @@ class Mapper:
             return
         self._next_look = math.ceil(gates.growth * len(living))
         self._began_with = self._began_with or self.right.turn
-        found = estimate_turn(self.map, self.camera, self.right.turn, self.options)
-        turn, job = found.turn, found.job
+        turn, job = estimate_turn(self.map, self.camera, self.right.turn, self.options)
         if not turn.is_as_sure_as(self.right.turn, gates):
             return
         if self._may_begin_anew and tells_yaw(self.camera, turn, gates):
@@ -336,13 +335,12 @@ class Mapper:
             return None, turn
         report = self._adjust_all()
         if self.camera.baseline > 0:
-            found, left_open = estimate_turn(self.map, self.camera, self.right.turn, self.options), math.inf
-            if found.turn.is_as_sure_as(turn, self.options.gates.rectification):
-                turn, left_open = found.turn, found.left_open
+            found, job = estimate_turn(self.map, self.camera, self.right.turn, self.options)
+            turn = found if found.is_as_sure_as(turn, self.options.gates.rectification) else turn
             if shift_between(self.camera, self.right.turn, turn) > self.options.gates.rectification.matters:
-                correct_map(self.map, self.camera, self.right.turn, turn, self.options, found.job)
+                correct_map(self.map, self.camera, self.right.turn, turn, self.options, job)
                 report = self._adjust_all()
-            turn = turn.confirming(self._began_with or turn, left_open)
+            turn = turn.confirming(self._began_with or turn)
         return report, turn
 
     def adjust_with_planes(self, number: int) -> tuple[SolveReport | None, PlaneOutcome | None]:

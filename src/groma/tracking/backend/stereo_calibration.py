@@ -9,27 +9,16 @@ with a right camera that may turn, against a prior of what rectification leaves 
 
 Points that are followed agree to some extent with any yaw that was assumed when they were looked for. So described
 features tell yaw first (:mod:`groma.tracking.backend.described_tracks`), and followed points, which are more precise,
-once it is known so. What all followed points have in common no sum over them shows; but described features know of no
-map. By how much the two differ beyond the noise of both tells the size of what is common, and which share s of the
-difference it is:
-
-.. math:: \tau^2 = \max\big(0,\; (\omega_f - \omega_d)^2 - \sigma_f^2 - \sigma_d^2\big), \qquad
-          s = \frac{\tau^2}{\tau^2 + \sigma_f^2 + \sigma_d^2}, \qquad \omega = (1 - s)\,\omega_f + s\,\omega_d .
-
-Where they agree, this is what followed points tell: both are of the same images, so their mean would be hardly better.
-
-Reference: R. DerSimonian, N. Laird, *Meta-analysis in clinical trials*, 1986.
+once it is known so.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
-from groma._typing import BoolArray, FloatArray
+from groma._typing import FloatArray
 from groma.adjustment.assembly_options import RightTurnPrior
 from groma.adjustment.terms.right_columns import RIGHT_CAMERAS
 from groma.errors import ProblemError
@@ -60,19 +49,10 @@ from groma.tracking.options import TrackOptions
 YAW = 4
 
 
-@dataclass(frozen=True)
-class TurnEstimate:
-    """How the right camera is turned, as a map tells it."""
-
-    turn: RightTurn
-    #: The adjustment of the map that told it, if one did.
-    job: AdjustmentJob | None = None
-    #: Variance of yaw up to which followed points may agree with what was assumed, unseen by described features.
-    left_open: float = math.inf
-
-
-def estimate_turn(track_map: TrackMap, camera: TrackCamera, turn: RightTurn, options: TrackOptions) -> TurnEstimate:
-    """Return how the right camera is turned.
+def estimate_turn(
+    track_map: TrackMap, camera: TrackCamera, turn: RightTurn, options: TrackOptions
+) -> tuple[RightTurn, AdjustmentJob | None]:
+    """Return how the right camera is turned, and the adjustment of the map that told it, if one did.
 
     Parameters
     ----------
@@ -87,40 +67,13 @@ def estimate_turn(track_map: TrackMap, camera: TrackCamera, turn: RightTurn, opt
     known = RightTurn.unknown(gates).joined(*_rows_of(track_map, camera, turn, gates))
     living = track_map.living()
     if len(living) < gates.min_keyframes:
-        return TurnEstimate(known)
-    features = described_tracks(track_map, camera, options.gates, options.point_sigma_px)
-    described = _by_columns(features, camera, turn, known, gates, 2)
-    followed = None
+        return known, None
     if tells_yaw(camera, turn, gates) and _step(living) <= gates.max_step:
-        followed = _by_columns(track_map, camera, turn, known, gates, gates.min_views)
-    if followed is None:
-        return TurnEstimate(known if described is None else described.with_(known), None, 0.0)
-    if described is None:
-        return TurnEstimate(followed.with_(known), followed.job)
-    return TurnEstimate(followed.corrected(described).with_(known), followed.job, described.variance)
-
-
-@dataclass(frozen=True)
-class _Yaw:
-    """What columns tell of yaw on their own."""
-
-    yaw: float
-    variance: float
-    job: AdjustmentJob
-
-    def corrected(self, described: _Yaw) -> _Yaw:
-        """Return what followed points tell without what they have in common; see the module."""
-        noise = self.variance + described.variance
-        common = max((self.yaw - described.yaw) ** 2 - noise, 0.0)
-        share = common / (common + noise)
-        yaw = (1.0 - share) * self.yaw + share * described.yaw
-        # Errors of both may go together, as they are of the same images.
-        sigma = (1.0 - share) * math.sqrt(self.variance) + share * math.sqrt(described.variance)
-        return _Yaw(yaw, sigma**2 + (1.0 - share) ** 2 * common, self.job)
-
-    def with_(self, known: RightTurn) -> RightTurn:
-        """Return what is known, with this."""
-        return known.joined(np.array([0.0, self.yaw, 0.0]), np.diag([0.0, 1.0 / self.variance, 0.0]))
+        found, job = _by_columns(track_map, camera, turn, known, gates, gates.min_views)
+        if job is not None:
+            return found, job
+    described = described_tracks(track_map, camera, options.gates, options.point_sigma_px)
+    return _by_columns(described, camera, turn, known, gates, 2)[0], None
 
 
 def tells_yaw(camera: TrackCamera, turn: RightTurn, gates: RectificationGates) -> bool:
@@ -130,13 +83,10 @@ def tells_yaw(camera: TrackCamera, turn: RightTurn, gates: RectificationGates) -
 
 def _by_columns(
     track_map: TrackMap, camera: TrackCamera, turn: RightTurn, known: RightTurn, gates: RectificationGates, views: int
-) -> _Yaw | None:
-    """Adjust a map together with the right camera; points seen by ``views`` keyframes take part.
-
-    None where they do not tell yaw.
-    """
+) -> tuple[RightTurn, AdjustmentJob | None]:
+    """Adjust a map together with the right camera; points seen by ``views`` keyframes take part."""
     living = track_map.living()
-    held = _begins(living)
+    held = np.arange(len(living)) == 0
     own = so3.exp(-turn.angles[None])[0]
     prior = RightTurnPrior(
         _log(own @ _exp(known.angles)), np.asarray(np.linalg.cholesky(np.linalg.inv(known.covariance)).T, np.float64)
@@ -144,29 +94,23 @@ def _by_columns(
     options = replace(TRACKING, lines=False, planes=False, right_turn=prior)
     job = job_of(track_map, camera, living, held, False, gates.max_iterations, options, views)
     if job is None or np.isfinite(job.point_table.right[:, 0]).sum() < gates.min_columns:
-        return None
+        return known, None
     job.function_tolerance = 1e-6
     job.solve()
     assert job.solved is not None
     try:
         covariances = Covariances(job.solved)
     except ProblemError:
-        return None
+        return known, None
     # What columns tell on their own of yaw counts for less where their errors are alike.
     before, after = known.covariance[1, 1], covariances.of(RIGHT_CAMERAS, 0)[0, YAW, YAW]
     information = 1.0 / after - 1.0 / before
     if not information > 0.0:
-        return None
+        return known, None
     yaw = _log(_exp(turn.angles) @ quaternion.to_matrix(job.solved.variables[RIGHT_CAMERAS].state[0, :4]))[1]
     own = (yaw / after - known.angles[1] / before) / information
-    return _Yaw(float(own), float(_alike(job, camera, covariances, gates) / information), job)
-
-
-def _begins(keyframes: list[Keyframe]) -> BoolArray:
-    """Which keyframes share no point with the one before: each begins a map of its own."""
-    seen = [keyframe.measured.points.index for keyframe in keyframes]
-    shared = [bool(np.isin(two, one).any()) for one, two in pairwise(seen)]
-    return ~np.array([False, *shared])
+    alike = _alike(job, camera, covariances, gates)
+    return known.joined(np.array([0.0, own, 0.0]), np.diag([0.0, information / alike, 0.0])), job
 
 
 def _step(keyframes: list[Keyframe]) -> float:
@@ -314,4 +258,4 @@ def _log(rotation: FloatArray) -> FloatArray:
     return so3.log(rotation[None])[0]
 
 
-__all__ = ["TurnEstimate", "correct_map", "estimate_turn", "shift_between", "tells_yaw"]
+__all__ = ["correct_map", "estimate_turn", "shift_between", "tells_yaw"]

@@ -15,7 +15,6 @@ larger than the yaw of real pairs. Yaw shifts all columns alike, which only moti
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -54,21 +53,16 @@ class RightTurn:
         return RightTurn(covariance @ (own @ self.angles + information @ other), covariance)
 
     def is_as_sure_as(self, other: RightTurn, gates: RectificationGates = DEFAULT.rectification) -> bool:
-        """Whether the angle that is hardest to tell, yaw, is known as well as in an earlier estimate.
+        """Whether the angle that is hardest to tell, yaw, is known as well as in an earlier estimate."""
+        return bool(self.covariance[1, 1] <= gates.as_sure * other.covariance[1, 1])
 
-        That one was as sure as it said, or as the difference says.
-        """
-        earlier = other.covariance[1, 1] + (self.angles[1] - other.angles[1]) ** 2
-        return bool(self.covariance[1, 1] <= gates.as_sure * earlier)
-
-    def confirming(self, assumed: RightTurn, left_open: float = math.inf) -> RightTurn:
+    def confirming(self, assumed: RightTurn) -> RightTurn:
         """Return the estimate with what followed points cannot tell: in part they agree with what was assumed.
 
-        Up to half of an error stayed where it was measured; then as much is left as was found, but no more than
-        described features leave open, a variance of yaw.
+        Up to half of an error stayed where it was measured; then as much is left as was found.
         """
         covariance = self.covariance.copy()
-        covariance[1, 1] += min((self.angles[1] - assumed.angles[1]) ** 2, left_open)
+        covariance[1, 1] += (self.angles[1] - assumed.angles[1]) ** 2
         return RightTurn(self.angles, covariance)
 
     def numbers(self, camera: TrackCamera) -> dict[str, list[float]]:
