@@ -144,9 +144,30 @@ def test_a_read_only_installation_uses_the_folder_of_the_user(fresh, monkeypatch
     assert home in kernel_cache.folder().parents
 
 
+def test_without_a_folder_of_the_user_processes_that_belong_together_share_one(fresh, monkeypatch, tmp_path):
+    """A service without a home: what is compiled is found again in this process, and removed when it ends."""
+    for locator in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
+        monkeypatch.setattr(locator, "ensure_cache_path", _refuse)
+    ends: list = []
+    monkeypatch.setattr(kernel_cache.atexit, "register", lambda *call, **options: ends.append((call, options)))
+    monkeypatch.setattr(kernel_cache, "_own_folder", None)
+    monkeypatch.setattr(kernel_cache.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    assert fresh()[1] > 0
+    result, compiled, loaded, _ = fresh()
+    assert (result, compiled) == (6.0, 0) and loaded > 0
+    (own,) = tmp_path.glob("groma-*")
+    assert os.environ["NUMBA_CACHE_DIR"] == str(own) and own.stat().st_mode & 0o077 == 0 and _files(own)
+    ((call, options),) = ends
+    call[0](*call[1:], **options)
+    assert not own.exists()
+
+
 def test_where_nothing_can_be_written_all_still_runs(fresh, monkeypatch):
     for locator in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
         monkeypatch.setattr(locator, "ensure_cache_path", _refuse)
+    monkeypatch.setattr(kernel_cache, "_own_folder", None)
+    monkeypatch.setattr(kernel_cache.tempfile, "mkdtemp", _refuse)
     assert fresh() == (6.0, 0, 0, 0)
     assert kernel_cache.folder() is None
 
@@ -159,7 +180,7 @@ def test_a_full_disk_costs_time_only(fresh, monkeypatch, tmp_path):
     assert not list(tmp_path.rglob("*.tmp"))
 
 
-def _refuse(*_):
+def _refuse(*_, **__):
     raise OSError("read-only file system")
 
 

@@ -100,6 +100,8 @@ def test_as_much_missing_as_there_is_doubted_and_a_small_part_is_not():
     doubted = doubted_if_missing(RIGHT, 8.0, 3.0)
     assert doubted.status == "uncertain" and "3 of 11 parts" in doubted.sentence
     assert doubted_if_missing(RIGHT, 0.0, 5.0).status == "uncertain"
+    # Of three parts the test could not say so even if all were there.
+    assert doubted_if_missing(RIGHT, 2.0, 1.0) is RIGHT
     # A person before a third of a place that is seen in many parts does not matter.
     assert doubted_if_missing(RIGHT, 30.0, 12.0) is RIGHT
 

@@ -2,7 +2,8 @@
 """Where compiled functions lie on disk, and when they are valid.
 
 **Where.** The first of these that can be written: the folder in ``NUMBA_CACHE_DIR``; ``__pycache__`` beside the
-sources; Numba's folder of the user (``~/.cache/numba`` on Linux), for installations that are read-only. Where none can
+sources; Numba's folder of the user (``~/.cache/numba`` on Linux), for installations that are read-only; a folder of
+this process and those that it starts, which ends with it. Where none can
 be written, functions are compiled in every process; nothing fails.
 
 **When.** One file per function and argument types. It opens with a digest of all that it depends on: versions, the
@@ -23,12 +24,15 @@ process compiles at the moment is waited for (:mod:`groma._kernels.turns`).
 
 from __future__ import annotations
 
+import atexit
 import gc
 import hashlib
 import json
 import os
 import pickle
+import shutil
 import sys
+import tempfile
 import threading
 import uuid
 import zlib
@@ -90,6 +94,8 @@ on_miss: list[Callable[[Counts], None]] = []
 #: Files that were written or found, and which function, for which argument types.
 _used: dict[Path, tuple[str, str, tuple]] = {}
 _lock = threading.Lock()
+#: Folder that ends with this process; None as long as no other was missing, empty if there is none either.
+_own_folder: str | None = None
 #: Held while a file is written; a process that ends at once takes it first.
 writing = threading.Lock()
 
@@ -307,13 +313,36 @@ class _Unopened:
         self._dispatcher = dispatcher
 
     def __getattr__(self, name: str) -> Any:
-        try:
-            opened: Any = _Cache(self._dispatcher.py_func, self._dispatcher)
-        except (RuntimeError, OSError):  # no folder that can be written, or no source: loops written for a notebook
-            opened = NullCache()
+        opened = _opened(self._dispatcher)
         self._dispatcher._cache = opened
         _watch(self._dispatcher._compiler, opened)
         return getattr(opened, name)
+
+
+def _opened(dispatcher: Any) -> Any:
+    """Return the files of a compiled function."""
+    source = Path(dispatcher.py_func.__code__.co_filename)
+    while True:
+        try:
+            return _Cache(dispatcher.py_func, dispatcher)
+        except (RuntimeError, OSError):  # no folder that can be written, or no source: loops written for a notebook
+            if not (source.is_file() and _takes_own_folder()):
+                return NullCache()
+
+
+def _takes_own_folder() -> bool:
+    """Keep compiled functions in a folder of this process and those that it starts, from now on; False if it has."""
+    global _own_folder
+    if _own_folder is not None:
+        return False
+    try:
+        _own_folder = tempfile.mkdtemp(prefix="groma-")
+    except OSError:
+        _own_folder = ""
+        return False
+    atexit.register(shutil.rmtree, _own_folder, ignore_errors=True)
+    os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = _own_folder  # type: ignore[attr-defined]
+    return True
 
 
 def _watch(compiler: Any, cache: Any) -> None:

@@ -170,7 +170,9 @@ def doubted_if_missing(verdict: Verdict, shown: float, missing: float, gates: Ve
     """
     from scipy.special import betainc
 
-    if missing < 1.0 or (shown > 0.0 and 2.0 * betainc(shown, missing + 1.0, 0.5) <= 1.0 - gates.whole):
+    chance = 1.0 - gates.whole
+    few = shown > missing and 0.5 ** (shown + missing - 1.0) > chance  # so few that no test could say so much
+    if missing < 1.0 or few or (shown > 0.0 and 2.0 * betainc(shown, missing + 1.0, 0.5) <= chance):
         return verdict
     words = (
         f"{verdict.sentence} But in {missing:.0f} of {shown + missing:.0f} parts of the image where this place has "
