@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from _renderings import BoxSettings, render_boxes
+from _rendered_boxes import BoxSettings, render_boxes
 from _workshop import CACHE
 
 from groma.features import LsdDetector, Segments

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from _line_scenes import MIN_LENGTH, SCENES, LineScene, boxes
-from _renderings import BoxSettings
+from _rendered_boxes import BoxSettings
 from _workshop import CACHE, ROOT
 from scipy.optimize import minimize
 from scipy.special import expit

@@ -22,7 +22,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from _renderings import BoxSettings, RenderedScene, render_boxes
+from _rendered_boxes import BoxSettings, RenderedScene, render_boxes
 from _workshop import CACHE
 
 from groma.adjustment.adjust import AdjustOptions, adjust

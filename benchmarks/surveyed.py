@@ -55,7 +55,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from _renderings import BoxSettings, render_boxes
+from _rendered_boxes import BoxSettings, render_boxes
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 

@@ -63,6 +63,7 @@ print("COUNTS", counts.compiled, counts.loaded, counts.unsaved)
 def fresh(tmp_path, monkeypatch):
     """A function that loads the module as a new process would, and returns what ``total`` gives and the counts."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # Numba reads it again when anything in the environment changes
     path = tmp_path / "cached_sample.py"
     path.write_text(SOURCE)
 
@@ -152,7 +153,6 @@ def test_without_a_folder_of_the_user_processes_that_belong_together_share_one(f
     monkeypatch.setattr(kernel_cache.atexit, "register", lambda *call, **options: ends.append((call, options)))
     monkeypatch.setattr(kernel_cache, "_own_folder", None)
     monkeypatch.setattr(kernel_cache.tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
     assert fresh()[1] > 0
     result, compiled, loaded, _ = fresh()
     assert (result, compiled) == (6.0, 0) and loaded > 0
