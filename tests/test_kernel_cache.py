@@ -17,6 +17,7 @@ from numba.core import caching
 import groma
 from groma._kernels import cache as kernel_cache
 from groma._kernels import digest as kernel_digest
+from groma._kernels import folder as kernel_folder
 
 pytestmark = [
     pytest.mark.kernels,
@@ -150,9 +151,9 @@ def test_without_a_folder_of_the_user_processes_that_belong_together_share_one(f
     for locator in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
         monkeypatch.setattr(locator, "ensure_cache_path", _refuse)
     ends: list = []
-    monkeypatch.setattr(kernel_cache.atexit, "register", lambda *call, **options: ends.append((call, options)))
-    monkeypatch.setattr(kernel_cache, "_own_folder", None)
-    monkeypatch.setattr(kernel_cache.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(kernel_folder.atexit, "register", lambda *call, **options: ends.append((call, options)))
+    monkeypatch.setattr(kernel_folder, "_own", None)
+    monkeypatch.setattr(kernel_folder.tempfile, "tempdir", str(tmp_path))
     assert fresh()[1] > 0
     result, compiled, loaded, _ = fresh()
     assert (result, compiled) == (6.0, 0) and loaded > 0
@@ -166,8 +167,8 @@ def test_without_a_folder_of_the_user_processes_that_belong_together_share_one(f
 def test_where_nothing_can_be_written_all_still_runs(fresh, monkeypatch):
     for locator in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
         monkeypatch.setattr(locator, "ensure_cache_path", _refuse)
-    monkeypatch.setattr(kernel_cache, "_own_folder", None)
-    monkeypatch.setattr(kernel_cache.tempfile, "mkdtemp", _refuse)
+    monkeypatch.setattr(kernel_folder, "_own", None)
+    monkeypatch.setattr(kernel_folder.tempfile, "mkdtemp", _refuse)
     assert fresh() == (6.0, 0, 0, 0)
     assert kernel_cache.folder() is None
 

@@ -24,15 +24,12 @@ process compiles at the moment is waited for (:mod:`groma._kernels.turns`).
 
 from __future__ import annotations
 
-import atexit
 import gc
 import hashlib
 import json
 import os
 import pickle
-import shutil
 import sys
-import tempfile
 import threading
 import uuid
 import zlib
@@ -51,6 +48,7 @@ from numba.core.serialize import dumps
 
 from groma._counted import counted
 from groma._kernels import digest as kernel_digest
+from groma._kernels import folder as kernel_folder
 from groma._kernels import inner as kernel_inner
 from groma._kernels import turns as kernel_turns
 
@@ -94,8 +92,6 @@ on_miss: list[Callable[[Counts], None]] = []
 #: Files that were written or found, and which function, for which argument types.
 _used: dict[Path, tuple[str, str, tuple]] = {}
 _lock = threading.Lock()
-#: Folder that ends with this process; None as long as no other was missing, empty if there is none either.
-_own_folder: str | None = None
 #: Held while a file is written; a process that ends at once takes it first.
 writing = threading.Lock()
 
@@ -326,23 +322,8 @@ def _opened(dispatcher: Any) -> Any:
         try:
             return _Cache(dispatcher.py_func, dispatcher)
         except (RuntimeError, OSError):  # no folder that can be written, or no source: loops written for a notebook
-            if not (source.is_file() and _takes_own_folder()):
+            if not (source.is_file() and kernel_folder.take_own()):
                 return NullCache()
-
-
-def _takes_own_folder() -> bool:
-    """Keep compiled functions in a folder of this process and those that it starts, from now on; False if it has."""
-    global _own_folder
-    if _own_folder is not None:
-        return False
-    try:
-        _own_folder = tempfile.mkdtemp(prefix="groma-")
-    except OSError:
-        _own_folder = ""
-        return False
-    atexit.register(shutil.rmtree, _own_folder, ignore_errors=True)
-    os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = _own_folder  # type: ignore[attr-defined]
-    return True
 
 
 def _watch(compiler: Any, cache: Any) -> None:
