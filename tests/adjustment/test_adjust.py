@@ -1,12 +1,13 @@
 """Adjusting scenes: noise floor with every chart, structure, gauge, robust stages, distortion, what is refused."""
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
 
 from groma.adjustment.adjust import AdjustOptions, adjust
-from groma.errors import InputError
+from groma.errors import InputError, ProblemError
 from groma.evaluation.poses import evaluate_poses
 from groma.scene import Relations
 from groma.scene.synthetic.scenes import holistic
@@ -172,3 +173,12 @@ def test_a_report_prints_its_main_figures():
     assert text[0].startswith(f"{report.num_images} images, {report.num_points} points, {report.num_lines} lines")
     assert text[1].startswith("points: ") and text[2].startswith("lines: ")
     assert report.termination.sentence in text[3] and len(text) < 12
+
+
+def test_a_focal_length_of_zero_is_refused_without_warnings():
+    scene = holistic(6, seed=1).start
+    params = scene.cameras.params.copy()
+    params[0, 0] = 0.0
+    with warnings.catch_warnings(), pytest.raises(ProblemError, match="positive focal lengths"):
+        warnings.simplefilter("error")
+        adjust(scene.replace(cameras=dataclasses.replace(scene.cameras, params=params)))

@@ -80,7 +80,8 @@ def lengths_per_pixel(scene: Scene, kind: str) -> FloatArray:
         ]
     )
     away = scene.cam_centers_in_world.take(image_idx, axis=0) - places.take(index, axis=0)
-    length = np.sqrt(np.einsum("ni,ni->n", away, away)) / focal_of[scene.images.camera_idx][image_idx]
+    with np.errstate(divide="ignore", invalid="ignore"):  # a focal length of zero is refused where a problem is made
+        length = np.sqrt(np.einsum("ni,ni->n", away, away)) / focal_of[scene.images.camera_idx][image_idx]
     count = np.bincount(index, minlength=len(places))
     mean = np.bincount(index, weights=length, minlength=len(places)) / np.maximum(count, 1)
     fallback = float(np.median(length)) if len(length) else 1.0
