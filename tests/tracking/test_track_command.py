@@ -146,6 +146,10 @@ def test_the_command_is_one_call(sequence, tmp_path):
     assert [event.done for event in events if event.frame] == list(range(1, 17)) and events[0].total == 16
     assert [event.frame for event in events if event.frame] == list(result.frames)
     assert len(read_tum(tmp_path / "work" / "keyframes.txt")) >= 1
+    pages = [(tmp_path / name / "report.html").read_text() for name in ("called", "commanded")]
+    assert "data:image/jpeg" not in pages[0] and pages[1].count("data:image/jpeg") >= 1  # the files are known there
+    result.write(tmp_path / "pictured", images=opened.pictures)
+    assert "data:image/jpeg" in (tmp_path / "pictured" / "report.html").read_text()
     with pytest.raises(OutputError, match="exists already"):
         result.write(tmp_path / "called")
 

@@ -29,6 +29,7 @@ from groma.tracking.options import TrackOptions
 from groma.tracking.outcome import LOST, SKIPPED, TrackedFrame, TrackResult
 from groma.tracking.saved import FrameSource, SavedMap, read_saved_map, sources_of
 from groma.tracking.tracker import Tracker
+from groma.viz.pictures import ImageFiles
 from groma.viz.report.trajectory import write_track_report
 
 #: Frames without a pose that are named in a warning.
@@ -90,7 +91,13 @@ class SequenceResult(TrackResult):
             numbers["reference"] = {"error": self.not_compared}
         return numbers
 
-    def write(self, folder: str | os.PathLike[str], title: str = "Track", force: bool = False) -> tuple[str, ...]:
+    def write(
+        self,
+        folder: str | os.PathLike[str],
+        title: str = "Track",
+        force: bool = False,
+        images: ImageFiles | None = None,
+    ) -> tuple[str, ...]:
         """Write everything that ``groma track`` writes to a folder, whole or not at all.
 
         ``trajectory.txt`` (TUM), the keyframes as a COLMAP model with lines and planes beside it (``structures``),
@@ -104,6 +111,8 @@ class SequenceResult(TrackResult):
             Heading of the page.
         force : bool
             Replace what is there.
+        images : path or mapping, optional
+            Photographs for the page: a folder, or files by the names of keyframes.
 
         Returns
         -------
@@ -121,7 +130,9 @@ class SequenceResult(TrackResult):
                 write_scene(submap.scene, place / "scene.npz")
                 write_tum(submap.trajectory, place / "trajectory.txt")
             page = draft / "report.html"
-            report = _failure(page.name, lambda: write_track_report(page, self, self.frames, self.scores, title=title))
+            report = _failure(
+                page.name, lambda: write_track_report(page, self, self.frames, self.scores, images, title)
+            )
             failed = tuple(sentence for sentence in (model, report) if sentence)
             numbers = self.summary()
             numbers["warnings"] += failed

@@ -164,7 +164,9 @@ def track(
     _output.check_output(output, force)
     with console.stages() as say:
         say(WRITING, 0, 1)
-        unwritten = result.write(output, f"Track of {sequence.absolute().name}", force)
+        files = getattr(frames, "pictures", {})  # of a video there are none
+        pictures = {name: files[name] for name in result.scene.images.names if name in files}
+        unwritten = result.write(output, f"Track of {sequence.absolute().name}", force, pictures or None)
     for sentence in unwritten:
         console.warn(sentence)
     shutil.rmtree(work, ignore_errors=True)

@@ -113,6 +113,11 @@ class FileSequence:
     def __len__(self) -> int:
         return len(self._entries)
 
+    @property
+    def pictures(self) -> dict[str, Path]:
+        """The files of frames by name; empty where frames are rectified, so that no file shows what was tracked."""
+        return {} if self._preparation.gray is not None else {entry.gray.name: entry.gray for entry in self._entries}
+
     def __iter__(self) -> Iterator[Frame]:
         for frame, remarks in read_ahead(self._load, self._entries):
             self.warnings.extend(remark for remark in remarks if remark not in self.warnings)

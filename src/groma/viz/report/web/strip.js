@@ -7,7 +7,7 @@ const thumbs = data.images.slice(0, MOST).map((entry, index) => {
   return { one, bitmap: null, visible: false, asked: false };
 });
 strip.replaceChildren(...thumbs.map(t => t.one));
-strip.hidden = thumbs.length < 2;
+strip.hidden = thumbs.length < 2 || !anyPhoto;
 
 // Photographs are decoded small, when they come into view.
 async function load(index) {
