@@ -293,3 +293,11 @@ def test_a_scene_is_aligned_with_measurements(truth_and_start):
     assert len(found.scene.camera_positions) == 0 and len(found.to_dict()["residuals"]) == 12
     with pytest.raises(InputError, match="none of its 8 names"):
         align(truth, truth.replace(images=truth.images.replace(names=tuple("abcdefgh"))))
+
+
+def test_places_beyond_all_bounds_are_refused():
+    source = np.random.default_rng(0).normal(size=(6, 3))
+    target = source.copy()
+    target[2] = 1e200
+    with pytest.raises(InputError, match=r"as far out as 1e\+200"):
+        robust_similarity(source, target)

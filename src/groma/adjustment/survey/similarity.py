@@ -62,6 +62,10 @@ class RobustSimilarity:
     on_line: bool
 
 
+#: Coordinates whose squares and products are still numbers.
+_LARGEST = 1e60
+
+
 def robust_similarity(source: FloatArray, target: FloatArray, seed: int = 0) -> RobustSimilarity:
     """Return the similarity that most of at least three correspondences (N, 3) agree on.
 
@@ -72,6 +76,8 @@ def robust_similarity(source: FloatArray, target: FloatArray, seed: int = 0) -> 
     """
     if len(source) < 3:
         raise InputError(f"A similarity needs three places that are known in both frames; there are {len(source)}.")
+    if (largest := max(np.abs(source).max(), np.abs(target).max())) > _LARGEST:
+        raise InputError(f"Measured places or camera centres lie as far out as {largest:.3g}. Check the file.")
     found = _fitted(source, target, seed)
     if len(source) > 3:
         mirror = np.array([-1.0, 1.0, 1.0])

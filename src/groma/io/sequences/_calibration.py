@@ -119,7 +119,8 @@ def calibration_of(camera: CameraLike) -> Calibration:
     if not isinstance(camera, (str, os.PathLike)):
         return from_opencv(camera)
     text = os.fspath(camera)
-    if isinstance(camera, str) and not Path(camera).is_file() and len(camera.split()) >= 4:
+    # Path.is_file fails where a text is too long for a name.
+    if isinstance(camera, str) and not os.path.isfile(camera) and len(camera.split()) >= 4:
         return _from_text(camera, "camera")
     return read_calibration(Path(text))
 
