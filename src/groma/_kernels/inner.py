@@ -22,7 +22,7 @@ from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.sigutils import normalize_signature
 
-from groma._kernels.library import rebuilt
+from groma._kernels.loading import rebuilt
 
 #: How the names of wrappers begin.
 _WRAPPER = "_ZN7cpython"

@@ -12,7 +12,7 @@ from numba.core.serialize import dumps
 if config.DISABLE_JIT:  # type: ignore[attr-defined]
     pytest.skip("no compiled code without the compiler", allow_module_level=True)
 
-from groma._kernels.library import rebuilt
+from groma._kernels.loading import rebuilt
 
 
 def _rebuilt(function, *example):
