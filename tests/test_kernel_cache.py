@@ -95,6 +95,14 @@ def test_what_was_compiled_is_found_again(fresh):
     assert loaded > 0
 
 
+def test_functions_of_others_are_not_among_the_files_of_the_package(fresh):
+    """Whether groma is ready must not hang on a file of somebody's own factor, which may go at any time."""
+    fresh()
+    mine = [path for path in kernel_cache.used_paths() if "cached_sample" in path.name]
+    assert mine
+    assert not {*mine} & {*kernel_cache.used_files()}
+
+
 def test_other_argument_types_have_files_of_their_own(fresh):
     fresh()
     assert fresh(np.ones(3, dtype=np.int64))[1] > 0

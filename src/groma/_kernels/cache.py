@@ -367,9 +367,10 @@ def folder() -> Path | None:
 
 
 def used_files() -> list[Path]:
-    """Return the files that were written or found by this process."""
+    """Return the files of the package's own functions that were written or found by this process."""
+    package = __name__.partition(".")[0]
     with _lock:
-        return sorted(_used)
+        return sorted(path for path, (module, *_) in _used.items() if module.partition(".")[0] == package)
 
 
 def used_paths() -> list[Path]:
