@@ -3,8 +3,6 @@
 
     python benchmarks/localize.py stairs DATA                     one query with given matches, 20 seeds, and peers
     python benchmarks/localize.py held-out MAP IMAGES TRUTH       photographs that are not in a map
-    python benchmarks/localize.py wrong MAP IMAGES OTHER...       photographs that must not be localised
-    python benchmarks/localize.py walls MAP IMAGES TRUTH          a map of one side, photographs of all sides
 
 ``DATA`` is ``localization_stairs/query_1.npz``; ``TRUTH`` a scene with the poses of all photographs in ``IMAGES``. Maps
 whose world is not that of the truth are aligned by the poses of their own images (``--align``). Photographs are
@@ -18,23 +16,16 @@ import json
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from groma.geometry import quaternion, so3
 from groma.io import read_scene
 from groma.localization.localizer import LocalizeOptions, Localizer
-from groma.localization.pose.absolute_pose import AbsolutePose, PoseOptions, estimate_absolute_pose
+from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
 from groma.localization.pose.camera import QueryCamera
-from groma.localization.pose.gates import VERDICT
-from groma.localization.pose.hypotheses import max_errors
-from groma.localization.pose.verdict import moved
-from groma.mapping.photographs import image_files, read_gray
 
 #: Shares of queries within these distances (metres) and angles (degrees) are told.
 LIMITS = ((0.01, 1.0), (0.02, 2.0), (0.05, 5.0))
-#: Orders of its blocks that each image is cut into.
-SHUFFLES = 4
 
 
 def main() -> None:
@@ -43,30 +34,16 @@ def main() -> None:
     stairs_of = commands.add_parser("stairs")
     stairs_of.add_argument("data", type=Path)
     held_of = commands.add_parser("held-out")
-    wrong_of = commands.add_parser("wrong")
-    for one in (held_of, wrong_of):
-        one.add_argument("map", type=Path)
-        one.add_argument("images", type=Path)
+    held_of.add_argument("map", type=Path)
+    held_of.add_argument("images", type=Path)
     held_of.add_argument("truth", type=Path)
     held_of.add_argument("--align", action="store_true")
     held_of.add_argument("--every", type=int, default=1, help="take every N-th query")
-    wrong_of.add_argument("others", type=Path, nargs="*")
-    wrong_of.add_argument("--limit", type=int, default=1000, help="photographs of a folder at most")
-    wrong_of.add_argument("--own-limit", type=int, default=1000, help="photographs of the map at most")
-    walls_of = commands.add_parser("walls")
-    walls_of.add_argument("map", type=Path)
-    walls_of.add_argument("images", type=Path)
-    walls_of.add_argument("truth", type=Path)
-    walls_of.add_argument("--width", type=int, default=8, help="photographs of a side, one after the other")
     given = parser.parse_args()
     if given.command == "stairs":
         told = stairs(given.data)
-    elif given.command == "held-out":
-        told = held_out(given.map, given.images, given.truth, given.align, given.every)
-    elif given.command == "walls":
-        told = walls(given.map, given.images, given.truth, given.width)
     else:
-        told = wrong(given.map, given.images, given.others, (given.own_limit, given.limit))
+        told = held_out(given.map, given.images, given.truth, given.align, given.every)
     print(json.dumps(told, indent=1))
 
 
@@ -209,95 +186,6 @@ def _matrix(pose: np.ndarray) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = quaternion.to_matrix(pose[None, :4])[0], pose[4:]
     return matrix
-
-
-# ------------------------------------------------------------------------------------------------------------ wrong
-
-
-def wrong(map_: Path, images: Path, others: list[Path], limits: tuple[int, int]) -> dict[str, object]:
-    """How many photographs that are not of a place are localised there, and which.
-
-    A picture put together of pieces may have one where it was. ``elsewhere`` counts those of the localised whose pose
-    is not that of the photograph that they were made of.
-    """
-    localizer = Localizer(map_, images)
-    rng = np.random.default_rng(0)
-    told: dict[str, object] = {}
-    own = _chosen(image_files(images), limits[0])
-    true = [localizer.localize(image).pose.cam_from_world for image in own]
-    kinds: dict[str, list[np.ndarray]] = {
-        "mirrored": [np.ascontiguousarray(image[:, ::-1]) for image in own],
-        "upside down and mirrored": [np.ascontiguousarray(image[::-1]) for image in own],
-        "blocks in another order": [_shuffled(image, rng) for image in own for _ in range(SHUFFLES)],
-        "noise": [rng.integers(0, 256, own[0].shape, dtype=np.uint8) for _ in range(3)],
-        "blank": [np.full_like(own[0], level) for level in (0, 128, 255)],
-    }
-    kinds |= {str(folder): _chosen(image_files(folder), limits[1]) for folder in others}
-    for name, pictures in kinds.items():
-        found = [localizer.localize(_sized(picture, own[0].shape)).pose for picture in pictures]
-        of = [row // SHUFFLES for row in range(len(found))] if name == "blocks in another order" else None
-        told[name] = {
-            "trials": len(found),
-            **{status: sum(one.status == status for one in found) for status in ("localized", "uncertain", "failed")},
-            "elsewhere": sum(
-                one.status == "localized" and (of is None or _is_other(one, true[of[row]]))
-                for row, one in enumerate(found)
-            ),
-            "sentences": sorted({f"{one.status}: {one.sentence}" for one in found if one.status != "failed"}),
-        }
-    return told
-
-
-def _chosen(files: list[Path], limit: int) -> list[np.ndarray]:
-    """An even choice of images."""
-    rows = np.unique(np.linspace(0, len(files) - 1, min(limit, len(files))).astype(int))
-    return [read_gray(files[row]) for row in rows]
-
-
-def _is_other(found: AbsolutePose, true: np.ndarray | None) -> bool:
-    """Whether a pose is another one than that of the whole photograph, as localisation tells two places apart."""
-    if true is None:
-        return True
-    places = found.matches.points3d[found.point_inliers]
-    limit = VERDICT.distinct * max_errors(found.matches)[0]
-    return moved(found.camera, found.cam_from_world, true, places) > limit
-
-
-def walls(map_: Path, images: Path, truth: Path, width: int) -> dict[str, object]:
-    """Maps of some photographs in a row, all others as queries: walls that look like those of the map are not those.
-
-    ``wrong`` are the localised whose pose is another one than the true one by more than half a metre or five degrees.
-    """
-    scene, true = read_scene(map_), read_scene(truth)
-    poses = dict(zip(true.images.names, true.cam_from_world, strict=True))
-    order = sorted(range(scene.num_images), key=lambda row: scene.images.names[row])
-    told: dict[str, object] = {}
-    for begin in range(0, len(order) - width + 1, width):
-        part = scene.subset(order[begin : begin + width])
-        localizer = Localizer(part, images)
-        rows = []
-        for name in sorted(set(poses) - set(part.images.names)):
-            found = localizer.localize(images / name).pose
-            error = (np.inf, np.inf) if found.status != "localized" else _errors(found.cam_from_world, poses[name])
-            rows.append((name, found.status, *error))
-        placed = [row for row in rows if row[1] == "localized"]
-        bad = [row for row in placed if row[2] > 0.5 or row[3] > 5.0]
-        told[part.images.names[0]] = {"trials": len(rows), "localized": len(placed), "wrong": bad}
-    return told
-
-
-def _sized(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """A picture in the size of the map's images, so that the calibration of the map is taken for it."""
-    return cv2.resize(picture, shape[::-1], interpolation=cv2.INTER_AREA) if picture.shape != shape else picture
-
-
-def _shuffled(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The same image with its twelfths in another order."""
-    rows = [np.array_split(row, 4, axis=1) for row in np.array_split(image, 3, axis=0)]
-    side = min(block.shape[0] for row in rows for block in row), min(block.shape[1] for row in rows for block in row)
-    blocks = [block[: side[0], : side[1]] for row in rows for block in row]
-    order = rng.permutation(len(blocks))
-    return np.vstack([np.hstack([blocks[order[4 * row + column]] for column in range(4)]) for row in range(3)])
 
 
 if __name__ == "__main__":
