@@ -228,7 +228,7 @@ def facades(folder: Path, seeds: list[int]) -> Iterator[Work]:
         place = folder / f"facade_{seed}"
         if not (place / "map").exists():
             rendered = write(place, seed)
-            command = ["map", str(place / "mapped"), "-o", str(place / "map"), "--poses", str(rendered), "-f"]
+            command = ["map", str(place / "mapped"), "-o", str(place / "map"), "--poses", str(rendered), "--fix-poses"]
             subprocess.run([sys.executable, "-m", "groma", *command], check=True, stdout=subprocess.DEVNULL)
 
         def trials(localizer: Localizer, place: Path = place) -> Iterator[Trial]:

@@ -8,20 +8,22 @@ import pytest
 from worlds import CAMERA, make_world
 
 from groma.geometry import se3
-from groma.localization.expected import FoundAgain, nearest_images, parts_shown
+from groma.localization.expected import FoundAgain, nearest_images, shown_of
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.verdict import Verdict, doubted_if_missing
+from groma.localization.pose.verdict import Verdict, doubted_if_missing, doubted_if_repeated
+from groma.localization.repeated import Described, unique_points
 from groma.scene import Cameras
 
 RIGHT = Verdict("localized", 1.0, "all agree.")
 
 
-def _index(seen, xyz, segments=None):
+def _index(seen, xyz, segments=None, unique=()):
     """An index of points (rows seen by each image) and of line observations (rows of each image)."""
     segments = [[] for _ in seen] if segments is None else segments
     return SimpleNamespace(
         image=np.zeros((len(seen), 1)),
         xyz=xyz,
+        unique=np.isin(np.arange(len(xyz)), unique),
         begin=np.concatenate([[0], np.cumsum([len(rows) for rows in seen])]),
         point=np.concatenate([np.asarray(rows, np.int64) for rows in seen]),
         segment_begin=np.concatenate([[0], np.cumsum([len(rows) for rows in segments])]),
@@ -48,6 +50,12 @@ def _best(world, points, lines):
     return best, matches
 
 
+def _parts(scene, index, rate, near, best, matches, lines=True):
+    """Parts that are shown and missing, if points are found again so often."""
+    found = np.flatnonzero(best.point_inliers)
+    return shown_of(scene, index, FoundAgain(np.tile(rate, (2, 1))), near, best, matches, found, lines)[0]
+
+
 def test_how_often_points_are_found_again_is_learned_from_the_map():
     """Every image sees each point with a probability of its own: often seen ones are found again more often."""
     rng = np.random.default_rng(0)
@@ -55,9 +63,13 @@ def test_how_often_points_are_found_again_is_learned_from_the_map():
     chance = np.where(np.arange(4000) < 2000, 0.9, 0.2)
     seen = [np.flatnonzero(rng.random(4000) < chance) for _ in range(8)]
     again = FoundAgain.of(_scene(world, 8, 0), _index(seen, world.points3d), 4)
-    assert again.rate[1] == pytest.approx(0.2, abs=0.05)
-    assert again.rate[4] == pytest.approx(0.9, abs=0.03)
-    assert again.rate[0] == 0.0
+    assert again.rate[0, 1] == pytest.approx(0.2, abs=0.05)
+    assert again.rate[0, 4] == pytest.approx(0.9, abs=0.03)
+    assert again.rate[0, 0] == 0.0
+    assert not again.rate[1].any()  # none is unique
+    again = FoundAgain.of(_scene(world, 8, 0), _index(seen, world.points3d, unique=np.arange(2000)), 4)
+    assert again.rate[1, 3] == pytest.approx(0.9, abs=0.05)
+    assert again.rate[0, 3] == pytest.approx(0.2, abs=0.05)
 
 
 def test_images_near_are_those_that_see_most():
@@ -71,12 +83,12 @@ def test_parts_of_the_image_without_what_is_expected_are_counted(lines):
     world = make_world(np.random.default_rng(1), points=600, lines=200)
     seen, rows = [np.arange(600)] * 3, [np.arange(200)] * 3
     index, scene = _index(seen, world.points3d, rows), _scene(world, 3, 200 if lines else 0)
-    again, near = FoundAgain(np.array([0.0, 0.2, 0.5, 0.9])), np.arange(3)
-    every = parts_shown(scene, index, again, near, *_best(world, np.ones(600, bool), np.ones(200, bool)), lines)
+    rate, near = np.array([0.0, 0.2, 0.5, 0.9]), np.arange(3)
+    every = _parts(scene, index, rate, near, *_best(world, np.ones(600, bool), np.ones(200, bool)), lines)
     assert every[0] > 40 and every[1] < 0.5
     left = world.points2d[:, 0] < 320
     inside = (world.segments2d[:, :, 0] < 320).all(axis=1)
-    half = parts_shown(scene, index, again, near, *_best(world, left, inside & lines), lines)
+    half = _parts(scene, index, rate, near, *_best(world, left, inside & lines), lines)
     assert sum(half) == pytest.approx(sum(every), abs=1e-9)
     assert abs(half[0] - half[1]) < 0.2 * sum(half)
     assert doubted_if_missing(RIGHT, *every) is RIGHT
@@ -89,9 +101,9 @@ def test_what_the_map_does_not_expect_is_no_evidence():
     left = np.flatnonzero(world.points2d[:, 0] < 320)
     index, scene = _index([left] * 2, world.points3d), _scene(world, 2, 0)
     best = _best(world, np.isin(np.arange(300), left), np.zeros(1, bool))
-    shown, missing = parts_shown(scene, index, FoundAgain(np.array([0.0, 0.0, 0.8])), np.arange(2), *best)
+    shown, missing = _parts(scene, index, np.array([0.0, 0.0, 0.8]), np.arange(2), *best)
     assert shown > 15 and missing < 1.0
-    assert parts_shown(scene, index, FoundAgain(np.zeros(3)), np.arange(2), *best) == (0.0, 0.0)
+    assert _parts(scene, index, np.zeros(3), np.arange(2), *best) == (0.0, 0.0)
 
 
 def test_as_much_missing_as_there_is_doubted_and_a_small_part_is_not():
@@ -110,7 +122,55 @@ def test_lines_behind_the_camera_are_not_expected():
     world = make_world(np.random.default_rng(3), points=1, lines=40)
     scene, index = _scene(world, 1, 40), _index([[]], world.points3d, [np.arange(40)])
     best, matches = _best(world, np.zeros(1, bool), np.zeros(40, bool))
-    assert parts_shown(scene, index, FoundAgain(np.zeros(2)), np.arange(1), best, matches)[1] > 10
+    assert _parts(scene, index, np.zeros(2), np.arange(1), best, matches)[1] > 10
     half_a_turn = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     best.pose = se3.compose(half_a_turn[None], world.pose[None])[0]
-    assert parts_shown(scene, index, FoundAgain(np.zeros(2)), np.arange(1), best, matches) == (0.0, 0.0)
+    assert _parts(scene, index, np.zeros(2), np.arange(1), best, matches) == (0.0, 0.0)
+
+
+def test_what_only_this_place_has_is_to_be_found_as_often_as_the_rest():
+    """A third of the points look like no other place. The map finds 60 % of its points again, the photograph 30 %."""
+    rng = np.random.default_rng(4)
+    world = make_world(rng, points=1500, lines=1)
+    unique = np.arange(1500) % 3 == 0
+    index, scene = _index([np.arange(1500)] * 2, world.points3d, unique=np.flatnonzero(unique)), _scene(world, 2, 0)
+    again = FoundAgain(np.array([[0.0, 0.0, 0.6]] * 2))
+
+    def told(chance_unique, chance):
+        agree = rng.random(1500) < np.where(unique, chance_unique, chance)
+        best, matches = _best(world, agree, np.zeros(1, bool))
+        parts, alone = shown_of(scene, index, again, np.arange(2), best, matches, np.flatnonzero(agree))
+        assert doubted_if_missing(RIGHT, *parts) is RIGHT
+        return alone
+
+    right, wrong = told(0.3, 0.3), told(0.1, 0.4)
+    assert right[1] < 0.2 * sum(right)
+    assert wrong[1] > 0.5 * sum(wrong)
+    assert sum(right) > 100
+    assert doubted_if_repeated(RIGHT, *right) is RIGHT
+    assert doubted_if_repeated(RIGHT, *wrong).status == "uncertain"
+    assert "looks like" in doubted_if_repeated(RIGHT, *wrong).sentence
+    doubted = Verdict("uncertain", 0.5, "of something else.")
+    assert doubted_if_repeated(doubted, *wrong) is doubted
+    # Too few to say anything.
+    index.unique[:] = np.arange(1500) < 3
+    assert told(0.0, 0.3) == (0.0, 0.0)
+
+
+def test_points_are_unique_where_nothing_else_in_the_image_is_described_like_them():
+    """Forty things, ten of which stand twice in every image; each view of a thing has noise."""
+    rng = np.random.default_rng(5)
+    things = rng.integers(0, 120, (40, 128))
+    thing = np.concatenate([np.arange(40), np.arange(10)])  # of each of 50 points
+    pixels, images = np.column_stack([np.arange(50) * 10.0, np.full(50, 100.0)]), 3
+    seen = np.clip(np.tile(things[thing], (images, 1)) + rng.normal(0, 3, (150, 128)), 0, 255).astype(np.uint8)
+    for upright in (False, True):
+        described = Described(np.tile(np.arange(50), images), np.tile(pixels, (images, 1)), seen, np.full(150, upright))
+        unique = unique_points(described, np.arange(0, 200, 50), np.full(images, 640.0), 51)
+        expected = np.ones(51, bool)
+        expected[[*range(10), *range(40, 50)]] = False
+        expected[50] = False  # nobody sees it
+        assert (unique == expected).mean() > 0.95
+        assert not unique[~expected].any()
+    # The same thing beside itself is one place.
+    assert unique_points(described, np.arange(0, 200, 50), np.full(images, 32.0 * 600.0), 51)[:50].all()

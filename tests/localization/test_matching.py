@@ -11,7 +11,7 @@ from groma.localization.landmarks import GATES, DescribedLandmarks, coarsest, co
 from groma.localization.line_matching import GATES as LINES
 from groma.localization.line_matching import SeenLines, lines_near
 from groma.localization.map_index import MapIndex
-from groma.localization.matching import MATCHES, match_descriptors, pairs_near
+from groma.localization.matching import MATCHES, alike_elsewhere, lengths_of, match_descriptors, pairs_near
 
 
 def _vectors(rng, count, size=32):
@@ -43,7 +43,10 @@ def test_points_near_where_they_are_expected():
     pixels[:100] = places[:100] + rng.normal(0, 3, (100, 2))
     first, second = (rng.integers(0, 256, (count, 128), dtype=np.uint8) for count in (200, 300))
     second[:100] = first[:100]
-    rows, columns, far = pairs_near(places, first, pixels, second, 6.0)
+    shuffled = rng.permutation(200)  # rows of the descriptors that places have
+    stored = np.empty_like(first)
+    stored[shuffled] = first
+    rows, columns, far = pairs_near(places, shuffled, (stored, lengths_of(stored)), pixels, second, 6.0)
     distance = np.linalg.norm(unit(first)[:, None] - unit(second)[None], axis=2)
     near = np.linalg.norm(places[:, None] - pixels[None], axis=2) <= 6.0
     expected = np.argwhere(near & (distance <= MATCHES.distance))
@@ -51,6 +54,18 @@ def test_points_near_where_they_are_expected():
     np.testing.assert_array_equal(np.column_stack([rows, columns])[order], expected)
     np.testing.assert_allclose(far[order], distance[tuple(expected.T)], atol=2e-3)
     assert len(expected) > 80
+
+
+def test_what_is_alike_elsewhere_in_an_image():
+    """The nearest descriptor of a place that is not beside; none where there is no such place."""
+    rng = np.random.default_rng(5)
+    pixels, vectors = rng.uniform(0, 300, (400, 2)), _vectors(rng, 400, 8)
+    away = np.linalg.norm(vectors[:, None] - vectors[None], axis=2)
+    far = np.linalg.norm(pixels[:, None] - pixels[None], axis=2) > 60.0
+    expected = np.where(far, away, np.inf).min(axis=1)
+    np.testing.assert_allclose(alike_elsewhere(vectors, pixels, 60.0), expected, atol=1e-3)
+    assert (expected > np.sort(away, axis=1)[:, 1] + 1e-3).any()
+    assert (alike_elsewhere(vectors[:3], pixels[:3], 1000.0) == 2.0).all()
 
 
 def test_lines_near_where_they_are_expected():

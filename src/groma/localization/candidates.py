@@ -116,13 +116,16 @@ def _points_near(
     if not len(rows) or not len(query.points):
         return np.zeros((0, 2), np.int64)
     first, second, far = pairs_near(
-        expected[index.point[rows]], index.descriptor[rows], query.points.pixels, query.points.descriptors, reach
-    )
+        expected[index.point[rows]], rows, (index.descriptor, index.length), query.points.pixels,
+        query.points.descriptors, reach,
+    )  # fmt: skip
     order = np.argsort(far, kind="stable")
     pairs = np.column_stack([second[order], index.point[rows[first[order]]]])
     # The nearest in description for the point of the query, and for that of the map.
-    best = [np.isin(np.arange(len(pairs)), np.unique(pairs[:, side], return_index=True)[1]) for side in (0, 1)]
-    return pairs[best[0] & best[1]]
+    best = np.zeros((2, len(pairs)), bool)
+    for side in (0, 1):
+        best[side, np.unique(pairs[:, side], return_index=True)[1]] = True
+    return pairs[best.all(axis=0)]
 
 
 __all__ = ["Candidates", "described_alike", "found_near"]

@@ -5,6 +5,9 @@ A photograph that is put together of pieces, or shows another place that has som
 with a pose in one part; elsewhere points and lines are to be seen by the map, and none is. Not all that could be seen
 is found again in any photograph. How often, the map knows from its own images: of the points that images near one of
 them see, and that its pose puts into it, it sees some itself, the more the more of the others do.
+
+Where a place repeats, another that looks like it shows what repeats in every part. What only this place has is missing
+there: points that look like no other (:mod:`groma.localization.repeated`). They are to be found about as often as all.
 """
 
 from __future__ import annotations
@@ -13,13 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.localization.landmarks import counted_in
 from groma.localization.map_index import MapIndex
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import VERDICT, VerdictGates
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.refinement import Refined
+from groma.localization.pose.refinement import Refined, cells_of
 from groma.scene import Scene
 
 #: Images of a map that are asked how often points are found again, at most.
@@ -32,7 +35,8 @@ _PIECES = 16
 class FoundAgain:
     """How often points of a map are found again, learned from its own images."""
 
-    #: (N + 1,) by the number of images near a photograph, of N, that see a point.
+    #: (2, N + 1) of points that repeat, and of unique ones, by the number of images near a photograph, of N, that see
+    #: them.
     rate: FloatArray
 
     @staticmethod
@@ -41,7 +45,7 @@ class FoundAgain:
         count = len(index.image)
         seen = [np.unique(index.point[index.begin[i] : index.begin[i + 1]]) for i in range(count)]
         total = np.bincount(np.concatenate([*seen, np.zeros(0, np.int64)]), minlength=len(index.xyz))
-        asked, found = np.ones(near + 1), np.zeros(near + 1)
+        asked, found = np.ones((2, near + 1)), np.zeros((2, near + 1))
         for image in np.unique(np.linspace(0, count - 1, min(count, _ASKED)).astype(int)).tolist():
             others = np.delete(np.arange(count), image)
             others = nearest_images(index, others, seen[image], near)
@@ -51,8 +55,9 @@ class FoundAgain:
             rows = total[point] - itself[point] >= 2  # points that are in the map without this image
             camera = QueryCamera.of(scene.cameras, int(scene.images.camera_idx[image]))
             rows[rows] = camera.inside(camera.project(scene.cam_from_world[image], index.xyz[point[rows]]))
-            np.add.at(asked, times[rows], 1.0)
-            np.add.at(found, times[rows], itself[point[rows]])
+            kind = index.unique[point[rows]].astype(np.int64), times[rows]
+            np.add.at(asked, kind, 1.0)
+            np.add.at(found, kind, itself[point[rows]])
         return FoundAgain(found / asked)
 
 
@@ -61,19 +66,24 @@ def nearest_images(index: MapIndex, images: IntArray, points: IntArray, count: i
     return images[np.argsort(-counted_in(index, images, points), kind="stable")[:count]]
 
 
-def parts_shown(
+#: How much of what is expected is there, and how much is missing.
+Shown = tuple[float, float]
+
+
+def shown_of(
     scene: Scene,
     index: MapIndex,
     again: FoundAgain,
     near: IntArray,
     best: Refined,
     matches: Matches,
+    found: IntArray,
     lines: bool = True,
     gates: VerdictGates = VERDICT,
-) -> tuple[float, float]:
-    """Return how many parts of an image show what a pose puts there, and how many show none of it.
+) -> tuple[Shown, Shown]:
+    """Return how many parts of an image show what a pose puts there, and how many cells what only this place has.
 
-    Parts count by what is expected in them, points and lines alike.
+    Parts count by what is expected in them, points and lines alike; cells by the unique points expected in them.
 
     Parameters
     ----------
@@ -81,8 +91,8 @@ def parts_shown(
         The map.
     near
         Its images near the photograph: what they see is expected.
-    best, matches
-        The pose, and what agrees with it.
+    best, matches, found
+        The pose, what was looked for under it, and the points of the index that agree.
     lines
         Whether lines were looked for.
     gates
@@ -93,12 +103,29 @@ def parts_shown(
     shown = np.concatenate([matches.points2d[best.point_inliers], _along(ends, _PIECES)[0]])
     point, times = _seen_by(index, near)
     pixel = camera.project(best.pose, index.xyz[point])
-    expected = [(pixel, again.rate[times], gates.expected)]
+    inside = camera.inside(pixel)
+    point, pixel, kind = point[inside], pixel[inside], index.unique[point[inside]]
+    rate = again.rate[kind.astype(np.int64), times[inside]]
+    expected = [(pixel, rate, gates.expected)]
     if lines and scene.num_lines:
         rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in near])
         known = np.unique(scene.line_observations.line_idx[index.segment[rows]])
         expected.append((*_lengths(camera, best.pose, scene.lines.segments[known]), 0.5 * side))
-    return _counted(camera, expected, shown, gates.parts)
+    is_found = np.isin(point, found)
+    alone = _alone(cells_of(pixel[kind], camera, gates.cells), rate, is_found, kind, gates.expected)
+    return _counted(camera, expected, shown, gates.parts), alone
+
+
+def _alone(cell: IntArray, rate: FloatArray, found: BoolArray, unique: BoolArray, least: float) -> Shown:
+    """Cells that show what only this place has, and cells that do not, if it is found as often as everything is."""
+    often = min(1.0, float(found.sum()) / max(float(rate.sum()), 1e-12))
+    expected = often * float(rate[unique].sum())
+    if expected < least:
+        return 0.0, 0.0
+    weight = np.bincount(cell, rate[unique])
+    count = float(weight.sum() ** 2 / (weight**2).sum())  # as many cells of one weight
+    share = min(1.0, float(found[unique].sum()) / expected)
+    return share * count, (1.0 - share) * count
 
 
 def _counted(
@@ -128,8 +155,13 @@ def _part(pixel: FloatArray, camera: QueryCamera, parts: int) -> IntArray:
 
 def _seen_by(index: MapIndex, images: IntArray) -> tuple[IntArray, IntArray]:
     """Points of a map that some images see, and how many of them do."""
-    seen = [np.unique(index.point[index.begin[i] : index.begin[i + 1]]) for i in images.tolist()]
-    return np.unique(np.concatenate([*seen, np.zeros(0, np.int64)]), return_counts=True)
+    times = np.zeros(len(index.xyz), np.int64)
+    for image in images.tolist():
+        seen = np.zeros(len(index.xyz), bool)
+        seen[index.point[index.begin[image] : index.begin[image + 1]]] = True
+        times += seen
+    point = np.flatnonzero(times)
+    return point, times[point]
 
 
 def _along(ends: FloatArray, pieces: int) -> tuple[FloatArray, FloatArray]:
@@ -148,4 +180,4 @@ def _lengths(camera: QueryCamera, pose: FloatArray, ends: FloatArray) -> tuple[F
     return middle, np.nan_to_num(length)
 
 
-__all__ = ["FoundAgain", "nearest_images", "parts_shown"]
+__all__ = ["FoundAgain", "Shown", "nearest_images", "shown_of"]

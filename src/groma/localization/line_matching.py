@@ -34,10 +34,12 @@ GATES = GuidedLineGates()
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 @loop
-def _near(lines, segments, reach, angle, overlap, rows, columns):
+def _near(lines, segments, order, middle, beyond, reach, angle, overlap, rows, columns):
     """Pairs of images of lines and segments that are near, of about one direction, and side by side.
 
-    The number of them that is returned may be more than the arrays hold.
+    Segments are in the order of their middles, along either axis of the image: only those are looked at whose middles
+    may lie beside the line, or beyond its ends by no more than so much. The number of pairs that is returned may be
+    more than the arrays hold.
     """
     count = 0
     for i in range(lines.shape[0]):
@@ -45,7 +47,14 @@ def _near(lines, segments, reach, angle, overlap, rows, columns):
         du, dv = lines[i, 1, 0] - u, lines[i, 1, 1] - v
         length = max(np.sqrt(du * du + dv * dv), 1e-9)
         du, dv = du / length, dv / length
-        for k in range(segments.shape[0]):
+        axis = 0 if abs(du) <= abs(dv) else 1
+        margin = reach + beyond * min(abs(du), abs(dv))
+        low, high = min(lines[i, 0, axis], lines[i, 1, axis]), max(lines[i, 0, axis], lines[i, 1, axis])
+        begin = np.searchsorted(middle[axis], low - margin)
+        for at in range(begin, segments.shape[0]):
+            if not middle[axis, at] <= high + margin:
+                break
+            k = order[axis, at]
             x, y = segments[k, 0, 0] - u, segments[k, 0, 1] - v
             across = y * du - x * dv
             if not (-reach <= across <= reach):
@@ -138,10 +147,15 @@ def lines_near(
 def _pairs_near(
     lines: FloatArray, segments: FloatArray, reach: float, gates: GuidedLineGates
 ) -> tuple[IntArray, IntArray]:
+    middle = segments.mean(axis=1).T
+    order = np.argsort(middle, axis=1, kind="stable")
+    middle = np.take_along_axis(middle, order, axis=1)
+    longest = float(np.nanmax(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)))
+    beyond = max(0.5 - gates.overlap, 0.0) * longest
     count = 4 * len(segments)
     while True:
         rows, columns = np.empty((2, count), np.int64)
-        found = _near(lines, segments, reach, gates.angle, gates.overlap, rows, columns)
+        found = _near(lines, segments, order, middle, beyond, reach, gates.angle, gates.overlap, rows, columns)
         if found <= count:
             return rows[:found], columns[:found]
         count = found

@@ -19,7 +19,7 @@ from groma.features.images import GrayImage, to_gray
 from groma.gates import gate
 from groma.io import read_scene
 from groma.localization.candidates import Candidates, described_alike, found_near
-from groma.localization.expected import FoundAgain, nearest_images, parts_shown
+from groma.localization.expected import FoundAgain, Shown, nearest_images, shown_of
 from groma.localization.features import DescribedImage, DescribedPoints, find_features, mirrored
 from groma.localization.landmarks import DescribedLandmarks, coarsest, seen_in
 from groma.localization.map_images import OPTIONS, image_paths, images_in_summary
@@ -220,10 +220,10 @@ class Localizer:
             points = mirrored(part.points, camera.width)
             return matched(points, self._alike(points)).matches(part.with_points(points), self.scene, self.index)
 
-        def expected(best: Refined) -> tuple[float, float]:
+        def expected(best: Refined) -> tuple[Shown, Shown]:
             seen, agreeing = last[0].matches(query, self.scene, self.index), last[0].points[best.point_inliers, 1]
             around = nearest_images(self.index, images, agreeing, self.options.gates.near)
-            return parts_shown(self.scene, self.index, self._again, around, best, seen, self.options.lines)
+            return shown_of(self.scene, self.index, self._again, around, best, seen, agreeing, self.options.lines)
 
         matches = found.matches(part, self.scene, self.index)
         pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, mirror, expected)

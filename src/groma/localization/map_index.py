@@ -12,13 +12,13 @@ import os
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from groma._typing import FloatArray, IntArray
+from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
 from groma.adjustment.fit import noise_of
@@ -29,10 +29,12 @@ from groma.features.matching.descriptor import describe
 from groma.features.segments import Segments
 from groma.io import atomic_output
 from groma.localization.features import Bytes, DescribedPoints, describe_places, find_points
+from groma.localization.matching import lengths_of
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.map_errors import SeenByImage, images_compared, shared_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.records import landmark_covariances, residual_squares
+from groma.localization.repeated import Described, unique_points
 from groma.localization.retrieval import VladRetrieval
 from groma.localization.triangulation import triangulate_features
 from groma.mapping.lines.neighbors import covisible_neighbors
@@ -40,7 +42,7 @@ from groma.mapping.photographs import read_gray
 from groma.scene import Scene
 
 #: Of the layout of the file; another one is built anew.
-_VERSION = 2
+_VERSION = 3
 #: Images that the features of an image are matched with.
 _NEIGHBORS = 12
 
@@ -53,7 +55,7 @@ _FORMS = {
     **dict.fromkeys(("begin", "point", "segment_begin", "segment"), form("iu", None)),
     "pixel": form("f", None, 2), "descriptor": form("u", None, 128), "segment_descriptor": form("f", None, 72),
     "vocabulary": form("f", None, 128), "image": form("f", None, None),
-    "shared_error": form("f", 2),
+    "shared_error": form("f", 2), "unique": form("b", None),
 }  # fmt: skip
 
 Progress = Callable[[str, int, int], None]
@@ -83,6 +85,13 @@ class MapIndex:
     #: (2,) what landmarks in one part of an image are off by together, radians as seen from it: where poses come from
     #: points alone, and from points and lines.
     shared_error: FloatArray = field(default_factory=lambda: np.zeros(2))
+    #: (P,) points that look like no other place in the images that see them; where repeated things are, the others.
+    unique: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+
+    @cached_property
+    def length(self) -> FloatArray:
+        """(F,) lengths of the descriptors."""
+        return lengths_of(self.descriptor)
 
     @property
     def is_whole(self) -> bool:
@@ -92,7 +101,7 @@ class MapIndex:
         return (
             len(self.pixel) == len(self.descriptor) == count
             and len(self.segment_descriptor) == len(self.segment)
-            and len(self.point_covariance) == len(self.xyz)
+            and len(self.point_covariance) == len(self.unique) == len(self.xyz)
             and len(self.segment_begin) - 1 == len(self.image) == images
             and self.image.shape[1] == 128 * len(self.vocabulary)
             and _divides(self.begin, count)
@@ -186,23 +195,29 @@ def build_index(scene: Scene, files: Sequence[Path], say: Progress) -> MapIndex:
     if not sum(map(len, points)) and not scene.num_lines:
         raise InputError("Nothing in the images of the map can be described: no points, no lines. Pass another map.")
     retrieval = VladRetrieval.learned([one.descriptors for one in features])
+    begin, point = np.concatenate([[0], np.cumsum([len(part) for part in points])]), np.concatenate(points)
+    described = Described(point, np.concatenate(pixels), np.concatenate(descriptors), point >= len(made.xyz))
     index = MapIndex(
         np.concatenate([made.xyz, scene.points.xyz]),
         np.concatenate([made.covariance, np.nan_to_num(own_covariance)]),
-        np.concatenate([[0], np.cumsum([len(part) for part in points])]),
-        np.concatenate(points),
-        np.concatenate(pixels),
-        np.concatenate(descriptors),
+        begin,
+        *described[:3],
         line_covariance,
         np.concatenate([[0], np.cumsum([len(part) for part in rows])]),
         np.concatenate(rows),
         np.concatenate([one.segment_descriptors for one in found]),
         retrieval.vocabulary,
         np.stack([retrieval.gather(one.descriptors) for one in features]),
+        unique=unique_points(described, begin, _longer_sides(scene), len(made.xyz) + scene.num_points),
     )
     sigma = np.concatenate(sigmas)
     seen = [_seen_by(scene, index, image, sigma, line_noise) for image in images_compared(scene.num_images).tolist()]
     return replace(index, shared_error=shared_errors(seen, partial(say, "comparing images of the map with the rest")))
+
+
+def _longer_sides(scene: Scene) -> FloatArray:
+    """Longer side of each image, pixels."""
+    return np.maximum(scene.cameras.width, scene.cameras.height)[scene.images.camera_idx].astype(np.float64)
 
 
 def _seen_by(scene: Scene, index: MapIndex, image: int, sigma: FloatArray, line_noise: float) -> SeenByImage:

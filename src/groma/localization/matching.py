@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from groma._numba import loop
 from groma._typing import FloatArray, IntArray
+from groma.execution import map_ranges
 from groma.gates import gate
 
 
@@ -30,25 +31,58 @@ Bytes = npt.NDArray[np.uint8]
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
 @loop
-def _compare(alike, row, column, best, top, second, column_top, column_best):
-    """Best and second best so far of each row of a block, and the best so far of each column."""
+def _compare(alike, row, column, best, top, second):
+    """Best and second best so far of each row of a block; few blocks of columns hold any, which a count tells."""
     for i in range(alike.shape[0]):
         one, two, at = top[row + i], second[row + i], best[row + i]
-        for j in range(alike.shape[1]):
-            value = alike[i, j]
-            if value > two:
+        for begin in range(0, alike.shape[1], 64):
+            end = min(begin + 64, alike.shape[1])
+            more = np.int32(0)
+            for j in range(begin, end):
+                more += np.int32(alike[i, j] > two)
+            if more == 0:
+                continue
+            for j in range(begin, end):
+                value = alike[i, j]
                 if value > one:
                     one, two, at = value, one, column + j
-                else:
+                elif value > two:
                     two = value
-            if value > column_top[column + j]:
-                column_top[column + j], column_best[column + j] = value, row + i
         best[row + i], top[row + i], second[row + i] = at, one, two
+
+
+@loop
+def _compare_far(alike, row, column, pixels, square, top):
+    """The best so far of each row of a block among places that are farther away than some distance."""
+    for i in range(alike.shape[0]):
+        one, u, v = top[row + i], pixels[row + i, 0], pixels[row + i, 1]
+        for begin in range(0, alike.shape[1], 64):
+            end = min(begin + 64, alike.shape[1])
+            more = np.int32(0)
+            for j in range(begin, end):
+                more += np.int32(alike[i, j] > one)
+            if more == 0:
+                continue
+            for j in range(begin, end):
+                away = (pixels[column + j, 0] - u) ** 2 + (pixels[column + j, 1] - v) ** 2
+                if alike[i, j] > one and away > square:
+                    one = alike[i, j]
+        top[row + i] = one
+
+
+@loop
+def _lengths(descriptors, out):
+    for i in range(descriptors.shape[0]):
+        square = np.int32(0)
+        for j in range(descriptors.shape[1]):
+            square += np.int32(descriptors[i, j]) * np.int32(descriptors[i, j])
+        out[i] = max(np.sqrt(np.float64(square)), 1e-6)
 
 
 @loop
 def _near(
     expected,
+    rows_of_first,
     first,
     first_length,
     cell_begin,
@@ -69,7 +103,7 @@ def _near(
     """
     count = 0
     for i in range(expected.shape[0]):
-        u, v = expected[i, 0], expected[i, 1]
+        u, v, own = expected[i, 0], expected[i, 1], rows_of_first[i]
         column, row = int(np.floor(u / reach)) + 1, int(np.floor(v / reach)) + 1
         for y in range(max(row - 1, 0), min(row + 2, cells[1])):
             for x in range(max(column - 1, 0), min(column + 2, cells[0])):
@@ -79,8 +113,8 @@ def _near(
                         continue
                     product = np.int32(0)
                     for j in range(first.shape[1]):
-                        product += np.int32(first[i, j]) * np.int32(second[k, j])
-                    cosine = product / (first_length[i] * second_length[k])
+                        product += np.int32(first[own, j]) * np.int32(second[k, j])
+                    cosine = product / (first_length[own] * second_length[k])
                     if cosine < least:
                         continue
                     if count < rows.shape[0]:
@@ -95,23 +129,64 @@ def match_descriptors(first: Vectors, second: Vectors, gates: MatchGates = MATCH
     """Return pairs (m, 2) of rows of two sets of descriptors of length one."""
     if len(first) < 2 or len(second) < 2:
         return np.zeros((0, 2), np.int64)
-    best, column_best = np.zeros(len(first), np.int64), np.zeros(len(second), np.int64)
+    best = np.zeros(len(first), np.int64)
     top, next_best = np.full((2, len(first)), -2.0, np.float32)
-    column_top = np.full(len(second), -2.0, np.float32)
-    for row in range(0, len(first), _ROWS):
+
+    def compare(rows: slice) -> None:
         for column in range(0, len(second), _COLUMNS):
-            alike = first[row : row + _ROWS] @ second[column : column + _COLUMNS].T
-            _compare(alike, row, column, best, top, next_best, column_top, column_best)
-    rows = np.flatnonzero(column_best[best] == np.arange(len(first)))
-    far, farther = _distance(top[rows]), _distance(next_best[rows])
-    good = (far <= gates.distance) & (far <= gates.ratio * farther)
-    return np.column_stack([rows[good], best[rows[good]]])
+            alike = first[rows] @ second[column : column + _COLUMNS].T
+            _compare(alike, rows.start, column, best, top, next_best)
+
+    map_ranges(compare, len(first), _ROWS)
+    far, farther = _distance(top), _distance(next_best)
+    rows = np.flatnonzero((far <= gates.distance) & (far <= gates.ratio * farther))
+    columns, which = np.unique(best[rows], return_inverse=True)
+    mutual = (first @ second[columns].T).argmax(axis=0)[which.ravel()] == rows if len(rows) else rows == 0
+    return np.column_stack([rows[mutual], best[rows[mutual]]])
+
+
+def alike_elsewhere(vectors: Vectors, pixels: FloatArray, beyond: float) -> FloatArray:
+    """Distances (n,) from descriptors of length one to the most alike in the same image that are farther away than so
+    many pixels; two where there is none.
+    """
+    top = np.full(len(vectors), -1.0, np.float32)
+    for row in range(0, len(vectors), _ROWS):
+        for column in range(0, len(vectors), _COLUMNS):
+            alike = vectors[row : row + _ROWS] @ vectors[column : column + _COLUMNS].T
+            _compare_far(alike, row, column, pixels, beyond**2, top)
+    return _distance(top)
+
+
+def lengths_of(descriptors: Bytes) -> FloatArray:
+    """Lengths (n,) of descriptors."""
+    out = np.empty(len(descriptors))
+    _lengths(descriptors, out)
+    return out
 
 
 def pairs_near(
-    expected: FloatArray, first: Bytes, pixels: FloatArray, second: Bytes, reach: float, gates: MatchGates = MATCHES
+    expected: FloatArray,
+    rows_of_first: IntArray,
+    first: tuple[Bytes, FloatArray],
+    pixels: FloatArray,
+    second: Bytes,
+    reach: float,
+    gates: MatchGates = MATCHES,
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Pairs of descriptors that are alike, of places that are expected (n, 2) near pixels (m, 2) of an image.
+    """Pairs of descriptors that are alike, of places that are expected near pixels of an image.
+
+    Parameters
+    ----------
+    expected, rows_of_first : (n, 2), (n,)
+        Places, and their rows in ``first``.
+    first : (F, 128), (F,)
+        Descriptors and their lengths.
+    pixels, second : (m, 2), (m, 128)
+        Of the image.
+    reach
+        Distance that is near, pixels.
+    gates
+        Which descriptors are alike.
 
     Returns
     -------
@@ -125,15 +200,12 @@ def pairs_near(
     number = cell[:, 1] * cells[0] + cell[:, 0]
     order = np.argsort(number, kind="stable")
     begin = np.searchsorted(number[order], np.arange(int(cells[0] * cells[1]) + 1))
-    lengths = [
-        np.maximum(np.linalg.norm(one.astype(np.float32), axis=1), 1e-6).astype(np.float64) for one in (first, second)
-    ]
     least, room = 1.0 - 0.5 * gates.distance**2, 4 * len(here)
     while True:
         rows, columns, far = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)
         count = _near(
-            np.ascontiguousarray(here), first, lengths[0], begin, order, cells, reach, there, second, lengths[1], least,
-            rows, columns, far,
+            np.ascontiguousarray(here), rows_of_first, *first, begin, order, cells, reach, there, second,
+            lengths_of(second), least, rows, columns, far,
         )  # fmt: skip
         if count <= room:
             return rows[:count], columns[:count], far[:count]
@@ -144,4 +216,13 @@ def _distance(product: npt.NDArray[np.float32]) -> FloatArray:
     return np.sqrt(np.maximum(2.0 - 2.0 * product.astype(np.float64), 0.0))
 
 
-__all__ = ["MATCHES", "Bytes", "MatchGates", "Vectors", "match_descriptors", "pairs_near"]
+__all__ = [
+    "MATCHES",
+    "Bytes",
+    "MatchGates",
+    "Vectors",
+    "alike_elsewhere",
+    "lengths_of",
+    "match_descriptors",
+    "pairs_near",
+]

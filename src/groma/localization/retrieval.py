@@ -42,8 +42,9 @@ class VladRetrieval:
         total = np.zeros_like(words)
         if len(values) and len(words):
             nearest = (values @ words.T - 0.5 * (words**2).sum(axis=1)).argmax(axis=1)
-            for word in np.unique(nearest):
-                total[word] = (values[nearest == word] - words[word]).sum(axis=0)
+            order = np.argsort(nearest, kind="stable")
+            used, begin, count = np.unique(nearest[order], return_index=True, return_counts=True)
+            total[used] = np.add.reduceat(values[order], begin) - count[:, None].astype(np.float32) * words[used]
         total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.float32(1e-9))
         return total.ravel() / np.float32(max(np.linalg.norm(total), 1e-9))
 

@@ -28,6 +28,7 @@ from groma.localization.pose.verdict import (
     doubted_if_in_pieces,
     doubted_if_mirrored,
     doubted_if_missing,
+    doubted_if_repeated,
     evidence_of,
     judge,
     median_distance,
@@ -172,7 +173,7 @@ def pose_from_matches(
     places: int = 1,
     guided: Callable[[Refined], Matches] | None = None,
     mirror: Callable[[], Matches] | None = None,
-    expected: Callable[[Refined], tuple[float, float]] | None = None,
+    expected: Callable[[Refined], tuple[tuple[float, float], tuple[float, float]]] | None = None,
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
 
@@ -189,7 +190,8 @@ def pose_from_matches(
         Returns the matches of the mirror image of the photograph, by points: where they agree with a pose far better,
         the photograph was mirrored.
     expected : callable, optional
-        Returns how many parts of the image show what a pose puts there, and how many show none of it.
+        Returns how many parts of the image show what a pose puts there, and how many show none of it; and how many
+        cells show what only this place has, and how many do not.
     """
     options = options or PoseOptions()
     best = _best(camera, matches, options)
@@ -212,7 +214,8 @@ def pose_from_matches(
         beyond = VERDICT.distinct * max_errors(matches)[0]
         verdict = doubted_if_in_pieces(verdict, first.agree, cells_elsewhere(own, matches, beyond))
     if expected is not None and verdict.status == "localized":
-        verdict = doubted_if_missing(verdict, *expected(best))
+        parts, alone = expected(best)
+        verdict = doubted_if_repeated(doubted_if_missing(verdict, *parts), *alone)
     if mirror is not None and verdict.status == "localized":
         verdict = _unless_mirrored(verdict, best, mirror(), matches, options)
     failed = verdict.status == "failed"

@@ -17,7 +17,8 @@ fall to either with the same probability; the first is the right one with the pr
 
 **The rest of the image.** What is to be seen under the pose is counted part by part of the image, by how often the map
 finds it again in its own images (:mod:`groma.localization.expected`). Where about as much is missing as is there, by
-the same test, a piece of the place is shown, or something that is like it.
+the same test, a piece of the place is shown, or something that is like it. So it is with points that look like no other
+place of the map: where what repeats is found and they are not, another place that looks like this one is shown.
 
 Reference: L. Moisan, B. Stival, *A probabilistic criterion to detect rigid point matches between two images and
 estimate the fundamental matrix*, 2004, eq. (9), for samples of three.
@@ -168,17 +169,37 @@ def doubted_if_missing(verdict: Verdict, shown: float, missing: float, gates: Ve
 
     ``shown`` and ``missing`` are numbers of parts of the image, by what is expected in them.
     """
-    from scipy.special import betainc
-
-    chance = 1.0 - gates.whole
-    few = shown > missing and 0.5 ** (shown + missing - 1.0) > chance  # so few that no test could say so much
-    if missing < 1.0 or few or (shown > 0.0 and 2.0 * betainc(shown, missing + 1.0, 0.5) <= chance):
+    if verdict.status != "localized" or not _much_is_missing(shown, missing, gates):
         return verdict
     words = (
         f"{verdict.sentence} But in {missing:.0f} of {shown + missing:.0f} parts of the image where this place has "
         "points or lines none is seen: the photograph may show this place in a part only, or something like it."
     )
     return Verdict("uncertain", 1.0 - gates.right, words)
+
+
+def doubted_if_repeated(verdict: Verdict, shown: float, missing: float, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where about as much of what only this place has is missing as is there.
+
+    ``shown`` and ``missing`` are numbers of cells of the image, by the unique points that are expected in them.
+    """
+    if verdict.status != "localized" or not _much_is_missing(shown, missing, gates):
+        return verdict
+    often = f"{100 * shown / (shown + missing):.0f} % as often as all"
+    words = (
+        f"{verdict.sentence} But points that look like no other place are found {often}: the photograph may show "
+        "another place that looks like this one."
+    )
+    return Verdict("uncertain", 1.0 - gates.right, words)
+
+
+def _much_is_missing(shown: float, missing: float, gates: VerdictGates) -> bool:
+    """Whether a sign test does not exclude that as much is missing as is shown."""
+    from scipy.special import betainc
+
+    chance = 1.0 - gates.whole
+    few = shown > missing and 0.5 ** (shown + missing - 1.0) > chance  # so few that no test could say so much
+    return not (missing < 1.0 or few or (shown > 0.0 and 2.0 * betainc(shown, missing + 1.0, 0.5) <= chance))
 
 
 def votes_of_a_rival(agree: int, gates: VerdictGates = VERDICT) -> int:
@@ -263,6 +284,7 @@ __all__ = [
     "doubted_if_in_pieces",
     "doubted_if_mirrored",
     "doubted_if_missing",
+    "doubted_if_repeated",
     "evidence_of",
     "judge",
     "median_distance",

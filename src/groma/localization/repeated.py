@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which points of a map look like no other place: they tell it from where the same things stand again.
+
+Windows of one facade are alike; what tells one from the next is beside them: stains, signs, doors. A point is unique if
+no other place in any image that sees it is described as much like it as views of one point are like each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from groma._typing import BoolArray, FloatArray, IntArray
+from groma.execution import map_work
+from groma.gates import gate
+from groma.localization.features import Bytes, unit
+from groma.localization.matching import alike_elsewhere
+
+
+@dataclass(frozen=True)
+class RepeatedGates:
+    """When two places look alike."""
+
+    alike: float = gate(
+        0.95, "quantile", "of the distances of descriptors of one point: as near ones look alike", "convention: 95 %"
+    )
+    cells: int = gate(
+        32, "cells", "per longer side: farther than one away is another place", "derived from the reach of a descriptor"
+    )
+
+
+GATES = RepeatedGates()
+
+
+class Described(NamedTuple):
+    """Descriptors of points in the images of a map, one image after the other."""
+
+    #: (F,) the point of each, (F, 2) pixels, (F, 128) descriptors, (F,) which are upright.
+    point: IntArray
+    pixel: FloatArray
+    descriptor: Bytes
+    upright: BoolArray
+
+
+def unique_points(
+    described: Described, begin: IntArray, sides: FloatArray, count: int, gates: RepeatedGates = GATES
+) -> BoolArray:
+    """Return which of ``count`` points look like no other place.
+
+    Parameters
+    ----------
+    described, begin
+        Points in images, and (I + 1,) where those of each image begin.
+    sides : (I,)
+        Longer sides of the images, pixels.
+    count
+        Number of points.
+    gates
+        What is alike.
+    """
+    work = [
+        (Described(*(part[begin[i] : begin[i + 1]] for part in described)), float(side) / gates.cells)
+        for i, side in enumerate(sides)
+    ]
+    nearest = np.full(count, np.inf)
+    np.minimum.at(nearest, described.point, np.concatenate([np.zeros(0), *map_work(_alike_elsewhere, work)]))
+    found = np.zeros(count, bool)
+    for upright in (False, True):
+        rows = np.flatnonzero(described.upright == upright)
+        points = described.point[rows]
+        found[points] = nearest[points] > _of_one_point(points, described.descriptor, rows, gates.alike)
+    return found
+
+
+def _alike_elsewhere(work: tuple[Described, float]) -> FloatArray:
+    """Distance from each point of an image to the most alike in another place of it."""
+    (_, pixel, descriptor, upright), beyond = work
+    out = np.empty(len(pixel))
+    for kind in (False, True):
+        rows = upright == kind
+        out[rows] = alike_elsewhere(unit(descriptor[rows]), pixel[rows], beyond)
+    return out
+
+
+def _of_one_point(points: IntArray, descriptors: Bytes, rows: IntArray, quantile: float) -> float:
+    """A quantile of the distances of descriptors of one point in two images."""
+    order = np.argsort(points, kind="stable")
+    same = np.flatnonzero(points[order][1:] == points[order][:-1])
+    same = same[:: max(len(same) // 20_000, 1)]
+    first, second = (unit(descriptors[rows[order[same + step]]]) for step in (0, 1))
+    return float(np.quantile(np.linalg.norm(first - second, axis=1), quantile)) if len(same) else 0.0
+
+
+__all__ = ["GATES", "Described", "RepeatedGates", "unique_points"]
