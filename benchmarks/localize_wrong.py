@@ -167,7 +167,7 @@ def pictures(map_: Path, images: Path, others: list[Path], limits: tuple[int, in
             for file in _chosen(folder, limits[1]):
                 yield Trial(folder.parts[-2], file.name, lambda file=file: _sized(read_gray(file), shape))
 
-    yield images.parts[-2], lambda: Localizer(map_, images), trials
+    yield map_.name, lambda: Localizer(map_, images), trials
 
 
 def _chosen(folder: Path, limit: int) -> list[Path]:

@@ -43,6 +43,10 @@ class Described(NamedTuple):
     descriptor: Bytes
     upright: BoolArray
 
+    def part(self, rows: slice) -> Described:
+        """Some of them."""
+        return Described(self.point[rows], self.pixel[rows], self.descriptor[rows], self.upright[rows])
+
 
 def unique_points(
     described: Described, begin: IntArray, sides: FloatArray, count: int, gates: RepeatedGates = GATES
@@ -60,10 +64,7 @@ def unique_points(
     gates
         What is alike.
     """
-    work = [
-        (Described(*(part[begin[i] : begin[i + 1]] for part in described)), float(side) / gates.cells)
-        for i, side in enumerate(sides)
-    ]
+    work = [(described.part(slice(begin[i], begin[i + 1])), float(side) / gates.cells) for i, side in enumerate(sides)]
     nearest = np.full(count, np.inf)
     np.minimum.at(nearest, described.point, np.concatenate([np.zeros(0), *map_work(_alike_elsewhere, work)]))
     found = np.zeros(count, bool)
