@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.execution import together
 from groma.features.matching.wide_baseline import match_wide_baseline
 from groma.features.segments import Segments
 from groma.localization.features import DescribedImage, unit
@@ -26,6 +27,8 @@ class Candidates:
     #: (n, 2) points of the query, and of the map; (m, 2) segments of the query, and lines of the map.
     points: IntArray
     lines: IntArray
+    #: (n,) distances of the descriptors of the points; none where they are not told.
+    distance: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def matches(self, query: DescribedImage, scene: Scene, index: MapIndex) -> Matches:
         """The matches with places, noise and covariances."""
@@ -91,21 +94,38 @@ def found_near(
 
     ``reach`` is how far points, and ends of segments from lines, may be from there, pixels.
     """
-    points = _points_near(query, index, images, camera, pose, reach[0])
-    if not lines:
-        return Candidates(points, np.zeros((0, 2), np.int64))
+
+    def points() -> tuple[IntArray, FloatArray]:
+        return _points_near(query, index, images, camera, pose, reach[0])
+
+    def segments() -> IntArray:
+        return _lines_near(query, scene, index, images, camera, pose, reach[1])
+
+    (pairs, distance), found = together(points, segments) if lines else (points(), np.zeros((0, 2), np.int64))
+    return Candidates(pairs, found, distance)
+
+
+def _lines_near(
+    query: DescribedImage,
+    scene: Scene,
+    index: MapIndex,
+    images: IntArray,
+    camera: QueryCamera,
+    pose: FloatArray,
+    reach: float,
+) -> IntArray:
     rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in images])
     line = scene.line_observations.line_idx[index.segment[rows]]
     determined = np.isfinite(index.line_covariance[line, 0, 0])
     known, owner = np.unique(line[determined], return_inverse=True)
     seen = SeenLines(owner.ravel(), index.segment_descriptor[rows[determined]], scene.lines.segments[known])
-    pairs = lines_near(camera, pose, seen, query.segments, query.segment_descriptors, reach[1])
-    return Candidates(points, np.column_stack([pairs[:, 1], known[pairs[:, 0]]]))
+    pairs = lines_near(camera, pose, seen, query.segments, query.segment_descriptors, reach)
+    return np.column_stack([pairs[:, 1], known[pairs[:, 0]]])
 
 
 def _points_near(
     query: DescribedImage, index: MapIndex, images: IntArray, camera: QueryCamera, pose: FloatArray, reach: float
-) -> IntArray:
+) -> tuple[IntArray, FloatArray]:
     rows = np.concatenate([np.arange(int(index.begin[i]), int(index.begin[i + 1])) for i in images])
     seen = np.zeros(len(index.xyz), bool)
     seen[index.point[rows]] = True
@@ -114,7 +134,7 @@ def _points_near(
     expected[point] = camera.project(pose, index.xyz[point])
     rows = rows[camera.inside(expected[index.point[rows]], reach)]
     if not len(rows) or not len(query.points):
-        return np.zeros((0, 2), np.int64)
+        return np.zeros((0, 2), np.int64), np.zeros(0)
     first, second, far = pairs_near(
         expected[index.point[rows]], rows, (index.descriptor, index.length), query.points.pixels,
         query.points.descriptors, reach,
@@ -125,7 +145,8 @@ def _points_near(
     best = np.zeros((2, len(pairs)), bool)
     for side in (0, 1):
         best[side, np.unique(pairs[:, side], return_index=True)[1]] = True
-    return pairs[best.all(axis=0)]
+    kept = best.all(axis=0)
+    return pairs[kept], far[order[kept]]
 
 
 __all__ = ["Candidates", "described_alike", "found_near"]

@@ -22,7 +22,7 @@ from groma.localization.map_index import MapIndex
 from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.gates import VERDICT, VerdictGates
 from groma.localization.pose.matches import Matches
-from groma.localization.pose.refinement import Refined, cells_of
+from groma.localization.pose.refinement import Refined
 from groma.scene import Scene
 
 #: Images of a map that are asked how often points are found again, at most.
@@ -66,10 +66,6 @@ def nearest_images(index: MapIndex, images: IntArray, points: IntArray, count: i
     return images[np.argsort(-counted_in(index, images, points), kind="stable")[:count]]
 
 
-#: How much of what is expected is there, and how much is missing.
-Shown = tuple[float, float]
-
-
 def shown_of(
     scene: Scene,
     index: MapIndex,
@@ -80,10 +76,11 @@ def shown_of(
     found: IntArray,
     lines: bool = True,
     gates: VerdictGates = VERDICT,
-) -> tuple[Shown, Shown]:
-    """Return how many parts of an image show what a pose puts there, and how many cells what only this place has.
+) -> tuple[tuple[float, float], float]:
+    """Return how many parts of an image show what a pose puts there and how many show none of it; and how often what
+    only this place has is found, as a share of how often all of it is.
 
-    Parts count by what is expected in them, points and lines alike; cells by the unique points expected in them.
+    Parts count by what is expected in them, points and lines alike.
 
     Parameters
     ----------
@@ -92,7 +89,7 @@ def shown_of(
     near
         Its images near the photograph: what they see is expected.
     best, matches, found
-        The pose, what was looked for under it, and the points of the index that agree.
+        The pose, what was looked for under it, and the points of the index that agree and are described alike.
     lines
         Whether lines were looked for.
     gates
@@ -111,21 +108,15 @@ def shown_of(
         rows = np.concatenate([np.arange(int(index.segment_begin[i]), int(index.segment_begin[i + 1])) for i in near])
         known = np.unique(scene.line_observations.line_idx[index.segment[rows]])
         expected.append((*_lengths(camera, best.pose, scene.lines.segments[known]), 0.5 * side))
-    is_found = np.isin(point, found)
-    alone = _alone(cells_of(pixel[kind], camera, gates.cells), rate, is_found, kind, gates.expected)
-    return _counted(camera, expected, shown, gates.parts), alone
+    often = _often_alone(rate, np.isin(point, found), kind, gates.expected)
+    return _counted(camera, expected, shown, gates.parts), often
 
 
-def _alone(cell: IntArray, rate: FloatArray, found: BoolArray, unique: BoolArray, least: float) -> Shown:
-    """Cells that show what only this place has, and cells that do not, if it is found as often as everything is."""
+def _often_alone(rate: FloatArray, found: BoolArray, unique: BoolArray, least: float) -> float:
+    """How often unique points are found, as a share of how often all are; one where hardly any are expected."""
     often = min(1.0, float(found.sum()) / max(float(rate.sum()), 1e-12))
     expected = often * float(rate[unique].sum())
-    if expected < least:
-        return 0.0, 0.0
-    weight = np.bincount(cell, rate[unique])
-    count = float(weight.sum() ** 2 / (weight**2).sum())  # as many cells of one weight
-    share = min(1.0, float(found[unique].sum()) / expected)
-    return share * count, (1.0 - share) * count
+    return 1.0 if expected < least else float(found[unique].sum()) / expected
 
 
 def _counted(
@@ -180,4 +171,4 @@ def _lengths(camera: QueryCamera, pose: FloatArray, ends: FloatArray) -> tuple[F
     return middle, np.nan_to_num(length)
 
 
-__all__ = ["FoundAgain", "Shown", "nearest_images", "shown_of"]
+__all__ = ["FoundAgain", "nearest_images", "shown_of"]

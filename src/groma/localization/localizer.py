@@ -19,7 +19,7 @@ from groma.features.images import GrayImage, to_gray
 from groma.gates import gate
 from groma.io import read_scene
 from groma.localization.candidates import Candidates, described_alike, found_near
-from groma.localization.expected import FoundAgain, Shown, nearest_images, shown_of
+from groma.localization.expected import FoundAgain, nearest_images, shown_of
 from groma.localization.features import DescribedImage, DescribedPoints, find_features, mirrored
 from groma.localization.landmarks import DescribedLandmarks, coarsest, seen_in
 from groma.localization.map_images import OPTIONS, image_paths, images_in_summary
@@ -29,6 +29,7 @@ from groma.localization.pose.camera import QueryCamera
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
+from groma.localization.repeated import Described, alike_limits
 from groma.localization.retrieval import VladRetrieval
 from groma.mapping.photographs import check_cameras, read_gray
 from groma.scene import Scene
@@ -122,6 +123,8 @@ class Localizer:
         self._retrieval = VladRetrieval(self.index.vocabulary)
         upright = np.arange(len(self.index.xyz)) >= len(self.index.xyz) - self.scene.num_points
         self._landmarks = DescribedLandmarks.of(self.index, upright)
+        of_points = Described(self.index.point, self.index.pixel, self.index.descriptor, upright[self.index.point])
+        self._alike_limits = alike_limits(of_points)
         self._again = FoundAgain.of(self.scene, self.index, self.options.gates.near)
 
     def camera_of_map(self, width: int, height: int) -> QueryCamera | None:
@@ -216,14 +219,16 @@ class Localizer:
             )
             return last[0].matches(query, self.scene, self.index)
 
-        def mirror() -> Matches:
-            points = mirrored(part.points, camera.width)
+        def mirror(step: int) -> Matches:
+            points = mirrored(part.points.take(np.arange(0, len(part.points), step)), camera.width)
             return matched(points, self._alike(points)).matches(part.with_points(points), self.scene, self.index)
 
-        def expected(best: Refined) -> tuple[Shown, Shown]:
+        def expected(best: Refined) -> tuple[tuple[float, float], float]:
             seen, agreeing = last[0].matches(query, self.scene, self.index), last[0].points[best.point_inliers, 1]
+            limit = self._alike_limits[self._landmarks.upright[agreeing].astype(np.int64)]
+            alike = agreeing[last[0].distance[best.point_inliers] <= limit]
             around = nearest_images(self.index, images, agreeing, self.options.gates.near)
-            return shown_of(self.scene, self.index, self._again, around, best, seen, agreeing, self.options.lines)
+            return shown_of(self.scene, self.index, self._again, around, best, seen, alike, self.options.lines)
 
         matches = found.matches(part, self.scene, self.index)
         pose = pose_from_matches(camera, matches, options, max(len(images), 1), guided, mirror, expected)

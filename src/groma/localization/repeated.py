@@ -26,6 +26,7 @@ class RepeatedGates:
     alike: float = gate(
         0.95, "quantile", "of the distances of descriptors of one point: as near ones look alike", "convention: 95 %"
     )
+    sample: int = gate(20_000, "pairs", "of descriptors that this is computed from", "cost: 20 ms")
     cells: int = gate(
         32, "cells", "per longer side: farther than one away is another place", "derived from the reach of a descriptor"
     )
@@ -68,11 +69,27 @@ def unique_points(
     nearest = np.full(count, np.inf)
     np.minimum.at(nearest, described.point, np.concatenate([np.zeros(0), *map_work(_alike_elsewhere, work)]))
     found = np.zeros(count, bool)
+    for upright, limit in zip((False, True), alike_limits(described, gates), strict=True):
+        points = described.point[described.upright == upright]
+        found[points] = nearest[points] > limit
+    return found
+
+
+def alike_limits(described: Described, gates: RepeatedGates = GATES) -> FloatArray:
+    """Return (2,) how far descriptors of one point in two images are from each other: of turned ones, of upright ones.
+
+    Parameters are those of :func:`unique_points`.
+    """
+    limits = np.zeros(2)
     for upright in (False, True):
         rows = np.flatnonzero(described.upright == upright)
-        points = described.point[rows]
-        found[points] = nearest[points] > _of_one_point(points, described.descriptor, rows, gates.alike)
-    return found
+        rows = rows[np.argsort(described.point[rows], kind="stable")]
+        same = np.flatnonzero(np.diff(described.point[rows]) == 0)
+        if len(same):
+            same = same[:: max(len(same) // gates.sample, 1)]
+            first, second = (unit(described.descriptor[rows[same + step]]) for step in (0, 1))
+            limits[int(upright)] = np.quantile(np.linalg.norm(first - second, axis=1), gates.alike)
+    return limits
 
 
 def _alike_elsewhere(work: tuple[Described, float]) -> FloatArray:
@@ -85,13 +102,4 @@ def _alike_elsewhere(work: tuple[Described, float]) -> FloatArray:
     return out
 
 
-def _of_one_point(points: IntArray, descriptors: Bytes, rows: IntArray, quantile: float) -> float:
-    """A quantile of the distances of descriptors of one point in two images."""
-    order = np.argsort(points, kind="stable")
-    same = np.flatnonzero(points[order][1:] == points[order][:-1])
-    same = same[:: max(len(same) // 20_000, 1)]
-    first, second = (unit(descriptors[rows[order[same + step]]]) for step in (0, 1))
-    return float(np.quantile(np.linalg.norm(first - second, axis=1), quantile)) if len(same) else 0.0
-
-
-__all__ = ["GATES", "Described", "RepeatedGates", "unique_points"]
+__all__ = ["GATES", "Described", "RepeatedGates", "alike_limits", "unique_points"]

@@ -20,7 +20,7 @@ from groma.localization.pose.gates import VERDICT
 from groma.localization.pose.hypotheses import max_errors, propose, straightened
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
-from groma.localization.pose.refinement import Refined, fitted, refine
+from groma.localization.pose.refinement import Refined, cells_of, fitted, refine
 from groma.localization.pose.verdict import (
     Evidence,
     Status,
@@ -34,6 +34,7 @@ from groma.localization.pose.verdict import (
     median_distance,
     most_votes,
     moved,
+    votes_of_a_part,
     votes_of_a_rival,
 )
 
@@ -54,6 +55,8 @@ class PoseOptions:
     focal_factors: tuple[float, ...] = (1.0,)
 
 
+#: Of so many points of a mirror image one is matched first.
+_SOME = 4
 #: Focal lengths of phones to telephoto lenses, over the longer side of the image, in steps of a fifth.
 UNKNOWN_LENS = tuple(0.5 * 1.2**step for step in range(10))
 
@@ -172,8 +175,8 @@ def pose_from_matches(
     options: PoseOptions | None = None,
     places: int = 1,
     guided: Callable[[Refined], Matches] | None = None,
-    mirror: Callable[[], Matches] | None = None,
-    expected: Callable[[Refined], tuple[tuple[float, float], tuple[float, float]]] | None = None,
+    mirror: Callable[[int], Matches] | None = None,
+    expected: Callable[[Refined], tuple[tuple[float, float], float]] | None = None,
 ) -> AbsolutePose:
     """Estimate a pose as :func:`estimate_absolute_pose` does.
 
@@ -187,11 +190,11 @@ def pose_from_matches(
         Returns more matches once a pose is near; they refine it, and are those that the result tells of. They are no
         evidence that the place is right, because they were looked for where it says.
     mirror : callable, optional
-        Returns the matches of the mirror image of the photograph, by points: where they agree with a pose far better,
-        the photograph was mirrored.
+        Returns the matches of the mirror image of the photograph, by each so many-th point: where they agree with a
+        pose far better, the photograph was mirrored.
     expected : callable, optional
-        Returns how many parts of the image show what a pose puts there, and how many show none of it; and how many
-        cells show what only this place has, and how many do not.
+        Returns how many parts of the image show what a pose puts there, and how many show none of it; and how often
+        what only this place has is found, as a share of how often all of it is.
     """
     options = options or PoseOptions()
     best = _best(camera, matches, options)
@@ -215,9 +218,9 @@ def pose_from_matches(
         verdict = doubted_if_in_pieces(verdict, first.agree, cells_elsewhere(own, matches, beyond))
     if expected is not None and verdict.status == "localized":
         parts, alone = expected(best)
-        verdict = doubted_if_repeated(doubted_if_missing(verdict, *parts), *alone)
+        verdict = doubted_if_repeated(doubted_if_missing(verdict, *parts), alone)
     if mirror is not None and verdict.status == "localized":
-        verdict = _unless_mirrored(verdict, best, mirror(), matches, options)
+        verdict = _unless_mirrored(verdict, own, mirror, matches, options)
     failed = verdict.status == "failed"
     return AbsolutePose(
         verdict.status,
@@ -236,13 +239,20 @@ def pose_from_matches(
 
 
 def _unless_mirrored(
-    verdict: Verdict, best: Refined, mirror: Matches, matches: Matches, options: PoseOptions
+    verdict: Verdict, best: Refined, mirror: Callable[[int], Matches], matches: Matches, options: PoseOptions
 ) -> Verdict:
-    """Return a verdict, or another one where the mirror image of a photograph fits clearly better."""
+    """Return a verdict, or another one where the mirror image of a photograph fits clearly better.
+
+    Some of its points are matched first: mostly far too few of them agree with any pose.
+    """
+    agree = len(np.unique(cells_of(matches.points2d, best.camera, VERDICT.cells)[best.point_inliers]))
+    if _best_of_others(best.camera, mirror(_SOME), options, votes_of_a_part(agree + 1, 1.0 / _SOME)) is None:
+        return verdict
     points = matches.take(np.ones(matches.num_points, bool), np.zeros(matches.num_lines, bool))
     own = evidence_of(fitted(best.camera, points, best.pose, _errors(points, options)), points)
-    other = _best_of_others(best.camera, mirror, options, own.agree + 1)
-    return verdict if other is None else doubted_if_mirrored(verdict, own, evidence_of(other, mirror))
+    every = mirror(1)
+    other = _best_of_others(best.camera, every, options, own.agree + 1)
+    return verdict if other is None else doubted_if_mirrored(verdict, own, evidence_of(other, every))
 
 
 def _errors(matches: Matches, options: PoseOptions) -> tuple[float, float]:
@@ -255,17 +265,20 @@ def _best_of_others(camera: QueryCamera, matches: Matches, options: PoseOptions,
     if possible < max(votes, 1):
         return None
     only_this = replace(options, refine_lens=False, focal_factors=(1.0,))
-    return _best(camera, matches, only_this, votes / possible)
+    return _best(camera, matches, only_this, votes / possible, votes // 2)
 
 
-def _best(camera: QueryCamera, matches: Matches, options: PoseOptions, share: float = 0.0) -> Refined | None:
+def _best(
+    camera: QueryCamera, matches: Matches, options: PoseOptions, share: float = 0.0, least: int = 0
+) -> Refined | None:
     """The pose that most agrees with, refined; None where there is none. Of several focal lengths the best.
 
-    ``share`` is the least share of the matches that such a pose is of interest with.
+    ``share`` is the least share of the matches that such a pose is of interest with, ``least`` their number before it
+    is refined.
     """
     errors = _errors(matches, options)
     starts = [_with_focal_length(camera, factor) for factor in options.focal_factors]
-    found = [(propose(straightened(one, matches), errors, options.seed, share), one) for one in starts]
+    found = [(propose(straightened(one, matches), errors, options.seed, share, least), one) for one in starts]
     refined = [refine(one, matches, pose, errors, options.refine_lens) for pose, one in found if pose is not None]
     return max(refined, key=lambda one: int(one.point_inliers.sum() + one.line_inliers.sum()), default=None)
 

@@ -71,6 +71,10 @@ class VerdictGates:
     whole: float = gate(
         0.99, "probability", "that more of what is expected is there than is missing", "chosen on the filing cabinet"
     )
+    alone: float = gate(
+        0.5, "share", "of how often all points are found, that unique ones are found",
+        "derived from the two places: one here, nothing in another",
+    )  # fmt: skip
     bend: float = gate(
         0.15, "share", "of their distance, by which neighbours may be off differently",
         "derived from perspective: as between views 10 degrees apart",

@@ -64,6 +64,7 @@ def propose(
     errors: tuple[float, float],
     seed: int,
     share: float = 0.0,
+    least: int = 0,
     gates: HypothesisGates = HYPOTHESES,
 ) -> FloatArray | None:
     """Return the pose (7,) cam_from_world that most matches agree with; None without one.
@@ -78,6 +79,8 @@ def propose(
         Of the samples.
     share
         A pose that a smaller share of the matches agrees with is of no interest, and need not be found.
+    least
+        Nor is one that fewer matches agree with.
     gates
         Numbers of the search.
     """
@@ -100,7 +103,7 @@ def propose(
         found, report = poselib.estimate_absolute_pose(
             matches.points2d, matches.points3d, straight.camera, settings, {}
         )
-    if report["num_inliers"] < gates.min_matches or not np.isfinite(found.Rt).all():
+    if report["num_inliers"] < max(gates.min_matches, least) or not np.isfinite(found.Rt).all():
         return None
     # The last digits depend on where arrays lie in memory; they are cut off, so that a seed gives one result.
     rotation = quaternion.from_matrix(np.asarray(found.R, np.float64)[None])[0].astype(np.float32).astype(np.float64)

@@ -169,7 +169,11 @@ def doubted_if_missing(verdict: Verdict, shown: float, missing: float, gates: Ve
 
     ``shown`` and ``missing`` are numbers of parts of the image, by what is expected in them.
     """
-    if verdict.status != "localized" or not _much_is_missing(shown, missing, gates):
+    from scipy.special import betainc
+
+    chance = 1.0 - gates.whole
+    few = shown > missing and 0.5 ** (shown + missing - 1.0) > chance  # so few that no test could say so much
+    if missing < 1.0 or few or (shown > 0.0 and 2.0 * betainc(shown, missing + 1.0, 0.5) <= chance):
         return verdict
     words = (
         f"{verdict.sentence} But in {missing:.0f} of {shown + missing:.0f} parts of the image where this place has "
@@ -178,34 +182,33 @@ def doubted_if_missing(verdict: Verdict, shown: float, missing: float, gates: Ve
     return Verdict("uncertain", 1.0 - gates.right, words)
 
 
-def doubted_if_repeated(verdict: Verdict, shown: float, missing: float, gates: VerdictGates = VERDICT) -> Verdict:
-    """Return a verdict, or ``uncertain`` where about as much of what only this place has is missing as is there.
+def doubted_if_repeated(verdict: Verdict, often: float, gates: VerdictGates = VERDICT) -> Verdict:
+    """Return a verdict, or ``uncertain`` where more of what only this place has is missing than is there.
 
-    ``shown`` and ``missing`` are numbers of cells of the image, by the unique points that are expected in them.
+    ``often`` is how often points that look like no other are found, as a share of how often all points are: one in this
+    place, nothing in another that looks like it.
     """
-    if verdict.status != "localized" or not _much_is_missing(shown, missing, gates):
+    if verdict.status != "localized" or often >= gates.alone:
         return verdict
-    often = f"{100 * shown / (shown + missing):.0f} % as often as all"
     words = (
-        f"{verdict.sentence} But points that look like no other place are found {often}: the photograph may show "
-        "another place that looks like this one."
+        f"{verdict.sentence} But points that look like no other place are found {100 * often:.0f} % as often as all: "
+        "the photograph may show another place that looks like this one."
     )
     return Verdict("uncertain", 1.0 - gates.right, words)
-
-
-def _much_is_missing(shown: float, missing: float, gates: VerdictGates) -> bool:
-    """Whether a sign test does not exclude that as much is missing as is shown."""
-    from scipy.special import betainc
-
-    chance = 1.0 - gates.whole
-    few = shown > missing and 0.5 ** (shown + missing - 1.0) > chance  # so few that no test could say so much
-    return not (missing < 1.0 or few or (shown > 0.0 and 2.0 * betainc(shown, missing + 1.0, 0.5) <= chance))
 
 
 def votes_of_a_rival(agree: int, gates: VerdictGates = VERDICT) -> int:
     """How many cells must agree with another place for it to make one with so many doubtful."""
     votes = np.arange(agree + 1)
     return int(np.argmax(_tail(votes, agree) > 1.0 - gates.right))
+
+
+def votes_of_a_part(votes: int, share: float, gates: VerdictGates = VERDICT) -> int:
+    """How many votes a share of the matches, drawn at random, has at least if all have so many."""
+    from scipy.special import bdtr
+
+    fewer = np.arange(votes + 1)
+    return int(np.argmax(bdtr(fewer, votes, share) > 1.0 - gates.right))
 
 
 def most_votes(matches: Matches, camera: QueryCamera, gates: VerdictGates = VERDICT) -> int:
@@ -290,5 +293,6 @@ __all__ = [
     "median_distance",
     "most_votes",
     "moved",
+    "votes_of_a_part",
     "votes_of_a_rival",
 ]
