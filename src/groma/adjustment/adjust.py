@@ -105,7 +105,7 @@ class AdjustOptions:
     structure_sigma_px: float = SURFACE_SIGMA_PX
     #: Hold lines together that meet: see :class:`groma.adjustment.assemble.AssemblyOptions`.
     meeting_lines: bool = False
-    #: Most steps tried.
+    #: Most steps tried (cost: time; most end before).
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in a step.
     function_tolerance: float = 1e-6

@@ -18,8 +18,11 @@ from groma.evaluation.poses import evaluate_poses
 from groma.scene import Scene, Similarity
 
 #: The cabinet in the frame of the motion capture: centre, heading about the vertical z, half sizes. Metres, radians.
+#: Derived from the motion capture.
 CENTER = np.array([-1.52988, 0.456476, 0.281575])
+#: Derived from the motion capture, as above.
 HEADING = 3.10232
+#: Derived from the motion capture, as above.
 HALF_SIZE = np.array([0.396318, 0.222742, 0.272709])
 
 #: A line belongs to an edge of the cabinet if its middle is so near (metres), it is so parallel (degrees), and it

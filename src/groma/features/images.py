@@ -11,6 +11,7 @@ from groma.errors import InputError, ShapeError
 
 GrayImage = npt.NDArray[np.uint8]
 
+#: Largest level in the format of 12 bits.
 _FULL_12_BITS = 4095
 
 

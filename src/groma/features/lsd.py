@@ -31,7 +31,7 @@ class LsdDetector:
     min_length: float = 20.0
     #: Smallest mean gradient across a segment, grey levels (of 255) per pixel.
     min_strength: float = 3.0
-    #: Reduction of the image before detection.
+    #: Reduction of the image before detection (convention: LSD's own).
     scale: float = 0.8
     #: Fit the end points to the grey levels across the segment (see :mod:`groma.features.edge_fit`).
     fit: bool = True

@@ -37,7 +37,7 @@ from groma.features.merging import merge_collinear
 from groma.features.segments import Segments
 from groma.gates import gate
 
-#: Largest file of a network, bytes.
+#: Largest file of a network, bytes (cost: memory).
 _LARGEST = 1 << 28
 _SMALLEST_IMAGE = 8
 _FORM = "input (1, H, W, 3 or 4), outputs (1, h, w, 1) and (1, h, w, 4), all float32, as M-LSD has them"

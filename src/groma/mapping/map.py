@@ -124,7 +124,7 @@ class MapOptions:
     #: Estimate focal lengths and distortion too; None: where ``camera_model`` changes the given cameras.
     refine_intrinsics: bool | None = None
     threads: int | None = None
-    #: Most steps of each adjustment.
+    #: Most steps of each adjustment (cost: time; most end before).
     max_iterations: int = 50
     #: The camera model: where points are reconstructed, of all cameras (None: SIMPLE_RADIAL); else the model that the
     #: given cameras are changed to (None: they keep theirs), and what it adds is estimated with the calibration.

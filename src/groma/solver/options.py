@@ -18,7 +18,7 @@ SHARED_SYSTEMS = ("auto", "formed", "products")
 class SolverOptions:
     """How a problem is solved. The defaults suit bundle adjustment."""
 
-    #: Most steps tried, accepted or not.
+    #: Most steps tried, accepted or not (cost: time; most end before).
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in an accepted step.
     function_tolerance: float = 1e-6

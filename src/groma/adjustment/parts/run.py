@@ -30,7 +30,7 @@ from groma.solver.solve import Progress
 from groma.solver.steps import States
 
 #: Squared residuals are counted by their binary logarithm, in so many bins from one end to the other, for a median that
-#: all processes agree on.
+#: all processes agree on (cost: a bin is 1.4 per cent wide, less than a median of parts is known to).
 BINS, BIN_RANGE = 4096, (-40.0, 40.0)
 #: Of every part and kind of landmark: the sum of squared residuals, pixels, and their number.
 Squares = list[dict[str, list[float]]]

@@ -38,7 +38,7 @@ from groma.mapping.posed.motions import Motions
 
 #: Median and lower quartile of a squared normalised residual of three coordinates.
 _MEDIAN, _QUARTILE = 2.366, 1.213
-#: Columns of an inverse that are computed at a time.
+#: Columns of an inverse that are computed at a time (cost: memory).
 _COLUMNS = 256
 
 
