@@ -32,8 +32,8 @@ drawings
 made
     Data that are made up: synthetic scenes, examples of factors and charts, conformance checks, what is run to compile.
 shapes
-    Fields marked ``ClassVar`` (rows of a residual, columns of a table), and lengths, dimensions and counts of axes
-    compared with less than eight: so many a minimal sample has, or so many names a message.
+    Fields marked ``ClassVar`` (rows of a residual, columns of a table), and lengths, dimensions and counts compared
+    with less than eight: so many a minimal sample has, or so many names a message.
 formulas
     Factors that are units (percent, milli, seconds and minutes, bytes), degrees of a circle and the largest number of
     eight bits anywhere, powers and logarithms of ten, divisors 3, 4, 6, 8 and 12 (means, moments), 1.4826 (the
@@ -216,12 +216,12 @@ def _literals(node: ast.AST, compiled: bool, ordered: bool = False, kind: str = 
 
 
 def _is_size(node: ast.expr) -> bool:
-    """Whether an expression is the length of something, or one of its dimensions."""
+    """Whether an expression is the length of something, one of its dimensions, or how much of it is true."""
     if isinstance(node, ast.Subscript):
         return _is_size(node.value)
     if isinstance(node, ast.Attribute):
         return node.attr in ("ndim", "shape", "size")
-    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "len"
+    return isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("len", "sum", "count_nonzero")
 
 
 def _is_formula(node: ast.BinOp, side: ast.expr) -> bool:

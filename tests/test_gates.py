@@ -131,8 +131,8 @@ def test_numbers_that_no_decision_hangs_on_stand_apart(tmp_path):
     assert counted("a/check.py", "STEP = 0.25\n") == {"made": 1} == counted("scene/synthetic/b.py", "STEP = 0.25\n")
     assert counted("a/b.py", "def some_example(r):\n    return 0.3 * r\ndef other(r):\n    return 0.3 * r\n") == {
         "made": 1, "floats": 1}  # fmt: skip
-    sizes = "def f(a):\n    return len(a) < 5, a.shape[0] < 3, len(a) < 8, a[3] < 5\n"
-    assert counted("a/b.py", sizes) == {"shapes": 2, "integers": 2}
+    sizes = "def f(a):\n    return len(a) < 5, a.shape[0] < 3, a.sum() < 4, len(a) < 8, a[3] < 5\n"
+    assert counted("a/b.py", sizes) == {"shapes": 3, "integers": 2}
     formulas = (
         "def f(a):\n    return 100.0 * a, a / 3.0, 10.0 ** a, a < 180.0, np.log(10.0), sys.version_info > (3, 9)\n"
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from groma.adjustment.adjust import LAST_SCALE_SIGMAS, damping_after, stage_tolerance
+from groma.adjustment.adjust import damping_after, stage_tolerance
 from groma.adjustment.assemble import disassemble
 from groma.adjustment.fit import MEDIAN_SQUARE
 from groma.adjustment.parts.checkpoint import Checkpoint, Progressed, reports_of
@@ -19,7 +19,7 @@ from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.relation_outcome import drop_failed_relations
 from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
-from groma.adjustment.stages import one_after_another, stage_entries
+from groma.adjustment.stages import STAGES, one_after_another, stage_entries
 from groma.factors.losses import GemanMcClure, Loss, Trivial
 from groma.io.archive import write_archive
 from groma.solver.options import SolverOptions
@@ -171,7 +171,7 @@ class Run:
         count = np.sum(exchange(self.reducer, count.tolist()), axis=0)
         middle = int(np.searchsorted(np.cumsum(count), 0.5 * count.sum()))
         median = 2.0 ** (BIN_RANGE[0] + (middle + 0.5) * (BIN_RANGE[1] - BIN_RANGE[0]) / BINS)
-        return max(loss.scale, LAST_SCALE_SIGMAS * float(np.sqrt(median / MEDIAN_SQUARE)))
+        return max(loss.scale, STAGES.last_scale * float(np.sqrt(median / MEDIAN_SQUARE)))
 
     def write(self, solved: Solved, output: Path) -> Written:
         """Write the parts of this process; return squared residuals and relations of all parts."""
