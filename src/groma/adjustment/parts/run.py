@@ -11,7 +11,6 @@ import numpy as np
 
 from groma.adjustment.adjust import damping_after, stage_tolerance
 from groma.adjustment.assemble import disassemble
-from groma.adjustment.fit import MEDIAN_SQUARE
 from groma.adjustment.parts.checkpoint import Checkpoint, Progressed, reports_of
 from groma.adjustment.parts.opened import LANDMARKS, OpenParts
 from groma.adjustment.parts.together import agreed, exchange
@@ -21,6 +20,7 @@ from groma.adjustment.rescue.restart import renew_lines, with_seen_ends
 from groma.adjustment.rescue.slips import without_slips
 from groma.adjustment.stages import STAGES, one_after_another, stage_entries
 from groma.factors.losses import GemanMcClure, Loss, Trivial
+from groma.gates import chi_square_gate
 from groma.io.archive import write_archive
 from groma.solver.options import SolverOptions
 from groma.solver.reduce.contract import Reducer
@@ -171,7 +171,7 @@ class Run:
         count = np.sum(exchange(self.reducer, count.tolist()), axis=0)
         middle = int(np.searchsorted(np.cumsum(count), 0.5 * count.sum()))
         median = 2.0 ** (BIN_RANGE[0] + (middle + 0.5) * (BIN_RANGE[1] - BIN_RANGE[0]) / BINS)
-        return max(loss.scale, STAGES.last_scale * float(np.sqrt(median / MEDIAN_SQUARE)))
+        return max(loss.scale, STAGES.last_scale * float(np.sqrt(median / chi_square_gate(0.5, 2))))
 
     def write(self, solved: Solved, output: Path) -> Written:
         """Write the parts of this process; return squared residuals and relations of all parts."""
