@@ -106,6 +106,3 @@ def maximise_shares(
     share, count = np.full(num, float(together[0])), np.bincount(owner, minlength=num)
     _maximise(density, clutter, owner, count, pooled, float(together[0]), rounds, share, probability)
     return share
-
-
-__all__ = ["inlier_probability", "maximise_shares"]

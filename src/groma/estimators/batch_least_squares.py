@@ -317,14 +317,3 @@ def solve_batch(
 
     map_ranges(solve, count, PROBLEMS_AT_ONCE)
     return BatchSolution(found, frames, cost, information, steps, converged)
-
-
-__all__ = [
-    "PROBLEMS_AT_ONCE",
-    "BatchSolution",
-    "Observations",
-    "ProblemKind",
-    "problem_kind",
-    "solve_batch",
-    "solve_damped",
-]

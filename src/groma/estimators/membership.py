@@ -116,6 +116,3 @@ def _density(found: Candidates, deviation: FloatArray) -> FloatArray:
     variance = found.variance + (deviation[:, None] * found.unit.reshape(len(deviation), -1)) ** 2
     squared = np.minimum((found.offset**2 / variance).sum(axis=1), 1400.0)
     return np.exp(-0.5 * squared) / np.sqrt((2.0 * np.pi * variance).prod(axis=1))
-
-
-__all__ = ["Candidates", "Membership", "MembershipGates", "memberships"]

@@ -239,6 +239,3 @@ def _numbers(names: Sequence[str]) -> IntArray | None:
         return None
     numbers = np.array([number for _, number in parts], np.int64)
     return numbers if len(np.unique(numbers)) == len(numbers) else None
-
-
-__all__ = ["NEAR_SECONDS", "PosesOfPhotographs", "read_poses"]

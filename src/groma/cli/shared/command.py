@@ -117,15 +117,3 @@ CAMERA_MODELS = (
 DETECTORS, MATCHERS = ["lsd"], ["wide_baseline", "flow"]
 MAPPERS, CALIBRATIONS = ["incremental", "global"], ["auto", "map", "exif", "unknown"]
 SEQUENCES, COMPILED = ["rgbd", "stereo", "mono"], ["adjust", "map", "track"]
-
-__all__ = [
-    "GENERAL",
-    "PLAIN",
-    "Command",
-    "NoColor",
-    "Panel",
-    "forbid_colours",
-    "left_to_shell",
-    "one_of",
-    "with_common_options",
-]

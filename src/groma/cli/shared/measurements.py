@@ -292,10 +292,3 @@ def say_survey(console: Console, numbers: dict[str, Any]) -> None:
         )
     if len(suspects) > 5:
         console.warn(f"The protocol lists {len(suspects) - 5} more that are probably wrong.")
-
-
-__all__ = [
-    "Check", "Control", "ControlSigma", "Crs", "DirectionSigma", "Directions", "DistanceSigma", "Distances", "Hold",
-    "KnownPlanes", "MarkSigma", "Measured", "PlaneSigma", "PoseSigma", "Poses", "PositionSigma", "Positions",
-    "given", "say_survey",
-]  # fmt: skip

@@ -282,6 +282,3 @@ class _Search:
 
 def _log_choose(n: int, k: int) -> float:
     return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
-
-
-__all__ = ["Motion", "MotionGates", "MotionOptions", "estimate_motion"]

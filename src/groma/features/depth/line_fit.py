@@ -219,6 +219,3 @@ def fit_all(ends, depth, noise, correlation, gates, shares, inverse_depth, covar
             inverse_depth[n, i] = joint_x[i]
             for j in range(2):
                 covariance[n, i, j] = scale * joint_inverse[i, j]
-
-
-__all__ = ["CREASE", "LEFT", "NONE", "RIGHT", "SURFACE", "fit_all"]

@@ -89,6 +89,3 @@ def places_by_gps(content: Any, names: Sequence[str]) -> FloatArray | None:
     return np.stack(
         [_DEGREE * places[:, 0], _DEGREE * np.cos(latitude) * places[:, 1], np.nan_to_num(0.0 * places[:, 2])], axis=1
     )
-
-
-__all__ = ["EXHAUSTIVE_LIMIT", "OVERLAP", "blocks_of_pairs", "pair_blocks", "places_by_gps"]

@@ -94,6 +94,3 @@ def size_of_image(folder: Path, name: str) -> tuple[int, int]:
     except OSError:
         return 0, 0
     return found if found is not None and 0 < min(found) and max(found) <= 10**6 else (0, 0)
-
-
-__all__ = ["checked_rows", "file_in", "points_table", "rigid", "size_of_image"]

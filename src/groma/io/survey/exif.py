@@ -126,6 +126,3 @@ def _rationals(block: bytes, order: str, entry: tuple[int, int, int], count: int
     start = struct.unpack_from(order + "I", block, place)[0]
     parts = struct.unpack_from(f"{order}{2 * count}I", block, start)
     return [above / below if below or above else 0.0 for above, below in zip(parts[::2], parts[1::2], strict=True)]
-
-
-__all__ = ["EXIF_SIGMA", "position_of", "read_exif_positions"]

@@ -87,6 +87,3 @@ def _shifted(layout: Layout, S: Blocks, shift: float) -> Blocks:
 def _product(layout: Layout, S: Blocks, x: FloatArray) -> FloatArray:
     parts = [np.ascontiguousarray(x[c.start : c.start + c.count * c.width]) for c in layout.kept]
     return np.concatenate(multiply(layout, S, parts))
-
-
-__all__ = ["NULL_TOLERANCE", "Modes", "divided", "scaled", "smallest"]
