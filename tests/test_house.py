@@ -5,6 +5,7 @@ Each list of exceptions says what is on it today. It may only become shorter: an
 """
 
 import ast
+import re
 import runpy
 import tomllib
 from collections.abc import Iterator
@@ -134,6 +135,22 @@ def test_functions_are_short():
 def test_rooms_are_small_and_say_what_they_are(room):
     assert len(list(MODULES[room].parent.glob("*.py"))) <= MAX_FILES
     assert ast.get_docstring(TREES[room])
+
+
+def test_files_that_are_spoken_of_exist():
+    """In the plan of the house, and in what rooms say of themselves."""
+    plan = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    found = [(ROOT, name) for name in re.findall(r"`([\w./]+/[\w./]*|[\w/]+\.py)`", plan)]
+    for room in PACKAGES:
+        said = ast.get_docstring(TREES[room]) or ""
+        found += [(MODULES[room].parent, name) for name in re.findall(r"``([\w/]+\.py)``", said)]
+    known = {path.relative_to(SOURCES).as_posix() for path in (SOURCES / "groma").rglob("*")}
+    missing = [
+        (str(place), name)
+        for place, name in found
+        if not (place / name).exists() and not any(f"/{path}".endswith(f"/{name.rstrip('/')}") for path in known)
+    ]
+    assert missing == []
 
 
 @pytest.mark.parametrize(
