@@ -15,7 +15,7 @@ from groma._numba import inline_kernel, kernel, loop
 #: Values of ``DepthLines.support``.
 NONE, SURFACE, CREASE, LEFT, RIGHT = range(5)
 
-#: Samples along a segment at most, and across on either side: the size of arrays.
+#: Samples along a segment at most, and across on either side: the size of arrays (cost: memory and time).
 _ALONG, _ACROSS = 24, 3
 
 

@@ -16,7 +16,8 @@ from groma.errors import FileFormatError
 from groma.io.pose_conventions import PoseConvention
 from groma.scene import Points
 
-#: Largest deviation of a rotation matrix from an orthonormal one: files hold three digits at least.
+#: Largest deviation of a rotation matrix from an orthonormal one: files hold three digits at least (derived from those
+#: digits).
 _ROTATION_SLIP = 5e-3
 #: Coordinates beyond this are no places; their squares leave the number range.
 _LARGEST = 1e100

@@ -23,7 +23,8 @@ from groma.io.survey.coordinates import CoordinateSystem, Places
 _HEAD = 1 << 18
 #: Tags of the format.
 _GPS, _RATIONAL = 0x8825, 5
-#: Standard deviations of receivers in cameras and phones, metres: east, north, height.
+#: Standard deviations of receivers in cameras and phones, metres: east, north, height (convention: of receivers without
+#: corrections).
 EXIF_SIGMA = (5.0, 5.0, 10.0)
 
 
