@@ -28,14 +28,7 @@ LONG_MODULES: set[str] = set()
 LONG_FUNCTIONS: set[str] = set()
 BORROWED: set[tuple[str, str]] = set()
 #: Rooms whose modules still list their names.
-BUSY = (
-    "groma._kernels",
-    "groma.adjustment.survey",
-    "groma.compilation",
-    "groma.localization",
-    "groma.mapping",
-    "groma.tracking",
-)
+BUSY = tuple(f"groma.{room}" for room in "_kernels adjustment compilation localization mapping scene tracking".split())
 
 
 def imported(tree: ast.AST) -> Iterator[str]:

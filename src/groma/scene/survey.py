@@ -255,3 +255,23 @@ def check_kinds(name: str, kinds: IntArray, allowed: tuple[int, ...]) -> None:
         row = int(np.argmin(known))
         names = ", ".join(f"{int(kind)} ({OBJECTS[kind]})" for kind in allowed)
         raise InputError(f"{name} must be one of {names}; row {row} is {kinds[row]}.")
+
+
+__all__ = [
+    "CHECK",
+    "CONTROL",
+    "DIRECTED",
+    "LOCATED",
+    "UNKNOWN",
+    "CameraPoses",
+    "CameraPositions",
+    "ControlPoints",
+    "Distances",
+    "Held",
+    "Kind",
+    "KnownDirections",
+    "KnownPlanes",
+    "Marks",
+    "check_covariance",
+    "diagonal_covariance",
+]

@@ -198,3 +198,6 @@ def _pull(rows: _Rows, taken: IntArray, stated: FloatArray) -> FloatArray:
     flat = (columns + len(stated) * np.arange(batch)[:, None]).ravel()
     sums = np.bincount(flat, pull.ravel(), batch * len(stated)).astype(np.float64, copy=False)
     return sums.reshape(batch, len(stated))
+
+
+__all__ = ["GATES", "JackknifeGates", "landmark_jackknife", "observations_alone"]
