@@ -135,6 +135,3 @@ class AssemblyOptions:
         fitted to many pixels has :math:`\rho = -1/2`: its places are those of the quadrature of Gauss.
         """
         return math.sqrt((1.0 + self.line_end_correlation) / (1.0 - self.line_end_correlation))
-
-
-__all__ = ["LINE_RESIDUALS", "PLANE_RESIDUALS", "SURFACE_SIGMA_PX", "AssemblyOptions", "RightTurnPrior"]

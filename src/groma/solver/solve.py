@@ -32,7 +32,7 @@ from groma.problem.parallel import FACTORS_FOR_THREADS, Workers
 from groma.problem.problem import Problem
 from groma.problem.tied import find_tied
 from groma.solver.damped_problem import DampedProblem, T
-from groma.solver.independent import STRETCH_GAIN_RATIO, IndependentProblem, stretch_factor
+from groma.solver.independent import STRETCH, IndependentProblem, stretch_factor
 from groma.solver.joint import JointProblem
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
@@ -175,7 +175,7 @@ def _improved(problem: DampedProblem[T], trial: T, best: T, share: float) -> tup
     if not trial.lowers(best, share):
         rescued = problem.rescue(trial)
         return (rescued, True) if rescued.lowers(best, share) else (trial, False)
-    if trial.gain_ratio > STRETCH_GAIN_RATIO:
+    if trial.gain_ratio > STRETCH.longer:
         longer = problem.stretch(trial, stretch_factor(trial.gain_ratio))
         trial = longer if longer.cost < trial.cost else trial
     return problem.refine(trial), True

@@ -35,4 +35,3 @@ def _factors(draft: Draft) -> Iterator[Group]:
 
 
 TERM = Term("distances", ("distances",), (), _factors)
-__all__ = ["TERM"]
