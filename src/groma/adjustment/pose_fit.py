@@ -17,6 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
@@ -234,9 +235,9 @@ def line_rows(
     shifted = ends.copy()
     for end in range(2):
         shifted[rows, 2 * end + axis] -= (scale * inverse_depth)[:, end]
-    known = np.isfinite(inverse_depth).all(axis=1)[:, None]
+    known = np.isfinite(inverse_depth).all(axis=1, keepdims=True)
     weight = np.where(known, 1.0 / np.hypot(scale * inverse_sigma, sigma[:, None]), 0.0)
-    return np.column_stack([plucker, ends, 1.0 / sigma, shifted, weight, axis])
+    return np.column_stack([plucker, ends, 1.0 / sigma, shifted, weight, axis.astype(np.float64)])
 
 
 def plane_rows(hesse: FloatArray, measured: FloatArray, sqrt_information: FloatArray) -> FloatArray:
@@ -250,8 +251,8 @@ def seen_map(
 ) -> SeenMap:  # fmt: skip
     """Return what a camera sees of a map: its tables, the baselines of pairs and of :func:`line_rows`, a prior (7,)."""
     offsets = np.array([[-baselines[1], 0.0, 0.0], [0.0, -baselines[1], 0.0]])
-    tables = (np.ascontiguousarray(table, np.float64) for table in (points, lines, planes))
-    return SeenMap(camera, baselines[0], offsets, *tables, _CHART.ambient(prior[None])[0], 1.0 / prior_sigma)
+    pose = _CHART.ambient(prior[None])[0]
+    return SeenMap(camera, baselines[0], offsets, points, lines, planes, pose, 1.0 / prior_sigma)
 
 
 def equations_at(seen: SeenMap, pose: FloatArray, loss: Loss) -> Equations:
@@ -299,9 +300,9 @@ def fit_pose(seen: SeenMap, start: FloatArray, loss: Loss) -> FloatArray:
     return pose
 
 
-def _moved(seen: SeenMap, pose: FloatArray, step: FloatArray, loss: Loss) -> tuple[FloatArray, Equations]:
+def _moved(seen: SeenMap, pose: FloatArray, step: NDArray[np.floating], loss: Loss) -> tuple[FloatArray, Equations]:
     """Return where a step leads, and the equations there."""
-    place = _CHART.retract(pose[None], step[None])[0]
+    place = _CHART.retract(pose[None], np.asarray(step[None], np.float64))[0]
     return place, equations_at(seen, place, loss)
 
 

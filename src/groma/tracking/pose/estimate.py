@@ -90,8 +90,8 @@ def estimate_pose(
         pose = fit_pose(seen, pose, loss)
     alone = equations_at(without_prior(seen), pose, GemanMcClure(GATE))  # weights that fall for large residuals
     depth = _median_depth(view, measured, pose)
-    agree = (worst < GATE for worst in alone.worst)
-    return PoseEstimate(pose, *agree, alone.H, weak_directions(alone.H, depth))
+    points, lines, planes = (worst < GATE for worst in alone.worst)
+    return PoseEstimate(pose, points, lines, planes, alone.H, weak_directions(alone.H, depth))
 
 
 def rough_pose(
