@@ -132,11 +132,12 @@ def with_measured_points(scene: Scene, survey: Survey, notes: list[str]) -> Scen
     sigma = max(float(np.sqrt(np.median(squares) / _MEDIAN_SQUARE)), 0.05) * seen.sigma[mine]
     xyz, unit = scene.points.xyz[rows], np.tile(np.eye(3), (len(rows), 1, 1))
     points, marks = scene.control_points, scene.marks
-    marked = marks.replace(
-        image_idx=np.append(marks.image_idx, seen.image_idx[mine]),
-        point_idx=np.append(marks.point_idx, of[seen.point_idx[mine]]),
-        pixel=np.concatenate([marks.pixel, seen.pixel[mine]]),
-        sigma=np.append(marks.sigma, sigma),
+    marked = Marks(
+        np.append(marks.image_idx, seen.image_idx[mine]),
+        np.append(marks.point_idx, of[seen.point_idx[mine]]),
+        np.concatenate([marks.pixel, seen.pixel[mine]]),
+        np.append(marks.sigma, sigma),
+        np.append(marks.rejected, np.zeros(len(mine), bool)),
     )
     notes.append(f"Made control points, with their observations as marks: {', '.join(named)}.")
     return scene.keep(points=of < 0).replace(
@@ -144,7 +145,7 @@ def with_measured_points(scene: Scene, survey: Survey, notes: list[str]) -> Scen
             (*points.names, *named), np.concatenate([points.xyz, xyz]), np.concatenate([points.measured, xyz]),
             np.concatenate([points.covariance, unit]), np.append(points.role, np.full(len(rows), UNKNOWN)),
         ),
-        marks=Marks(marked.image_idx, marked.point_idx, marked.pixel, marked.sigma),
+        marks=marked,
     )  # fmt: skip
 
 

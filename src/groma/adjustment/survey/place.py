@@ -38,11 +38,13 @@ from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of, residuals_of
 from groma.problem.variables import Variables
 from groma.scene import ControlPoints, Keypoints, Scene, Similarity
-from groma.scene.survey import UNKNOWN, Kind
+from groma.scene.survey import UNKNOWN, Kind, accepted
 
 _STEPS, _TOLERANCE = 50, 1e-6
 #: Directions of less than this share of the information of others are not known.
 _UNKNOWN = 1e-13
+#: What is left by rounding of numbers that cancel.
+_ROUNDING = 1e-12
 #: Terms whose measurements notice where the scene is.
 _TERMS = (
     pose_priors.TERM, camera_poses.POSITIONS, camera_poses.POSES, control_points.CONTROL, distances.TERM,
@@ -62,7 +64,7 @@ def settled(scene: Scene) -> Scene:
 
 def _best(scene: Scene) -> Similarity:
     """Return the similarity to where a scene fits best."""
-    light = _with_places(scene.keep(points=[], line_observations=[]).replace(keypoints=Keypoints()))
+    light = _with_places(accepted(scene).keep(points=[], line_observations=[]).replace(keypoints=Keypoints()))
     centers = light.cam_centers_in_world
     middle, total = centers.mean(axis=0), Similarity()
     length = float(np.median(np.linalg.norm(centers - middle, axis=1))) or 1.0
@@ -151,7 +153,9 @@ def _normal_equations(problem: Problem, center: FloatArray, length: float) -> tu
 def moved(motions: dict[str, FloatArray], factor: Factor, problem: Problem) -> FloatArray:
     """Return how residuals change with world motions (count, dof, k) of the groups, (N, m, k)."""
     blocks = jacobians_of(factor, problem.variables)
-    return np.sum([blocks[slot.name] @ motions[ref.group][ref.index] for slot, ref in factor.references()], axis=0)
+    parts = np.stack([blocks[slot.name] @ motions[ref.group][ref.index] for slot, ref in factor.references()])
+    total = parts.sum(axis=0)
+    return np.where(np.abs(total) > _ROUNDING * np.abs(parts).sum(axis=0), total, 0.0)  # two ends that move as one
 
 
 def weighted(factor: Factor, problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
