@@ -142,7 +142,7 @@ class Distances(Table):
     """Measured distances between two objects each: scale bars, tapes, bases of stereo heads, heights above a floor.
 
     Objects are camera centres, control points, lines and planes. From a line or plane it is measured at the foot of a
-    place.
+    place; between skew lines where they are nearest.
     """
 
     noun: ClassVar[str] = "distance"
@@ -152,15 +152,20 @@ class Distances(Table):
     first_idx: IntArray = column(np.int64, kinds="first_kind")
     second_kind: IntArray = column(np.int64)
     second_idx: IntArray = column(np.int64, kinds="second_kind")
-    #: (N, 3) of a line or plane that is the first: near where it is measured; else any place.
+    #: (N, 3) of a line or plane that is the first: near where it is measured; else any place. It does not count where
+    #: ``is_shortest``.
     anchor: FloatArray = column(np.float64, 3, world="points")
     #: (N,) distance and its standard deviation, scene units.
     distance: FloatArray = column(np.float64, length=1, measured=True)
     sigma: FloatArray = column(np.float64, length=1, measured=True)
     #: (N,) whether the row is a gross error that takes no part.
     rejected: BoolArray = column(np.bool_, fill=False)
+    #: (N,) of two lines: whether it is the shortest between them, wherever that is.
+    is_shortest: BoolArray = column(np.bool_, fill=False)
 
     def _check(self) -> None:
+        if (self.is_shortest & ((self.first_kind != Kind.LINE) | (self.second_kind != Kind.LINE))).any():
+            raise InputError("Distances.is_shortest is of two lines; other kinds have a place. Set it to False.")
         check_sigma("Distances.distance", self.distance)
         check_sigma("Distances.sigma", self.sigma)
         for side in ("first", "second"):

@@ -3,13 +3,13 @@
 
 A robust loss limits what a wrong measurement does; it goes on pulling, and makes its neighbours look wrong, too. So
 the worst of what the test calls gross errors (:func:`~groma.adjustment.survey.records.gross_errors`) are rejected
-together, the scene is adjusted without them, each is tested against what is left, and the next are taken. Those that fit
-take part again, once for all, and so do those without which hardly anything checks others: of two scale bars that
-contradict each other nobody knows which is wrong, and both keep what the loss leaves them. Nothing is rejected without which less of the scene's place, turn and scale would be known.
+together, the scene is adjusted without them, each is tested against what is left, and the next are taken. Those that
+fit take part again, once for all, and so do those without which hardly anything checks others: of two scale bars that
+contradict each other nobody knows which is wrong, and both keep what the loss leaves them. Nothing is rejected without
+which less of the scene's place, turn and scale would be known.
 
-References: Baarda's data snooping, 1968; Foerstner on separability, *Reliability and discernability of extended
-Gauss-Markov models*, 1983; rejecting all and accepting again as in A. Hadi, J. Simonoff, *Procedures for
-the identification of multiple outliers in linear models*, 1993.
+References: W. Baarda, *A testing procedure for use in geodetic networks*, 1968; W. Foerstner, *Reliability and
+discernability of extended Gauss-Markov models*, 1983, on tests that are correlated.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from groma.adjustment.report import AdjustResult
-from groma.adjustment.stages import OWN_LOSS
-from groma.adjustment.survey.records import GATES, Reliability, gross_errors
+from groma.adjustment.stages import keeps_loss
+from groma.adjustment.survey.records import GATES, Reliability, gross_errors, rejection_limit
 from groma.adjustment.survey.reliability import reliability
 from groma.adjustment.terms.open_motions import num_open_motions
 from groma.errors import ProblemError
@@ -67,9 +67,10 @@ def without_gross_errors(
         again = adjust_again(scene)
         if (told := reliability_of(again.scene, again.problem)) is None:
             break
-        if unclear := _no_longer_checked(reliability_of(result.scene, _at_full_weight(result.problem)), told):
-            doubted = wanted - before
-            returned |= {place for place in doubted if place[0] in unclear} or doubted
+        doubted = {place: size for place, size in new.items() if place in wanted}
+        full = reliability_of(result.scene, _at_full_weight(result.problem))
+        if doubted and (unclear := _no_longer_checked(full, told, min(doubted.values()))):
+            returned |= {place for place in doubted if place[0] in unclear} or doubted.keys()
         else:
             result, found = again, told
     return result, found
@@ -81,17 +82,19 @@ def _worst(wrong: dict[tuple[str, int], float]) -> set[tuple[str, int]]:
     return {place for place, size in wrong.items() if size >= GATES.at_once * most[place[0]]}
 
 
-def _no_longer_checked(before: Reliability | None, after: Reliability) -> set[str]:
-    """Return the tables of measurements that hardly anything checks but what was rejected: they may be wrong instead.
+def _no_longer_checked(before: Reliability | None, after: Reliability, size: float) -> set[str]:
+    """Return the tables of measurements that may be wrong in place of what was rejected.
 
-    If the tests of two measurements have the correlation rho, one has 1 - rho^2 of its redundancy without the other.
+    If the tests of two measurements have the correlation rho, one has 1 - rho^2 of its redundancy without the other, and
+    with the first rejected in place of the second, the normalised residual w of that is w sqrt(1 - rho^2): if this is
+    still beyond the limit, it is not the first that is wrong.
     """
     if before is None:
         return set()
     share = {(one.place, one.coordinate): one.redundancy for one in before.measurements}
     pairs = [(one, share[one.place, one.coordinate]) for one in after.measurements if not one.is_rejected]
-    left = 1.0 - GATES.separable**2
-    return {one.place[0] for one, had in pairs if had > GATES.checked and one.redundancy < left * had}
+    least = (rejection_limit(after.measurements) / size) ** 2
+    return {one.place[0] for one, had in pairs if had > GATES.checked and one.redundancy < least * had}
 
 
 def _at_full_weight(problem: Problem | None) -> Problem | None:
@@ -99,7 +102,7 @@ def _at_full_weight(problem: Problem | None) -> Problem | None:
     if problem is None:
         return None
     return problem.with_losses([
-        Huber(_NEVER) if factor.type_name in OWN_LOSS and isinstance(factor.loss, Huber) else factor.loss
+        Huber(_NEVER) if keeps_loss(factor) and isinstance(factor.loss, Huber) else factor.loss
         for factor in problem.factors
     ])  # fmt: skip
 

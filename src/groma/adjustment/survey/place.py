@@ -32,12 +32,13 @@ from groma.adjustment.terms.contract import Draft
 from groma.factors.contract import Factor
 from groma.geometry import line3, so3
 from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.incidence import closest_points
 from groma.geometry.manifold import Euclidean
 from groma.problem.gauge import world_motions
 from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of, residuals_of
 from groma.problem.variables import Variables
-from groma.scene import ControlPoints, Keypoints, Scene, Similarity
+from groma.scene import ControlPoints, Distances, Keypoints, Scene, Similarity
 from groma.scene.survey import UNKNOWN, Kind, accepted
 
 _STEPS, _TOLERANCE = 50, 1e-6
@@ -95,6 +96,7 @@ def _with_places(scene: Scene) -> Scene:
 
     With the whole scene these places move as points do; on a line that moves alone they stay at the foot of an anchor.
     """
+    scene = scene.replace(distances=measured_at_places(scene))
     places, tables = [scene.control_points.xyz], {}
     for name, kinds, column in (("distances", "first_kind", "first_idx"), ("known_planes", "kind", "idx")):
         table = getattr(scene, name)
@@ -116,6 +118,16 @@ def _with_places(scene: Scene) -> Scene:
         np.append(points.role, np.full(count, UNKNOWN)),
     )
     return scene.replace(control_points=points, **tables)
+
+
+def measured_at_places(scene: Scene) -> Distances:
+    """Return the distances, the shortest between two lines as measured where the first is nearest to the second now."""
+    table, lines = scene.distances, scene.lines.plucker
+    if not (rows := np.flatnonzero(table.is_shortest)).size:
+        return table
+    anchor = table.anchor.copy()
+    anchor[rows] = closest_points(lines[table.first_idx[rows]], lines[table.second_idx[rows]]).first
+    return table.replace(anchor=anchor, is_shortest=np.zeros(len(table), bool))
 
 
 def _feet(places: FloatArray, objects: FloatArray) -> FloatArray:
@@ -155,7 +167,8 @@ def moved(motions: dict[str, FloatArray], factor: Factor, problem: Problem) -> F
     blocks = jacobians_of(factor, problem.variables)
     parts = np.stack([blocks[slot.name] @ motions[ref.group][ref.index] for slot, ref in factor.references()])
     total = parts.sum(axis=0)
-    return np.where(np.abs(total) > _ROUNDING * np.abs(parts).sum(axis=0), total, 0.0)  # two ends that move as one
+    rounding = _ROUNDING * np.abs(parts).sum(axis=0).max(axis=-1, keepdims=True, initial=0.0)
+    return np.where(np.abs(total) > rounding, total, 0.0)  # two ends that move as one
 
 
 def weighted(factor: Factor, problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -170,4 +183,4 @@ def weighted(factor: Factor, problem: Problem) -> tuple[FloatArray, FloatArray, 
     return residual, information, factor.loss.evaluate(squares)[1]
 
 
-__all__ = ["moved", "settled", "weighted"]
+__all__ = ["measured_at_places", "moved", "settled", "weighted"]

@@ -25,7 +25,7 @@ r           redundancy number: how far the others check the measurement (1 fully
 w           normalised residual, residual / (sigma sqrt r); standard normal without gross errors
 MDE         smallest error that the test finds
 effect      most that an error of that size moves the result, in standard deviations of the result
-weight      what a robust loss left of the weight; of what was taken out 0: it took no part, and is tested against the rest
+weight      what a robust loss left of the weight; 0 of what was taken out, which is tested against the others
 """
 
 
@@ -80,9 +80,8 @@ def _tests(survey: Mapping[str, Any]) -> str:
     suspects = [one for one in survey["measurements"] if one["is_suspect"]]
     for one in sorted(suspects, key=lambda one: -abs(one["normalized"])):
         name = f"{one['kind']} {one['name']} {one['coordinate']}".rstrip()
-        lines.append(
-            f"{'Taken out' if one['is_rejected'] else 'Suspect'}: {name}, residual {one['residual']:.4g}, w {one['normalized']:.1f}"
-        )
+        verdict = "Taken out" if one["is_rejected"] else "Suspect"
+        lines.append(f"{verdict}: {name}, residual {one['residual']:.4g}, w {one['normalized']:.1f}")
     return _section("Test for gross errors", "\n".join(lines if suspects else [*lines, "No measurement is suspect."]))
 
 

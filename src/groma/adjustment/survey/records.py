@@ -15,7 +15,6 @@ from scipy.special import ndtri
 
 from groma.gates import gate
 
-
 #: The median of the size of a standard normal number.
 _MEDIAN = 0.6745
 
@@ -31,9 +30,6 @@ class ReliabilityGates:
     )
     few: int = gate(
         5, "coordinates", "of a kind, from which on their scatter tells its noise", "cost: whether a kind is doubted"
-    )
-    separable: float = gate(
-        0.9, "correlation", "of two tests, from which on nobody knows which one is wrong", "convention: Foerstner"
     )
     checked: float = gate(0.01, "share", "below which nothing checks a measurement", "convention: of geodesy")
     at_once: float = gate(
@@ -142,6 +138,12 @@ class Reliability:
         }
 
 
+def rejection_limit(measurements: Sequence[Measurement]) -> float:
+    """Return the normalised residual that none of so many good measurements exceeds, but for a small probability."""
+    tests = sum(one.normalized is not None for one in measurements)
+    return float(-ndtri(GATES.false_alarm / (2.0 * max(tests, 1))))
+
+
 def gross_errors(measurements: Sequence[Measurement]) -> dict[tuple[str, int], float]:
     """Return by table and row the measurements beyond what the noise of their kind explains, all tests taken together.
 
@@ -149,7 +151,7 @@ def gross_errors(measurements: Sequence[Measurement]) -> dict[tuple[str, int], f
     where all are worse than stated, none is a gross error for that. The values are the largest normalised residuals.
     """
     tests = [(one.kind, one.place, abs(one.normalized)) for one in measurements if one.normalized is not None]
-    limit = float(-ndtri(GATES.false_alarm / (2.0 * max(len(tests), 1))))
+    limit = rejection_limit(measurements)
     found: dict[tuple[str, int], float] = {}
     for kind in dict.fromkeys(kind for kind, _, _ in tests):
         sizes = [(place, size) for of, place, size in tests if of == kind]
@@ -167,4 +169,5 @@ def noncentrality(level: float = GATES.level, power: float = GATES.power) -> flo
 
 __all__ = [
     "GATES", "TABLES", "CheckPoint", "Measurement", "Reliability", "ReliabilityGates", "gross_errors", "noncentrality",
+    "rejection_limit",
 ]  # fmt: skip
