@@ -125,9 +125,9 @@ class MapResult:
         if len(self.scene.camera_motions):
             problem = _problem_of(self.scene, self.adjusted_with)
             numbers["rolling_shutter"] = motions_of(self.scene, problem).to_dict()
-        if self.scene.has_survey:
+        if self.scene.has_survey or len(self.scene.pose_priors):
             found = reliability_of(self.scene, _problem_of(self.scene, self.adjusted_with))
-            numbers["survey"] = survey_numbers(self.surveyed, found)
+            numbers["survey"] = survey_numbers(self.surveyed, found, self.scene)
         return numbers
 
     def write(

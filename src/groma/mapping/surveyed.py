@@ -14,6 +14,7 @@ from typing import Any
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
 from groma.adjustment.survey.attach import Survey, Surveyed, with_survey
+from groma.adjustment.survey.given_poses import given_poses_of
 from groma.adjustment.survey.gross_errors import without_gross_errors
 from groma.adjustment.survey.records import Reliability
 from groma.gates import gate
@@ -53,12 +54,12 @@ class SurveyedResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values: the entry ``survey`` of ``summary.json``."""
-        return survey_numbers(self.surveyed, self.reliability)
+        return survey_numbers(self.surveyed, self.reliability, self.result.scene)
 
 
-def survey_numbers(surveyed: Surveyed | None, found: Reliability | None) -> dict[str, Any]:
+def survey_numbers(surveyed: Surveyed | None, found: Reliability | None, scene: Scene) -> dict[str, Any]:
     """Return what a summary says of measurements, as plain values."""
-    return (surveyed.to_dict() if surveyed else {}) | (found.to_dict() if found else {})
+    return (surveyed.to_dict() if surveyed else {}) | (found.to_dict() if found else {}) | given_poses_of(scene)
 
 
 def adjust_surveyed(

@@ -85,8 +85,8 @@ def _worst(wrong: dict[tuple[str, int], float]) -> set[tuple[str, int]]:
 def _no_longer_checked(before: Reliability | None, after: Reliability, size: float) -> set[str]:
     """Return the tables of measurements that may be wrong in place of what was rejected.
 
-    If the tests of two measurements have the correlation rho, one has 1 - rho^2 of its redundancy without the other, and
-    with the first rejected in place of the second, the normalised residual w of that is w sqrt(1 - rho^2): if this is
+    If the tests of two measurements have the correlation rho, one has 1 - rho^2 of its redundancy without the other.
+    With the first rejected in place of the second, the normalised residual w of that is w sqrt(1 - rho^2): if this is
     still beyond the limit, it is not the first that is wrong.
     """
     if before is None:

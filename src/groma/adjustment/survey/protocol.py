@@ -45,6 +45,8 @@ def protocol(summary: Mapping[str, Any]) -> str:
             rows = [one for one in survey["measurements"] if one["kind"] == kind]
             if rows:
                 parts.append(_section(title, _table(rows) + "\n" + _EXPLAINED))
+    if survey.get("given_poses"):
+        parts.append(_section("Given poses", _given_poses(survey["given_poses"])))
     if survey.get("held"):
         parts.append(_section("Held as they are", ", ".join(survey["held"])))
     if survey.get("check_points"):
@@ -83,6 +85,15 @@ def _tests(survey: Mapping[str, Any]) -> str:
         verdict = "Taken out" if one["is_rejected"] else "Suspect"
         lines.append(f"{verdict}: {name}, residual {one['residual']:.4g}, w {one['normalized']:.1f}")
     return _section("Test for gross errors", "\n".join(lines if suspects else [*lines, "No measurement is suspect."]))
+
+
+def _given_poses(told: Mapping[str, Any]) -> str:
+    """Return what poses without a stated noise were found to be worth."""
+    rows = [("", "sigma, estimated", "rms residual")]
+    rows += [("shift along an axis", f"{told['sigma']:.4g}", f"{told['rms']:.4g}")]
+    rows += [("turn about an axis (degrees)", f"{told['sigma_deg']:.4g}", f"{told['rms_deg']:.4g}")]
+    without = f"\nWithout a given pose, or with a wrong one: {', '.join(told['without'])}." if told["without"] else ""
+    return f"{told['number']} images, with the noise that the photographs show.\n{aligned(rows)}{without}"
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:

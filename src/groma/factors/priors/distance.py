@@ -18,7 +18,7 @@ to a camera or point q', to a line and to a plane. With the unit vectors :math:`
           \frac{\partial r}{\partial (n, w)} = \frac{\sigma}{\lVert n\rVert}
           \left[(q - \sigma\delta\hat n)^\top,\; 1\right].
 
-Between two lines it is that from the place on the first, which has a meaning for parallel ones; between skew lines it is
+Between two lines it is that from the place on the first, which has a meaning for parallel ones; of skew lines it is
 the shortest of all, from where the first is nearest to the second,
 
 .. math:: q = \frac{k \cdot m'\, d - m \times (d' \times k)}{\lVert k\rVert^2}, \qquad k = d \times d' .
