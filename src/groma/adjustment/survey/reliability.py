@@ -325,7 +325,7 @@ def _rows_in_scene(scene: Scene, test: _Test) -> IntArray:
     return test.rows if rejected is None else np.flatnonzero(rejected != test.takes_part)[test.rows]
 
 
-def _squares_and_shares(scene: Scene, test: _Test, wrong: set[tuple[str, int]]) -> tuple[float, float]:
+def _squares_and_shares(scene: Scene, test: _Test, wrong: Collection[tuple[str, int]]) -> tuple[float, float]:
     """Return the weighted squares and the redundancy of the measurements of a group that are not wrong."""
     good = np.array([(TABLES[test.kind], row) not in wrong for row in _rows_in_scene(scene, test).tolist()], bool)
     good &= test.takes_part
