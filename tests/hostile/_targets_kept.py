@@ -122,6 +122,7 @@ def _maps(work: Path) -> Iterator[Made]:
         arrays[name] = arrays[name].astype(np.float32)
     arrays |= {"begin": count, "segment_begin": count, "point": np.arange(5) % 4, "segment": np.arange(5) % 2}
     arrays["descriptor"] = rng.integers(0, 255, (5, 128)).astype(np.uint8)
+    arrays["unique"] = np.arange(4) < 2
     index = MapIndex(**{item.name: arrays[item.name] for item in fields(MapIndex)})
     index.write(work / "i.npz", "digest", work)
     yield (
