@@ -141,6 +141,5 @@ class LoopGates:
     held_by: int = gate(
         8, "keyframes", "earlier keyframes that hold each one in the pose graph", "cost: time of a loop"
     )
-    loss: float = gate(3.0, "sigma", "scale of the Huber loss of the pose graph", "derived from normal noise: 1 in 370")
     max_iterations: int = gate(30, "steps", "steps of the pose graph", "cost: converges in fewer")
     final_iterations: int = gate(15, "steps", "steps of the adjustment at the end, twice", "cost: converges in fewer")
