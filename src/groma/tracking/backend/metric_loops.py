@@ -1,31 +1,26 @@
 # SPDX-License-Identifier: BSD-3-Clause
-r"""Loops of a map with a metric scale: each moves the path as far as the map leaves it open.
+"""Loops of a map with a metric scale: each is one more measurement of the map, as sure as its features are.
 
-The map itself says how well it knows the way from one keyframe to another: with the one held, the covariance
-:math:`P` of the other's pose, and its covariance :math:`P_k` with every keyframe k, are those of the adjustment of
-all. A place that is recognised measures that pose once more, with the covariance R
-(:mod:`groma.tracking.backend.place_again`). With the difference e of both poses (left twist), keyframes move by
-
-.. math:: \delta_k = P_k\,(P + R)^{-1} e,
-
-the least squares of both, to first order. Where the map is surer than the loop, it hardly moves. A loop farther away
-than both deviations allow is another place that looks alike, and left out.
+A place that is recognised measures the motion between two keyframes, with a covariance
+(:mod:`groma.tracking.backend.place_again`). All keyframes and landmarks are adjusted together with it, so the path
+moves as far as the map leaves it open, and where it does. Twice the rise of the cost over that of the map alone is the
+squared distance of the loop from the path in standard deviations of both; one that is too far is another place that
+looks alike, and left out. Deviations of a path by its map are too small by a factor of two or three, so too far is
+several times them, on the average of six components.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from groma._typing import FloatArray, IntArray
-from groma.errors import ProblemError
+from groma._typing import IntArray
 from groma.factors.contract import Ref
 from groma.factors.priors.pose_between import PoseBetween
 from groma.geometry import se3
 from groma.problem.problem import Problem
-from groma.solver.covariance.clusters import with_kept
-from groma.solver.covariance.marginals import Covariances
-from groma.tracking.backend.local_adjustment import job_of
-from groma.tracking.backend.loop_closure import move
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
+from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of
 from groma.tracking.backend.place_again import KnownMap, PlaceAgain, join_place, measure_place
 from groma.tracking.frame.camera import TrackCamera
 from groma.tracking.gates import LoopGates
@@ -41,60 +36,48 @@ def close_loop(
     options: TrackOptions,
 ) -> bool:
     """Close a loop with what a search found, if the map allows for it; return whether the map was changed."""
-    known, best, corrected = KnownMap(track_map, camera), None, None
+    known, best, adjusted = KnownMap(track_map, camera), None, None
     for keyframe, first, second in pairs:
         if not (keyframe.alive and newest.alive):
             continue
         place = measure_place(known, known, keyframe, newest, (first, second), options)
         if place is None or (best is not None and len(place.pairs) <= len(best.pairs)):
             continue
-        poses = corrected_path(track_map, camera, place, options)
-        if poses is not None:
-            best, corrected = place, poses
-    if best is None or corrected is None:
+        job = adjusted_with(track_map, camera, place, options)
+        if job is not None:
+            best, adjusted = place, job
+    if best is None or adjusted is None:
         return False
     track_map.loops.append((best.keyframe.index, newest.index, best.keyframe_from_newest))
-    move(track_map, track_map.living(), np.column_stack([corrected, np.ones(len(corrected))]))
+    adjusted.apply(track_map)
     join_place(track_map, best, options)
     return True
 
 
-def corrected_path(
+def adjusted_with(
     track_map: TrackMap, camera: TrackCamera, place: PlaceAgain, options: TrackOptions
-) -> FloatArray | None:
-    """Return the poses (K, 7) of the living keyframes with a place measured again; None where it contradicts them.
+) -> AdjustmentJob | None:
+    """Return the adjustment of a map with a place measured again; None where that contradicts the map.
 
     The first keyframe stays where it is.
     """
-    living = track_map.living()
-    first, last = living.index(place.keyframe), living.index(place.newest)
-    shared = _covariances_with(track_map, camera, first, last, options)
-    if shared is None:
-        return None
-    poses = np.array([keyframe.pose for keyframe in living])
-    error = se3.log(se3.compose(place.pose[None], se3.inverse(poses[last : last + 1])))[0]
-    pull = np.linalg.solve(shared[last] + place.covariance[:6, :6], error)
-    if error @ pull > len(error) * options.gates.loops.jump**2:
-        return None
-    moved = se3.compose(se3.exp(shared @ pull), poses)
-    anchor = se3.compose(se3.inverse(moved[:1]), poses[:1])
-    return se3.compose(moved, np.tile(anchor, (len(moved), 1)))
-
-
-def _covariances_with(
-    track_map: TrackMap, camera: TrackCamera, held: int, last: int, options: TrackOptions
-) -> FloatArray | None:
-    """Covariances (K, 6, 6) of the living keyframes' poses with that of one of them, another one held."""
-    living = track_map.living()
-    job = job_of(track_map, camera, living, np.arange(len(living)) == held, options.relations)
+    living, gates = track_map.living(), options.gates.loops
+    job = job_of(track_map, camera, living, np.arange(len(living)) == 0, options.relations, gates.max_iterations)
     if job is None:
         return None
-    problem = Problem(job.problem.variables, [*job.problem.factors, _steps(living, options.gates.loops)])
-    try:
-        found = with_kept(Covariances(problem), "frames", last)["frames"]
-    except ProblemError:
-        return None
-    return found if np.isfinite(found).all() else None
+    alone = Problem(job.problem.variables, [*job.problem.factors, _steps(living, gates)])
+    again = PoseBetween(
+        first=Ref("frames", np.array([living.index(place.newest)])),
+        second=Ref("frames", np.array([living.index(place.keyframe)])),
+        first_from_second=se3.compose(place.pose[None], se3.inverse(place.keyframe.pose[None])),
+        sqrt_information=np.asarray(np.linalg.inv(np.linalg.cholesky(place.covariance[:6, :6])), np.float64)[None],
+    )
+    settings = SolverOptions(max_iterations=gates.max_iterations, function_tolerance=1e-4, threads=1)
+    before = solve(alone, settings)
+    after = solve(Problem(before.problem.variables, [*alone.factors, again]), settings)
+    job.solved, job.report = after.problem, after.report
+    rise = 2.0 * (after.report.final_cost - before.report.final_cost)
+    return job if rise < 6.0 * gates.jump**2 else None
 
 
 def _steps(living: list[Keyframe], gates: LoopGates) -> PoseBetween:
@@ -111,4 +94,4 @@ def _steps(living: list[Keyframe], gates: LoopGates) -> PoseBetween:
     )
 
 
-__all__ = ["close_loop", "corrected_path"]
+__all__ = ["adjusted_with", "close_loop"]

@@ -137,7 +137,9 @@ class LoopGates:
     scale_sigma: float = gate(
         0.02, "1", "noise of the logarithm of a relative scale, of one camera", "derived from that of positions"
     )
-    jump: float = gate(6.0, "sigma", "a loop moves the newest keyframe by less: places are alike", SEQUENCES)
+    jump: float = gate(
+        6.0, "sigma", "a loop is nearer to the path, on the average of its components: places are alike", SEQUENCES
+    )
     held_by: int = gate(
         8, "keyframes", "earlier keyframes that hold each one in the pose graph", "cost: time of a loop"
     )
