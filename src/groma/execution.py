@@ -31,7 +31,8 @@ _Result = TypeVar("_Result")
 
 #: Pieces of work that wait for each worker; more would only take memory.
 _WAITING = 2
-#: Calls to an executor of processes that each of its workers gets, so that all end at about the same time.
+#: Calls to an executor of processes that each of its workers gets, so that all end at about the same time (cost: of
+#: waiting for the last).
 _CALLS = 4
 
 

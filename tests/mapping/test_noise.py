@@ -13,9 +13,9 @@ from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.errors import InputError
 from groma.evaluation import evaluate_poses
+from groma.geometry import quaternion
 from groma.mapping.noise.landmarks import point_noise
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
-from groma.geometry import quaternion
 from groma.problem.residuals import residuals_of
 from groma.scene import PointDepths, Relations, Similarity, synthetic
 

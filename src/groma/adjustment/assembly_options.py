@@ -86,7 +86,8 @@ class AssemblyOptions:
     #: pixels (``pixels``, weighted by the noise of the images). Those with a standard deviation are always distances.
     structure_form: str = "metric"
     #: Points on lines tie points to lines, and only one of the two can be eliminated. With more lines than this they
-    #: are measured in pixels instead, which leaves points and lines uncoupled. The solver keeps no more unasked.
+    #: are measured in pixels instead, which leaves points and lines uncoupled. The solver keeps no more unasked. Cost:
+    #: memory and time.
     max_coupled_lines: int = 4000
     #: Hold lines together that meet. This ties lines to lines, so that all lines stay in the reduced system: for scenes
     #: of some hundred lines.

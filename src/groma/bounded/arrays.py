@@ -28,6 +28,7 @@ from groma.errors import FileFormatError
 Array = npt.NDArray[Any]
 
 _ENDING = ".npy"
+#: Bytes of a header: the format's own limit is 64 kB, no array of numbers needs as much.
 _HEADER_LIMIT = 4096
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)

@@ -21,7 +21,7 @@ from groma.errors import FileFormatError
 
 _Kind = TypeVar("_Kind", dict[str, Any], list[Any], str)
 _WORDS = {dict: "an object {...}", list: "a list [...]", str: "a text"}
-#: Longest text that is taken for a name, characters.
+#: Longest text that is taken for a name, characters (cost: length of a message).
 _LONGEST_NAME = 4096
 #: Numbers from here on are taken for infinite.
 _LARGEST_NUMBER = 1e300

@@ -21,6 +21,7 @@ from groma._numba import loop
 from groma._typing import FloatArray, IntArray
 from groma.errors import ShapeError
 
+#: Cost: rounds of expectation maximisation.
 _ROUNDS = 30
 
 

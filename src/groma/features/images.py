@@ -11,6 +11,9 @@ from groma.errors import InputError, ShapeError
 
 GrayImage = npt.NDArray[np.uint8]
 
+#: Smaller images show no segment, pixels: a detector needs a few gradients (derived from their support).
+MIN_SIDE = 8
+#: Largest level in the format of 12 bits.
 _FULL_12_BITS = 4095
 
 
@@ -59,4 +62,4 @@ def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
     return np.ascontiguousarray(image, dtype=np.uint8)
 
 
-__all__ = ["GrayImage", "to_gray"]
+__all__ = ["MIN_SIDE", "GrayImage", "to_gray"]

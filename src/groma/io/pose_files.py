@@ -42,7 +42,8 @@ from groma.scene import Cameras
 
 #: Seconds by which a time may miss that of a photograph: the convention of the TUM benchmark.
 NEAR_SECONDS = 0.02
-#: Digits from which a whole number is nanoseconds.
+#: Digits from which a whole number is nanoseconds (derived from Unix time: seconds have ten
+#: digits).
 _NANOSECOND_DIGITS = 16
 
 

@@ -20,7 +20,7 @@ from groma.scene import Scene
 if TYPE_CHECKING:
     from groma.io.limap.structures import Structures
 
-#: Bytes that :attr:`SceneFormat.recognise` is given.
+#: Bytes that :attr:`SceneFormat.recognise` is given (cost: time only).
 HEAD_BYTES = 256
 
 

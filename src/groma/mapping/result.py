@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
+from groma.adjustment.adjust import AdjustOptions
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.contributions import Contribution, contributions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.report import AdjustReport, AdjustResult
 from groma.adjustment.rolling_shutter import motions_of
-from groma.adjustment.stages import with_loss
+from groma.adjustment.stages import STAGES, with_loss
 from groma.adjustment.survey.attach import Surveyed
 from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
@@ -217,7 +217,7 @@ def _problem_of(scene: Scene, told: AdjustOptions) -> Problem:
 def last_loss(told: AdjustOptions) -> Loss:
     """Return the loss that an adjustment of photographs ends with."""
     if told.loss == "auto":
-        return GemanMcClure(LAST_SCALE_SIGMAS)
+        return GemanMcClure(STAGES.last_scale)
     return loss(told.loss, 1.0 if told.loss_scale is None else told.loss_scale)
 
 

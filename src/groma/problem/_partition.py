@@ -12,7 +12,8 @@ from groma.problem.problem import Problem
 
 #: Kinds of variables that are eliminated where possible.
 LANDMARK_KINDS = ("point", "line")
-#: Largest number of variables that may be moved to the reduced system without being asked.
+#: Largest number of variables that may be moved to the reduced system without being asked (cost: the reduced system
+#: grows with the square).
 MAX_KEPT_LANDMARKS = 4000
 
 

@@ -18,6 +18,7 @@ from groma._counted import counted
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.fit import noise_of
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.names import nearest, rows_by_name
@@ -53,8 +54,6 @@ class ObjectGates:
 
 
 GATES = ObjectGates()
-#: The median of a squared residual of two coordinates, in variances.
-_MEDIAN_SQUARE = 1.386
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +128,7 @@ def with_measured_points(scene: Scene, survey: Survey, notes: list[str]) -> Scen
     of[rows] = count + np.arange(len(rows))
     mine = np.flatnonzero(of[seen.point_idx] >= 0)
     squares = squared_residuals_px(assemble(scene.keep(lines=[]), AssemblyOptions()))["points"]
-    sigma = max(float(np.sqrt(np.median(squares) / _MEDIAN_SQUARE)), 0.05) * seen.sigma[mine]
+    sigma = max(noise_of(squares), 0.05) * seen.sigma[mine]
     xyz, unit = scene.points.xyz[rows], np.tile(np.eye(3), (len(rows), 1, 1))
     points, marks = scene.control_points, scene.marks
     marked = marks.replace(

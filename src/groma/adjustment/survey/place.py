@@ -40,6 +40,7 @@ from groma.problem.variables import Variables
 from groma.scene import ControlPoints, Keypoints, Scene, Similarity
 from groma.scene.survey import UNKNOWN, Kind
 
+#: Cost: steps of a fit that ends before, and where it has converged.
 _STEPS, _TOLERANCE = 50, 1e-6
 #: Directions of less than this share of the information of others are not known.
 _UNKNOWN = 1e-13

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from groma.adjustment.survey.align import Alignment
     from groma.cli.shared.console import Console
 
-#: Places with the largest residuals that are told.
+#: Places with the largest residuals that are told (convention: what a table on a screen can hold).
 _TOLD = 5
 
 

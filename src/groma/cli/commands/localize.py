@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from groma.localization.placed import PlacedImage
     from groma.localization.result import LocalizeResult
 
-#: Localised photographs in the table; those that are not are always told.
+#: Localised photographs in the table; those that are not are always told (convention: what a table on a screen can
+#: hold).
 _SHOWN = 12
 _MIN_LENGTH = 15.0
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from groma._numba import loop
 
-CAMERA, POINT, LINE, PLANE = 0, 1, 2, 3
+CAMERA, POINT, LINE, PLANE = range(4)
 #: Kinds of variables by these codes.
 KINDS = ("pose", "point", "line", "plane")
 

@@ -28,11 +28,11 @@ class DepthNoise:
     and :math:`c_2 = \sigma_d / (f b)`.
     """
 
-    #: c0, metres.
+    #: c0, metres (convention: Nguyen et al. 2012).
     constant: float = 0.0012
-    #: c2, one over metres.
+    #: c2, one over metres (convention: Nguyen et al. 2012).
     quadratic: float = 0.0019
-    #: z0, metres.
+    #: z0, metres (convention: Nguyen et al. 2012).
     offset: float = 0.4
     #: Number of neighbouring pixels that err alike; covariances are multiplied by it.
     correlation: float = 1.0

@@ -15,7 +15,7 @@ import numpy as np
 from groma._numba import inline_kernel, kernel, loop
 from groma.gates import gate
 
-#: Regions that are remembered: the size of an array.
+#: Regions that are remembered: the size of an array (cost: they fit in a byte).
 MAX_REGIONS = 120
 #: The normals of two regions are compared up to this angle, radians: beyond, noise tells nothing of them.
 _ANY_ANGLE = 1.5

@@ -32,7 +32,7 @@ from groma.io.colmap.sfm import (
 )
 from groma.scene import PosePriors, Scene
 
-#: Matches that a pair of images, or an image and a map, must agree on: COLMAP's numbers.
+#: Matches that a pair of images, or an image and a map, must agree on: COLMAP's numbers (convention: as in COLMAP).
 MIN_MATCHES = 15
 
 

@@ -16,7 +16,7 @@ EXHAUSTIVE_LIMIT = 120
 #: Followers, and then every second power of two, so that a walk around a building is closed.
 OVERLAP = 12
 _FARTHEST = 2**9
-#: Images whose pairs are matched in one call; their features are loaded once for all of them.
+#: Images whose pairs are matched in one call; their features are loaded once for all of them (cost: time only).
 _BLOCK = 8
 #: Nearest places that are matched, and pairs in a call then.
 _NEAREST, _PAIRS_IN_A_CALL = 24, 200

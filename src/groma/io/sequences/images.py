@@ -26,7 +26,7 @@ from groma.io.sequences._reader import Entry, FileSequence, Selection, read_ahea
 from groma.io.sequences.frame import Frame, Kind, SequenceCamera
 from groma.io.trajectories import Trajectory, read_trajectory
 
-#: Frames a second where nothing says it.
+#: Frames a second where nothing says it (convention: usual for video).
 RATE = 30.0
 
 _NO_CAMERA = (

@@ -20,7 +20,7 @@ from groma.io.sequences._calibration import Calibration, from_opencv
 from groma.io.sequences._reader import Entry, FileSequence, Selection, simple_sequence
 from groma.io.trajectories import Trajectory, read_trajectory
 
-#: Frames a second where there is no ``times.txt``.
+#: Frames a second where there is no ``times.txt`` (convention: as in the benchmark).
 RATE = 10.0
 
 

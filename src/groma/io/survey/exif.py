@@ -19,8 +19,9 @@ from groma._counted import counted
 from groma.errors import InputError
 from groma.io.survey.coordinates import CoordinateSystem, Places
 
-#: Bytes of a file that are read: EXIF stands in one of the first segments, of 64 kB at most.
+#: Bytes of a file that are read: EXIF stands in one of the first segments, of 64 kB at most (cost: time only).
 _HEAD = 1 << 18
+#: Tags of the format.
 _GPS, _RATIONAL = 0x8825, 5
 #: Standard deviations of receivers in cameras and phones, metres: east, north, height.
 EXIF_SIGMA = (5.0, 5.0, 10.0)

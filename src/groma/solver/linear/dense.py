@@ -17,7 +17,8 @@ from groma.solver.linear.lapack import potrf, potrs
 
 #: Flops of a factorisation, measured on one core.
 DENSE_FLOPS_PER_SECOND = 2.5e10
-#: Up to this many unknowns a dense factorisation costs little, and is exact: where poses alone are kept, and otherwise.
+#: Up to this many unknowns a dense factorisation costs little, and is exact: where poses alone are kept, and otherwise
+#: (cost: time alone).
 DENSE_POSE_UNKNOWNS, DENSE_OTHER_UNKNOWNS = 360, 1000
 
 # ---------------------------------------------------------------------------------------------------------- Kernels

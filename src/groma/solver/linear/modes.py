@@ -21,6 +21,7 @@ from groma.solver.linear.fronts import Fronts
 NULL_TOLERANCE = 1e-11
 #: Added to the diagonal while modes are sought; raised by tens until the factorisation succeeds.
 SHIFT, MAX_SHIFT = 1e-10, 1e-5
+#: Modes sought at a time, and rounds of inverse iteration (cost: time and memory).
 MODES, ROUNDS = 16, 4
 
 

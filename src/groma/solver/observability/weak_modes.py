@@ -21,7 +21,7 @@ from groma.solver.linear.modes import MAX_SHIFT, MODES, ROUNDS, SHIFT, Modes, sm
 if TYPE_CHECKING:
     from scipy.sparse import csc_array, csr_array
 
-#: Systems of up to so many unknowns are decomposed completely.
+#: Systems of up to so many unknowns are decomposed completely (cost: time alone).
 DENSE = 300
 #: Directions of a landmark whose scaled information is below this share of the largest are left alone.
 LANDMARK_TOLERANCE = 1e-11

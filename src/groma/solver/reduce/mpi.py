@@ -30,7 +30,7 @@ LAUNCHERS = (
     ("PMIX_RANK", "SLURM_STEP_NUM_TASKS"),
 )
 
-#: Numbers in one message, because MPI makes copies of it; and numbers added at once.
+#: Numbers in one message, because MPI makes copies of it; and numbers added at once (cost: memory).
 SUMMED_AT_ONCE, ADDED_AT_ONCE = 1 << 19, 1 << 14
 
 

@@ -14,10 +14,10 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import IntArray
-from groma.factors.contract import Ref
-from groma.factors.priors.pose_between import PoseBetween
+from groma.adjustment.graphs.pose_graph import motion_factors
 from groma.geometry import se3
 from groma.problem.problem import Problem
+from groma.scene.pose_graph import Motions
 from groma.solver.options import SolverOptions
 from groma.solver.solve import solve
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of
@@ -65,33 +65,29 @@ def adjusted_with(
     job = job_of(track_map, camera, living, np.arange(len(living)) == 0, options.relations, gates.max_iterations)
     if job is None:
         return None
-    alone = Problem(job.problem.variables, [*job.problem.factors, _steps(living, gates)])
-    again = PoseBetween(
-        first=Ref("frames", np.array([living.index(place.newest)])),
-        second=Ref("frames", np.array([living.index(place.keyframe)])),
-        first_from_second=se3.compose(place.pose[None], se3.inverse(place.keyframe.pose[None])),
-        sqrt_information=np.asarray(np.linalg.inv(np.linalg.cholesky(place.covariance[:6, :6])), np.float64)[None],
+    alone = Problem(job.problem.variables, [*job.problem.factors, motion_factors(_steps(living, gates), "frames")])
+    again = Motions(
+        np.array([living.index(place.newest)]),
+        np.array([living.index(place.keyframe)]),
+        se3.compose(place.pose[None], se3.inverse(place.keyframe.pose[None])),
+        np.asarray(np.linalg.inv(place.covariance[None, :6, :6]), np.float64),
     )
     settings = SolverOptions(max_iterations=gates.max_iterations, function_tolerance=1e-4, threads=1)
     before = solve(alone, settings)
-    after = solve(Problem(before.problem.variables, [*alone.factors, again]), settings)
+    after = solve(Problem(before.problem.variables, [*alone.factors, motion_factors(again, "frames")]), settings)
     job.solved, job.report = after.problem, after.report
     rise = 2.0 * (after.report.final_cost - before.report.final_cost)
     return job if rise < 6.0 * gates.jump**2 else None
 
 
-def _steps(living: list[Keyframe], gates: LoopGates) -> PoseBetween:
+def _steps(living: list[Keyframe], gates: LoopGates) -> Motions:
     """Steps from keyframe to keyframe, loosely: they count where a map was followed over a gap without landmarks."""
     poses, row = np.array([keyframe.pose for keyframe in living]), np.arange(len(living) - 1)
     depth = np.array([keyframe.depth for keyframe in living[1:]])
     sigma = gates.jump * np.repeat([[gates.shift_sigma, gates.turn_sigma]], 3, axis=1) * np.ones((len(row), 6))
     sigma[:, :3] *= depth[:, None]
-    return PoseBetween(
-        first=Ref("frames", row),
-        second=Ref("frames", row + 1),
-        first_from_second=se3.compose(poses[:-1], se3.inverse(poses[1:])),
-        sqrt_information=np.eye(6) / sigma[:, None],
-    )
+    relative = se3.compose(poses[:-1], se3.inverse(poses[1:]))
+    return Motions(row, row + 1, relative, np.eye(6) / sigma[:, :, None] ** 2)
 
 
 __all__ = ["adjusted_with", "close_loop"]
