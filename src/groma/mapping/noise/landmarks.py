@@ -109,7 +109,8 @@ def point_noise(scene: Scene, sigma_px: float | None = None) -> PointNoise:
     Columns in the right images of stereo pairs, and depths, are observations, too.
     """
     parts = _pixel_rows(scene), _column_rows(scene), _depth_rows(scene)
-    point, residual, by_world = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    point = np.concatenate([part[0] for part in parts])
+    residual, by_world = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
     good = np.asarray(np.isfinite(residual) & np.isfinite(by_world).all(axis=1))
     residual, by_world = np.where(good, residual, 0.0), np.where(good[:, None], by_world, 0.0)
     count = np.bincount(point[good], minlength=scene.num_points)

@@ -67,9 +67,9 @@ def adjusted_with(
         return None
     alone = Problem(job.problem.variables, [*job.problem.factors, motion_factors(_steps(living, gates), "frames")])
     again = Motions(
-        np.array([living.index(place.newest)]),
         np.array([living.index(place.keyframe)]),
-        se3.compose(place.pose[None], se3.inverse(place.keyframe.pose[None])),
+        np.array([living.index(place.newest)]),
+        se3.compose(place.keyframe.pose[None], se3.inverse(place.pose[None])),
         np.asarray(np.linalg.inv(place.covariance[None, :6, :6]), np.float64),
     )
     settings = SolverOptions(max_iterations=gates.max_iterations, function_tolerance=1e-4, threads=1)
