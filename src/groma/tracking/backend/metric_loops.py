@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import IntArray
+from groma.adjustment.assemble import assemble
 from groma.adjustment.graphs.pose_graph import motion_factors
 from groma.geometry import se3
 from groma.problem.problem import Problem
@@ -65,7 +66,8 @@ def adjusted_with(
     job = job_of(track_map, camera, living, np.arange(len(living)) == 0, options.relations, gates.max_iterations)
     if job is None:
         return None
-    alone = Problem(job.problem.variables, [*job.problem.factors, motion_factors(_steps(living, gates), "frames")])
+    start = assemble(job.scene, job.options).problem
+    alone = Problem(start.variables, [*start.factors, motion_factors(_steps(living, gates), "frames")])
     again = Motions(
         np.array([living.index(place.keyframe)]),
         np.array([living.index(place.newest)]),
