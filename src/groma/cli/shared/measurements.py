@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 PANEL = Panel("Measurements")
 #: Residuals so many times as large as stated are told.
 WORSE = 2.0
+#: Wrong measurements that are named.
+_LISTED = 5
 Positions = Annotated[
     str | None,
     PANEL.option(
@@ -285,10 +287,20 @@ def say_survey(console: Console, numbers: dict[str, Any]) -> None:
             "larger ones, or look for what is wrong with all of them."
         )
     suspects = [one for one in numbers.get("measurements", ()) if one["is_suspect"] and one["kind"] not in worse]
-    for one in sorted(suspects, key=lambda one: -abs(one["normalized"]))[:5]:
+    suspects = sorted(suspects, key=lambda one: -abs(one["normalized"]))
+    first = {(one["kind"], one["name"]): one for one in reversed(suspects) if one["is_rejected"]}
+    rejected = sorted(first.values(), key=lambda one: -abs(one["normalized"]))
+    left = [one for one in suspects if not one["is_rejected"]]
+    _warn_of(console, "Taken out as wrong", rejected, "Correct or delete it.")
+    _warn_of(console, "Probably wrong", left, "Check it.")
+
+
+def _warn_of(console: Console, what: str, measurements: Sequence[Mapping[str, Any]], advice: str) -> None:
+    """Name the worst measurements, the worst first."""
+    for one in measurements[:_LISTED]:
         console.warn(
-            f"Probably wrong: {one['kind']} {one['name']} {one['coordinate']}".rstrip()
-            + f" (residual {one['residual']:.4g}, {abs(one['normalized']):.1f} standard deviations). Check it."
+            f"{what}: {one['kind']} {one['name']} {one['coordinate']}".rstrip()
+            + f" (residual {one['residual']:.4g}, {abs(one['normalized']):.1f} standard deviations). {advice}"
         )
-    if len(suspects) > 5:
-        console.warn(f"The protocol lists {len(suspects) - 5} more that are probably wrong.")
+    if len(measurements) > _LISTED:
+        console.warn(f"{what}: {len(measurements) - _LISTED} more, listed in the protocol.")
