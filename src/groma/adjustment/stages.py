@@ -53,6 +53,11 @@ OWN_LOSS = (
 )  # fmt: skip
 
 
+def keeps_loss(factor: Factor) -> bool:
+    """Tell whether a factor is of what other instruments measured, or of marks that it was measured at."""
+    return factor.type_name in OWN_LOSS or any(ref.group == "control_points" for _, ref in factor.references())
+
+
 def with_loss(problem: Problem, loss: Loss, relation_loss: Loss | None = None) -> Problem:
     """Return a problem under a loss; priors keep theirs.
 
@@ -62,7 +67,7 @@ def with_loss(problem: Problem, loss: Loss, relation_loss: Loss | None = None) -
         relation_loss = make_loss(loss.name, RELATION_SCALES[loss.name]) if loss.name in RELATION_SCALES else loss
 
     def of(factor: Factor) -> Loss:
-        if factor.type_name in OWN_LOSS:
+        if keeps_loss(factor):
             return factor.loss
         return relation_loss if factor.type_name in RELATION_FACTORS else loss
 

@@ -21,6 +21,7 @@ from groma.adjustment.report import AdjustReport, AdjustResult
 from groma.adjustment.rolling_shutter import motions_of
 from groma.adjustment.stages import STAGES, with_loss
 from groma.adjustment.survey.attach import Surveyed
+from groma.adjustment.survey.gross_errors import reliability_of
 from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
 from groma.bounded.json_text import json_text
@@ -31,7 +32,7 @@ from groma.mapping.depth.points import MeasuredDepths
 from groma.mapping.lines.confidence import left_out, with_confidence
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.lines.line_map import LineMap, explain
-from groma.mapping.surveyed import reliability_of, survey_numbers
+from groma.mapping.surveyed import survey_numbers
 from groma.mapping.unused import without_unused
 from groma.problem.problem import Problem
 from groma.scene import Scene
@@ -124,9 +125,9 @@ class MapResult:
         if len(self.scene.camera_motions):
             problem = _problem_of(self.scene, self.adjusted_with)
             numbers["rolling_shutter"] = motions_of(self.scene, problem).to_dict()
-        if self.scene.has_survey:
+        if self.scene.has_survey or len(self.scene.pose_priors):
             found = reliability_of(self.scene, _problem_of(self.scene, self.adjusted_with))
-            numbers["survey"] = survey_numbers(self.surveyed, found)
+            numbers["survey"] = survey_numbers(self.surveyed, found, self.scene)
         return numbers
 
     def write(
