@@ -13,10 +13,11 @@ from groma.errors import InputError, ShapeError
 from groma.geometry import quaternion, se3, so3
 from groma.localization.pose.absolute_pose import PoseOptions, estimate_absolute_pose
 from groma.localization.pose.camera import QueryCamera
+from groma.localization.pose.gates import REFINEMENT
 from groma.localization.pose.hypotheses import max_errors
 from groma.localization.pose.matches import Matches
 from groma.localization.pose.pieces import cells_elsewhere
-from groma.localization.pose.refinement import fitted, refine
+from groma.localization.pose.refinement import _of_normal_noise, _pull, fitted, last_scale, refine
 from groma.localization.pose.verdict import votes_of_a_rival
 
 #: What wrong matches may still do: the loss leaves them a small weight. A pixel is 0.007 here.
@@ -344,3 +345,15 @@ def test_wrong_cameras_are_refused():
 def test_public_names():
     assert groma.estimate_absolute_pose is estimate_absolute_pose
     assert so3 is not None
+
+
+def test_the_noise_of_a_fit_to_few_matches_is_not_told_too_small():
+    """Residuals of five matches, six of ten directions of which the fit has taken."""
+    rng = np.random.default_rng(11)
+    found = []
+    for _ in range(2000):
+        basis = np.linalg.qr(rng.normal(size=(10, 6)))[0]
+        noise = rng.normal(size=10)
+        found.append(_pull((noise - basis @ (basis.T @ noise)).reshape(5, 2), 6, REFINEMENT)[1] ** 2)
+    square, stiffness = _of_normal_noise(last_scale(5))
+    assert np.mean(found) == pytest.approx(square / stiffness**2, rel=0.06)

@@ -160,18 +160,19 @@ def _pull(residual: FloatArray, unknowns: int, gates: RefinementGates) -> tuple[
     those of the residuals and, counted as some more observations, those of normal noise as stated.
     """
     scale = last_scale(len(residual), gates)
-    c = scale**2
-    square = (residual**2).sum(axis=1, keepdims=True)
-    weight = (1.0 + square / c) ** -2
-    stiffness = weight - 4.0 * residual**2 / c * (1.0 + square / c) ** -3
+    c, free = scale**2, max(residual.size - unknowns, 0)
+    weight = (1.0 + (residual**2).sum(axis=1, keepdims=True) / c) ** -2
+    # A fit makes residuals smaller than the noise; of a few matches so much that a loss would seem stiffer than it is.
+    noise = residual * np.sqrt(residual.size / max(free, 1))
+    square = (noise**2).sum(axis=1, keepdims=True)
+    of_noise = (1.0 + square / c) ** -2
+    stiffness = of_noise - 4.0 * noise**2 / c * (1.0 + square / c) ** -3
     square_of_normal, stiffness_of_normal = _of_normal_noise(scale)
     stated = 2.0 * gates.stated_weight
-    mean = (float(stiffness.sum()) + stated * stiffness_of_normal) / (residual.size + stated)
-    mean = max(mean, float(weight.mean()) ** 2)  # of far outliers it may vanish
-    pull = weight * residual
-    free = max(residual.size - unknowns, 0)
-    variance = (float((pull**2).sum()) + stated * square_of_normal) / (free + stated)
-    return pull / mean, float(np.sqrt(variance)) / mean
+    mean = (free * float(stiffness.mean()) + stated * stiffness_of_normal) / (free + stated)
+    mean = max(mean, float(of_noise.mean()) ** 2)  # of far outliers it may vanish
+    variance = (free * float(((of_noise * noise) ** 2).mean()) + stated * square_of_normal) / (free + stated)
+    return weight * residual / mean, float(np.sqrt(variance)) / mean
 
 
 @lru_cache(maxsize=256)
