@@ -31,7 +31,8 @@ _Result = TypeVar("_Result")
 
 #: Pieces of work that wait for each worker; more would only take memory.
 _WAITING = 2
-#: Calls to an executor of processes that each of its workers gets, so that all end at about the same time.
+#: Calls to an executor of processes that each of its workers gets, so that all end at about the same time (cost: of
+#: waiting for the last).
 _CALLS = 4
 
 
@@ -240,16 +241,3 @@ def _num_workers(executor: Any) -> int:
             return number
     client = getattr(executor, "_client", None)  # of dask.distributed
     return max(1, sum(client.nthreads().values())) if client is not None else available_cores()
-
-
-__all__ = [
-    "available_cores",
-    "beside",
-    "map_in_threads",
-    "map_ranges",
-    "map_work",
-    "num_threads",
-    "num_workers",
-    "together",
-    "work_with",
-]

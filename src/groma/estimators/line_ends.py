@@ -23,6 +23,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
 from groma.execution import map_ranges
 from groma.gates import gate, numbers
+from groma.geometry.incidence import MIN_SINE
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def _along(center, ray, X):
     dw = d0 * w0 + d1 * w1 + d2 * w2
     fw = ray[0] * w0 + ray[1] * w1 + ray[2] * w2
     determinant = dd * ff - df * df
-    if not determinant > 4e-4 * dd * ff:
+    if not determinant > MIN_SINE**2 * dd * ff:
         return np.nan, -1.0
     return (df * fw - ff * dw) / determinant, (dd * fw - df * dw) / determinant
 

@@ -32,14 +32,13 @@ import numpy.typing as npt
 from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError
 from groma.features.edge_fit import EDGES, measure_edges
-from groma.features.images import GrayImage, to_gray
+from groma.features.images import MIN_SIDE, GrayImage, to_gray
 from groma.features.merging import merge_collinear
-from groma.features.segments import Segments
+from groma.features.segments import MIN_LENGTH, MIN_STRENGTH, Segments
 from groma.gates import gate
 
-#: Largest file of a network, bytes.
+#: Largest file of a network, bytes (cost: memory).
 _LARGEST = 1 << 28
-_SMALLEST_IMAGE = 8
 _FORM = "input (1, H, W, 3 or 4), outputs (1, h, w, 1) and (1, h, w, 4), all float32, as M-LSD has them"
 
 
@@ -74,9 +73,9 @@ class OnnxDetector:
     #: The ONNX file.
     file: str
     #: Shortest segment, pixels.
-    min_length: float = 20.0
+    min_length: float = MIN_LENGTH
     #: Smallest mean gradient across a segment, grey levels (of 255) per pixel.
-    min_strength: float = 3.0
+    min_strength: float = MIN_STRENGTH
     #: Keep at most so many, the longest; 0 keeps all.
     max_segments: int = 0
     #: Hash of the content of the file, so that results are not taken for those of another one.
@@ -99,7 +98,7 @@ class OnnxDetector:
     def detect(self, image: npt.NDArray[np.generic]) -> Segments:
         """Segments of an image (H, W) or (H, W, 3), 8 bit, longest first."""
         gray = to_gray(image)
-        if min(gray.shape) < _SMALLEST_IMAGE or gray.min() == gray.max():
+        if min(gray.shape) < MIN_SIDE or gray.min() == gray.max():
             return Segments.empty()
         network = _network(self.file, self.content)
         rough = [network.segments(gray, tile) for tile in _tiles(gray.shape, network.size)]
@@ -276,6 +275,3 @@ def _checked(session: Any, file: str, gates: NetworkGates = NETWORK) -> _Network
             "it for smaller ones: larger images are cut into tiles."
         )
     return _Network(session, file, inputs[0].name, (shape[2], shape[1]), shape[3], last[1].name, last[4].name)
-
-
-__all__ = ["NETWORK", "NetworkGates", "OnnxDetector", "covered"]

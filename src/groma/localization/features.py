@@ -25,7 +25,7 @@ from groma.localization.pose.camera import QueryCamera
 from groma.mapping.image_segments import Straightener
 
 Bytes = npt.NDArray[np.uint8]
-#: A descriptor of length one, in bytes, has about this length.
+#: A descriptor of length one, in bytes, has about this length (the format of COLMAP's descriptors).
 _LENGTH = 512.0
 
 

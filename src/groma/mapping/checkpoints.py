@@ -27,6 +27,7 @@ from groma.mapping.folder_lock import LOCK, lock_folder
 
 _Options = TypeVar("_Options")
 _Result = TypeVar("_Result")
+#: Characters of a key in the format of names of files.
 _KEY_LENGTH = 12
 
 

@@ -47,7 +47,7 @@ class LensGates:
 
 
 GATES = LensGates()
-#: Places looked at along a segment, to find the part of it inside the image.
+#: Places looked at along a segment, to find the part of it inside the image (cost: time).
 _SAMPLES = 65
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from groma.scene import Scene
 from groma.scene.survey import Kind
 
-#: Points that determine a plane, a line counting twice; lines that share a direction.
+#: Points that determine a plane, a line counting twice; lines that share a direction (derived from geometry).
 _MIN_ON_PLANE, _MIN_ALONG = 3, 2
 
 

@@ -60,12 +60,13 @@ class Workers:
             self._pool = None
 
 
-#: Problems with fewer factors are one share: they are not worth a thread.
+#: Problems with fewer factors are one share: they are not worth a thread (cost: time only).
 FACTORS_FOR_THREADS = 50_000
 #: Most shares, and most bytes that their copies of the reduced system take for every factor, about twice what its
-#: measurement does, unless two copies take more: even one thread has them all.
+#: measurement does, unless two copies take more: even one thread has them all (cost: memory).
 MAX_SHARES, MAX_BYTES = 16, 96
-#: Landmarks add to each block of a copy so many times on average, or clearing and adding the copies takes too long.
+#: Landmarks add to each block of a copy so many times on average, or clearing and adding the copies takes too long
+#: (cost: time alone).
 USES_OF_A_BLOCK = 20
 
 

@@ -32,9 +32,10 @@ from groma.tracking.tracker import Tracker
 from groma.viz.pictures import ImageFiles
 from groma.viz.report.trajectory import write_track_report
 
-#: Frames without a pose that are named in a warning.
+#: Frames without a pose that are named in a warning (convention: what a sentence can hold).
 NAMED = 5
-#: Largest difference between the times of a frame and of a pose of the reference, seconds.
+#: Largest difference between the times of a frame and of a pose of the reference, seconds (convention: of the TUM
+#: benchmark).
 MAX_TIME_DIFFERENCE = 0.02
 
 

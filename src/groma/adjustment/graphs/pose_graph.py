@@ -37,7 +37,7 @@ from groma.solver.report import Iteration, SolveReport
 from groma.solver.solve import solve
 
 #: Where a robust loss begins to bend unless the caller says so, in standard deviations: the length that the error of a
-#: right motion (six numbers) exceeds once in a hundred.
+#: right motion (six numbers) exceeds once in a hundred (derived from the chi-square distribution of six).
 LOSS_SCALE = 4.1
 #: Increments (rho, omega) of cam_from_world that leave the plane z = 0.
 _OUT_OF_PLANE = np.array([False, False, True, True, True, False])
@@ -54,7 +54,7 @@ class PoseGraphOptions:
     #: No loss for motions from one pose to the next (ids that follow each other): odometry errs a little all the time,
     #: place recognition much now and then.
     trust_odometry: bool = True
-    #: Most steps.
+    #: Most steps (cost: time; most end before).
     max_iterations: int = 100
     #: ``auto``, ``dense``, ``sparse``, ``pcg``, or a solver that was registered.
     linear_solver: str = "auto"

@@ -17,7 +17,7 @@ from groma.io.survey import ControlFile, Places
 from groma.scene import CameraPositions, ControlPoints, Marks, Scene
 from groma.scene.survey import CHECK, CONTROL, UNKNOWN, diagonal_covariance
 
-#: Names that a sentence lists at most.
+#: Names that a sentence lists at most (convention: what a sentence can hold).
 _LISTED = 5
 
 

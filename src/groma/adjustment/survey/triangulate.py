@@ -20,7 +20,7 @@ from groma.scene import Marks, Scene
 
 #: Rays farther from a point than this angle (radians) do not agree with it.
 _ANGLE = 0.01
-#: Pairs of marks that are tried at most.
+#: Pairs of marks that are tried at most (cost: time).
 _PAIRS = 200
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from groma.adjustment.survey.align import Alignment
     from groma.cli.shared.console import Console
 
-#: Places with the largest residuals that are told.
+#: Places with the largest residuals that are told (convention: what a table on a screen can hold).
 _TOLD = 5
 
 
@@ -25,7 +25,7 @@ def align(
         typer.Argument(metavar="[REFERENCE]", help="A scene with images of the same names, of any format."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="OUT", help="Folder or file for the moved scene.")
+        Path | None, _options.PLAIN.option("Folder or file for the moved scene.", "--output", "-o", metavar="OUT")
     ] = None,
     positions: _measured.Positions = None,
     control: _measured.Control = None,

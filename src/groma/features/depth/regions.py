@@ -16,7 +16,7 @@ from groma._numba import inline_kernel, kernel, loop
 from groma._ordering import ascending, copy
 from groma.gates import gate
 
-#: Regions that are remembered: the size of an array.
+#: Regions that are remembered: the size of an array (cost: they fit in a byte).
 MAX_REGIONS = 120
 #: The normals of two regions are compared up to this angle, radians: beyond, noise tells nothing of them.
 _ANY_ANGLE = 1.5
@@ -316,6 +316,3 @@ def assign(depth, pinhole, noise, bend, inlier, size, step, blocks, thetas, labe
                     centers[best, 0] += x * z
                     centers[best, 1] += y * z
                     centers[best, 2] += z
-
-
-__all__ = ["MAX_REGIONS", "REGIONS", "RegionGates", "assign", "block_sums", "grow", "join"]

@@ -17,7 +17,8 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.gates import gate
 
-#: A median absolute deviation of normal noise times this is a standard deviation.
+#: A median absolute deviation of normal noise times this is a standard deviation (derived from the normal
+#: distribution).
 ROBUST = 1.4826
 
 

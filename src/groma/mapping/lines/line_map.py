@@ -17,7 +17,8 @@ from groma.scene import LineObservations, Lines, Relations, Scene
 if TYPE_CHECKING:
     from groma.features.segments import Segments
 
-#: Groups of segments that :func:`explain` names; the others are counted together.
+#: Groups of segments that :func:`explain` names; the others are counted together (convention: what a sentence can
+#: hold).
 _NAMED = 4
 
 

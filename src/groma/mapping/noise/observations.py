@@ -60,7 +60,7 @@ GATES = ObservationNoiseGates()
 _MEDIAN = 2.0 * math.log(2.0)
 #: Guards: smallest squared residual over the usual one (its logarithm is taken), bounds of half the degrees of freedom.
 _MIN_SQUARE, _SHAPES = 1e-4, (0.5, 1e4)
-#: Rounds of expectation maximisation.
+#: Rounds of expectation maximisation (cost: time).
 _STEPS = 20
 
 

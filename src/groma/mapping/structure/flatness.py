@@ -24,9 +24,9 @@ from groma.mapping.noise.landmarks import line_noise, point_noise
 from groma.mapping.structure.find import StructureOptions
 from groma.scene import Scene
 
-#: Deviations that are tried, each five per cent larger than the one before.
+#: Deviations that are tried, each five per cent larger than the one before (cost: time).
 _TRIED = 100
-#: Unknowns of a plane.
+#: Unknowns of a plane (derived from geometry).
 _UNKNOWNS = 3
 #: Plane, height, variance and length of a pixel of landmarks.
 _Heights = tuple[IntArray, FloatArray, FloatArray, FloatArray]

@@ -31,7 +31,7 @@ from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
 from groma.tracking.pose.relocalise import KnownFeatures, Places, known_features, match_near
 from groma.tracking.result import map_to_scene
 
-#: A pose without a prior.
+#: A pose without a prior (derived from the size of scenes: wider than any).
 _ANYWHERE = np.array([1e3] * 3 + [10.0] * 3)
 
 

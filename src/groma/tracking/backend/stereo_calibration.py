@@ -45,7 +45,7 @@ from groma.tracking.map.map_scene import TRACKING
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
 
-#: Of the increments of a right camera.
+#: Of the increments of a right camera (the format of an increment).
 YAW = 4
 
 

@@ -39,7 +39,7 @@ class KindGates:
     top_quantile: float = gate(0.9, "quantile", "of p that stands for the best kind", "chosen on benchmarks/lines.py")
 
 
-#: Newton steps of the fit at most.
+#: Newton steps of the fit at most (cost: none are made after convergence).
 _STEPS = 50
 
 

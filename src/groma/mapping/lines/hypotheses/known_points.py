@@ -19,7 +19,7 @@ from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.views import LineViews
 
-#: Points of one segment that are looked at.
+#: Points of one segment that are looked at (cost: time).
 _MAX_POINTS = 16
 
 
