@@ -80,6 +80,3 @@ def median(values):
     for k in range(1, half):
         below = max(below, left[k])
     return 0.5 * (below + left[half])
-
-
-__all__ = ["ascending", "copy", "median", "sort_by"]
