@@ -291,7 +291,7 @@ def fit_pose(seen: SeenMap, start: FloatArray, loss: Loss) -> FloatArray:
                 place, there = other, beyond
         fell = here.cost - there.cost
         if fell > 0.0:
-            pose, damping, growth = place, damping / 5.0, 2.0
+            pose, damping, growth = place, damping / STRETCH.lowered, 2.0
         else:
             fell, damping, growth = promised, damping * growth, 2.0 * growth
         if fell <= TOLERANCE * here.cost:
