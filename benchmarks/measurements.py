@@ -15,9 +15,9 @@ and of the distance between the first camera and the one farthest from it (1).
 ``photographs``: the photographs themselves, their poses by pycolmap, positions of the survey with 2 cm of noise, one of
 them 0.3 m off. ``one-map``: the photographs' own map, brought into the frame of the survey, is the truth; positions
 of it are drawn with 2 cm, every second time with one of them 0.3 m off: what comes from positions is seen, what comes
-from pixels is in the truth, too. ``detection``: gross errors of many sizes in one position of made blocks; the share that the test finds,
-against the power that theory gives for the redundancy of that position. ``utm``: a block flown over a town, with
-positions and control points, in coordinates of UTM and at the origin.
+from pixels is in the truth, too. ``detection``: gross errors of many sizes in one position of made blocks; the share
+that the test finds, against the power that theory gives for the redundancy of that position. ``utm``: a block flown
+over a town, with positions and control points, in coordinates of UTM and at the origin.
 """
 
 import argparse
