@@ -13,11 +13,11 @@ pixels (0.3 px) and measurements are drawn anew each time. Positions (2 cm), the
 then one scale bar: squared errors of the cameras in units of their covariance (NEES, 3 a camera), of the check points,
 and of the distance between the first camera and the one farthest from it (1).
 ``photographs``: the photographs themselves, their poses by pycolmap, positions of the survey with 2 cm of noise, one of
-them 0.3 m off. ``one-map``: the photographs' own map, brought into the frame of the survey, is the truth; positions
-of it are drawn with 2 cm, every second time with one of them 0.3 m off: what comes from positions is seen, what comes
-from pixels is in the truth, too. ``detection``: gross errors of many sizes in one position of made blocks; the share that the test finds,
-against the power that theory gives for the redundancy of that position. ``utm``: a block flown over a town, with
-positions and control points, in coordinates of UTM and at the origin.
+them 0.3 m off. ``one-map``: the photographs' own map, brought into the frame of the survey, is the truth; positions of it
+are drawn with 2 cm, in every fifth draw once more with one of them 0.3 m off: what comes from positions is seen, what
+comes from pixels is in the truth, too. ``detection``: gross errors of many sizes in one position of made blocks; the
+share that the test finds, against the power that theory gives for the redundancy of that position. ``utm``: a block
+flown over a town, with positions and control points, in coordinates of UTM and at the origin.
 """
 
 import argparse
@@ -195,7 +195,7 @@ def one_map(arguments: argparse.Namespace) -> None:
     true, rows, named, blamed = truth.cam_centers_in_world, {False: [], True: []}, 0, 0
     for draw in range(arguments.draws):
         rng = np.random.default_rng(draw)
-        for wrong in (False, True):
+        for wrong in (False, True)[: 1 + (draw % 5 == 0)]:
             xyz = true + rng.normal(size=true.shape) * POSITION
             row, direction = int(rng.integers(len(xyz))), rng.normal(size=3)
             xyz[row] += 0.3 * wrong * direction / np.linalg.norm(direction)
@@ -211,7 +211,7 @@ def one_map(arguments: argparse.Namespace) -> None:
         ratio, off, sigma = np.mean(values, axis=0)
         words = "one position 0.3 m off" if wrong else "good positions"
         print(f"{words}: NEES {ratio:.2f} (3), rms error {1e3 * off**0.5:.2f} mm, predicted {1e3 * sigma**0.5:.2f} mm")
-    print(f"taken out: {named} of {arguments.draws} wrong ones, {blamed} good ones")
+    print(f"taken out: {named} of {len(rows[True])} wrong ones, {blamed} good ones")
 
 
 def aligned_with_scale(source: np.ndarray, target: np.ndarray) -> float:
