@@ -13,7 +13,7 @@ pixels (0.3 px) and measurements are drawn anew each time. Positions (2 cm), the
 then one scale bar: squared errors of the cameras in units of their covariance (NEES, 3 a camera), of the check points,
 and of the distance between the first camera and the one farthest from it (1).
 ``photographs``: the photographs themselves, their poses by pycolmap, positions of the survey with 2 cm of noise, one of
-them 0.3 m off. ``one-map``: the photographs' own map, brought into the frame of the survey, is the truth; positions of it
+them 0.3 m off. ``one-map``: the photographs' own map, in the frame of the survey, is the truth; positions of it
 are drawn with 2 cm, in every fifth draw once more with one of them 0.3 m off: what comes from positions is seen, what
 comes from pixels is in the truth, too. ``detection``: gross errors of many sizes in one position of made blocks; the
 share that the test finds, against the power that theory gives for the redundancy of that position. ``utm``: a block
@@ -34,7 +34,7 @@ from groma.adjustment.survey.reliability import reliability
 from groma.geometry import quaternion
 from groma.io import read_scene
 from groma.io.survey import CoordinateSystem, Places
-from groma.mapping.surveyed import adjust_surveyed
+from groma.mapping.surveyed import adjust_surveyed, weighted
 from groma.scene import (
     CameraPositions,
     Cameras,
@@ -191,6 +191,7 @@ def one_map(arguments: argparse.Namespace) -> None:
     """Predicted against actual errors of positions on photographs, from one map."""
     folder = arguments.data / "strecha_castle_p30"
     alone = groma.adjust(read_scene(folder / "sparse_inc")).scene
+    alone = groma.adjust(alone, weighted(alone, groma.AdjustOptions())).scene  # the weights that the draws will have
     truth = groma.align(alone, read_scene(folder / "sparse_gt")).scene
     true, rows, named, blamed = truth.cam_centers_in_world, {False: [], True: []}, 0, 0
     for draw in range(arguments.draws):
