@@ -136,7 +136,7 @@ def _comment(node: ast.stmt, lines: list[str]) -> str:
     while above > 0 and lines[above - 1].lstrip().startswith("#:"):
         above -= 1
     behind = lines[(node.end_lineno or node.lineno) - 1][node.end_col_offset or 0 :]
-    return " ".join(line.strip(" #:") for line in lines[above : node.lineno - 1]) + behind
+    return " ".join(line.lstrip(" #:").rstrip() for line in lines[above : node.lineno - 1]) + behind
 
 
 def _inside(node: ast.AST, compiled: bool, words: dict[str, object], lines: list[str]) -> Iterator[Number]:

@@ -241,16 +241,3 @@ def _num_workers(executor: Any) -> int:
             return number
     client = getattr(executor, "_client", None)  # of dask.distributed
     return max(1, sum(client.nthreads().values())) if client is not None else available_cores()
-
-
-__all__ = [
-    "available_cores",
-    "beside",
-    "map_in_threads",
-    "map_ranges",
-    "map_work",
-    "num_threads",
-    "num_workers",
-    "together",
-    "work_with",
-]

@@ -95,6 +95,3 @@ def chi_square_gate(probability: float, dof: int) -> float:
     from scipy.special import chdtri  # takes longer to import than most of what needs it takes to run
 
     return float(chdtri(dof, probability))
-
-
-__all__ = ["ORIGINS", "chi_square_gate", "gate", "gate_classes", "is_gate_class", "numbers", "table"]

@@ -54,6 +54,3 @@ def diagnose_scene(
         return f"{group.removesuffix('s')} {index}"
 
     return diagnose(problem, name, threads=threads)
-
-
-__all__ = ["MANY_IMAGES", "diagnose_scene"]

@@ -76,6 +76,3 @@ def inliers(
             },
         }  # fmt: skip
     return found
-
-
-__all__ = ["FIT", "FitGates", "inliers", "noise_of"]

@@ -202,6 +202,3 @@ def why_steps_ran_out(numbers: Mapping[str, Any]) -> list[str]:
         "The steps ran out where cameras or calibrations are unobservable: along these the cost falls slowly, and "
         "wherever more steps end is one result of many. Hold them, or add data."
     ]
-
-
-__all__ = ["AdjustReport", "AdjustResult", "Progress", "not_converged", "why_steps_ran_out"]

@@ -178,6 +178,3 @@ def _content(stream: IO[bytes], header: Header, size: int, where: str) -> Array:
     if header.dtype.kind == "U" and np.frombuffer(content, header.dtype.byteorder + "u4").max() > sys.maxunicode:
         raise FileFormatError(f"{where} holds text that is none. Save it with numpy.savez.")
     return flat.reshape(header.shape, order="F" if header.fortran else "C").copy()
-
-
-__all__ = ["ArrayMembers", "Check", "Header", "form", "opened_arrays", "read_array"]

@@ -136,6 +136,3 @@ def _seen(value: Any) -> str:
         return "nothing"
     text = repr(value) if not isinstance(value, dict | list) or len(value) < 20 else f"{type(value).__name__} of many"
     return text[:60] + ("..." if len(text) > 60 else "")
-
-
-__all__ = ["begins_with", "member", "number", "of_kind", "read_document", "size", "table"]

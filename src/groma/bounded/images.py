@@ -166,5 +166,3 @@ _KINDS: Mapping[bytes, Callable[[bytes], tuple[int, int] | None]] = {
     **{b"P%d" % number: _pnm for number in range(1, 8)},
     **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), _tiff),
 }
-
-__all__ = ["decoded", "image_size"]

@@ -187,5 +187,3 @@ OPENCV_FISHEYE = register_camera(
     opencv_fisheye_project_jacobian,
     opencv_fisheye_unproject,
 )
-
-__all__ = ["OPENCV_FISHEYE"]

@@ -117,5 +117,3 @@ FOV = register_camera(
     fov_project_jacobian,
     fov_unproject,
 )
-
-__all__ = ["FOV"]

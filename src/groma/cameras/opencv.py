@@ -270,5 +270,3 @@ FULL_OPENCV = register_camera(
     full_opencv_project_jacobian,
     full_opencv_unproject,
 )
-
-__all__ = ["FULL_OPENCV", "OPENCV"]

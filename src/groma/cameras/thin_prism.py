@@ -253,5 +253,3 @@ RAD_TAN_THIN_PRISM_FISHEYE = register_camera(
     rad_tan_thin_prism_fisheye_project_jacobian,
     rad_tan_thin_prism_fisheye_unproject,
 )
-
-__all__ = ["RAD_TAN_THIN_PRISM_FISHEYE", "THIN_PRISM_FISHEYE"]

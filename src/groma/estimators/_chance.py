@@ -24,6 +24,3 @@ def log10_poisson_tail(count: float, mean: float) -> float:
     first = math.floor(count) + 1
     log_tail = math.log(tail) if tail > 0.0 else first * math.log(mean) - mean - math.lgamma(first + 1)
     return log_tail / math.log(10.0)
-
-
-__all__ = ["chi_square_quantile", "log10_poisson_tail"]

@@ -77,5 +77,3 @@ class PlaneSearchGates:
 
 #: The numbers in use.
 PLANE_SEARCH = PlaneSearchGates()
-
-__all__ = ["PLANE_SEARCH", "PlaneOptions", "PlaneSearchGates"]

@@ -23,6 +23,9 @@ from groma.errors import ShapeError
 
 #: Cost: rounds of expectation maximisation.
 _ROUNDS = 30
+#: Squared distances beyond this count as this, in variances: a density does not become zero (derived from the range of
+#: doubles).
+MAX_SQUARE = 1400.0
 
 
 @loop
@@ -79,7 +82,7 @@ def inlier_probability(
             f"{owner.shape}."
         )
     spread = np.maximum(sigma, 1e-12 * band[owner] if len(band) else 0.0)
-    noise = np.sqrt(2.0 / np.pi) / spread * np.exp(-0.5 * np.minimum((distance / spread) ** 2, 1400.0))
+    noise = np.sqrt(2.0 / np.pi) / spread * np.exp(-0.5 * np.minimum((distance / spread) ** 2, MAX_SQUARE))
     clutter = 1.0 / band[owner] if len(band) else np.zeros(0)
     count = np.bincount(owner, minlength=len(band))
     if pooled > 0.0 and len(distance):
@@ -106,6 +109,3 @@ def maximise_shares(
     share, count = np.full(num, float(together[0])), np.bincount(owner, minlength=num)
     _maximise(density, clutter, owner, count, pooled, float(together[0]), rounds, share, probability)
     return share
-
-
-__all__ = ["inlier_probability", "maximise_shares"]

@@ -52,6 +52,7 @@ _FRAME: ByLength[Callable[..., None]] = ByLength()
 _RESIDUALS: ByLength[Callable[..., None]] = ByLength()
 _MOVE: ByLength[Callable[..., None]] = ByLength()
 
+#: Damping of the first step, at least, and refused steps after which a problem is left (cost: steps).
 FIRST_DAMPING, MIN_DAMPING, MAX_ATTEMPTS = 1e-4, 1e-12, 8
 #: A pivot below this fraction of its diagonal entry means a singular system.
 PIVOT_TOLERANCE = 1e-12
@@ -317,14 +318,3 @@ def solve_batch(
 
     map_ranges(solve, count, PROBLEMS_AT_ONCE)
     return BatchSolution(found, frames, cost, information, steps, converged)
-
-
-__all__ = [
-    "PROBLEMS_AT_ONCE",
-    "BatchSolution",
-    "Observations",
-    "ProblemKind",
-    "problem_kind",
-    "solve_batch",
-    "solve_damped",
-]

@@ -141,6 +141,3 @@ def supported_intervals(
     line = np.repeat(np.arange(num_lines), count)
     row = pointers[line] + np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
     return line, np.column_stack([begins[row], ends[row]])
-
-
-__all__ = ["supported_intervals"]

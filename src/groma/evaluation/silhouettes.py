@@ -108,6 +108,3 @@ def read_silhouettes(folder: str | os.PathLike[str], names: tuple[str, ...]) -> 
                 raise InputError(f"{files[0]} is not an image that can be read. Save the silhouette as PNG.")
             masks[name] = picture > 0
     return masks
-
-
-__all__ = ["LIMITS", "SilhouetteScores", "evaluate_silhouettes", "read_silhouettes"]

@@ -343,17 +343,3 @@ def _drift(poses: FloatArray, truth: FloatArray) -> tuple[float | None, float | 
     translation, rotation = _relative_errors(poses, truth, rows, np.concatenate(second).astype(np.int64))
     size = np.concatenate(by)
     return float((translation / size).mean() * 100), float(np.degrees(rotation / size).mean()), lengths, path
-
-
-__all__ = [
-    "SEGMENT_LENGTHS",
-    "Alignment",
-    "Spread",
-    "StepUnit",
-    "TrajectoryScores",
-    "apply_similarity",
-    "associate",
-    "counts_lines",
-    "in_order",
-    "score_trajectory",
-]

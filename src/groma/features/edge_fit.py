@@ -254,6 +254,3 @@ def measure_edges(
         smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
         _measure_all(smooth, ends, fit, numbers(gates), new_ends, sigma, strength)
     return new_ends, sigma, strength
-
-
-__all__ = ["EDGES", "EdgeGates", "measure_edges"]

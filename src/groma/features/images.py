@@ -60,6 +60,3 @@ def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
             code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
             image = cv2.cvtColor(np.ascontiguousarray(image, dtype=np.uint8), code)
     return np.ascontiguousarray(image, dtype=np.uint8)
-
-
-__all__ = ["MIN_SIDE", "GrayImage", "to_gray"]

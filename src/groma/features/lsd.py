@@ -87,6 +87,3 @@ class LsdDetector:
 
 def _keep_long(ends: npt.NDArray[np.float64], shortest: float) -> npt.NDArray[np.float64]:
     return ends[np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]) >= shortest]
-
-
-__all__ = ["LsdDetector"]

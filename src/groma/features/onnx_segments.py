@@ -251,6 +251,3 @@ def _checked(session: Any, file: str) -> _Network:
             f"{made or 'none'}. Write an adapter as a detector of your own (docs/extending.md)."
         )
     return _Network(session, inputs[0].name, (shape[2], shape[1]), shape[3], last[1].name, last[4].name)
-
-
-__all__ = ["NETWORK", "NetworkGates", "OnnxDetector", "covered"]

@@ -90,6 +90,3 @@ class Segments:
     def empty() -> Segments:
         """No segments."""
         return Segments(np.zeros((0, 4)), np.zeros(0), np.zeros(0))
-
-
-__all__ = ["MIN_LENGTH", "MIN_STRENGTH", "Segments"]

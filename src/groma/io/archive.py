@@ -175,5 +175,3 @@ register_format(
         write=write_archive,
     )
 )
-
-__all__ = ["is_archive_name", "looks_like_archive", "read_archive", "write_archive"]

@@ -150,6 +150,3 @@ def _check_size(path: Path, shape: tuple[int, ...], size: tuple[int, int]) -> No
         f"{path} has {shape[1]}x{shape[0]} pixels, its photograph {size[0]}x{size[1]}.{turned} Pass depth maps of the "
         "size of the photographs, registered to them."
     )
-
-
-__all__ = ["ENDINGS", "DepthMap", "DepthMaps"]

@@ -202,6 +202,3 @@ def _planar(poses: FloatArray) -> FloatArray:
 
 def _join(numbers: Iterable[float]) -> str:
     return " ".join(map(repr, numbers))
-
-
-__all__ = ["looks_like_g2o", "read_g2o", "write_g2o"]

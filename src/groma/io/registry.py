@@ -198,6 +198,3 @@ def _sources(readable: list[SceneFormat]) -> str:
 
 def _listed(words: list[str]) -> str:
     return f"{', '.join(words[:-1])} or {words[-1]}"
-
-
-__all__ = ["SceneFormat", "check_target", "formats", "read_scene", "register_format", "write_scene"]

@@ -189,14 +189,3 @@ def _common(one: FloatArray, other: FloatArray) -> FloatArray:
 def _beyond(place: FloatArray, interval: FloatArray) -> FloatArray:
     """How far places (N,) lie outside of intervals (N, 2)."""
     return np.maximum(np.maximum(interval[:, 0] - place, place - interval[:, 1]), 0.0)
-
-
-__all__ = [
-    "MIN_SQUARED_SINE",
-    "LineIntervals",
-    "line_pieces",
-    "observed_shares",
-    "one_line_per_interval",
-    "shares_on_lines",
-    "supported_lengths",
-]

@@ -97,6 +97,3 @@ def _hull(places: FloatArray) -> FloatArray | None:
     from scipy.spatial import ConvexHull
 
     return places[ConvexHull(places).vertices]
-
-
-__all__ = ["PALETTE", "patch_area", "patch_groups", "plane_patches", "triangle_fans"]

@@ -140,6 +140,3 @@ def _bytes_of_blocks(layout: Layout) -> int:
         for e in layout.eliminated
         for c, incidences in e.incidences.items()
     )
-
-
-__all__ = ["COMPACT_FROM", "JointProblem"]

@@ -196,6 +196,3 @@ class Run:
                 total = outcome.setdefault(kind, dict.fromkeys(counts, 0))
                 outcome[kind] = {name: total[name] + count for name, count in counts.items()}
         return Written([told[path.name]["squares"] for path in opened.paths], outcome)
-
-
-__all__ = ["Run", "Solved", "Squares", "Written"]

@@ -54,4 +54,3 @@ def _control(draft: Draft) -> Iterator[Group]:
 
 MARKS = Term("marks", ("marks",), ("control_points",), _marks)
 CONTROL = Term("control points", ("control_points", "marks"), ("control_points",), _control)
-__all__ = ["CONTROL", "MARKS"]

@@ -36,4 +36,3 @@ def _factors(draft: Draft) -> Iterator[Group]:
 
 
 TERM = Term("distances", ("distances",), (), _factors)
-__all__ = ["TERM"]

@@ -31,180 +31,133 @@ def adjust(
     source: _options.Input,
     output: Annotated[
         Path | None,
-        typer.Option(
+        _options.PLAIN.option(
+            "Result: a folder (COLMAP model and structures), a groma archive (.npz) or a BAL file (.txt, .bz2, "
+            ".gz). Without it nothing but the report is written.",
             "--output",
             "-o",
             metavar="OUT",
-            help="Result: a folder (COLMAP model and structures), a groma archive (.npz) or a BAL file (.txt, .bz2, "
-            ".gz). Without it nothing but the report is written.",
         ),
     ] = None,
     loss: Annotated[
         str,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.LOSSES),
+        _options.ADJUSTMENT.option(
+            "auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron, truncated, or one of an installed "
+            "package. auto: robust (Cauchy, then Geman-McClure) for what comes from matching, none for BAL files.",
+            choices=_complete.LOSSES,
             metavar="NAME",
-            help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron, truncated, or one of an installed "
-            "package. auto: robust "
-            "(Cauchy, then Geman-McClure) for what comes from matching, none for BAL files.",
-            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = "auto",
     loss_scale: Annotated[
         float | None,
-        typer.Option(
-            metavar="S",
-            help="Scale of the loss, in units of the noise (pixels for images). Default: 1.",
-            rich_help_panel=_options.ADJUSTMENT,
+        _options.ADJUSTMENT.option(
+            "Scale of the loss, in units of the noise (pixels for images). Default: 1.", metavar="S"
         ),
     ] = None,
     camera_model: Annotated[
         str | None,
-        typer.Option(
-            "--camera-model",
-            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
+        _options.CAMERAS.option(
+            "Change the lens model of all cameras first (PINHOLE to OPENCV, ...); what it adds starts at 0 and is"
+            " estimated.",
+            choices=_complete.CAMERA_MODELS,
             metavar="NAME",
-            help="Change the lens model of all cameras first (PINHOLE to OPENCV, ...); what it adds starts at 0 and is "
-            "estimated.",
-            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     refine_intrinsics: Annotated[
         bool | None,
-        typer.Option(
+        _options.CAMERAS.option(
+            "Estimate the calibration too. Default: for BAL files and with --camera-model.",
             "--refine-intrinsics/--fix-intrinsics",
-            help="Estimate the calibration too. Default: for BAL files and with --camera-model.",
-            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     refine_principal_point: Annotated[
-        bool,
-        typer.Option(
-            "--refine-principal-point",
-            help="With the intrinsics: principal points too.",
-            rich_help_panel=_options.CAMERAS,
-        ),
+        bool, _options.CAMERAS.option("With the intrinsics: principal points too.", "--refine-principal-point")
     ] = False,
     refine_rigs: Annotated[
-        bool,
-        typer.Option(
-            "--refine-rigs", help="Estimate where the cameras sit on their rig.", rich_help_panel=_options.CAMERAS
-        ),
+        bool, _options.CAMERAS.option("Estimate where the cameras sit on their rig.", "--refine-rigs")
     ] = False,
     rolling_shutter: _options.RollingShutter = None,
-    points: Annotated[
-        bool, typer.Option("--points/--no-points", help="Use points.", rich_help_panel=_options.ADJUSTMENT)
-    ] = True,
-    lines: Annotated[
-        bool, typer.Option("--lines/--no-lines", help="Use lines.", rich_help_panel=_options.ADJUSTMENT)
-    ] = True,
-    planes: Annotated[
-        bool, typer.Option("--planes/--no-planes", help="Use planes.", rich_help_panel=_options.ADJUSTMENT)
-    ] = True,
+    points: Annotated[bool, _options.ADJUSTMENT.option("Use points.", "--points/--no-points")] = True,
+    lines: Annotated[bool, _options.ADJUSTMENT.option("Use lines.", "--lines/--no-lines")] = True,
+    planes: Annotated[bool, _options.ADJUSTMENT.option("Use planes.", "--planes/--no-planes")] = True,
     max_iterations: Annotated[
         int | None,
-        typer.Option(
-            min=0,
-            metavar="N",
-            help="Stop after N steps. Default: 50, for pose graphs 100.",
-            rich_help_panel=_options.ADJUSTMENT,
-        ),
+        _options.ADJUSTMENT.option("Stop after N steps. Default: 50, for pose graphs 100.", min=0, metavar="N"),
     ] = None,
     linear_solver: Annotated[
         str,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.LINEAR_SOLVERS),
+        _options.ADJUSTMENT.option(
+            "How each step is solved: auto, dense, sparse, pcg, or a solver of an installed package.",
+            choices=_complete.LINEAR_SOLVERS,
             metavar="NAME",
-            help="How each step is solved: auto, dense, sparse, pcg, or a solver of an installed package.",
-            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = "auto",
     line_chart: Annotated[
         str | None,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.LINE_CHARTS),
-            metavar="NAME",
-            help="Line parametrisation: cartesian (default), orthonormal_left, orthonormal_right, free_left, "
+        _options.ADJUSTMENT.option(
+            "Line parametrisation: cartesian (default), orthonormal_left, orthonormal_right, free_left, "
             "free_right, or one of an installed package.",
-            rich_help_panel=_options.ADJUSTMENT,
+            choices=_complete.LINE_CHARTS,
+            metavar="NAME",
         ),
     ] = None,
     line_residual: Annotated[
         LineResidual,
-        typer.Option(
-            help="How segments are compared with lines: endpoints, distances in the image; bearing, angles of rays; "
-            "normal, the plane through camera and segment, also against the ray to the line's anchor.",
-            rich_help_panel=_options.ADJUSTMENT,
+        _options.ADJUSTMENT.option(
+            "How segments are compared with lines: endpoints, distances in the image; bearing, angles of rays; "
+            "normal, the plane through camera and segment, also against the ray to the line's anchor."
         ),
     ] = "endpoints",
     plane_residual: Annotated[
         PlaneResidual,
-        typer.Option(
-            help="How measured planes are compared: normal_offset, in the camera; quaternion, in the world.",
-            rich_help_panel=_options.ADJUSTMENT,
+        _options.ADJUSTMENT.option(
+            "How measured planes are compared: normal_offset, in the camera; quaternion, in the world."
         ),
     ] = "normal_offset",
     gauge: Annotated[
         str | None,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.GAUGES),
+        _options.ADJUSTMENT.option(
+            "free; first_camera, to hold the first camera and the scale; or auto (default): free, unless "
+            "distances between landmarks are in scene units.",
+            choices=_complete.GAUGES,
             metavar="NAME",
-            help="free; first_camera, to hold the first camera and the scale; or auto (default): free, unless distances"
-            " between landmarks are in scene units.",
-            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = None,
     page: Annotated[
-        Path | None,
-        typer.Option(
-            "--report",
-            metavar="FILE",
-            help="Also write an HTML page: before and after.",
-            rich_help_panel=_options.RESULTS,
-        ),
+        Path | None, _options.RESULTS.option("Also write an HTML page: before and after.", "--report", metavar="FILE")
     ] = None,
     covariance: Annotated[
         Path | None,
-        typer.Option(
-            "--covariance",
-            metavar="FILE",
-            help="Also write how certain the result is: covariances (.npz) or standard deviations (.json) of images, "
+        _options.RESULTS.option(
+            "Also write how certain the result is: covariances (.npz) or standard deviations (.json) of images, "
             "points, lines, planes and directions.",
-            rich_help_panel=_options.RESULTS,
+            metavar="FILE",
         ),
     ] = None,
     covariance_gauge: Annotated[
         CovarianceGauge,
-        typer.Option(
-            "--covariance-gauge",
-            help="What it refers to: inner, all camera centres together; held, the first camera and the scale.",
-            rich_help_panel=_options.RESULTS,
+        _options.RESULTS.option(
+            "What it refers to: inner, all camera centres together; held, the first camera and the scale."
         ),
     ] = "auto",
     sigma0: Annotated[
         float,
-        typer.Option(
-            "--sigma0",
-            metavar="S",
-            help="With --covariance: the noise of the measurements in units of that stated (1 pixel unless the scene "
+        _options.RESULTS.option(
+            "With --covariance: the noise of the measurements in units of that stated (1 pixel unless the scene "
             "says otherwise).",
-            rich_help_panel=_options.RESULTS,
+            metavar="S",
         ),
     ] = 1.0,
     diagnosis: Annotated[
         bool | None,
-        typer.Option(
-            "--diagnosis/--no-diagnosis",
-            help="Say what the data do not determine. Default: yes up to 300 images.",
-            rich_help_panel=_options.RESULTS,
+        _options.RESULTS.option(
+            "Say what the data do not determine. Default: yes up to 300 images.", "--diagnosis/--no-diagnosis"
         ),
     ] = None,
     keep: Annotated[
         Keep,
-        typer.Option(
-            "--keep",
-            help="With a folder of parts: keep them in memory from one step to the next; auto: where they fit.",
-            rich_help_panel=_options.ADJUSTMENT,
+        _options.ADJUSTMENT.option(
+            "With a folder of parts: keep them in memory from one step to the next; auto: where they fit."
         ),
     ] = "auto",
     positions: _measured.Positions = None,
@@ -225,11 +178,9 @@ def adjust(
     crs: _measured.Crs = None,
     protocol: Annotated[
         Path | None,
-        typer.Option(
-            "--protocol",
+        _measured.PANEL.option(
+            "Also write the measurements with residuals, redundancy and tests, as text (adjustment.txt).",
             metavar="FILE",
-            help="Also write the measurements with residuals, redundancy and tests, as text (adjustment.txt).",
-            rich_help_panel=_measured.PANEL,
         ),
     ] = None,
     contributions: _options.Contributions = False,

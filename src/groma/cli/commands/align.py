@@ -25,7 +25,7 @@ def align(
         typer.Argument(metavar="[REFERENCE]", help="A scene with images of the same names, of any format."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="OUT", help="Folder or file for the moved scene.")
+        Path | None, _options.PLAIN.option("Folder or file for the moved scene.", "--output", "-o", metavar="OUT")
     ] = None,
     positions: _measured.Positions = None,
     control: _measured.Control = None,

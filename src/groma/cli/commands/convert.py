@@ -27,15 +27,14 @@ def convert(
     ],
     parts: Annotated[
         bool,
-        typer.Option(
-            "--parts",
-            help="Cut the scene into parts in the folder OUTPUT, which groma adjust adjusts one by one, or by many "
+        _options.PLAIN.option(
+            "Cut the scene into parts in the folder OUTPUT, which groma adjust adjusts one by one, or by many "
             "processes together.",
+            "--parts",
         ),
     ] = False,
     part_size: Annotated[
-        int | None,
-        typer.Option("--part-size", min=1, metavar="N", help="With --parts: observations of a part. Default: 1000000."),
+        int | None, _options.PLAIN.option("With --parts: observations of a part. Default: 1000000.", min=1, metavar="N")
     ] = None,
     force: _options.Force = False,
     threads: _options.Threads = None,

@@ -4,8 +4,6 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from groma.cli.shared import options as _options
 from groma.cli.shared import output as _output
 from groma.cli.shared.console import Console
@@ -14,7 +12,9 @@ from groma.cli.shared.console import Console
 def demo(
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR", help="Folder for the results. Default: groma_demo, replaced."),
+        _options.PLAIN.option(
+            "Folder for the results. Default: groma_demo, replaced.", "--output", "-o", metavar="DIR"
+        ),
     ] = None,
     force: _options.Force = False,
     threads: _options.Threads = None,

@@ -61,10 +61,10 @@ def poses(
 
 _Thresholds = Annotated[
     list[float] | None,
-    typer.Option(
+    _options.PLAIN.option(
+        "Distance in units of REF; may be repeated. By default 1, 5 and 10 thousandths of its extent.",
         "--threshold",
         metavar="TAU",
-        help="Distance in units of REF; may be repeated. By default 1, 5 and 10 thousandths of its extent.",
     ),
 ]
 
@@ -82,13 +82,13 @@ def lines(
     threshold: _Thresholds = None,
     silhouettes: Annotated[
         Path | None,
-        typer.Option(
+        _options.PLAIN.option(
+            "Masks of the object, named like the images of EST: how far lines leave them. REF is then optional.",
             metavar="FOLDER",
-            help="Masks of the object, named like the images of EST: how far lines leave them. REF is then optional.",
         ),
     ] = None,
     align: Annotated[
-        bool, typer.Option("--align", help="First align EST to REF by the poses of images in both scenes.")
+        bool, _options.PLAIN.option("First align EST to REF by the poses of images in both scenes.", "--align")
     ] = False,
     force: _options.Force = False,
     threads: _options.Threads = None,
@@ -169,11 +169,10 @@ def planes(
     ],
     threshold: _Thresholds = None,
     max_angle: Annotated[
-        float, typer.Option("--max-angle", metavar="DEG", help="Largest angle between planes that match.")
+        float, _options.PLAIN.option("Largest angle between planes that match.", metavar="DEG")
     ] = 10.0,
     max_offset: Annotated[
-        float | None,
-        typer.Option("--max-offset", metavar="D", help="Largest offset of planes that match; by default 1 % of REF."),
+        float | None, _options.PLAIN.option("Largest offset of planes that match; by default 1 % of REF.", metavar="D")
     ] = None,
     force: _options.Force = False,
     threads: _options.Threads = None,
@@ -222,21 +221,19 @@ def planes(
 def trajectory(
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory to judge.")],
     reference: Annotated[Path, typer.Argument(metavar="REF", help="Trajectory taken for true.")],
-    format: Annotated[_Format, typer.Option("--format", help="Format of both files; .gz is unpacked.")] = "auto",
-    align: Annotated[_Alignment, typer.Option("--align", help="Alignment of EST to REF; sim3 for monocular.")] = "se3",
+    format: Annotated[_Format, _options.PLAIN.option("Format of both files; .gz is unpacked.")] = "auto",
+    align: Annotated[_Alignment, _options.PLAIN.option("Alignment of EST to REF; sim3 for monocular.")] = "se3",
     max_time_difference: Annotated[
-        float, typer.Option("--max-time-difference", metavar="S", help="Largest difference of associated times, s.")
+        float, _options.PLAIN.option("Largest difference of associated times, s.", metavar="S")
     ] = 0.01,
     times: Annotated[
         Path | None,
-        typer.Option(
-            "--times",
-            metavar="FILE",
-            help="Times of a REF without any (KITTI), one a line; by default times.txt beside it.",
+        _options.PLAIN.option(
+            "Times of a REF without any (KITTI), one a line; by default times.txt beside it.", metavar="FILE"
         ),
     ] = None,
-    rpe_delta: Annotated[float, typer.Option("--rpe-delta", metavar="D", help="Step of the relative errors.")] = 1.0,
-    rpe_unit: Annotated[_StepUnit, typer.Option("--rpe-unit", help="Unit of the step.")] = "frames",
+    rpe_delta: Annotated[float, _options.PLAIN.option("Step of the relative errors.", metavar="D")] = 1.0,
+    rpe_unit: Annotated[_StepUnit, _options.PLAIN.option("Unit of the step.")] = "frames",
     force: _options.Force = False,
     threads: _options.Threads = None,
     json_target: _options.Json = None,

@@ -27,38 +27,36 @@ def localize(
         typer.Argument(metavar="MAP", help="OUT of groma map or groma track, a COLMAP model, or an archive (.npz)."),
     ],
     queries: Annotated[list[Path], typer.Argument(metavar="QUERIES", help="Photographs, and folders of them.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")],
+    output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     images: Annotated[
         Path | None,
-        typer.Option(
-            "--images",
-            metavar="FOLDER",
-            help="The photographs of the map. Needed unless an earlier run described the map.",
+        _options.PLAIN.option(
+            "The photographs of the map. Needed unless an earlier run described the map.", metavar="FOLDER"
         ),
     ] = None,
     calibration: Annotated[
         str,
-        typer.Option(
-            "--calibration",
-            autocompletion=_complete.one_of(*_complete.CALIBRATIONS),
+        _options.PLAIN.option(
+            "Of the queries: map, exif, unknown; or auto, the first of these that fits.",
+            choices=_complete.CALIBRATIONS,
             metavar="SOURCE",
-            help="Of the queries: map, exif, unknown; or auto, the first of these that fits.",
         ),
     ] = "auto",
     camera_model: Annotated[
         str | None,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
+        _options.PLAIN.option(
+            "Lens model of the queries, by COLMAP's name; with its parameters.",
+            choices=_complete.CAMERA_MODELS,
             metavar="NAME",
-            help="Lens model of the queries, by COLMAP's name; with its parameters.",
         ),
     ] = None,
     camera_params: Annotated[
-        str | None, typer.Option(metavar="F,CX,CY,...", help="The parameters, if they are known; they are then kept.")
+        str | None,
+        _options.PLAIN.option("The parameters, if they are known; they are then kept.", metavar="F,CX,CY,..."),
     ] = None,
-    lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Use lines besides points.")] = True,
+    lines: Annotated[bool, _options.PLAIN.option("Use lines besides points.", "--lines/--no-lines")] = True,
     min_length: Annotated[
-        float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")
+        float, _options.PLAIN.option("Shortest line segment, pixels.", min=5.0, metavar="PX")
     ] = _MIN_LENGTH,
     force: _options.Force = False,
     threads: _options.Threads = None,

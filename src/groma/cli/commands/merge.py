@@ -14,17 +14,17 @@ from groma.cli.shared import options as _options
 def merge(
     first: Annotated[Path, typer.Argument(metavar="A", help="OUT of groma map, or a COLMAP model.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="Another one, of a place that overlaps.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")],
+    output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     first_images: Annotated[
         Path | None,
-        typer.Option("--images-a", metavar="FOLDER", help="The photographs of A, where it does not tell."),
+        _options.PLAIN.option("The photographs of A, where it does not tell.", "--images-a", metavar="FOLDER"),
     ] = None,
     second_images: Annotated[
         Path | None,
-        typer.Option("--images-b", metavar="FOLDER", help="The photographs of B, where it does not tell."),
+        _options.PLAIN.option("The photographs of B, where it does not tell.", "--images-b", metavar="FOLDER"),
     ] = None,
     scale: Annotated[
-        bool, typer.Option("--scale/--no-scale", help="B may have another scale; without, both have the same.")
+        bool, _options.PLAIN.option("B may have another scale; without, both have the same.", "--scale/--no-scale")
     ] = True,
     force: _options.Force = False,
     threads: _options.Threads = None,

@@ -4,30 +4,26 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from groma.cli.shared import options as _options
 
 
 def report(
     source: _options.Input,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The HTML file.")] = Path(
+    output: Annotated[Path, _options.PLAIN.option("The HTML file.", "--output", "-o", metavar="FILE")] = Path(
         "report.html"
     ),
     images: Annotated[
-        Path | None,
-        typer.Option("--images", metavar="DIR", help="Folder of the photographs, with what was measured in them."),
+        Path | None, _options.PLAIN.option("Folder of the photographs, with what was measured in them.", metavar="DIR")
     ] = None,
     before: Annotated[
-        Path | None, typer.Option(metavar="SCENE", help="The same scene before adjustment, to compare with.")
+        Path | None, _options.PLAIN.option("The same scene before adjustment, to compare with.", metavar="SCENE")
     ] = None,
     covariance: Annotated[
         Path | None,
-        typer.Option(
-            "--covariance",
-            metavar="FILE",
-            help="Arrays of groma adjust --covariance FILE.npz: lengths and angles measured on the page get standard "
+        _options.PLAIN.option(
+            "Arrays of groma adjust --covariance FILE.npz: lengths and angles measured on the page get standard "
             "deviations.",
+            metavar="FILE",
         ),
     ] = None,
     force: _options.Force = False,

@@ -19,14 +19,16 @@ _RUNS = 100
 def selfcheck(
     golden: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder of reference values (*.json) to compare with as well."),
+        _options.PLAIN.option("Folder of reference values (*.json) to compare with as well.", metavar="DIR"),
     ] = None,
     nees: Annotated[
         bool,
-        typer.Option("--nees", help="Check covariances instead: errors of simulated scenes against what they predict."),
+        _options.PLAIN.option(
+            "Check covariances instead: errors of simulated scenes against what they predict.", "--nees"
+        ),
     ] = False,
     runs: Annotated[
-        int, typer.Option(min=2, metavar="N", help="Scenes simulated with --nees, for either gauge.")
+        int, _options.PLAIN.option("Scenes simulated with --nees, for either gauge.", min=2, metavar="N")
     ] = _RUNS,
     seed: _options.Seed = 0,
     force: _options.Force = False,

@@ -4,8 +4,6 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
-
 from groma.cli.shared import options as _options
 
 Kind = Literal["holistic", "corridor"]
@@ -13,16 +11,20 @@ Kind = Literal["holistic", "corridor"]
 
 def synth(
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for truth.npz and start.npz (made anew).")
+        Path, _options.PLAIN.option("Folder for truth.npz and start.npz (made anew).", "--output", "-o", metavar="OUT")
     ],
     kind: Annotated[
         Kind,
-        typer.Option(help="holistic: cameras on a sphere look into a cube of points, lines, planes. corridor: a walk."),
+        _options.PLAIN.option(
+            "holistic: cameras on a sphere look into a cube of points, lines, planes. corridor: a walk."
+        ),
     ] = "holistic",
-    cameras: Annotated[int, typer.Option("--cameras", "-n", min=2, metavar="N", help="Number of cameras.")] = 50,
+    cameras: Annotated[int, _options.PLAIN.option("Number of cameras.", "--cameras", "-n", min=2, metavar="N")] = 50,
     noise: Annotated[
         float | None,
-        typer.Option(min=0.0, metavar="PX", help="Noise of the measurements, pixels. Default: 1; in a corridor 0.5."),
+        _options.PLAIN.option(
+            "Noise of the measurements, pixels. Default: 1; in a corridor 0.5.", min=0.0, metavar="PX"
+        ),
     ] = None,
     seed: _options.Seed = 0,
     force: _options.Force = False,

@@ -23,81 +23,54 @@ def track(
             metavar="SEQUENCE", help="Folder of TUM RGB-D, 7-Scenes, KITTI, EuRoC or plain images; or a video."
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")],
+    output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     map_: Annotated[
         Path | None,
-        typer.Option(
-            "--map", metavar="MAP", help="OUT of an earlier track: begin lost in it, go on in its world, and add to it."
+        _options.PLAIN.option(
+            "OUT of an earlier track: begin lost in it, go on in its world, and add to it.", "--map", metavar="MAP"
         ),
     ] = None,
     camera: Annotated[
         str | None,
-        typer.Option(
-            "--camera",
-            metavar="CAMERA",
-            help="Calibration file, or its numbers as OpenCV has them: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: what "
+        _options.CAMERAS.option(
+            "Calibration file, or its numbers as OpenCV has them: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: what "
             "the sequence says.",
-            rich_help_panel=_options.CAMERAS,
+            metavar="CAMERA",
         ),
     ] = None,
     camera_model: Annotated[
         str | None,
-        typer.Option(
-            "--camera-model",
-            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
+        _options.CAMERAS.option(
+            "Lens model, by COLMAP's name; with its parameters, in place of --camera.",
+            choices=_complete.CAMERA_MODELS,
             metavar="NAME",
-            help="Lens model, by COLMAP's name; with its parameters, in place of --camera.",
-            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     camera_params: Annotated[
-        str | None,
-        typer.Option(
-            "--camera-params",
-            metavar="F,CX,CY,...",
-            help="The parameters, pixels counted as COLMAP does.",
-            rich_help_panel=_options.CAMERAS,
-        ),
+        str | None, _options.CAMERAS.option("The parameters, pixels counted as COLMAP does.", metavar="F,CX,CY,...")
     ] = None,
     kind: Annotated[
         str | None,
-        typer.Option(
-            "--kind",
-            autocompletion=_complete.one_of(*_complete.SEQUENCES),
-            metavar="KIND",
-            help="rgbd, stereo or mono; told by the files otherwise.",
-            rich_help_panel=_options.CAMERAS,
+        _options.CAMERAS.option(
+            "rgbd, stereo or mono; told by the files otherwise.", choices=_complete.SEQUENCES, metavar="KIND"
         ),
     ] = None,
-    points: Annotated[
-        bool, typer.Option("--points/--no-points", help="Follow points.", rich_help_panel=_options.LANDMARKS)
-    ] = True,
-    lines: Annotated[
-        bool, typer.Option("--lines/--no-lines", help="Follow line segments.", rich_help_panel=_options.LANDMARKS)
-    ] = True,
+    points: Annotated[bool, _options.LANDMARKS.option("Follow points.", "--points/--no-points")] = True,
+    lines: Annotated[bool, _options.LANDMARKS.option("Follow line segments.", "--lines/--no-lines")] = True,
     line_detector: _options.LineDetector = "lsd",
     planes: Annotated[
-        bool,
-        typer.Option(
-            "--planes/--no-planes",
-            help="Find planes in depth images, or in points and lines.",
-            rich_help_panel=_options.LANDMARKS,
-        ),
+        bool, _options.LANDMARKS.option("Find planes in depth images, or in points and lines.", "--planes/--no-planes")
     ] = True,
-    loops: Annotated[bool, typer.Option("--loops/--no-loops", help="Close loops.")] = True,
+    loops: Annotated[bool, _options.PLAIN.option("Close loops.", "--loops/--no-loops")] = True,
     max_frames: Annotated[
-        int | None, typer.Option("--max-frames", min=1, metavar="N", help="Stop after N frames. Default: all.")
+        int | None, _options.PLAIN.option("Stop after N frames. Default: all.", min=1, metavar="N")
     ] = None,
-    stride: Annotated[int, typer.Option("--stride", min=1, metavar="N", help="Take every N-th frame.")] = 1,
-    max_depth: Annotated[
-        float, typer.Option("--max-depth", min=0.1, metavar="M", help="Ignore depths beyond, metres.")
-    ] = 6.0,
+    stride: Annotated[int, _options.PLAIN.option("Take every N-th frame.", min=1, metavar="N")] = 1,
+    max_depth: Annotated[float, _options.PLAIN.option("Ignore depths beyond, metres.", min=0.1, metavar="M")] = 6.0,
     depth_scale: Annotated[
         float | None,
-        typer.Option(
-            "--depth-scale",
-            metavar="S",
-            help="Depth in files per metre. Default: that of the layout (TUM 5000, else 1000).",
+        _options.PLAIN.option(
+            "Depth in files per metre. Default: that of the layout (TUM 5000, else 1000).", metavar="S"
         ),
     ] = None,
     force: _options.Force = False,

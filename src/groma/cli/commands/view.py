@@ -16,17 +16,18 @@ def view(
     source: Annotated[Path, typer.Argument(metavar="INPUT", help="Model to look at; with --live the OUT of a track.")],
     images: Annotated[
         Path | None,
-        typer.Option(
-            "--images",
+        _options.PLAIN.option(
+            "Folder of the photographs. Default: the one that groma map noted, or a folder images near INPUT.",
             metavar="DIR",
-            help="Folder of the photographs. Default: the one that groma map noted, or a folder images near INPUT.",
         ),
     ] = None,
     port: Annotated[
-        int, typer.Option("--port", "-p", min=0, max=65535, metavar="N", help="Port, or the next free one; 0: any.")
+        int, _options.PLAIN.option("Port, or the next free one; 0: any.", "--port", "-p", min=0, max=65535, metavar="N")
     ] = 8080,
-    live: Annotated[bool, typer.Option("--live", help="Follow groma track while it runs: INPUT is its OUT.")] = False,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
+    live: Annotated[
+        bool, _options.PLAIN.option("Follow groma track while it runs: INPUT is its OUT.", "--live")
+    ] = False,
+    browser: Annotated[bool, _options.PLAIN.option("Open a browser.", "--browser/--no-browser")] = True,
     force: _options.Force = False,
     threads: _options.Threads = None,
     json_target: _options.Json = None,

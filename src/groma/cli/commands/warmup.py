@@ -19,7 +19,7 @@ def warmup(
             help="What to compile for; everything if left out.",
         ),
     ] = None,
-    again: Annotated[bool, typer.Option("--again", help="Run even if everything is there.")] = False,
+    again: Annotated[bool, _options.PLAIN.option("Run even if everything is there.", "--again")] = False,
     force: _options.Force = False,
     threads: _options.Threads = None,
     json_target: _options.Json = None,

@@ -16,14 +16,25 @@ from typer.core import TyperCommand
 
 from groma.errors import did_you_mean
 
-#: Heading of ``--help`` for what every command takes; options without a heading come first.
-GENERAL = "General"
-NoColor = Annotated[
-    bool,
-    typer.Option(
-        "--no-color", help="Use no colours; so does the environment variable NO_COLOR.", rich_help_panel=GENERAL
-    ),
-]
+
+def one_of(*names: str) -> Callable[[str], Sequence[str]]:
+    """Return a completion by names; parts of installed packages are not among them."""
+    return lambda incomplete: [name for name in names if name.lower().startswith(incomplete.lower())]
+
+
+class Panel(str):
+    """A heading of ``--help``; makes the options under it. Those without a heading come first."""
+
+    def option(self, text: str, *flags: str, choices: Sequence[str] = (), **settings: Any) -> Any:
+        """Declare an option with its help; ``--name`` of the argument unless flags say otherwise."""
+        if choices:
+            settings["autocompletion"] = one_of(*choices)
+        return typer.Option(*flags, help=text, rich_help_panel=self or None, **settings)
+
+
+#: What every command takes, and what stands under no heading.
+GENERAL, PLAIN = Panel("General"), Panel("")
+NoColor = Annotated[bool, GENERAL.option("Use no colours; so does the environment variable NO_COLOR.", "--no-color")]
 
 
 class Command(TyperCommand):
@@ -92,11 +103,6 @@ def left_to_shell(incomplete: str) -> list[str]:
     return []
 
 
-def one_of(*names: str) -> Callable[[str], Sequence[str]]:
-    """Return a completion by names; parts of installed packages are not among them."""
-    return lambda incomplete: [name for name in names if name.lower().startswith(incomplete.lower())]
-
-
 #: What options may be given, as far as groma itself has it; tests compare them with the registries, which take a second
 #: to import.
 LOSSES = "auto none huber soft_l1 cauchy tukey geman_mcclure barron truncated".split()
@@ -111,5 +117,3 @@ CAMERA_MODELS = (
 DETECTORS, MATCHERS = ["lsd"], ["wide_baseline", "flow"]
 MAPPERS, CALIBRATIONS = ["incremental", "global"], ["auto", "map", "exif", "unknown"]
 SEQUENCES, COMPILED = ["rgbd", "stereo", "mono"], ["adjust", "map", "track"]
-
-__all__ = ["Command", "NoColor", "forbid_colours", "left_to_shell", "one_of", "with_common_options"]

@@ -102,6 +102,3 @@ def complain(what: str, text: str, style: Style) -> None:
     if is_terminal(sys.stderr):
         line = wrapped(line, terminal_width()).replace(what, paint(what, style, sys.stderr), 1)
     print(line, file=sys.stderr, flush=True)
-
-
-__all__ = ["Console", "complain", "warn"]

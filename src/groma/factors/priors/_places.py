@@ -83,6 +83,3 @@ def put_place(kind, row, a, q, g, out, c):
         for j in range(3):
             out[c + j] = -s * g[j] - across * (a[j] - 2.0 * s * row[j])
         out[c + 3] = -across
-
-
-__all__ = ["CAMERA", "KINDS", "LINE", "PLANE", "POINT", "place_on", "put_place"]

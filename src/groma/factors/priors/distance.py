@@ -205,6 +205,3 @@ class Distance(Factor):
         names = (("first", first), ("second", second))
         poses = {group: random_poses(rng, 4, rotation=0.7) for group, name in names if name == "camera"}
         return make_example(factor, rng, states=poses)
-
-
-__all__ = ["Distance"]

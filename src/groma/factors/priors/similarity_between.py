@@ -170,6 +170,3 @@ class SimilarityBetween(Factor):
         second = (first + rng.integers(1, 4, 6)) % 4
         factor = cls(first=Ref("cameras", first), second=Ref("cameras", second), first_from_second=some(6))
         return make_example(factor, rng, states={"cameras": some(4)})
-
-
-__all__ = ["SimilarityBetween"]

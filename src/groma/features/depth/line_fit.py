@@ -15,7 +15,7 @@ from groma._numba import inline_kernel, kernel, loop
 #: Values of ``DepthLines.support``.
 NONE, SURFACE, CREASE, LEFT, RIGHT = range(5)
 
-#: Samples along a segment at most, and across on either side: the size of arrays.
+#: Samples along a segment at most, and across on either side: the size of arrays (cost: memory and time).
 _ALONG, _ACROSS = 24, 3
 
 
@@ -219,6 +219,3 @@ def fit_all(ends, depth, noise, correlation, gates, shares, inverse_depth, covar
             inverse_depth[n, i] = joint_x[i]
             for j in range(2):
                 covariance[n, i, j] = scale * joint_inverse[i, j]
-
-
-__all__ = ["CREASE", "LEFT", "NONE", "RIGHT", "SURFACE", "fit_all"]

@@ -78,6 +78,3 @@ def as_pinhole(params: npt.ArrayLike) -> FloatArray:
     if not (np.isfinite(pinhole).all() and (pinhole[:2] > 0).all()):
         raise InputError(f"pinhole must be finite, with positive focal lengths; got {pinhole.tolist()}.")
     return pinhole
-
-
-__all__ = ["DepthNoise", "as_depth", "as_pinhole"]

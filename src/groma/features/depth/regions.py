@@ -314,6 +314,3 @@ def assign(depth, pinhole, noise, bend, inlier, size, step, blocks, thetas, labe
                     centers[best, 0] += x * z
                     centers[best, 1] += y * z
                     centers[best, 2] += z
-
-
-__all__ = ["MAX_REGIONS", "REGIONS", "RegionGates", "assign", "block_sums", "grow", "join"]

@@ -122,5 +122,3 @@ register_format(
         read=read_bundler,
     )
 )
-
-__all__ = ["read_bundler"]

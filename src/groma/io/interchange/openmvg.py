@@ -206,5 +206,3 @@ register_format(
         read=read_openmvg,
     )
 )
-
-__all__ = ["read_openmvg"]

@@ -183,15 +183,3 @@ def _from_numbers(numbers: FloatArray, source: str) -> Calibration:
 
 def _checked(model: str, params: FloatArray, size: tuple[int, int] | None, source: str) -> Calibration:
     return Calibration(model, checked_params(model, params, source), size)
-
-
-__all__ = [
-    "Calibration",
-    "CameraLike",
-    "Rectification",
-    "calibration_of",
-    "find_calibration",
-    "from_opencv",
-    "read_calibration",
-    "rectification",
-]

@@ -241,6 +241,3 @@ def _image(path: Path, shape: tuple[int, int], remarks: list[str], otherwise: st
         )
         return None
     return image
-
-
-__all__ = ["Entry", "FileSequence", "Preparation", "Selection", "file_size", "read_ahead", "simple_sequence"]

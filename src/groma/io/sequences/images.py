@@ -154,6 +154,3 @@ def _times(folder: Path, images: list[Path]) -> list[float]:
 def _reference(folder: Path) -> Trajectory | None:
     path = folder / "groundtruth.txt"
     return read_trajectory(path, "tum") if path.is_file() else None
-
-
-__all__ = ["VideoSequence", "image_files", "open_images", "open_video"]

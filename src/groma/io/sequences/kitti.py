@@ -103,6 +103,3 @@ def _reference(folder: Path, times: list[float] | None, count: int, warnings: li
                 poses = poses.take(np.arange(count))
             return poses.replace(timestamps=np.array([_time(times, number) for number in range(len(poses))]))
     return None
-
-
-__all__ = ["is_kitti", "open_kitti"]

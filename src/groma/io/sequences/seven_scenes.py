@@ -134,6 +134,3 @@ def _reference(root: Path, colors: list[Path]) -> Trajectory | None:
     matrix[:3, :3], matrix[:3, 3] = u @ vt, COLOR_FROM_DEPTH[:, 3]
     depth_from_color = np.broadcast_to(se3.inverse(se3.from_matrix(matrix)), (len(poses), 7))
     return Trajectory(np.array(times), se3.compose(np.array(poses), depth_from_color))
-
-
-__all__ = ["open_seven_scenes", "register_depth", "seven_scenes_root"]

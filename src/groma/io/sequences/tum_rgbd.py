@@ -128,6 +128,3 @@ def _listed(path: Path, number: int, words: list[str]) -> tuple[float, Path]:
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     with reading(path, "list of images"):
         return list(read_words(path))
-
-
-__all__ = ["is_tum_rgbd", "open_tum_rgbd", "pair_by_time"]

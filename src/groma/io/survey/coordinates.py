@@ -247,8 +247,3 @@ def _projected(group: Places, target: str) -> FloatArray:
     if not np.isfinite(found[known]).all():
         raise InputError(f"{group.source}: places lie outside the area of {target}. Is that the right system?")
     return found
-
-
-__all__ = [
-    "CoordinateSystem", "Places", "WorldFrame", "common_frame", "described", "east_north_up", "geocentric",
-]  # fmt: skip

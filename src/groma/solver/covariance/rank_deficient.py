@@ -123,6 +123,3 @@ def deficiency(layout: Layout, modes: Modes, num_free: int) -> ProblemError:
 
 def _kind(layout: Layout, kept: KeptClass) -> str:
     return layout.problem.variables[kept.members[0].group].manifold.kind
-
-
-__all__ = ["LOOSE", "deficiency", "hold_unobservable_blocks", "loses_the_cameras", "zero_modes"]

@@ -78,6 +78,3 @@ class Dense:
         for (a, b), S in blocks.items():
             rows, columns = layout.blocks[a, b]
             _scatter(S, rows, columns, layout.kept[a].start, layout.kept[b].start, M)
-
-
-__all__ = ["DENSE_FLOPS_PER_SECOND", "Dense"]

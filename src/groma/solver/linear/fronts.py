@@ -310,6 +310,3 @@ def _supernodes(position: IntArray, rows: IntArray, columns: IntArray, widths: I
         own = np.array(sorted(columns_of[j]), np.int64)
         fronts.append(_Front(at[np.concatenate([own, structure[j]])], len(own)))
     return fronts
-
-
-__all__ = ["Fronts"]

@@ -187,6 +187,3 @@ class ConjugateGradients:
             return float(r @ z)
 
         return precondition
-
-
-__all__ = ["ConjugateGradients"]

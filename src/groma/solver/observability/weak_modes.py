@@ -211,6 +211,3 @@ def _by_iteration(matrix: csc_array) -> tuple[FloatArray, FloatArray]:
     product = X.T @ (matrix @ X)
     values, vectors = np.linalg.eigh(0.5 * (product + product.T))
     return values, X @ vectors
-
-
-__all__ = ["weak_modes"]

@@ -129,6 +129,3 @@ def _add(others: Any, sums: Any, _datatype: Any) -> None:
     for first in range(0, len(total), ADDED_AT_ONCE):
         part = slice(first, first + ADDED_AT_ONCE)
         exact_sums.add_sums(total[part], more[part])
-
-
-__all__ = ["LAUNCHERS", "Ranks", "reducer_of_launcher", "started_as"]

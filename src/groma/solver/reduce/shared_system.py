@@ -256,6 +256,3 @@ class SharedSystem:
                 blocks[member.blocks(np.arange(count)), member.offset : member.offset + dof] = delta
             parts.append(blocks.reshape(-1))
         return parts
-
-
-__all__ = ["SharedSystem"]

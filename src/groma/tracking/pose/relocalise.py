@@ -175,11 +175,15 @@ class _Search:
         self.gates, self.all_gates = data.options.gates.finding, data.options.gates
         self._best: Found | None = None
         self._tried: list[FloatArray] = []
+        self._near: dict[tuple[bytes, float], IntArray] = {}
 
     def near(self, pose: FloatArray, radius: float) -> IntArray:
-        """Pairs (n, 2) of known features and features of the frame, near where a pose says."""
-        max_bits = self.all_gates.features.max_bits_near
-        return match_near(self.camera, self.known, self.data.features, pose, radius, max_bits)
+        """Pairs (n, 2) of known features and features of the frame, near where a pose says; poses are asked again."""
+        asked = pose.tobytes(), radius
+        if asked not in self._near:
+            max_bits = self.all_gates.features.max_bits_near
+            self._near[asked] = match_near(self.camera, self.known, self.data.features, pose, radius, max_bits)
+        return self._near[asked]
 
     def proposal_near(self, guess: FloatArray) -> FloatArray | None:
         """Pose from features matched in wide surroundings of where a guess says."""

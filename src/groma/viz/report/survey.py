@@ -61,6 +61,3 @@ def _check_points(points: Sequence[Mapping[str, Any]]) -> str:
     caption = "Points whose coordinates took no part: computed less measured, with the standard deviation of that. "
     caption += "Chi-square is 3 on average."
     return table("Check points", caption, ["point", "x", "y", "z", "chi-square"], rows)
-
-
-__all__ = ["MAX_LISTED", "survey_card"]
