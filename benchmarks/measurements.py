@@ -190,7 +190,9 @@ def photographs(arguments: argparse.Namespace) -> dict:
 def one_map(arguments: argparse.Namespace) -> None:
     """Predicted against actual errors of positions on photographs, from one map."""
     folder = arguments.data / "strecha_castle_p30"
-    alone = groma.adjust(read_scene(folder / "sparse_inc")).scene
+    found = read_scene(folder / "sparse_inc")
+    found = found.keep(points=np.random.default_rng(0).permutation(found.num_points) < arguments.points)
+    alone = groma.adjust(found).scene
     alone = groma.adjust(alone, weighted(alone, groma.AdjustOptions())).scene  # the weights that the draws will have
     truth = groma.align(alone, read_scene(folder / "sparse_gt")).scene
     true, rows, named, blamed = truth.cam_centers_in_world, {False: [], True: []}, 0, 0
