@@ -39,11 +39,12 @@ def run(images, model, threads):
     mark("imports")
     from groma.cli.app import app  # noqa: F401 - the command line is part of every run
     from groma.compilation.loading import loading
-    from groma.execution import work_with
+    from groma.execution import share_memory, work_with
     from groma.io import read_scene
     from groma.mapping.map import MapOptions, map_images
 
     mark("reading the model")
+    share_memory()
     scene = read_scene(model)
     with tempfile.TemporaryDirectory() as folder, work_with(threads):
         with loading("map", threads):

@@ -26,7 +26,7 @@ from groma.factors.observations.line_reprojection import endpoint_distance, imag
 from groma.factors.priors.pose_prior import compose_with_inverse, inverse_left_jacobian, pose_log
 from groma.geometry.charts.chart import perpendicular_kernel
 from groma.geometry.charts.pose_charts import POSE_CHARTS
-from groma.solver.independent import SHORTEN_GAIN_RATIO, STRETCH_GAIN_RATIO, stretch_factor
+from groma.solver.independent import STRETCH, stretch_factor
 
 #: Steps under one loss, the relative decrease of the cost that ends them, and the first damping.
 MAX_STEPS, TOLERANCE, FIRST_DAMPING = 8, 1e-3, 1e-6
@@ -285,13 +285,13 @@ def fit_pose(seen: SeenMap, start: FloatArray, loss: Loss) -> FloatArray:
         promised = 0.5 * float(damping * (step * diagonal) @ step - here.g @ step)
         place, there = _moved(seen, pose, step, loss)
         ratio = (here.cost - there.cost) / max(promised, 1e-300)
-        if promised > TOLERANCE * here.cost and not SHORTEN_GAIN_RATIO <= ratio <= STRETCH_GAIN_RATIO:
+        if promised > TOLERANCE * here.cost and not STRETCH.shorter <= ratio <= STRETCH.longer:
             other, beyond = _moved(seen, pose, stretch_factor(ratio) * step, loss)
             if beyond.cost < there.cost:
                 place, there = other, beyond
         fell = here.cost - there.cost
         if fell > 0.0:
-            pose, damping, growth = place, damping / 5.0, 2.0
+            pose, damping, growth = place, damping / STRETCH.lowered, 2.0
         else:
             fell, damping, growth = promised, damping * growth, 2.0 * growth
         if fell <= TOLERANCE * here.cost:

@@ -131,9 +131,10 @@ def looking_at(centers: npt.ArrayLike, targets: npt.ArrayLike, up: npt.ArrayLike
     """
     centers, targets = np.broadcast_arrays(np.asarray(centers, np.float64), np.asarray(targets, np.float64))
     ahead = unit(targets - centers)
-    right = unit(np.cross(ahead, up))
+    right = unit(np.cross(ahead, np.asarray(up, np.float64)))
     rotation = np.stack([right, np.cross(ahead, right), ahead], axis=-2)
-    return np.concatenate([quaternion.from_matrix(rotation), -(rotation @ centers[..., None])[..., 0]], axis=-1)
+    q, t = quaternion.from_matrix(rotation), -(rotation @ centers[..., None])[..., 0]
+    return np.concatenate([q, t], axis=-1, dtype=np.float64)
 
 
 def hat(xi: FloatArray) -> FloatArray:

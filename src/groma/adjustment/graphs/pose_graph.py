@@ -198,14 +198,19 @@ def motion_problem(
     losses : sequence of (rows, loss)
         The loss of some motions each: one group of factors.
     """
-    every = PoseBetween(
-        first=Ref("poses", motions.first_idx),
-        second=Ref("poses", motions.second_idx),
+    every = motion_factors(motions, "poses")
+    factors = [replace(every.take(rows), loss=loss) for rows, loss in losses]
+    return Problem({"poses": Variables(POSE_CHARTS["left"], body_from_world, constant)}, factors)
+
+
+def motion_factors(motions: Motions, group: str) -> PoseBetween:
+    """Return the factors of motions between poses (body_from_world) of a group of variables, without a loss."""
+    return PoseBetween(
+        first=Ref(group, motions.first_idx),
+        second=Ref(group, motions.second_idx),
         first_from_second=motions.first_from_second,
         sqrt_information=_roots(motions.information),
     )
-    factors = [replace(every.take(rows), loss=loss) for rows, loss in losses]
-    return Problem({"poses": Variables(POSE_CHARTS["left"], body_from_world, constant)}, factors)
 
 
 def _rows(graph: PoseGraph, options: PoseGraphOptions) -> tuple[IntArray, IntArray]:
@@ -228,4 +233,11 @@ def _roots(information: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
 
 
-__all__ = ["PoseGraphOptions", "PoseGraphResult", "adjust_pose_graph", "motion_problem", "pose_graph_problem"]
+__all__ = [
+    "PoseGraphOptions",
+    "PoseGraphResult",
+    "adjust_pose_graph",
+    "motion_factors",
+    "motion_problem",
+    "pose_graph_problem",
+]

@@ -9,6 +9,7 @@ import typer
 from groma.cli.shared import command as _complete
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 from groma.errors import InputError, did_you_mean
 
 LineResidual = Literal["endpoints", "bearing", "normal"]
@@ -28,6 +29,7 @@ def _check_linear_solver(name: str) -> None:
 
 
 def adjust(
+    console: Console,
     source: _options.Input,
     output: Annotated[
         Path | None,
@@ -186,11 +188,7 @@ def adjust(
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
     seed: _options.NoSeed = 0,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Adjust cameras, points, lines and planes together (bundle adjustment).
 
@@ -201,18 +199,16 @@ def adjust(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.adjusting import Wanted, adjust_and_write
-    from groma.cli.shared.console import Console
     from groma.cli.shared.input import check_inputs, refuse_idle
     from groma.cli.shared.parts import PartsWanted, adjust_parts_and_write, has_company, is_parts
     from groma.cli.shared.pose_graph import adjust_graph_and_write, is_pose_graph
 
     if linear_solver != "auto":
         _check_linear_solver(linear_solver)
-    console = Console(quiet, verbose, json_target, threads)
     measured = _measured.given(locals())
     in_parts = has_company() or is_parts(source)
     if not in_parts:
-        _output.check_outputs(force, output, page, covariance, protocol, json_target=json_target)
+        _output.check_outputs(force, output, page, covariance, protocol, json_target=console.json_target)
     if covariance is not None and covariance.suffix not in (".npz", ".json"):
         raise InputError(f"--covariance must end in .npz or .json; got {covariance}.")
     if not 0.0 < sigma0 < float("inf"):
@@ -234,10 +230,10 @@ def adjust(
         }  # fmt: skip
         graph_options = _chosen(
             loss="none" if loss == "auto" else loss, loss_scale=loss_scale, linear_solver=linear_solver,
-            max_iterations=max_iterations, threads=threads,
+            max_iterations=max_iterations, threads=console.threads,
         )  # fmt: skip
         numbers = adjust_graph_and_write(source, output, console, force, graph_options, refused)
-        _output.write_json(json_target, numbers, force)
+        _output.write_json(console.json_target, numbers, force)
         return
 
     from groma.adjustment.adjust import AdjustOptions
@@ -246,14 +242,14 @@ def adjust(
         loss=loss, loss_scale=loss_scale, camera_model=camera_model, refine_intrinsics=refine_intrinsics,
         refine_principal_point=refine_principal_point, refine_rigs=refine_rigs, points=points, lines=lines,
         planes=planes, max_iterations=max_iterations, linear_solver=linear_solver, line_chart=line_chart, gauge=gauge,
-        line_residual=line_residual, plane_residual=plane_residual, threads=threads,
+        line_residual=line_residual, plane_residual=plane_residual, threads=console.threads,
     ))  # fmt: skip
     if in_parts:
         refused = {
             "--report": page, "--covariance": covariance, "--contributions": contributions, "--diagnosis": diagnosis,
             "--camera-model": camera_model, "--rolling-shutter": rolling_shutter, **measured.given,
         }  # fmt: skip
-        adjust_parts_and_write(source, console, options, PartsWanted(output, json_target, force, keep), refused)
+        adjust_parts_and_write(source, console, options, PartsWanted(output, console.json_target, force, keep), refused)
         return
     wanted = Wanted(
         output,
@@ -264,7 +260,7 @@ def adjust(
         diagnosis,
         contributions,
         truth,
-        json_target,
+        console.json_target,
         force,
         measured,
         protocol,

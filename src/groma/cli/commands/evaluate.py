@@ -20,17 +20,13 @@ _StepUnit = Literal["frames", "metres", "seconds"]
 
 
 def poses(
+    console: Console,
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to judge.")],
     reference: Annotated[Path, typer.Argument(metavar="REF", help="Scene taken for true.")],
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Compare the camera poses of two scenes after similarity alignment; images are matched by name."""
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
     check_inputs(estimate, reference)
 
     from groma.evaluation.poses import evaluate_poses
@@ -56,7 +52,7 @@ def poses(
         ("pose error within", *(f"{degrees:g}°" for degrees in scores.auc)),
         [["area under curve", *(f"{value:.3f}" for value in scores.auc.values())]],
     )
-    _output.write_json(json_target, scores.to_dict(), force)
+    _output.write_json(console.json_target, scores.to_dict(), force)
 
 
 _Thresholds = Annotated[
@@ -70,6 +66,7 @@ _Thresholds = Annotated[
 
 
 def lines(
+    console: Console,
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene or line set to judge.")],
     reference: Annotated[
         Path | None,
@@ -91,18 +88,13 @@ def lines(
         bool, _options.PLAIN.option("First align EST to REF by the poses of images in both scenes.", "--align")
     ] = False,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Compare 3D line segments with a reference: how much of it is covered, how much of the lines is right.
 
     With --silhouettes also, or only, with the silhouettes of the object, into which a true line projects from
     everywhere.
     """
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
     check_inputs(estimate, reference, silhouettes)
     if reference is None and silhouettes is None:
         raise InputError("There is nothing to compare with. Pass a reference, --silhouettes FOLDER, or both.")
@@ -112,7 +104,7 @@ def lines(
         numbers |= _compare_lines(console, estimate, reference, threshold, align)
     if silhouettes is not None:
         numbers["silhouettes"] = _compare_silhouettes(console, estimate, silhouettes)
-    _output.write_json(json_target, numbers, force)
+    _output.write_json(console.json_target, numbers, force)
 
 
 def _compare_lines(
@@ -162,6 +154,7 @@ def _compare_silhouettes(console: Console, estimate: Path, folder: Path) -> dict
 
 
 def planes(
+    console: Console,
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to judge.")],
     reference: Annotated[
         Path,
@@ -175,14 +168,9 @@ def planes(
         float | None, _options.PLAIN.option("Largest offset of planes that match; by default 1 % of REF.", metavar="D")
     ] = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Compare planes with reference planes (angles and offsets of matches) or with points (share explained)."""
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
     check_inputs(estimate, reference)
 
     from groma.evaluation.planes import evaluate_planes, score_planes_by_points
@@ -207,7 +195,7 @@ def planes(
                 ["offsets, units of the reference", f"{found.offset_mean:.4g}", f"{found.offset_max:.4g}"],
             ]
             console.table(("", "mean", "largest"), rows)
-        _output.write_json(json_target, found.to_dict(), force)
+        _output.write_json(console.json_target, found.to_dict(), force)
         return
     shares = score_planes_by_points(scene.planes.hesse, read_reference(reference).surface_points(), threshold)
     console.say(f"{counted(shares.num_planes, 'planes')}, {counted(shares.num_points, 'points')}")
@@ -215,10 +203,11 @@ def planes(
         [f"{tau:.4g}", _percent(share), f"{shares.inlier_rmse[tau]:.4g}"] for tau, share in shares.inlier_share.items()
     ]
     console.table(("within", "of the points", "rms"), rows)
-    _output.write_json(json_target, shares.to_dict(), force)
+    _output.write_json(console.json_target, shares.to_dict(), force)
 
 
 def trajectory(
+    console: Console,
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory to judge.")],
     reference: Annotated[Path, typer.Argument(metavar="REF", help="Trajectory taken for true.")],
     format: Annotated[_Format, _options.PLAIN.option("Format of both files; .gz is unpacked.")] = "auto",
@@ -235,17 +224,12 @@ def trajectory(
     rpe_delta: Annotated[float, _options.PLAIN.option("Step of the relative errors.", metavar="D")] = 1.0,
     rpe_unit: Annotated[_StepUnit, _options.PLAIN.option("Unit of the step.")] = "frames",
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Compare a trajectory with a reference: absolute and relative errors, and drift; poses are matched by time.
 
     Two files of equal length of which one has no times (KITTI) are matched by line.
     """
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
     check_inputs(estimate, reference)
 
     from groma.evaluation.trajectory import Spread, counts_lines, score_trajectory
@@ -297,7 +281,7 @@ def trajectory(
             f"Drift {scores.drift_percent:.4g} % and {scores.drift_deg_per_metre:.4g} deg/m, mean over segments of "
             f"{scores.segment_lengths[0]:.4g} to {scores.segment_lengths[-1]:.4g} m."
         )
-    _output.write_json(json_target, scores.to_dict(), force)
+    _output.write_json(console.json_target, scores.to_dict(), force)
 
 
 def _percent(share: float) -> str:

@@ -9,9 +9,9 @@ import typer
 from groma._counted import counted
 from groma.cli.shared import command as _complete
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 
 if TYPE_CHECKING:
-    from groma.cli.shared.console import Console
     from groma.localization.placed import PlacedImage
     from groma.localization.result import LocalizeResult
 
@@ -22,6 +22,7 @@ _MIN_LENGTH = 15.0
 
 
 def localize(
+    console: Console,
     map_: Annotated[
         Path,
         typer.Argument(metavar="MAP", help="OUT of groma map or groma track, a COLMAP model, or an archive (.npz)."),
@@ -59,11 +60,7 @@ def localize(
         float, _options.PLAIN.option("Shortest line segment, pixels.", min=5.0, metavar="PX")
     ] = _MIN_LENGTH,
     force: _options.Force = False,
-    threads: _options.Threads = None,
     seed: _options.Seed = 0,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Localise photographs in a map.
 
@@ -73,11 +70,9 @@ def localize(
     Finished queries are kept in OUT.work until the end: after an interruption the same command goes on from there.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
     from groma.cli.shared.input import camera_parameters, check_inputs, refuse_idle
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
+    _output.check_outputs(force, output, json_target=console.json_target)
     check_inputs(map_, *queries, images)
     refuse_idle(("--min-length", min_length != _MIN_LENGTH and not lines, "with lines"))
 
@@ -116,10 +111,10 @@ def localize(
     shutil.rmtree(work, ignore_errors=True)
     _say(console, result)
     console.wrote_page(output)
-    _output.write_json(json_target, result.to_dict(), force)
+    _output.write_json(console.json_target, result.to_dict(), force)
 
 
-def _say(console: "Console", result: "LocalizeResult") -> None:
+def _say(console: Console, result: "LocalizeResult") -> None:
     """A row for every photograph, at most a dozen of those that are localised; why the others are not; a count."""
     found = result.queries
     localized = [one for one in found if one.status == "localized"]

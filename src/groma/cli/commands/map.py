@@ -11,11 +11,11 @@ from groma.cli.shared import command as _complete
 from groma.cli.shared import depth as _depth
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 from groma.cli.shared.ranks import led_by_first_rank
 from groma.errors import InputError
 
 if TYPE_CHECKING:
-    from groma.cli.shared.console import Console
     from groma.io.colmap.rigs import RigDescription
     from groma.mapping.map import MapOptions
     from groma.scene import Scene
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 @led_by_first_rank
 def map_(
+    console: Console,
     images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of photographs, and of folders of them.")],
     output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     model: Annotated[
@@ -160,11 +161,7 @@ def map_(
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
     seed: _options.Seed = 0,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Map photographs: points, lines and planes, adjusted together.
 
@@ -173,12 +170,10 @@ def map_(
     the end: after an interruption the same command goes on from there.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
     from groma.cli.shared.extending import check_extension
     from groma.cli.shared.input import camera_parameters, check_inputs, refuse_idle
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
+    _output.check_outputs(force, output, json_target=console.json_target)
     measured = _measured.given(locals() | {"poses": poses if _has_noise(poses, pose_sigma) else None})
     check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, *measured.files)
     maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
@@ -219,7 +214,7 @@ def map_(
         rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
         rolling_shutter=rolling_shutter,
-        threads=threads,
+        threads=console.threads,
         seed=seed,
     )
     start, options = _start(console, images, model, poses, options)
@@ -232,7 +227,7 @@ def map_(
         extended = extend_map(console, extend, images, map_images, output, force, stages)
         photographs, start = extended.folder, extended.scene
     survey = measured.read(photographs, lambda: _names_in(photographs)) if measured else None
-    with work_with(threads):
+    with work_with(console.threads):
         result = run_map(console, photographs, work, start, options, matches, survey, maps)
         if extended is not None and survey is None:
             result = in_world_of(result, extended.map)
@@ -243,7 +238,7 @@ def map_(
     end_queries(output)
     say_map(console, result, numbers)
     console.wrote_page(output)
-    _output.write_json(json_target, numbers, force)
+    _output.write_json(console.json_target, numbers, force)
 
 
 def _names_in(folder: Path) -> list[str]:
@@ -268,7 +263,7 @@ def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> No
         raise InputError("--rig is for images without a model: a model has its own rigs. Leave it out.")
 
 
-def _rigs(console: "Console", images: Path, path: Path | None) -> "tuple[RigDescription, ...]":
+def _rigs(console: Console, images: Path, path: Path | None) -> "tuple[RigDescription, ...]":
     """Return the rigs of a file, or of the one in the folder of photographs, and say what they hold."""
     from groma.io.colmap.rigs import RIG_FILE, check_rigs, read_rigs
     from groma.mapping.photographs import image_files
@@ -284,7 +279,7 @@ def _rigs(console: "Console", images: Path, path: Path | None) -> "tuple[RigDesc
 
 
 def _start(
-    console: "Console", images: Path, model: Path | None, poses: Path | None, options: "MapOptions"
+    console: Console, images: Path, model: Path | None, poses: Path | None, options: "MapOptions"
 ) -> "tuple[Scene | None, MapOptions]":
     """Return the scene to start from, None where the photographs must do; and options that know its calibration."""
     from groma.io import read_scene

@@ -5,11 +5,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 
 Kind = Literal["holistic", "corridor"]
 
 
 def synth(
+    console: Console,
     output: Annotated[
         Path, _options.PLAIN.option("Folder for truth.npz and start.npz (made anew).", "--output", "-o", metavar="OUT")
     ],
@@ -28,10 +30,6 @@ def synth(
     ] = None,
     seed: _options.Seed = 0,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Make a scene of points, lines and planes whose exact truth is known.
 
@@ -39,10 +37,8 @@ def synth(
     landmarks, as an adjustment would meet it.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
+    _output.check_outputs(force, output, json_target=console.json_target)
 
     from groma.io import write_scene
     from groma.scene import synthetic
@@ -56,5 +52,5 @@ def synth(
         write_scene(made.start, draft / "start.npz")
     console.wrote(f"{output / 'truth.npz'} and {output / 'start.npz'}: {sentence_of(made.truth)}")
     _output.write_json(
-        json_target, {"kind": kind, "seed": seed, "noise_px": made.noise_px, **counts_of(made.truth)}, force
+        console.json_target, {"kind": kind, "seed": seed, "noise_px": made.noise_px, **counts_of(made.truth)}, force
     )

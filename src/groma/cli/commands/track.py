@@ -2,21 +2,20 @@
 """``groma track``: follow a camera through a sequence, and map points, lines and planes on the way."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import typer
 
 from groma.cli.shared import command as _complete
 from groma.cli.shared import options as _options
-
-if TYPE_CHECKING:
-    from groma.cli.shared.console import Console
+from groma.cli.shared.console import Console
 
 #: As :func:`groma.tracking.track` names them.
 _STAGES = ("tracking frame", "adjusting all keyframes")
 
 
 def track(
+    console: Console,
     sequence: Annotated[
         Path,
         typer.Argument(
@@ -74,10 +73,6 @@ def track(
         ),
     ] = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Track a camera through a sequence.
 
@@ -87,12 +82,10 @@ def track(
     was lost for long and no place was recognised later, further maps are in OUT/submap_2, submap_3, ...
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
     from groma.cli.shared.input import camera_line, refuse_idle
     from groma.errors import InputError, did_you_mean
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
+    _output.check_outputs(force, output, json_target=console.json_target)
     if kind not in (None, *_complete.SEQUENCES):
         raise InputError(f"--kind must be rgbd, stereo or mono; got {kind!r}.{did_you_mean(kind, _complete.SEQUENCES)}")
     line = camera_line(camera_model, camera_params)
@@ -146,10 +139,10 @@ def track(
     numbers = result.summary()
     _say(console, numbers)
     console.wrote_page(output)
-    _output.write_json(json_target, numbers, force)
+    _output.write_json(console.json_target, numbers, force)
 
 
-def _say(console: "Console", numbers: dict[str, Any]) -> None:
+def _say(console: Console, numbers: dict[str, Any]) -> None:
     statuses = [[f"frames {status}", f"{count:,}"] for status, count in sorted(numbers["frames"].items())]
     kinds = ("keyframes", "points", "lines", "planes", "loops")
     console.table(("", "number"), [*statuses, *([kind, f"{numbers[kind]:,}"] for kind in kinds)])

@@ -42,10 +42,12 @@ def run_map(
     """Map a folder of photographs; Ctrl-C ends the command and keeps the finished stages in ``work``."""
     from groma.cli.shared.interrupt import interruptible
     from groma.compilation.loading import loading
+    from groma.execution import share_memory
     from groma.mapping.checkpoints import check_free, has_stages
     from groma.mapping.map import map_images
 
     check_free(work)
+    share_memory()
     console.expect_compilation("map")
     start: Start = "photographs" if model is None else "model" if model.num_point_observations else "poses"
     console.expect_stages(

@@ -13,16 +13,6 @@ from groma.cli.shared.command import GENERAL, PLAIN, Panel
 CAMERAS, LANDMARKS = Panel("Cameras and poses"), Panel("Points, lines and planes")
 ADJUSTMENT, RESULTS = Panel("Adjustment"), Panel("Results")
 
-Json = Annotated[
-    str | None,
-    GENERAL.option("Write a machine-readable report to FILE; '-' is standard output.", "--json", metavar="FILE"),
-]
-Quiet = Annotated[bool, GENERAL.option("Say nothing but errors.", "--quiet", "-q")]
-Verbose = Annotated[bool, GENERAL.option("Say more.", "--verbose", "-v")]
-Threads = Annotated[
-    int | None,
-    GENERAL.option("Use at most N threads. Default: one per core, where that pays.", "--threads", min=1, metavar="N"),
-]
 Seed = Annotated[int, GENERAL.option("Seed of the random numbers.", "--seed", min=0, metavar="N")]
 #: Of commands that draw no random numbers: accepted, so that a script can pass it to every command, and not shown.
 NoSeed = Annotated[int, typer.Option("--seed", min=0, hidden=True)]

@@ -15,7 +15,8 @@ from groma._typing import FloatArray
 from groma.geometry import se3
 from groma.solver.report import SolveReport
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
-from groma.tracking.backend.loop_closure import LoopSearch, close_loop, search_for_loop
+from groma.tracking.backend.loop_closure import LoopSearch, search_for_loop
+from groma.tracking.backend.metric_loops import close_loop
 from groma.tracking.backend.plane_outcome import PlaneOutcome, drop_what_failed
 from groma.tracking.backend.scaled_loops import close_scaled_loops
 from groma.tracking.backend.stereo_calibration import correct_map, estimate_turn, shift_between, tells_yaw
@@ -260,7 +261,7 @@ class Mapper:
             return
         last = self.map.last
         before = last.pose.copy()
-        if close_loop(self.map, self.camera, search.newest, pairs, self.options.gates):
+        if close_loop(self.map, self.camera, search.newest, pairs, self.options):
             self.loops += 1
             _follow_world(present, se3.compose(se3.inverse(last.pose[None]), before[None])[0])
 
