@@ -251,7 +251,8 @@ def full_opencv_unproject(params, uv, bearing):
 def opencv_unproject(params, uv, bearing):
     """Unit bearing with (fx, fy, cx, cy, k1, k2, p1, p2)."""
     full = np.zeros(12)
-    full[:8] = params[:8]
+    for k in range(8):
+        full[k] = params[k]
     return full_opencv_unproject(full, uv, bearing)
 
 

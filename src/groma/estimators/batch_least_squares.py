@@ -195,7 +195,8 @@ def _solve_all(
                     better = after <= before
                     done = after >= before * (1.0 - tolerance) - floor
                 if better:
-                    x[n] = trial
+                    for k in range(trial.size):
+                        here.flat[k] = trial.flat[k]
                     damping = max(damping * 0.1, MIN_DAMPING)
                     break
                 damping *= 10.0

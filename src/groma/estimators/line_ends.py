@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._numba import kernel, loop
+from groma._ordering import ascending, median
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
 from groma.execution import map_ranges
@@ -62,7 +63,7 @@ def _along(center, ray, X):
 def _seen_twice(first, last):
     """From where to where at least two of the intervals cover a line; empty (inf, -inf) if no two overlap."""
     count = len(first)
-    by_first, by_last = np.argsort(first), np.argsort(last)
+    by_first, by_last = ascending(first), ascending(last)
     depth, low, high = 0, np.inf, -np.inf
     i = j = 0
     while j < count:
@@ -88,7 +89,7 @@ def _end_of(last, size, limit, stop, gates):
     same_end, majority, quantile = gates
     count = len(last)
     place = limit
-    order = np.argsort(-last)
+    order = ascending(-last)
     for k in order:
         if last[k] > limit:
             continue
@@ -105,7 +106,7 @@ def _end_of(last, size, limit, stop, gates):
             break
         if majority * beyond > count:
             break
-    reach = same_end * np.median(size)
+    reach = same_end * median(size)
     total = 0.0
     for k in order:
         if abs(last[k] - place) <= reach:

@@ -281,6 +281,8 @@ def trajectory(
             f"Drift {scores.drift_percent:.4g} % and {scores.drift_deg_per_metre:.4g} deg/m, mean over segments of "
             f"{scores.segment_lengths[0]:.4g} to {scores.segment_lengths[-1]:.4g} m."
         )
+    else:
+        console.say("No drift by length of the way: the camera moved no farther than its positions err.")
     _output.write_json(console.json_target, scores.to_dict(), force)
 
 
