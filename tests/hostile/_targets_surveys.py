@@ -17,6 +17,7 @@ from _targets_tables import EUROC, G2O_3D, KITTI, TUM
 
 from groma.adjustment.survey.attach import with_survey
 from groma.adjustment.survey.given import Survey
+from groma.geometry import quaternion, se3
 from groma.io import write_archive, write_scene
 from groma.io.colmap.rigs import by_frames, check_rigs, read_rigs
 from groma.io.measured_poses import holds_covariances, read_camera_poses
@@ -53,6 +54,7 @@ def _files() -> dict[str, bytes]:
     names, xyz = scene.images.names, scene.points.xyz
     centers = zip(names, scene.cam_centers_in_world, strict=True)
     listed = "\n".join(f"{name} {x:.4f} {y:.4f} {z:.4f} 0.1" for name, (x, y, z) in centers)
+    down = -quaternion.to_matrix(scene.cam_from_world[:, :4])[:, :, 2]
     row = scene.point_observations
     marks = [
         f"{x:.3f} {y:.3f} {z:.3f} {u:.2f} {v:.2f} {names[image]} p{point}"
@@ -65,9 +67,13 @@ def _files() -> dict[str, bytes]:
         "gcp_list.txt": "local\n" + "\n".join(marks),
         "gcp.json": json.dumps({"points": _ground_control(scene)}),
         "bars.csv": f"p0 p1 1.5 0.01\n{names[0]},{names[1]},2.0",
-        "down.txt": "\n".join(f"{name} 0.02 0.9 0.4" for name in names) + "\np0 vertical 2",
+        "down.txt": "\n".join(f"{name} {x:.4f} {y:.4f} {z:.4f}" for name, (x, y, z) in zip(names, down, strict=True))
+        + "\np0 vertical 2",
         "levels.txt": f"p0 z 1.5\n{names[0]} 0 0 1 -2 0.1",
-        "poses.txt": "\n".join(f"{name} {k} {k % 2} 0 0 0 0 1 0.1 1" for k, name in enumerate(names)),
+        "poses.txt": "\n".join(
+            f"{name} {x:.4f} {y:.4f} {z:.4f} {i:.6f} {j:.6f} {k:.6f} {w:.6f} 0.1 1"
+            for name, (i, j, k, w, x, y, z) in zip(names, se3.inverse(scene.cam_from_world), strict=True)
+        ),
     }
     return {name: text.encode() for name, text in texts.items()}
 
