@@ -304,16 +304,3 @@ def _moved(seen: SeenMap, pose: FloatArray, step: NDArray[np.floating], loss: Lo
     """Return where a step leads, and the equations there."""
     place = _CHART.retract(pose[None], np.asarray(step[None], np.float64))[0]
     return place, equations_at(seen, place, loss)
-
-
-__all__ = [
-    "Equations",
-    "SeenMap",
-    "equations_at",
-    "fit_pose",
-    "line_rows",
-    "plane_rows",
-    "point_rows",
-    "seen_map",
-    "without_prior",
-]

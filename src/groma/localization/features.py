@@ -174,18 +174,3 @@ def _straightener(model: str, params: tuple[float, ...], width: int, height: int
     from groma import cameras
 
     return Straightener.of(cameras.model(model), np.array(params), width, height)
-
-
-__all__ = [
-    "FEATURES",
-    "Bytes",
-    "DescribedImage",
-    "DescribedPoints",
-    "FeatureGates",
-    "describe_places",
-    "find_corners",
-    "find_features",
-    "find_points",
-    "mirrored",
-    "unit",
-]

@@ -258,16 +258,3 @@ def _remove(entry: Path) -> None:
     else:
         with suppress(OSError):
             entry.unlink()
-
-
-__all__ = [
-    "Stage",
-    "Stages",
-    "check_free",
-    "digest",
-    "digest_files",
-    "has_stages",
-    "remove_stages",
-    "stage",
-    "system_reason",
-]

@@ -192,6 +192,3 @@ def given_segments(
 def _given_in(folder: Path, known: set[str], external: ExternalMatches, name: str) -> Segments:
     """The given segments of an image, none where they are not known."""
     return external.segments_of(name, read_gray(folder / name)) if name in known else Segments.empty()
-
-
-__all__ = ["Straightener", "detect_segments", "given_segments"]

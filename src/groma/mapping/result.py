@@ -248,6 +248,3 @@ def result_of(
         outcomes={outcome.name.lower(): count for outcome, count in line_map.outcome_counts().items()},
         warnings=(*missing, *adjusted.report.warnings),
     )
-
-
-__all__ = ["SCENES_OF_RESULT", "MapResult", "last_loss", "result_of"]

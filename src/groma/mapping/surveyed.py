@@ -149,9 +149,3 @@ def weighted(scene: Scene, options: AdjustOptions) -> AdjustOptions:
     if options.lines and scene.num_line_observations:
         sigma["line_sigma_px"] = noise_px(scene, "lines")
     return replace(options, **sigma)
-
-
-__all__ = [
-    "SurveyedResult", "Tied", "adjust_surveyed", "adjust_with_survey", "survey_numbers", "tied",
-    "weighted",
-]  # fmt: skip

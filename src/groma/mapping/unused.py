@@ -39,6 +39,3 @@ def without_unused(scene: Scene, *others: Scene) -> tuple[Scene, ...]:
     if all(mask.all() for mask in kept.values()):
         return scene, *others
     return tuple(one.keep(**kept) for one in (scene, *others))
-
-
-__all__ = ["without_unused"]

@@ -212,6 +212,3 @@ def _is_wide(model: camera_models.CameraModel, params: FloatArray, pixels: Float
     straight, whole = model.undistort_pixels(params, pixels), np.array(size, float)
     kept = np.all((straight >= -0.5 * whole) & (straight <= 1.5 * whole), axis=1)
     return bool(kept.mean() < 1.0 - GATES.max_lost)
-
-
-__all__ = ["WideDetection", "WideGates", "WideViews"]

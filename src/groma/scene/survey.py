@@ -313,29 +313,3 @@ def check_kinds(name: str, kinds: IntArray, allowed: tuple[int, ...]) -> None:
         row = int(np.argmin(known))
         names = ", ".join(f"{int(kind)} ({OBJECTS[kind]})" for kind in allowed)
         raise InputError(f"{name} must be one of {names}; row {row} is {kinds[row]}.")
-
-
-__all__ = [
-    "CHECK",
-    "CONTROL",
-    "DIRECTED",
-    "LOCATED",
-    "REJECTABLE",
-    "REJECTED",
-    "UNKNOWN",
-    "CameraPoses",
-    "CameraPositions",
-    "ControlPoints",
-    "Distances",
-    "Held",
-    "Kind",
-    "KnownDirections",
-    "KnownPlanes",
-    "Marks",
-    "accepted",
-    "check_covariance",
-    "diagonal_covariance",
-    "only_rejected",
-    "rejected_rows",
-    "with_rejected",
-]

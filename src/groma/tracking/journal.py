@@ -86,6 +86,3 @@ class Journal:
         write_scene(tracker.scene(), self._folder / "scene.npz", force=True)
         took = time.monotonic() - began
         self._next = time.monotonic() + max(EVERY, took / SHARE)
-
-
-__all__ = ["Journal"]

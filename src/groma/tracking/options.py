@@ -65,6 +65,3 @@ class TrackOptions:
         for name in ("min_segment_length", "max_depth", "point_sigma_px", "keyframe_motion", "keyframe_turn"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} must be positive; got {getattr(self, name)}.")
-
-
-__all__ = ["TrackOptions"]

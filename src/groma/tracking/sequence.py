@@ -339,6 +339,3 @@ def _failure(what: str, step: Callable[[], object]) -> str | None:
     except Exception as error:
         return f"Not written: {what}, which failed ({type(error).__name__}: {error}). Please report it."
     return None
-
-
-__all__ = ["SequenceResult", "TrackProgress", "track"]

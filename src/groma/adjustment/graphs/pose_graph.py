@@ -231,13 +231,3 @@ def _roots(information: FloatArray) -> FloatArray:
     """Return R (E, 6, 6) with R^T R the information, which may be semidefinite."""
     values, vectors = np.linalg.eigh(information)
     return np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
-
-
-__all__ = [
-    "PoseGraphOptions",
-    "PoseGraphResult",
-    "adjust_pose_graph",
-    "motion_factors",
-    "motion_problem",
-    "pose_graph_problem",
-]

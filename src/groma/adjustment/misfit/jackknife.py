@@ -206,6 +206,3 @@ def _without_own(leverage: FloatArray, residual: FloatArray) -> FloatArray:
         along = np.swapaxes(axes, 1, 2) @ residual[bold]
         error[bold] = axes @ (along / (1.0 - np.minimum(shares, GATES.max_leverage))[:, :, None])
     return error
-
-
-__all__ = ["GATES", "JackknifeGates", "landmark_jackknife", "observations_alone"]

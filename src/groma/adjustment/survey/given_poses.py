@@ -33,6 +33,3 @@ def given_poses_of(scene: Scene) -> dict[str, Any]:
             "without": [scene.images.names[row] for row in np.flatnonzero(~used)],
         }
     }
-
-
-__all__ = ["given_poses_of"]

@@ -293,8 +293,3 @@ def _spread_on(scene: Scene, plane: int) -> FloatArray:
     first /= np.linalg.norm(first)
     angles = 2.0 * np.pi / 3.0 * np.arange(3)[:, None]
     return middle + size * (np.cos(angles) * first + np.sin(angles) * np.cross(n, first))
-
-
-__all__ = [
-    "direction_table", "distance_table", "find", "held_table", "plane_table", "pose_table", "with_measured_points",
-]  # fmt: skip

@@ -182,6 +182,3 @@ def weighted(factor: Factor, problem: Problem) -> tuple[FloatArray, FloatArray, 
         information = np.swapaxes(root, 1, 2) @ root
     squares = np.einsum("ni,nij,nj->n", residual, information, residual)
     return residual, information, factor.loss.evaluate(squares)[1]
-
-
-__all__ = ["measured_at_places", "moved", "settled", "weighted"]

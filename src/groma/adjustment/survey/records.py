@@ -165,9 +165,3 @@ def gross_errors(measurements: Sequence[Measurement]) -> dict[tuple[str, int], f
 def noncentrality(level: float = GATES.level, power: float = GATES.power) -> float:
     """Return by how many standard deviations a mean must be off for a two-sided test to find it with a power."""
     return float(ndtri(power) - ndtri(level / 2.0))
-
-
-__all__ = [
-    "GATES", "TABLES", "CheckPoint", "Measurement", "Reliability", "ReliabilityGates", "gross_errors", "noncentrality",
-    "rejection_limit",
-]  # fmt: skip

@@ -200,6 +200,3 @@ def upright(found: RobustSimilarity, scene: Scene, target: FloatArray) -> Robust
     old, middle = found.similarity, places.mean(0)
     moved = Similarity(old.scale, turn @ old.rotation, turn @ (old.translation - middle) + middle)
     return RobustSimilarity(moved, found.residuals, found.inliers, found.scatter, True)
-
-
-__all__ = ["GATES", "RobustSimilarity", "SimilarityGates", "robust_similarity", "turn_between", "upright"]

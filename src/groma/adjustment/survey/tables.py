@@ -120,6 +120,3 @@ def listed(names: Sequence[str], kind: str) -> str:
     """Return how many there are, and the first names."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return f"{counted(len(names), kind)}, {', '.join(names[:_LISTED])}{more}"
-
-
-__all__ = ["control_tables", "listed", "position_table", "sigma_of", "tell_unknown"]

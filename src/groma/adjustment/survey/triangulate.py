@@ -79,6 +79,3 @@ def _nearest(centers: FloatArray, rays: FloatArray) -> FloatArray | None:
 def _angles(point: FloatArray, centers: FloatArray, rays: FloatArray) -> FloatArray:
     away = unit(point - centers)
     return np.arctan2(np.linalg.norm(np.cross(away, rays), axis=1), np.einsum("ni,ni->n", away, rays))
-
-
-__all__ = ["rays_of", "triangulated"]

@@ -95,6 +95,3 @@ def _of_places(q: FloatArray) -> FloatArray:
     moved[:, :, :3], moved[:, :, 6] = np.eye(3), q
     moved[:, [0, 1, 2], [4, 5, 3]], moved[:, [1, 2, 0], [3, 4, 5]] = q[:, [2, 0, 1]], -q[:, [2, 0, 1]]
     return moved
-
-
-__all__ = ["coordinates_to_hold", "num_open_motions"]

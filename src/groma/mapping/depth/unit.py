@@ -136,6 +136,3 @@ def say_left_out(used: BoolArray, names: Sequence[str]) -> list[str]:
     more = "" if len(left) <= 3 else f" and {len(left) - 3} more"
     listed = ", ".join(left[:3]) + more
     return [f"{len(left)} of {counted(len(names), 'photographs')} without a depth map, or with an empty one: {listed}."]
-
-
-__all__ = ["ROBUST", "UNITS", "UnitGates", "common_unit", "own_units", "say_left_out"]

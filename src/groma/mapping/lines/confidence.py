@@ -178,17 +178,3 @@ def _inside(pixels: FloatArray, size: FloatArray) -> BoolArray:
     ends = pixels.reshape(-1, 2, 2)
     inside = ((ends >= 0.0) & (ends <= size)) if size.all() else np.isfinite(ends)
     return np.asarray(inside.all(axis=(1, 2)), np.bool_)
-
-
-__all__ = [
-    "DEFAULT_CONFIDENCE",
-    "GATES",
-    "WEIGHTS",
-    "ConfidenceGates",
-    "left_out",
-    "line_accuracy",
-    "line_confidence",
-    "line_evidence",
-    "usual_distance",
-    "with_confidence",
-]

@@ -110,6 +110,3 @@ def _images(number: int) -> str:
 
 def _percent(part: int, total: int) -> str:
     return f"{100.0 * part / total:.0f} %" if 200 * part >= total else "under 1 %"
-
-
-__all__ = ["LineMap", "explain"]

@@ -56,6 +56,3 @@ class MapLinesOptions:
     def selective(min_length: float = MIN_LENGTH) -> MapLinesOptions:
         """Fewer lines of higher precision: known to 2.5 thousandths of their distance, and 25 pixels long."""
         return MapLinesOptions(min_length=min_length, max_uncertainty=0.0025, min_longest=25.0)
-
-
-__all__ = ["MIN_LENGTH", "MapLinesOptions"]

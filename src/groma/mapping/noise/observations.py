@@ -167,6 +167,3 @@ def _inverse_trigamma(value: float) -> float:
     """Where the trigamma function, which falls, has a value; the nearer end where that is out of bounds."""
     shapes = np.geomspace(*_SHAPES, 1000)[::-1]
     return float(np.interp(value, polygamma(1, shapes), shapes))
-
-
-__all__ = ["line_end_correlation", "moved_px", "noise_px", "with_point_noise"]

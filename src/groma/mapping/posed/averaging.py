@@ -279,6 +279,3 @@ def _disagreement(point: FloatArray, at: FloatArray, way: FloatArray) -> float:
     between = point - at
     size = np.maximum(np.linalg.norm(between, axis=1), 1e-12)
     return float(np.median(np.arccos(np.clip(np.einsum("ij,ij->i", between, way) / size, -1.0, 1.0))))
-
-
-__all__ = ["Averaged", "AveragingGates", "average_centers", "average_rotations"]

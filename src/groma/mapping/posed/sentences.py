@@ -60,6 +60,3 @@ def about_left_out(names: Sequence[str], seen: BoolArray) -> list[str]:
         f"{len(rows)} of {len(seen)} images see too few points of the others for their poses to be checked, and were "
         f"left out: {listed}{more}."
     ]
-
-
-__all__ = ["about_gross_errors", "about_left_out", "about_noise"]

@@ -206,6 +206,3 @@ def _near(
     variance[rows], axes = np.linalg.eigh(noise)
     offset[rows] = np.einsum("nab,nai,ni->nb", axes, basis, other[rows])
     return np.column_stack([first, second]), offset, variance, right
-
-
-__all__ = ["AngleGates", "Angles", "right_angles"]

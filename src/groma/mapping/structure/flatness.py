@@ -109,6 +109,3 @@ def _of_lines(scene: Scene, sigma_px: float | None) -> _Heights:
     height = np.einsum("nei,ni->ne", scene.lines.segments[line], normal) + offset[:, None]
     length = np.repeat(lengths_per_pixel(scene, "line")[line], 2)
     return np.repeat(plane, 2), height.ravel(), variance.ravel(), length
-
-
-__all__ = ["plane_noise_px", "surface_noise_px"]

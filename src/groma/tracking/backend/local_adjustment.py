@@ -241,6 +241,3 @@ def job_of(
         camera, keyframes, held, point_ids, line_ids, plane_ids, scene, replace(options, held_frames=coordinates),
         points, point_rows, point_pose, lines, line_rows, line_pose, max_iterations,
     )  # fmt: skip
-
-
-__all__ = ["AdjustmentJob", "job_of", "window_job"]

@@ -200,16 +200,3 @@ def join_lines(track_map: TrackMap, pairs: IntArray) -> None:
         if (index != table.index).any():
             unique = np.unique(index, return_index=True)[1]
             keyframe.measured = replace(keyframe.measured, lines=replace(table, index=index).take(unique))
-
-
-__all__ = [
-    "LoopSearch",
-    "agreeing_pose",
-    "can_be",
-    "join_lines",
-    "join_points",
-    "known_loops",
-    "move",
-    "neighbours",
-    "search_for_loop",
-]

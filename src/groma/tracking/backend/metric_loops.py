@@ -90,6 +90,3 @@ def _steps(living: list[Keyframe], gates: LoopGates) -> Motions:
     sigma[:, :3] *= depth[:, None]
     relative = se3.compose(poses[:-1], se3.inverse(poses[1:]))
     return Motions(row, row + 1, relative, np.eye(6) / sigma[:, :, None] ** 2)
-
-
-__all__ = ["adjusted_with", "close_loop"]

@@ -265,6 +265,3 @@ def _common(values: FloatArray, variance: FloatArray, least: int, floor: float) 
         weight = agree / variance
         middle = float((weight * values).sum() / weight.sum())
     return middle, float(1.0 / weight.sum())
-
-
-__all__ = ["KnownMap", "PlaceAgain", "join_place", "measure_place"]

@@ -86,6 +86,3 @@ def _solved(track_map: TrackMap, loops: list[PlaceAgain], gates: LoopGates) -> S
     motions = SimilarityMotions(every[:, 0], every[:, 1], measured, covariance)
     options = SolverOptions(max_iterations=gates.max_iterations, threads=1)
     return adjust_similarity_graph(poses, motions, options=options)
-
-
-__all__ = ["close_scaled_loops"]

@@ -256,6 +256,3 @@ def _exp(angles: FloatArray) -> FloatArray:
 
 def _log(rotation: FloatArray) -> FloatArray:
     return so3.log(rotation[None])[0]
-
-
-__all__ = ["correct_map", "estimate_turn", "shift_between", "tells_yaw"]

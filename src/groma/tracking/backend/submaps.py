@@ -217,6 +217,3 @@ def about_submaps(breaks: list[tuple[float, float]], where: Sequence[tuple[int, 
 
 def _shifted(index: IntArray, by: int) -> IntArray:
     return np.where(index >= 0, index + by, -1)
-
-
-__all__ = ["Joint", "Places", "Submap", "about_submaps", "best_joint", "find_joint", "joined_map", "search_older_maps"]

@@ -196,14 +196,3 @@ def line_ends(
         out[:, k] = foot + share[:, None] * direction
         good &= se3.transform_points(poses, out[:, k])[:, 2] > 0
     return out, good
-
-
-__all__ = [
-    "FollowedSegments",
-    "assign",
-    "carried",
-    "coarse_flow",
-    "expected_segments",
-    "line_ends",
-    "measured_edges",
-]

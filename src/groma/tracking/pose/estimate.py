@@ -136,6 +136,3 @@ def _median_depth(view: MapView, measured: Measurements, pose: FloatArray) -> fl
     depths = into(pose, np.concatenate(places))[:, 2]
     depths = depths[depths > 0]
     return float(np.median(depths)) if len(depths) else 1.0
-
-
-__all__ = ["GATE", "LOSSES", "PoseEstimate", "estimate_pose", "rough_pose", "weak_directions"]

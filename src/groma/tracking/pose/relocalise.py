@@ -365,18 +365,3 @@ def match_planes(
         return PlaneMeasurements.empty()
     index, rows = assign_planes(track_map.planes, data.planes, pose, angle, distance, data.options.gates.planes)
     return PlaneMeasurements(index, data.planes.plane[rows], data.planes.sqrt_information[rows])
-
-
-__all__ = [
-    "Found",
-    "KnownFeatures",
-    "Places",
-    "feature_places",
-    "find_pose",
-    "known_features",
-    "match_lines",
-    "match_near",
-    "match_planes",
-    "pose_from_matches",
-    "promote",
-]

@@ -110,6 +110,3 @@ def found_again(
     number = np.bincount(line_of[member], minlength=num_lines)
     mean = np.bincount(line_of[member], p[member], minlength=num_lines) / np.maximum(number, 1)
     return mean >= asked
-
-
-__all__ = ["KindGates", "features_of", "found_again", "repeatability"]

@@ -171,6 +171,3 @@ def lines_through_points(
         gates.tolerance, AGREEMENT.min_overlap, slot, index, values,
     )  # fmt: skip
     return index[:count], values[:count]
-
-
-__all__ = ["KnownPointGates", "lines_through_points"]

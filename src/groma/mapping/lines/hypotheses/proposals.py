@@ -374,15 +374,3 @@ def _sorted_beams(beam_i: FloatArray, beam_j: FloatArray) -> tuple[FloatArray | 
     order = np.argsort(beam_j[:, 0], kind="stable")
     first = beam_j[order, 0]
     return beam_j, pointers, members, order, np.searchsorted(np.append(first, first + 2.0 * np.pi), beam_i, "right")
-
-
-__all__ = [
-    "OUT_OF_BEAM",
-    "PROPOSED",
-    "WEAK",
-    "ProposalGates",
-    "Proposals",
-    "Proposer",
-    "Questions",
-    "angles_about_baseline",
-]

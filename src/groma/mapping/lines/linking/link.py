@@ -159,6 +159,3 @@ def link(
     size = np.bincount(parent, minlength=len(parent))
     members = np.flatnonzero(size[parent] > 1)
     return members, parent[members]
-
-
-__all__ = ["join_once", "link"]
