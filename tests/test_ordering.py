@@ -56,13 +56,28 @@ def compiled_functions():
                     yield path.name, found
 
 
+def made_here(function):
+    """Names of arrays that a function makes."""
+    for part in ast.walk(function):
+        if isinstance(part, ast.Assign):
+            names, values = part.targets[0], part.value
+            both = isinstance(names, ast.Tuple) and isinstance(values, ast.Tuple)
+            for name, value in zip(names.elts, values.elts, strict=True) if both else [(names, values)]:
+                if isinstance(value, ast.Call) and ast.unparse(value.func) in ("np.empty", "np.zeros", "np.full"):
+                    yield ast.unparse(name)
+
+
 def test_compiled_loops_do_without_what_takes_long_to_compile():
     """Sorting and medians of NumPy, and rows copied by ``a[:] = b``: groma._ordering has short ones."""
     found = []
     for file, function in compiled_functions():
+        arrays = set(made_here(function))
         for part in ast.walk(function):
             if isinstance(part, ast.Call) and ast.unparse(part.func) in LONG:
                 found.append(f"{file}, {function.name}: {ast.unparse(part)}")
+            if isinstance(part, ast.Assign) and isinstance(part.targets[0], ast.Subscript):
+                if ast.unparse(part.value).removesuffix(".T") in arrays:
+                    found.append(f"{file}, {function.name}: {ast.unparse(part)}")
             if isinstance(part, ast.Assign) and any(isinstance(inside, ast.Slice) for target in part.targets
                                                     for inside in ast.walk(target)):  # fmt: skip
                 if any(isinstance(inside, ast.Subscript) for inside in ast.walk(part.value)):

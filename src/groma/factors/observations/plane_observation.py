@@ -97,7 +97,8 @@ def _basis_all(measured, out):
     B = np.empty((2, 3))
     for i in range(measured.shape[0]):
         perpendicular_kernel(measured[i, 0], measured[i, 1], measured[i, 2], B)
-        out[i] = B.T
+        for a in range(3):
+            out[i, a, 0], out[i, a, 1] = B[0, a], B[1, a]
 
 
 # ------------------------------------------------------------------------------------------------------------- Public

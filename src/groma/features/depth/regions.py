@@ -204,7 +204,7 @@ def grow(sums, counts, noise, limits, gates, min_blocks, labels, regions, region
                 queue[tail, 0], queue[tail, 1] = a, b
                 tail += 1
         if tail >= min_blocks:
-            regions[found] = region
+            copy(region, regions[found])
             region_counts[found] = pixels
             found += 1
         else:
@@ -249,9 +249,9 @@ def join(regions, region_counts, count, noise, limits, gates, target):
                     allowed = max(gate, looser * own) + _bend_allowance(regions[c], thetas[c], noise, bend)
                     fits = fits and _chi_square(regions[c], theta) < allowed * region_counts[c]
                 if fits:
-                    regions[a] = both
+                    copy(both, regions[a])
                     region_counts[a] += region_counts[b]
-                    thetas[a] = theta
+                    copy(theta, thetas[a])
                     for c in range(count):
                         if target[c] == b:
                             target[c] = a
