@@ -45,6 +45,10 @@ CHOSEN_ON = {
     "boxes 702, random views": BoxSettings(seed=702, texture=8.0, **{**_SMALL, "cameras": "random"}),
     "facade 711": BoxSettings(seed=711, texture=8.0, **_FACADE),
     "facade 712, rough": BoxSettings(seed=712, texture=8.0, rough=0.01, **_FACADE),
+    "boxes 703, round bodies": BoxSettings(seed=703, texture=10.0, **{**_SMALL, "num_boxes": 5, "num_round": 6}),
+    "boxes 704, wide": BoxSettings(seed=704, texture=12.0, **{**_SMALL, "focal": 420.0}),
+    "facade 713, rough": BoxSettings(seed=713, texture=12.0, rough=0.012, **_FACADE),
+    "facade 714, rough": BoxSettings(seed=714, texture=10.0, rough=0.015, **_FACADE),
 }
 REPORTED_ON = {
     "boxes 801": BoxSettings(seed=801, texture=12.0, **_SMALL),

@@ -4,11 +4,7 @@ r"""Directions that many features share: perpendicular to plane normals, or para
 A segment in an image fixes a plane through the camera centre; the direction of its 3D line is perpendicular to the
 plane's normal, whatever the camera model. Lines that are parallel in space therefore share a direction v with
 
-.. math:: z_i = \frac{n_i^\top v}{\sqrt{v^\top \Sigma_i v + \sigma_0^2}} \sim N(0, 1),
-
-and directions of 3D lines, with :math:`B_i` two unit vectors across :math:`d_i`, have
-
-.. math:: z_i = (B_i^\top \Sigma_i B_i + \sigma_0^2 I)^{-1/2} B_i^\top v \sim N(0, I_2).
+.. math:: z_i = \frac{n_i^\top v}{\sqrt{v^\top \Sigma_i v + \sigma_0^2}} \sim N(0, 1).
 
 :math:`\sigma_0` says how parallel things are that are built to be parallel. Directions are found one after the other:
 the candidate that explains most, refined by robust least squares, then taken out. A feature agrees with a random
@@ -17,6 +13,9 @@ segments count more, and a direction is kept when fewer than ``max_false_alarms`
 among all that could be tried:
 
 .. math:: N_\text{tried}\; P(\text{Poisson}(\textstyle\sum p_i) \ge k) < N_\text{false}.
+
+Directions of 3D lines are components of a mixture (:mod:`groma.estimators._parallel_lines`); the same bound holds there
+for the evidence of each.
 
 The sign of a direction has no meaning.
 """
@@ -31,6 +30,7 @@ from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.estimators._chance import chi_square_quantile, log10_poisson_tail
 from groma.estimators._direction_features import Parallel, Perpendicular, crossings
+from groma.estimators._parallel_lines import Acceptance, ParallelGates, find_parallel, most_likely
 from groma.gates import gate
 from groma.geometry.algebra import dot, norm, perpendicular, unit, vectors
 
@@ -67,8 +67,9 @@ class DirectionGates:
     )
 
 
-#: The numbers in use.
+#: The numbers in use, of normals and of lines.
 DIRECTIONS = DirectionGates()
+PARALLEL = ParallelGates()
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,10 @@ class DirectionSet:
     label: IntArray
     #: (M, 2) pairs of directions that are orthogonal within their uncertainty.
     orthogonal: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    #: Of 3D lines: (N,) probability that they are along their direction, and how far their ends deviate from it beyond
+    #: their noise, pixels.
+    probability: FloatArray = field(default_factory=lambda: np.zeros(0))
+    deviation: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.vectors)
@@ -165,7 +170,7 @@ def directions_from_lines(
     covariance: FloatArray,
     options: DirectionOptions | None = None,
     candidates: FloatArray | None = None,
-    groups: IntArray | None = None,
+    turned: FloatArray | None = None,
 ) -> DirectionSet:
     """Find directions shared by 3D lines; either sign of a line's direction is the same.
 
@@ -179,8 +184,9 @@ def directions_from_lines(
         What counts as a direction.
     candidates : (H, 3) float64, optional
         Further directions to try, such as vanishing directions of images.
-    groups : (N,) int, optional
-        Group of each line, for ``min_groups``.
+    turned : (N,) float64, optional
+        Angle by which a pixel at both ends turns each line, radians: how far edges deviate from what they are parallel
+        to is estimated. By default they do not.
 
     Returns
     -------
@@ -192,7 +198,7 @@ def directions_from_lines(
     ShapeError, InputError
         If shapes do not fit, or a number is not finite.
     """
-    options = options or DirectionOptions()
+    options, gates = options or DirectionOptions(), PARALLEL
     directions = vectors(directions, 3, "directions")
     covariance = np.asarray(covariance, dtype=np.float64)
     if directions.ndim != 2 or covariance.shape != (len(directions), 3, 3):
@@ -201,12 +207,42 @@ def directions_from_lines(
             f"{covariance.shape}."
         )
     _check_finite(directions, covariance)
-    features = Parallel.of(unit(directions), covariance, options.parallel_sigma)
-    best = np.argsort(features.area, kind="stable")[: DIRECTIONS.max_candidates]
-    tried = unit(directions)[best]
+    directions = unit(directions)
+    exact = np.full(len(directions), options.parallel_sigma)
+    pool = Parallel.of(directions, covariance, exact)
+    guesses = directions[np.argsort(pool.area, kind="stable")[: gates.max_candidates]]
     if candidates is not None:
-        tried = np.concatenate([tried, unit(vectors(candidates, 3, "candidates"))])
-    return _search(features, options, groups, tried)
+        guesses = np.concatenate([guesses, unit(vectors(candidates, 3, "candidates"))])
+    least, apart = options.min_coincidences + 1, gates.same * options.parallel_sigma
+    wanted = Acceptance(least, options.max_directions, options.max_sigma, apart, options.max_false_alarms)
+    tried = np.zeros(1) if turned is None else np.concatenate([[gates.start_px, 0.0], gates.deviations])
+    turned = np.zeros(len(pool)) if turned is None else turned
+    pools = [Parallel.of(directions, covariance, np.hypot(exact, px * turned)) for px in tried]
+    found = find_parallel(pools[0], guesses, wanted, gates)
+    likeliest = most_likely(pools, found, gates)
+    if likeliest:
+        found = find_parallel(pools[likeliest], guesses, wanted, gates)
+    if len(found.vectors) == 0:
+        none = np.zeros(len(pool))
+        return DirectionSet(found.vectors, found.covariance, np.zeros(0, np.int64), none[:0], np.full(len(pool), -1))
+    label = found.probability.argmax(axis=0)
+    mine = label, np.arange(len(label))
+    probability, squared = found.probability[mine], found.squared[mine]
+    agrees = (probability > 0.5) & (squared < gates.quantile(options.level))
+    # Student's distribution is normal with a variance of its own for each line: its factor, where it is the residual's.
+    factor = np.maximum((gates.freedom + squared) / (gates.freedom + 2.0), 1.0)
+    beyond = (factor - 1.0) * pool.area / np.maximum(turned, 1e-12) ** 2 + factor * tried[likeliest] ** 2
+    label = np.where(agrees, label, -1)
+    return DirectionSet(
+        found.vectors,
+        found.covariance,
+        np.bincount(label[agrees], minlength=len(found.vectors)),
+        -found.evidence / np.log(10.0),
+        label,
+        orthogonal_pairs(found.vectors, found.covariance, DIRECTIONS.same * options.parallel_sigma),
+        probability,
+        np.where(turned > 0.0, np.sqrt(beyond), 0.0),
+    )
 
 
 def orthogonal_pairs(
@@ -255,32 +291,27 @@ def _check_finite(*arrays: FloatArray) -> None:
 
 
 def _search(
-    features: Perpendicular | Parallel,
+    features: Perpendicular,
     options: DirectionOptions,
     groups: IntArray | None,
     candidates: FloatArray | None,
 ) -> DirectionSet:
     """Take directions one after the other; see the module."""
     rng = np.random.default_rng(options.seed)
-    gate = chi_square_quantile(options.level, features.freedom)
+    gate = chi_square_quantile(options.level, 1)
     # Features out to where one in 10^4 ends are taken out together: what is left must not repeat the direction.
-    wide = chi_square_quantile(DIRECTIONS.taken, features.freedom)
-    tried = max(len(features), 2) ** (3 - features.freedom)
+    wide = chi_square_quantile(DIRECTIONS.taken, 1)
+    tried = max(len(features), 2) ** 2
     remaining = np.arange(len(features))
     found: list[FloatArray] = []
     covariances: list[FloatArray] = []
     alarms: list[float] = []
-    least = options.min_coincidences + 3 - features.freedom
+    least = options.min_coincidences + 2
     while len(found) < options.max_directions and len(remaining) >= max(least, 2):
         pool = features.take(remaining)
-        if candidates is not None:
-            guesses = candidates
-        else:
-            guesses = (
-                crossings(pool, DIRECTIONS.max_candidates, DIRECTIONS.min_sine, rng)
-                if isinstance(pool, Perpendicular)
-                else np.zeros((0, 3))
-            )
+        guesses = candidates
+        if guesses is None:
+            guesses = crossings(pool, DIRECTIONS.max_candidates, DIRECTIONS.min_sine, rng)
         if len(guesses) == 0:
             break
         scored = pool
@@ -314,7 +345,7 @@ def _search(
 
 
 def _collect(
-    features: Perpendicular | Parallel,
+    features: Perpendicular,
     found: list[FloatArray],
     covariances: list[FloatArray],
     alarms: list[float],
@@ -335,13 +366,13 @@ def _collect(
     return DirectionSet(directions, covariance, support, np.array(alarms), label, pairs)
 
 
-def _score(pool: Perpendicular | Parallel, candidates: FloatArray, gate: float) -> FloatArray:
+def _score(pool: Perpendicular, candidates: FloatArray, gate: float) -> FloatArray:
     """Information (H,) that candidates explain: certain features count more, those near the gate less."""
     agreement = np.maximum(1.0 - pool.squared(candidates) / gate, 0.0)
     return -(agreement * np.log(np.maximum(pool.chance(candidates, gate), 1e-12))).sum(axis=1)
 
 
-def _refine(pool: Perpendicular | Parallel, start: FloatArray, gate: float) -> tuple[FloatArray, FloatArray]:
+def _refine(pool: Perpendicular, start: FloatArray, gate: float) -> tuple[FloatArray, FloatArray]:
     """Robust least squares: Gauss-Newton with Geman-McClure weights inside twice the gate's radius."""
     direction = unit(start)
     information, basis, scale = np.eye(2), np.zeros((2, 3)), 1.0
