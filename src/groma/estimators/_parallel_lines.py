@@ -2,13 +2,14 @@
 r"""Directions that 3D lines share, as components of a mixture that explains the directions of all lines.
 
 With :math:`B_i` two unit vectors across the line and :math:`S_i = B_i^\top(\Sigma_i + \sigma_0^2 I + t^2\ell_i^2 I)B_i`
-its noise, how parallel things are that are built to be so, and how far both ends of edges deviate from them, t pixels,
-each of which turns the line by :math:`\ell_i`, the square of a line along v is
+its noise, how parallel things are, and how far both ends of edges deviate from them, t pixels, each of which turns the
+line by :math:`\ell_i`, the square of a line along v is
 :math:`z^2 = (B_i v)^\top S_i^{-1} B_i v`, and its density that of Student's distribution,
 
 .. math:: g_i(v) = \frac{1}{2\pi\sqrt{|S_i|}} \left(1 + \frac{z^2}{\nu}\right)^{-(\nu + 2)/2}.
 
-Errors that all images of an edge share are in no covariance, so true members have heavy tails. All other directions lie
+Errors that all images of an edge share are in no covariance, so true members have heavy tails. :math:`\sigma_0` and t
+are those that make all lines likeliest: walls are parallel to a fifth of a degree at worst. All other directions lie
 anywhere on the half sphere, density :math:`1/2\pi`.
 
 A direction more makes the lines more likely by a factor that is integrated over where it may be and how many lines
@@ -28,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
-from groma._typing import FloatArray
+from groma._typing import FloatArray, IntArray
 from groma.estimators._direction_features import Parallel
 from groma.gates import gate
 from groma.geometry.algebra import perpendicular, unit
@@ -47,7 +48,12 @@ class ParallelGates:
     )
     most_px: float = gate(3.0, "px", "deviation of ends at most", "chosen on benchmarks/structure.py")
     tried: int = gate(16, "deviations", "that are tried", "cost: each two fifths larger than the one before")
-    max_candidates: int = gate(512, "directions", "candidates of one round", "cost: time of a search")
+    looser: float = gate(
+        4.0, "1", "how much less parallel things may be than those that are exactly so",
+        "convention: walls to a fifth of a degree",
+    )  # fmt: skip
+    angles: int = gate(3, "deviations", "of directions that are tried", "cost: each twice as large as the one before")
+    max_candidates: int = gate(256, "directions", "candidates of one round", "cost: time of a search")
     max_refined: int = gate(3, "directions", "best candidates that are refined", "cost: time of a search")
     rounds: int = gate(15, "rounds", "of expectation and maximisation", "cost: converges in fewer")
     same: float = gate(
@@ -79,7 +85,7 @@ class Acceptance:
 
 
 @dataclass(frozen=True)
-class Mixture:
+class ParallelLines:
     """Directions, and what of the lines is theirs."""
 
     #: (D, 3) unit vectors, the likeliest first; (D, 3, 3) covariances.
@@ -87,12 +93,67 @@ class Mixture:
     covariance: FloatArray
     #: (D,) natural logarithm of the Bayes factor of each when it was found.
     evidence: FloatArray
-    #: (D, N) probability that each line is along each direction, and the square of its whitened residual.
+    #: (N,) the likeliest direction of each line, its probability, and the square of the line's whitened residual.
+    label: IntArray
+    probability: FloatArray
+    squared: FloatArray
+    #: (N,) how far the ends of each line deviate from its direction beyond their noise, pixels.
+    deviation: FloatArray
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Directions (D, 3) with the evidence of each, and (D, N) probabilities and squared residuals of lines."""
+
+    vectors: FloatArray
+    evidence: FloatArray
     probability: FloatArray
     squared: FloatArray
 
 
-def find_parallel(pool: Parallel, guesses: FloatArray, wanted: Acceptance, gates: ParallelGates) -> Mixture:
+def parallel_lines(
+    directions: FloatArray,
+    covariance: FloatArray,
+    sigma: float,
+    turned: FloatArray | None,
+    candidates: FloatArray,
+    wanted: Acceptance,
+    gates: ParallelGates,
+) -> ParallelLines:
+    """Find the directions that lines share; ``turned`` None: ends do not deviate. The rest is said in the module."""
+    px = np.zeros(1) if turned is None else np.concatenate([[gates.start_px, 0.0], gates.deviations])
+    turned = np.zeros(len(directions)) if turned is None else turned
+    noise = [(angle, one) for angle in np.geomspace(gates.looser * sigma, sigma, gates.angles) for one in px]
+    pools = [Parallel.of(directions, covariance, np.hypot(angle, one * turned)) for angle, one in noise]
+    guesses = directions[np.argsort(pools[0].area, kind="stable")[: gates.max_candidates]]
+    guesses = np.concatenate([guesses, candidates])
+    found = _search(pools[0], guesses, wanted, gates)
+    best = _most_likely(pools, found, gates) if len(found.vectors) else len(pools) - len(px)
+    if best:
+        found = _search(pools[best], guesses, wanted, gates)
+    weight = found.probability * (gates.freedom + 2.0) / (gates.freedom + found.squared)
+    spread = [_covariance(pools[best], one, vector) for one, vector in zip(weight, found.vectors, strict=True)]
+    nothing = np.zeros((1, len(directions)))
+    label = np.concatenate([found.probability, nothing]).argmax(axis=0)
+    mine = label, np.arange(len(label))
+    squared = np.concatenate([found.squared, nothing])[mine]
+    # Student's distribution is normal with a variance of its own for each line: its factor, if the residual tells it.
+    factor = np.maximum((gates.freedom + squared) / (gates.freedom + 2.0), 1.0)
+    angle, deviation = noise[best]
+    beyond = (factor - 1.0) * pools[best].area + angle**2 - sigma**2
+    beyond = np.divide(beyond, turned**2, out=np.zeros(len(label)), where=turned > 0.0)
+    return ParallelLines(
+        found.vectors,
+        np.array(spread).reshape(-1, 3, 3),
+        found.evidence,
+        label,
+        np.concatenate([found.probability, nothing])[mine],
+        squared,
+        np.sqrt(np.maximum(beyond, 0.0) + deviation**2),
+    )
+
+
+def _search(pool: Parallel, guesses: FloatArray, wanted: Acceptance, gates: ParallelGates) -> _Found:
     """Find the directions of lines among guesses (H, 3)."""
     found, share, evidence = np.zeros((0, 3)), np.zeros(0), []
     while len(found) < wanted.most and len(pool) >= max(wanted.least, 2):
@@ -106,12 +167,10 @@ def find_parallel(pool: Parallel, guesses: FloatArray, wanted: Acceptance, gates
         )
         evidence.append(factor)
     found, _, probability, squared = _settled(pool, found, share, True, gates)
-    weight = probability * (gates.freedom + 2.0) / (gates.freedom + squared)
-    covariance = [_covariance(pool, one, vector) for one, vector in zip(weight, found, strict=True)]
-    return Mixture(found, np.array(covariance).reshape(-1, 3, 3), np.array(evidence), probability, squared)
+    return _Found(found, np.array(evidence), probability, squared)
 
 
-def most_likely(pools: list[Parallel], found: Mixture, gates: ParallelGates) -> int:
+def _most_likely(pools: list[Parallel], found: _Found, gates: ParallelGates) -> int:
     """Which of several pools of the same lines, with other noise, is the likeliest with these directions."""
     none = 1.0 - found.probability.sum(axis=0, keepdims=True)
     share = np.maximum(np.concatenate([found.probability, none]).mean(axis=1, keepdims=True), 1e-12)
@@ -225,4 +284,4 @@ def _covariance(pool: Parallel, weight: FloatArray, direction: FloatArray) -> Fl
     return basis.T @ np.linalg.inv(information) @ basis
 
 
-__all__ = ["Acceptance", "Mixture", "ParallelGates", "find_parallel", "most_likely"]
+__all__ = ["Acceptance", "ParallelGates", "ParallelLines", "parallel_lines"]

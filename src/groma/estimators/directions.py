@@ -29,8 +29,8 @@ import numpy as np
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.estimators._chance import chi_square_quantile, log10_poisson_tail
-from groma.estimators._direction_features import Parallel, Perpendicular, crossings
-from groma.estimators._parallel_lines import Acceptance, ParallelGates, find_parallel, most_likely
+from groma.estimators._direction_features import Perpendicular, crossings
+from groma.estimators._parallel_lines import Acceptance, ParallelGates, parallel_lines
 from groma.gates import gate
 from groma.geometry.algebra import dot, norm, perpendicular, unit, vectors
 
@@ -198,7 +198,7 @@ def directions_from_lines(
     ShapeError, InputError
         If shapes do not fit, or a number is not finite.
     """
-    options, gates = options or DirectionOptions(), PARALLEL
+    options = options or DirectionOptions()
     directions = vectors(directions, 3, "directions")
     covariance = np.asarray(covariance, dtype=np.float64)
     if directions.ndim != 2 or covariance.shape != (len(directions), 3, 3):
@@ -207,41 +207,21 @@ def directions_from_lines(
             f"{covariance.shape}."
         )
     _check_finite(directions, covariance)
-    directions = unit(directions)
-    exact = np.full(len(directions), options.parallel_sigma)
-    pool = Parallel.of(directions, covariance, exact)
-    guesses = directions[np.argsort(pool.area, kind="stable")[: gates.max_candidates]]
-    if candidates is not None:
-        guesses = np.concatenate([guesses, unit(vectors(candidates, 3, "candidates"))])
-    least, apart = options.min_coincidences + 1, gates.same * options.parallel_sigma
-    wanted = Acceptance(least, options.max_directions, options.max_sigma, apart, options.max_false_alarms)
-    tried = np.zeros(1) if turned is None else np.concatenate([[gates.start_px, 0.0], gates.deviations])
-    turned = np.zeros(len(pool)) if turned is None else turned
-    pools = [Parallel.of(directions, covariance, np.hypot(exact, px * turned)) for px in tried]
-    found = find_parallel(pools[0], guesses, wanted, gates)
-    likeliest = most_likely(pools, found, gates)
-    if likeliest:
-        found = find_parallel(pools[likeliest], guesses, wanted, gates)
-    if len(found.vectors) == 0:
-        none = np.zeros(len(pool))
-        return DirectionSet(found.vectors, found.covariance, np.zeros(0, np.int64), none[:0], np.full(len(pool), -1))
-    label = found.probability.argmax(axis=0)
-    mine = label, np.arange(len(label))
-    probability, squared = found.probability[mine], found.squared[mine]
-    agrees = (probability > 0.5) & (squared < gates.quantile(options.level))
-    # Student's distribution is normal with a variance of its own for each line: its factor, where it is the residual's.
-    factor = np.maximum((gates.freedom + squared) / (gates.freedom + 2.0), 1.0)
-    beyond = (factor - 1.0) * pool.area / np.maximum(turned, 1e-12) ** 2 + factor * tried[likeliest] ** 2
-    label = np.where(agrees, label, -1)
+    guesses = np.zeros((0, 3)) if candidates is None else unit(vectors(candidates, 3, "candidates"))
+    sigma, bound = options.parallel_sigma, options.max_false_alarms
+    apart = PARALLEL.same * sigma
+    wanted = Acceptance(options.min_coincidences + 1, options.max_directions, options.max_sigma, apart, bound)
+    found = parallel_lines(unit(directions), covariance, sigma, turned, guesses, wanted, PARALLEL)
+    agrees = (found.probability > 0.5) & (found.squared < PARALLEL.quantile(options.level))
     return DirectionSet(
         found.vectors,
         found.covariance,
-        np.bincount(label[agrees], minlength=len(found.vectors)),
+        np.bincount(found.label[agrees], minlength=len(found.vectors)),
         -found.evidence / np.log(10.0),
-        label,
-        orthogonal_pairs(found.vectors, found.covariance, DIRECTIONS.same * options.parallel_sigma),
-        probability,
-        np.where(turned > 0.0, np.sqrt(beyond), 0.0),
+        np.where(agrees, found.label, -1),
+        orthogonal_pairs(found.vectors, found.covariance, DIRECTIONS.same * sigma),
+        found.probability,
+        found.deviation,
     )
 
 

@@ -60,7 +60,7 @@ class StructureOptions:
     #: contain errors that images share, such as those of an edge that is a groove.
     min_line_probability: float = 0.9
     #: The same for lines along directions, of which there may be many that are nearly the same.
-    min_parallel_probability: float = 0.98
+    min_parallel_probability: float = 0.97
     #: Landmarks seen in fewer images take no part: nothing checks their matches. A stereo pair is two images.
     min_views: int = 3
     #: Landmarks whose reprojection error is so many times the usual one take no part.
