@@ -170,11 +170,11 @@ def test_how_parallel_lines_are_is_estimated(scatter):
     found = directions_from_lines(directions, np.tile(2e-4**2 * np.eye(3), (240, 1, 1)))
     assert len(found) == 3
     assert angles(found.vectors, FRAME).min(axis=1).max() < scatter
-    assert (found.probability > 0.97).mean() > 0.97
+    assert (found.probability > 0.9).mean() > 0.95
 
 
 def test_how_far_ends_deviate_is_estimated():
-    """A pixel turns short lines more; lines off by several of the usual deviations still belong, and are held by less."""
+    """A pixel turns short lines more; lines off by several usual deviations still belong, and are held by less."""
     rng = np.random.default_rng(12)
     turned = np.exp(rng.uniform(np.log(1e-3), np.log(1e-2), 200))
     off = 0.3 * turned
@@ -214,7 +214,25 @@ def test_horizontal_lines_at_any_angle_share_no_direction():
         true = np.concatenate([np.tile([0.0, 0.0, 1.0], (40, 1)), level])
         directions = unit(true + 3e-3 * rng.normal(size=(100, 3)))
         found = directions_from_lines(directions, np.tile(3e-3**2 * np.eye(3), (100, 1, 1)), options)
-        certain = (found.label >= 0) & (found.probability > 0.97)
+        certain = (found.label >= 0) & (found.probability > 0.9)
         assert certain[:40].sum() >= 38
         sure += certain[40:].sum()
     assert sure <= 12  # of 600
+
+
+def test_nearly_parallel_lines_are_told_from_parallel_ones():
+    """Shutters open by one to nine degrees, among lines of a facade that deviate by a pixel or less."""
+    wrong = right = 0
+    for seed in range(10):
+        rng = np.random.default_rng([15, seed])
+        turned = np.exp(rng.uniform(np.log(2e-3), np.log(1e-2), 60))
+        opened = np.radians(rng.uniform(1.0, 9.0, 16))[:, None] * unit(rng.normal(size=(16, 3)))
+        truth = np.tile(FRAME[0], (60, 1))
+        truth[:16] = unit(truth[:16] + opened)
+        directions = unit(truth + 0.4 * turned[:, None] * rng.normal(size=(60, 3)))
+        found = directions_from_lines(
+            directions, np.tile(5e-4**2 * np.eye(3), (60, 1, 1)), DirectionOptions(level=0.99), None, turned
+        )
+        along = (found.label == 0) & (found.probability > 0.9)
+        wrong, right = wrong + along[:16].sum(), right + along[16:].sum()
+    assert wrong <= 12 and right > 0.9 * 440  # of 160; some of the shutters are as good as closed

@@ -18,7 +18,8 @@ that it exceeds :math:`1/N_\text{false}` with a probability below :math:`N_\text
 that explains most first, as long as it does. They compete for lines, so a cluster is not explained twice.
 
 What belongs to which is decided at the end among more: lines perpendicular to a found direction are more frequent than
-others, as the edges of boxes that stand on one floor are, so each direction has its circle of such lines, too.
+others, as the edges of boxes that stand on one floor are, and so are lines that are nearly along it, as those of an
+open shutter. So each direction has its circle of the ones and its cap of the others, too, each with its own share.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
 
 from groma._typing import FloatArray, IntArray
 from groma.estimators._direction_features import Parallel
@@ -53,6 +54,9 @@ class ParallelGates:
         "convention: walls to a fifth of a degree",
     )  # fmt: skip
     angles: int = gate(3, "deviations", "of directions that are tried", "cost: each twice as large as the one before")
+    nearly: float = gate(
+        0.036, "rad", "that lines deviate which are nearly parallel", "convention: 2 degrees, as of nearly right angles"
+    )
     max_candidates: int = gate(256, "directions", "candidates of one round", "cost: time of a search")
     max_refined: int = gate(3, "directions", "best candidates that are refined", "cost: time of a search")
     rounds: int = gate(15, "rounds", "of expectation and maximisation", "cost: converges in fewer")
@@ -175,7 +179,7 @@ def _most_likely(pools: list[Parallel], found: _Found, gates: ParallelGates) -> 
     none = 1.0 - found.probability.sum(axis=0, keepdims=True)
     share = np.maximum(np.concatenate([found.probability, none]).mean(axis=1, keepdims=True), 1e-12)
     parts = (np.vstack([_members(pool, found.vectors, gates), _anywhere(pool)]) for pool in pools)
-    return int(np.argmax([logsumexp(np.log(share) + part, axis=0).sum() for part in parts]))
+    return int(np.argmax([np.logaddexp.reduce(np.log(share) + part, axis=0).sum() for part in parts]))
 
 
 def _anywhere(pool: Parallel) -> FloatArray:
@@ -187,6 +191,12 @@ def _members(pool: Parallel, vectors: FloatArray, gates: ParallelGates) -> Float
     """Logarithm (D, N) of the densities of lines along directions."""
     bent = np.log1p(pool.squared(vectors) / gates.freedom)
     return -0.5 * (gates.freedom + 2.0) * bent - np.log(2.0 * math.pi * pool.area)
+
+
+def _nearly(pool: Parallel, vectors: FloatArray, gates: ParallelGates) -> FloatArray:
+    """Logarithm (D, N) of the densities of lines that are nearly along directions."""
+    variance = gates.nearly**2 + pool.area
+    return -0.5 * (1.0 - (vectors @ pool.directions.T) ** 2) / variance - np.log(2.0 * math.pi * variance)
 
 
 def _across(pool: Parallel, vectors: FloatArray, gates: ParallelGates) -> FloatArray:
@@ -209,7 +219,7 @@ def _best(
     """Direction, share of the lines and evidence of the best new direction; None if none is one."""
     vectors, share = found
     log_share = np.log(np.append(share, max(1.0 - share.sum(), 1e-12)))[:, None]
-    before = logsumexp(log_share + np.vstack([_members(pool, vectors, gates), _anywhere(pool)]), axis=0)
+    before = np.logaddexp.reduce(log_share + np.vstack([_members(pool, vectors, gates), _anywhere(pool)]), axis=0)
     ratio = np.exp(np.minimum(_members(pool, guesses, gates) - before, 600.0))
     part = np.full((len(guesses), 1), 3.0 / len(pool))
     for _ in range(4):
@@ -250,18 +260,19 @@ def _refined(
 
 
 def _settled(
-    pool: Parallel, vectors: FloatArray, share: FloatArray, with_circles: bool, gates: ParallelGates
+    pool: Parallel, vectors: FloatArray, share: FloatArray, with_more: bool, gates: ParallelGates
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Directions together: vectors, shares, and (D, N) probabilities and squared residuals of lines along them."""
     num = len(vectors)
-    others = np.full(1 + num * with_circles, max(1.0 - share.sum(), 1e-12) / (1 + num * with_circles))
+    kinds = 1 + 2 * num * with_more
+    others = np.full(kinds, max(1.0 - share.sum(), 1e-12) / kinds)
     shares, mine, squared = np.concatenate([share, others]), np.zeros((num, len(pool))), np.zeros((num, len(pool)))
     for _ in range(gates.rounds if num else 0):
         parts = [_members(pool, vectors, gates), _anywhere(pool)]
-        if with_circles:
-            parts.append(_across(pool, vectors, gates))
+        if with_more:
+            parts += [_nearly(pool, vectors, gates), _across(pool, vectors, gates)]
         mixed = np.log(np.maximum(shares, 1e-300))[:, None] + np.vstack(parts)
-        probability = np.exp(mixed - logsumexp(mixed, axis=0))
+        probability = np.exp(mixed - np.logaddexp.reduce(mixed, axis=0))
         shares, mine, squared = probability.mean(axis=1), probability[:num], pool.squared(vectors)
         weight = mine * (gates.freedom + 2.0) / (gates.freedom + squared)
         vectors = np.array([_mean(pool, *one) for one in zip(weight, vectors, strict=True)])

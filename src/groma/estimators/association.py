@@ -15,7 +15,10 @@ probability.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from scipy.special import pdtrc
 
 from groma._numba import loop
 from groma._typing import FloatArray, IntArray
@@ -107,4 +110,17 @@ def maximise_shares(
     return share
 
 
-__all__ = ["inlier_probability", "maximise_shares"]
+def log10_poisson_tail(count: float, mean: float) -> float:
+    """Return the logarithm of the probability of more than ``count`` events where ``mean`` are expected."""
+    if count < 0:
+        return 0.0
+    if mean <= 0.0:
+        return -math.inf
+    tail = float(pdtrc(count, mean))
+    # Below the smallest number the first term is nearly all of the sum.
+    first = math.floor(count) + 1
+    log_tail = math.log(tail) if tail > 0.0 else first * math.log(mean) - mean - math.lgamma(first + 1)
+    return log_tail / math.log(10.0)
+
+
+__all__ = ["inlier_probability", "log10_poisson_tail", "maximise_shares"]

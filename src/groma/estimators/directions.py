@@ -28,10 +28,10 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.estimators._chance import chi_square_quantile, log10_poisson_tail
 from groma.estimators._direction_features import Perpendicular, crossings
 from groma.estimators._parallel_lines import Acceptance, ParallelGates, parallel_lines
-from groma.gates import gate
+from groma.estimators.association import log10_poisson_tail
+from groma.gates import chi_square_gate, gate
 from groma.geometry.algebra import dot, norm, perpendicular, unit, vectors
 
 
@@ -259,7 +259,7 @@ def orthogonal_pairs(
     cosine = dot(directions[first], directions[second])
     variance = np.einsum("mi,mij,mj->m", directions[first], covariance[second], directions[first])
     variance += np.einsum("mi,mij,mj->m", directions[second], covariance[first], directions[second])
-    passed = cosine**2 < chi_square_quantile(level, 1) * (variance + sigma**2)
+    passed = cosine**2 < chi_square_gate(1.0 - level, 1) * (variance + sigma**2)
     passed &= variance < max_sigma**2
     return np.column_stack([first, second])[passed]
 
@@ -278,9 +278,9 @@ def _search(
 ) -> DirectionSet:
     """Take directions one after the other; see the module."""
     rng = np.random.default_rng(options.seed)
-    gate = chi_square_quantile(options.level, 1)
+    gate = chi_square_gate(1.0 - options.level, 1)
     # Features out to where one in 10^4 ends are taken out together: what is left must not repeat the direction.
-    wide = chi_square_quantile(DIRECTIONS.taken, 1)
+    wide = chi_square_gate(1.0 - DIRECTIONS.taken, 1)
     tried = max(len(features), 2) ** 2
     remaining = np.arange(len(features))
     found: list[FloatArray] = []

@@ -56,11 +56,9 @@ class StructureOptions:
     level: float = 0.99
     #: Least probability that a related landmark is no clutter.
     min_probability: float = 0.7
-    #: The same for lines on planes. It is higher, as a wrong relation bends a whole line, and as covariances do not
-    #: contain errors that images share, such as those of an edge that is a groove.
+    #: The same for lines on planes and along directions. It is higher, as a wrong relation bends a whole line, and as
+    #: covariances do not contain errors that images share, such as those of an edge that is a groove.
     min_line_probability: float = 0.9
-    #: The same for lines along directions, of which there may be many that are nearly the same.
-    min_parallel_probability: float = 0.97
     #: Landmarks seen in fewer images take no part: nothing checks their matches. A stereo pair is two images.
     min_views: int = 3
     #: Landmarks whose reprojection error is so many times the usual one take no part.
@@ -213,7 +211,7 @@ def _parallels(
         math.sqrt(2.0) * marks.line_pixel[lines] / length[lines],
     )
     rows = np.flatnonzero(found.label >= 0)
-    rows = rows[found.probability[rows] > options.min_parallel_probability]
+    rows = rows[found.probability[rows] > options.min_line_probability]
     pairs = np.column_stack([lines[rows], found.label[rows]])
     along = Pairs(pairs, found.probability[rows], found.deviation[rows])
     directions, new = _only_directions(found, along.counts(len(found)) >= _MIN_PARALLEL)
