@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from groma.geometry import quaternion
+from groma.geometry import quaternion, se3
 from groma.scene import Cameras, PointObservations, Points, Scene
 
 #: Places per edge at which its visibility is tested.
@@ -194,7 +194,7 @@ def _front(settings: BoxSettings, rng: np.random.Generator) -> np.ndarray:
     for k in range(settings.num_images):
         a = np.pi * (0.15 + 0.7 * k / max(settings.num_images - 1, 1))
         center = np.array([3.5 * np.cos(a), 3.0 - 5.0 * np.sin(a), 1.4]) + rng.normal(0, 0.15, 3)
-        poses.append(_looking(center, np.array([0.6 * np.cos(a), FLOOR, 1.2]) + rng.normal(0, 0.1, 3)))
+        poses.append(se3.looking_at(center, np.array([0.6 * np.cos(a), FLOOR, 1.2]) + rng.normal(0, 0.1, 3)))
     return np.array(poses)
 
 
@@ -215,7 +215,7 @@ def _ring(settings: BoxSettings, rng: np.random.Generator) -> np.ndarray:
     for k in range(settings.num_images):
         a = 2 * np.pi * k / settings.num_images
         center = np.array([3.6 * np.cos(a), 3.6 * np.sin(a), 1.4 + 0.5 * np.sin(3 * a)]) + rng.normal(0, 0.05, 3)
-        poses.append(_looking(center, np.array([0, 0, 0.3])))
+        poses.append(se3.looking_at(center, np.array([0, 0, 0.3])))
     return np.array(poses)
 
 
@@ -227,18 +227,9 @@ def _scattered(settings: BoxSettings, rng: np.random.Generator) -> np.ndarray:
         center = away * np.array([np.cos(around) * np.cos(up), np.sin(around) * np.cos(up), np.sin(up)])
         if np.hypot(center[0], center[1]) < 2.0 and center[2] < 1.2:
             continue  # among the boxes
-        poses.append(_looking(center, np.array([0, 0, 0.3]) + rng.normal(0, 0.3, 3), rng.normal(0, 0.15)))
+        upright = se3.looking_at(center, np.array([0, 0, 0.3]) + rng.normal(0, 0.3, 3))
+        poses.append(se3.compose(se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, -rng.normal(0, 0.15)])), upright))
     return np.array(poses)
-
-
-def _looking(center: np.ndarray, target: np.ndarray, roll: float = 0.0) -> np.ndarray:
-    """Pose (7,) of a camera that looks at a target, turned about its axis by ``roll`` radians."""
-    z = (target - center) / np.linalg.norm(target - center)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    y = np.cross(z, x)
-    R = np.stack([np.cos(roll) * x + np.sin(roll) * y, np.cos(roll) * y - np.sin(roll) * x, z])
-    return np.concatenate([quaternion.from_matrix(R[None])[0], -R @ center])
 
 
 def _blotches(rng: np.random.Generator, size: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 
     python benchmarks/known_geometry.py --data DATA [--draws 30]
     python benchmarks/known_geometry.py --landmarks [--draws 30]
+    python benchmarks/known_geometry.py --skew [--draws 30]
 
 Cameras, points and who sees what are those of castle-P30 (``measurements.py castle``); pixels (0.3 px) and
 measurements are drawn anew each time. The squared error of a camera in units of its covariance is 3 on average if the
@@ -11,6 +12,9 @@ covariance is right. Then the wrong phones (gravity 2 to 10 degrees off) that th
 ``--landmarks``: made blocks of twenty cameras with points, lines and planes, three positions, ten distances (5 mm) of
 cameras from lines and planes, and those of planes that are parallel. Then one of the distances has an error: the share
 that the test finds, against the power that theory gives for its redundancy.
+
+``--skew``: the same blocks with three positions and the shortest distances of eight pairs of lines that are far from
+parallel (5 mm).
 """
 
 import argparse
@@ -25,6 +29,7 @@ from groma.adjustment.survey.records import GATES
 from groma.adjustment.survey.reliability import reliability
 from groma.adjustment.terms.objects import rows_by_kind
 from groma.geometry import quaternion, se3
+from groma.geometry.incidence import closest_points
 from groma.io import read_scene
 from groma.scene import CameraPoses, Distances, Held, KnownDirections, KnownPlanes, Scene
 from groma.scene.survey import UNKNOWN, Kind
@@ -119,6 +124,41 @@ def with_landmark_distances(scene: Scene, centers: np.ndarray, rng: np.random.Ge
     return scene.replace(distances=table)
 
 
+def skew(draws: int) -> None:
+    """Print predicted against actual errors with shortest distances of lines that are far from parallel."""
+    told = groma.AdjustOptions(
+        loss="none", point_sigma_px=0.5, line_sigma_px=0.5, structure_sigma_px=0.02, check_lens=False
+    )
+    rows: dict[str, list[tuple[float, ...]]] = {"3 positions": [], "with distances": []}
+    for draw in range(draws):
+        rng = np.random.default_rng(draw)
+        made = holistic(20, noise_px=0.5, seed=draw)
+        placed = with_positions(made.truth, rng)
+        few = placed.replace(camera_positions=placed.camera_positions.take([0, 7, 14]))
+        pairs = closest_points(few.lines.plucker[:, None], few.lines.plucker)
+        good = np.argwhere(np.triu((pairs.sine > 0.3) & (pairs.distance > 0.1)))
+        first, second = good[rng.permutation(len(good))[:8]].T
+        apart = pairs.distance[first, second] + rng.normal(size=len(first)) * DISTANCE
+        kinds, sigma = np.full(len(first), Kind.LINE), np.full(len(first), DISTANCE)
+        every = np.ones(len(first), bool)
+        table = Distances(kinds, first, kinds, second, np.zeros((len(first), 3)), apart, sigma, is_shortest=every)
+        true = made.truth.cam_centers_in_world
+        for name, scene in (("3 positions", few), ("with distances", few.replace(distances=table))):
+            result = groma.adjust(scene, told)
+            centers, off = result.uncertainty().centers, result.scene.cam_centers_in_world - true
+            squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(centers), off)
+            tests = reliability(result.scene, result.problem).measurements
+            size = [one.normalized**2 for one in tests if one.kind == "distance" and one.normalized is not None]
+            sigma_of = np.trace(centers, axis1=1, axis2=2).mean()
+            rows[name].append((squares.mean(), (off**2).sum(axis=1).mean(), sigma_of, np.mean(size or [np.nan])))
+    for name, values in rows.items():
+        ratio, off, sigma, size = np.mean(values, axis=0)
+        print(
+            f"{name}: NEES {ratio:.2f} (3), rms error {1e3 * off**0.5:.1f}, predicted {1e3 * sigma**0.5:.1f}, "
+            f"squared normalised residuals {size:.2f} (1)"
+        )
+
+
 def landmarks(draws: int) -> None:
     """Print predicted against actual errors with distances of lines and planes, and gross errors found."""
     told = groma.AdjustOptions(
@@ -165,7 +205,11 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=30)
     parser.add_argument("--points", type=int, default=2000, help="points of the castle that take part")
     parser.add_argument("--landmarks", action="store_true", help="distances of lines and planes, in made blocks")
+    parser.add_argument("--skew", action="store_true", help="shortest distances of lines, in made blocks")
     arguments = parser.parse_args()
+    if arguments.skew:
+        skew(arguments.draws)
+        return
     if arguments.landmarks:
         landmarks(arguments.draws)
         return

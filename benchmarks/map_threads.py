@@ -9,8 +9,8 @@ threads can run. What is done while only one can is its *serial* work. A thread 
 core counts as running: the serial share holds on a busy machine too, where the ratio of wall times does not. It reads
 the state of threads under ``/proc``, so it needs Linux.
 
-Columns: seconds of processor time and of wall time with one thread, the same with two, serial work in seconds of the
-processor time with two, and its share of all work.
+Columns: seconds of processor time and of wall time with one thread and the largest memory until then, the same with
+two, serial work in seconds of the processor time with two, and its share of all work.
 """
 
 import argparse
@@ -34,25 +34,34 @@ def run(images, model, threads):
 
     def mark(stage, *_):
         if not marks or marks[-1][2] != stage:
-            marks.append((time.monotonic(), time.process_time(), stage))
+            marks.append((time.monotonic(), time.process_time(), stage, peak()))
 
     mark("imports")
     from groma.cli.app import app  # noqa: F401 - the command line is part of every run
-    from groma.execution import work_with
+    from groma.compilation.loading import loading
+    from groma.execution import share_memory, work_with
     from groma.io import read_scene
     from groma.mapping.map import MapOptions, map_images
 
     mark("reading the model")
+    share_memory()
     scene = read_scene(model)
     with tempfile.TemporaryDirectory() as folder, work_with(threads):
-        result = map_images(images, Path(folder) / "work", scene, MapOptions(threads=threads), mark)
+        with loading("map", threads):
+            result = map_images(images, Path(folder) / "work", scene, MapOptions(threads=threads), mark)
         mark("diagnosis and uncertainty")
         summary = result.summary(result.diagnose())
         mark("writing, report")
         result.write(Path(folder) / "map", images=images, summary=summary)
     mark("end")
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {"marks": marks, "peak": peak, "lines": result.scene.num_lines}
+    from groma.mapping.checkpoints import digest
+
+    return {"marks": marks, "peak": peak(), "lines": result.scene.num_lines, "scene": digest(result.scene)}
+
+
+def peak():
+    """Largest memory of this process so far, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def watched(command, bytecode):
@@ -87,9 +96,10 @@ def can_run(task, root=Path("/proc")):
 def stages_of(found, times, numbers):
     """Processor time, wall time and serial share of each stage of a run."""
     marks, stages = found["marks"], {}
-    begins = [moment for moment, _, _ in marks]
-    for (begin, cpu, stage), (end, until, _) in pairwise(marks):
+    begins = [mark[0] for mark in marks]
+    for (begin, cpu, stage, _), (end, until, _, peak) in pairwise(marks):
         entry = stages.setdefault(stage, {"cpu": 0.0, "wall": 0.0, "one": 0, "many": 0})
+        entry["peak"] = peak
         entry["cpu"] += until - cpu
         entry["wall"] += end - begin
     stages[marks[0][2]]["cpu"] += marks[0][1]
@@ -127,20 +137,24 @@ def main():
             for threads, runs in rounds.items():
                 found, times, numbers = watched([*command, str(threads)], bytecode)
                 runs.append((stages_of(found, times, numbers), found))
-    print(f"{'stage':28s} {'CPU 1':>7} {'wall 1':>7} {'CPU 2':>7} {'wall 2':>7} {'serial':>7} {'share':>6}")
+    names = ("CPU 1", "wall 1", "MB 1", "CPU 2", "wall 2", "MB 2", "serial", "share")
+    print(f"{'stage':28s} " + " ".join(f"{name:>7s}" for name in names))
+    columns = [(1, "cpu"), (1, "wall"), (1, "peak"), (2, "cpu"), (2, "wall"), (2, "peak"), (2, "serial")]
     table = {
-        stage: [
-            median([run[0].get(stage, {}).get(key, 0.0) for run in rounds[threads]])
-            for threads, key in ((1, "cpu"), (1, "wall"), (2, "cpu"), (2, "wall"), (2, "serial"))
-        ]
+        stage: [median([run[0].get(stage, {}).get(key, 0.0) for run in rounds[threads]]) for threads, key in columns]
         for stage in rounds[2][0][0]
     }
-    table["all"] = [sum(row[k] for row in table.values()) for k in range(5)]
+    several = [max if key == "peak" else sum for _, key in columns]
+    table["all"] = [of(row[k] for row in table.values()) for k, of in enumerate(several)]
     for stage, row in table.items():
-        print(f"{stage:28s} " + " ".join(f"{value:7.2f}" for value in row) + f" {row[4] / max(row[2], 1e-9):6.0%}")
+        print(f"{stage:28s} " + " ".join(f"{value:7.2f}" for value in row) + f" {row[6] / max(row[3], 1e-9):6.0%}")
     one, two = (median([run[1]["peak"] for run in rounds[threads]]) for threads in (1, 2))
+    scenes = {run[1]["scene"] for runs in rounds.values() for run in runs}
     print(f"\npeak memory {one:.0f} and {two:.0f} MB, ratio {two / one:.2f}; lines {rounds[2][0][1]['lines']}")
-    print(f"ratio of wall times {table['all'][1] / table['all'][3]:.2f}")
+    print(
+        f"ratio of wall times {table['all'][1] / table['all'][4]:.2f}; the scenes are "
+        + ("the same bit by bit" if len(scenes) == 1 else "NOT the same")
+    )
 
 
 if __name__ == "__main__":

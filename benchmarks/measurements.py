@@ -3,6 +3,7 @@
 
     python benchmarks/measurements.py castle --data DATA [--draws 50]
     python benchmarks/measurements.py photographs --data DATA
+    python benchmarks/measurements.py one-map --data DATA [--draws 50]
     python benchmarks/measurements.py detection [--blocks 60]
     python benchmarks/measurements.py utm [--images 1000]
     python benchmarks/measurements.py picture --data DATA --picture docs/images/measurements.svg
@@ -12,9 +13,11 @@ pixels (0.3 px) and measurements are drawn anew each time. Positions (2 cm), the
 then one scale bar: squared errors of the cameras in units of their covariance (NEES, 3 a camera), of the check points,
 and of the distance between the first camera and the one farthest from it (1).
 ``photographs``: the photographs themselves, their poses by pycolmap, positions of the survey with 2 cm of noise, one of
-them 0.3 m off. ``detection``: gross errors of many sizes in one position of made blocks; the share that the test finds,
-against the power that theory gives for the redundancy of that position. ``utm``: a block flown over a town, with
-positions and control points, in coordinates of UTM and at the origin.
+them 0.3 m off. ``one-map``: the photographs' own map, brought into the frame of the survey, is the truth; positions
+of it are drawn with 2 cm, every second time with one of them 0.3 m off: what comes from positions is seen, what comes
+from pixels is in the truth, too. ``detection``: gross errors of many sizes in one position of made blocks; the share
+that the test finds, against the power that theory gives for the redundancy of that position. ``utm``: a block flown
+over a town, with positions and control points, in coordinates of UTM and at the origin.
 """
 
 import argparse
@@ -184,6 +187,33 @@ def photographs(arguments: argparse.Namespace) -> dict:
     return {"told": told, "true": true}
 
 
+def one_map(arguments: argparse.Namespace) -> None:
+    """Predicted against actual errors of positions on photographs, from one map."""
+    folder = arguments.data / "strecha_castle_p30"
+    alone = groma.adjust(read_scene(folder / "sparse_inc")).scene
+    truth = groma.align(alone, read_scene(folder / "sparse_gt")).scene
+    true, rows, named, blamed = truth.cam_centers_in_world, {False: [], True: []}, 0, 0
+    for draw in range(arguments.draws):
+        rng = np.random.default_rng(draw)
+        for wrong in (False, True):
+            xyz = true + rng.normal(size=true.shape) * POSITION
+            row, direction = int(rng.integers(len(xyz))), rng.normal(size=3)
+            xyz[row] += 0.3 * wrong * direction / np.linalg.norm(direction)
+            given = Places(truth.images.names, xyz, np.full(xyz.shape, POSITION), CoordinateSystem(), "positions")
+            told = adjust_surveyed(truth, Survey(positions=given))
+            covariance, off = told.result.uncertainty().centers, told.result.scene.cam_centers_in_world - true
+            sizes = (off**2).sum(axis=1).mean(), np.trace(covariance, axis1=1, axis2=2).mean()
+            rows[wrong].append((nees(told.result.scene, truth, covariance), *sizes))
+            rejected = {one.name for one in told.reliability.measurements if one.is_rejected}
+            named += wrong and truth.images.names[row] in rejected
+            blamed += len(rejected - ({truth.images.names[row]} if wrong else set()))
+    for wrong, values in rows.items():
+        ratio, off, sigma = np.mean(values, axis=0)
+        words = "one position 0.3 m off" if wrong else "good positions"
+        print(f"{words}: NEES {ratio:.2f} (3), rms error {1e3 * off**0.5:.2f} mm, predicted {1e3 * sigma**0.5:.2f} mm")
+    print(f"taken out: {named} of {arguments.draws} wrong ones, {blamed} good ones")
+
+
 def aligned_with_scale(source: np.ndarray, target: np.ndarray) -> float:
     from groma.evaluation.alignment import align_points
 
@@ -331,7 +361,7 @@ def picture(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("castle", "photographs", "detection", "utm", "picture"))
+    parser.add_argument("what", choices=("castle", "photographs", "one-map", "detection", "utm", "picture"))
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--draws", type=int, default=50)
     parser.add_argument("--points", type=int, default=3000, help="points of the castle that take part")
@@ -340,7 +370,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--picture", type=Path, default=Path("docs/images/measurements.svg"))
     arguments = parser.parse_args()
-    globals()[arguments.what](arguments)
+    globals()[arguments.what.replace("-", "_")](arguments)
 
 
 if __name__ == "__main__":

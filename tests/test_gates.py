@@ -105,3 +105,37 @@ def test_count_of_tuned_numbers(tmp_path):
     )
     found = counting.count(tmp_path)["room"]
     assert found == {"named": 1, "gates chosen": 1, "defaults": 1, "integers": 1, "floats": 2}
+
+
+def test_numbers_that_no_decision_hangs_on_stand_apart(tmp_path):
+    """Each rule of the count by a number that it takes, beside one that it leaves."""
+    counting = _module(ROOT / "benchmarks" / "tuned_numbers.py")
+
+    def counted(name, text):
+        path = tmp_path / "house" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        found = counting.count(tmp_path / "house")[name.split("/")[0].removesuffix(".py")]
+        path.unlink()
+        return dict(found)
+
+    assert counted("a/b.py", "#: Rows at once\n#: (cost: memory).\nROWS = 512\n#: Near.\nNEAR = 7\n") == {
+        "stated": 1, "named": 1}  # fmt: skip
+    assert counted("a/b.py", "_NONE = 65535  # of the format\n") == {"formats": 1}
+    fields = (
+        "class Options:\n    #: Steps (chosen on a scene).\n    steps: int = 50\n    #: Length.\n    size: int = 9\n"
+    )
+    assert counted("a/b.py", fields + "    rows: ClassVar[int] = 3\n") == {"stated": 1, "defaults": 1, "shapes": 1}
+    assert counted("io/b.py", "def f(a):\n    return a > 12 or a > 12.5\n") == {"formats": 1, "floats": 1}
+    assert counted("viz/b.py", "WIDTH = 560\n") == {"drawings": 1} == counted("io/drawn.py", "WIDTH = 560\n")
+    assert counted("a/check.py", "STEP = 0.25\n") == {"made": 1} == counted("scene/synthetic/b.py", "STEP = 0.25\n")
+    assert counted("a/b.py", "def some_example(r):\n    return 0.3 * r\ndef other(r):\n    return 0.3 * r\n") == {
+        "made": 1, "floats": 1}  # fmt: skip
+    sizes = "def f(a):\n    return len(a) < 5, a.shape[0] < 3, a.sum() < 4, len(a) < 8, a[3] < 5\n"
+    assert counted("a/b.py", sizes) == {"shapes": 3, "integers": 2}
+    formulas = (
+        "def f(a):\n    return 100.0 * a, a / 3.0, 10.0 ** a, a < 180.0, np.log(10.0), sys.version_info > (3, 9)\n"
+    )
+    assert counted("a/b.py", formulas) == {"formulas": 4}
+    others = "def f(a):\n    return a > 100.0, 3.0 * a, a / 5.0, a ** 10.0, np.log(a + 10.0)\n"
+    assert counted("a/b.py", others) == {"floats": 5}

@@ -8,11 +8,11 @@ costs next to nothing. Sub-packages are reachable the same way: ``groma.geometry
 
 import zlib as _zlib  # noqa: F401  (before pycolmap, whose library hides Python's own deflate and breaks it)
 from importlib import import_module
-from typing import TYPE_CHECKING
 
 import groma._moved  # noqa: F401  (names the new place of modules that moved)
 from groma._version import __version__ as __version__
 
+TYPE_CHECKING = False  # as in typing, which takes longer to import than all the rest
 if TYPE_CHECKING:
     from groma import (
         adjustment,

@@ -15,6 +15,3 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Return a key by which img2 comes before img10."""
     parts = re.split(r"(\d+)", name)
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
-
-
-__all__ = ["counted", "natural_key"]

@@ -43,6 +43,3 @@ def log_warnings(area: Area, sentences: Iterable[str]) -> None:
     """Log what is odd about a result."""
     for sentence in sentences:
         logger_of(area).warning(sentence)
-
-
-__all__ = ["Area", "log_warnings", "logged_stages", "logger_of"]

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
-from typing import Any
 
-_ROOT = Path(__file__).parent
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any
+
 #: Packages and modules whose last name changed too.
 _RENAMED = {
     "groma.pipelines": "groma.adjustment (adjust, uncertainty, pose graphs) and groma.mapping (lines, structure)",
@@ -35,8 +36,11 @@ class _Finder:
 
 
 def _places(name: str) -> list[str]:
-    found = [*_ROOT.rglob(f"{name}.py"), *(init.parent for init in _ROOT.rglob(f"{name}/__init__.py"))]
-    return sorted(".".join(("groma", *file.relative_to(_ROOT).with_suffix("").parts)) for file in found)
+    from pathlib import Path
+
+    root = Path(__file__).parent
+    found = [*root.rglob(f"{name}.py"), *(init.parent for init in root.rglob(f"{name}/__init__.py"))]
+    return sorted(".".join(("groma", *file.relative_to(root).with_suffix("").parts)) for file in found)
 
 
 sys.meta_path.append(_Finder())

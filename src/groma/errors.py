@@ -47,6 +47,3 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     by_key = {other.lower().replace("-", "_"): other for other in known}
     close = difflib.get_close_matches(name.lower().replace("-", "_"), by_key, n=1)
     return f" Did you mean {by_key[close[0]]!r}?" if close else ""
-
-
-__all__ = ["FileFormatError", "GromaError", "InputError", "OutputError", "ProblemError", "ShapeError", "did_you_mean"]

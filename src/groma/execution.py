@@ -17,11 +17,13 @@ for any number of them, and are put together in their order.
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -31,7 +33,10 @@ _Result = TypeVar("_Result")
 
 #: Pieces of work that wait for each worker; more would only take memory.
 _WAITING = 2
-#: Calls to an executor of processes that each of its workers gets, so that all end at about the same time.
+#: What glibc's ``mallopt`` calls the number of places that memory is taken from.
+_M_ARENA_MAX = -8
+#: Calls to an executor of processes that each of its workers gets, so that all end at about the same time (cost: of
+#: waiting for the last).
 _CALLS = 4
 
 
@@ -65,6 +70,16 @@ def available_cores() -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:
         return os.cpu_count() or 1
+
+
+def share_memory() -> None:
+    """Let all threads of this process take memory from one place, where the system's library is glibc.
+
+    Otherwise what a thread gives back is kept for that thread, and two of them hold a quarter more than one.
+    """
+    if sys.platform == "linux" and "MALLOC_ARENA_MAX" not in os.environ:
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
 
 
 @contextmanager
@@ -240,16 +255,3 @@ def _num_workers(executor: Any) -> int:
             return number
     client = getattr(executor, "_client", None)  # of dask.distributed
     return max(1, sum(client.nthreads().values())) if client is not None else available_cores()
-
-
-__all__ = [
-    "available_cores",
-    "beside",
-    "map_in_threads",
-    "map_ranges",
-    "map_work",
-    "num_threads",
-    "num_workers",
-    "together",
-    "work_with",
-]

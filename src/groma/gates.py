@@ -15,6 +15,8 @@ code, and the page of thresholds in the documentation is made from the classes::
 
 Where there is a noise model a gate is a quantile at a stated probability (:func:`chi_square_gate`), not a number of
 pixels. Options that a user is meant to change stay in the ``...Options`` classes; numerical guards stay in kernels.
+Constants on which no decision about data hangs, such as sizes of pieces of work, and defaults of options say where they
+come from in their comment: ``#: Rows compared at a time (cost: memory).``
 """
 
 from __future__ import annotations
@@ -93,6 +95,3 @@ def chi_square_gate(probability: float, dof: int) -> float:
     from scipy.special import chdtri  # takes longer to import than most of what needs it takes to run
 
     return float(chdtri(dof, probability))
-
-
-__all__ = ["ORIGINS", "chi_square_gate", "gate", "gate_classes", "is_gate_class", "numbers", "table"]

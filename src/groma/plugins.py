@@ -39,6 +39,3 @@ def load_plugins() -> tuple[str, ...]:
         else:
             loaded.append(point.name)
     return tuple(loaded)
-
-
-__all__ = ["GROUP", "load_plugins"]

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 import groma
-from groma.adjustment.adjust import LAST_SCALE_SIGMAS, _wide_enough
+from groma.adjustment.adjust import _wide_enough
 from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.adjustment.stages import STAGES
 from groma.evaluation import evaluate_poses
 from groma.factors.losses import Cauchy, GemanMcClure, Trivial
 from groma.scene import Relations, synthetic
@@ -23,7 +24,7 @@ def test_last_scale_follows_the_noise():
     truth, _ = _scene(1.5)
     assembly = assemble(truth, AssemblyOptions(planes=False))
     wide = _wide_enough(GemanMcClure(2.0), assembly)
-    assert wide.scale == pytest.approx(LAST_SCALE_SIGMAS * 1.5, rel=0.1)
+    assert wide.scale == pytest.approx(STAGES.last_scale * 1.5, rel=0.1)
     assert _wide_enough(GemanMcClure(100.0), assembly).scale == 100.0
     for other in (Trivial(), Cauchy(1.0)):
         assert _wide_enough(other, assembly) is other

@@ -16,10 +16,14 @@ import groma
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.parts import adjust_parts, join_parts, write_parts
+from groma.adjustment.survey.given_poses import given_poses_of
+from groma.adjustment.survey.protocol import protocol
 from groma.factors.losses import Trivial
+from groma.geometry import se3
 from groma.io.archive import read_archive
+from groma.mapping.surveyed import adjust_surveyed
 from groma.problem.residuals import residuals_of
-from groma.scene import CameraPositions, Held
+from groma.scene import CameraPositions, Held, PosePriors
 from groma.scene.survey import Kind, diagonal_covariance
 
 LEAST_SQUARES = AdjustOptions(loss="none", point_sigma_px=0.5, check_lens=False)
@@ -86,3 +90,21 @@ def test_marks_weigh_as_stated(truth_and_start):
     ]
     np.testing.assert_allclose(marks[0].sqrt_information, 1 / MARK_PX)
     assert groma.adjust(scene, LEAST_SQUARES).report.num_measurements["marks"] == len(scene.marks)
+
+
+def test_the_protocol_says_what_given_poses_are_worth(truth_and_start):
+    """The noise they count with, what they are off, and which images have none."""
+    truth = with_everything(truth_and_start[0], np.random.default_rng(0))
+    off = np.array([0.0, 0.03, -0.04, np.radians(2.0), 0.0, 0.0])
+    given = se3.compose(se3.exp(np.tile(off, (7, 1))), truth.frames.rig_from_world[:7])
+    sigma = np.tile(np.repeat([0.05, np.radians(0.5)], 3), (7, 1))
+    scene = truth.replace(pose_priors=PosePriors(np.arange(7), given, sigma))
+    told = given_poses_of(scene)["given_poses"]
+    assert told["number"] == 7 and told["without"] == [truth.images.names[7]]
+    np.testing.assert_allclose([told["sigma"], told["sigma_deg"]], [0.05, 0.5])
+    np.testing.assert_allclose([told["rms"], told["rms_deg"]], [0.05 / np.sqrt(3), 2.0 / np.sqrt(3)], rtol=1e-3)
+    found = adjust_surveyed(scene)
+    text = protocol(found.result.summary() | {"survey": found.to_dict()})
+    assert "Given poses" in text and "shift along an axis" in text and "  0.05 " in text
+    assert f"Without a given pose, or with a wrong one: {truth.images.names[7]}." in text
+    assert given_poses_of(truth) == {}

@@ -20,7 +20,7 @@ from groma.adjustment.survey.reliability import reliability
 from groma.adjustment.terms.open_motions import coordinates_to_hold
 from groma.adjustment.uncertainty import position_sigma
 from groma.errors import InputError
-from groma.geometry import quaternion, se3
+from groma.geometry import incidence, line3, quaternion, se3
 from groma.io.survey import DirectionsFile, DistancesFile, PlanesFile, PosesFile
 from groma.problem.residuals import residuals_of
 from groma.scene import CameraPoses, Distances, Held, KnownDirections, KnownPlanes, PosePriors
@@ -56,6 +56,10 @@ def test_distances_between_objects_of_every_kind(truth):
     """Names are found, kinds are put in order, and the residuals of true distances are zero."""
     centers, plane, line = truth.cam_centers_in_world, truth.planes.hesse[0], 3
     p0, middle = truth.control_points.xyz[0], truth.lines.segments[5].mean(axis=0)
+    lines = truth.lines.plucker.copy()
+    along = quaternion.rotate(quaternion.exp(np.array([0.03, 0.0, 0.03])), lines[line, 3:])  # two degrees from parallel
+    lines[5] = line3.from_point_and_direction(middle, along)
+    truth = truth.replace(lines=truth.lines.replace(plucker=lines))
     near = truth.points.xyz[4]
     rows = [
         ("00001.png", "00004.png", np.linalg.norm(centers[3] - centers[0])),
@@ -90,17 +94,29 @@ def gravity_file(scene, rng, sigma_deg=0.5, world=DOWN):
     return DirectionsFile(scene.images.names, seen, np.tile(DOWN, (count, 1)), np.full(count, sigma_deg), "imu.txt")
 
 
-def test_distances_of_objects_that_are_not_parallel_are_told(truth):
-    """Where on a line its distance from another one is measured, matters if these are not parallel."""
-    d = truth.lines.plucker[:, 3:] / np.linalg.norm(truth.lines.plucker[:, 3:], axis=1, keepdims=True)
-    angles = np.degrees(np.arccos(np.minimum(np.abs(d @ d[0]), 1.0)))
-    other = int(np.argmax(angles))
-    apart = abs(d[0] @ truth.planes.hesse[0, :3])
-    ids, plane = truth.lines.ids, f"plane:{truth.planes.ids[0]}"
-    given = DistancesFile((f"line:{ids[0]}",) * 2, (f"line:{ids[other]}", plane), np.ones(2), np.ones(2), "bars.csv")
-    notes = [note for note in with_survey(truth, Survey(distances=given)).notes if "from parallel" in note]
-    assert f"line:{ids[0]} and line:{ids[other]} are {angles[other]:.0f} degrees" in notes[0]
-    assert len(notes) == 1 + (np.degrees(np.arcsin(apart)) > 10.0)
+def test_distances_of_objects_that_are_not_parallel(truth):
+    """Of two lines it is the shortest, wherever that is, and told; what has none, or no side, is refused."""
+    lines, ids, plane = truth.lines.plucker, truth.lines.ids, f"plane:{truth.planes.ids[0]}"
+    pairs = incidence.closest_points(lines[:1], lines)
+    other = int(np.argmax(pairs.distance * (pairs.sine > 0.5)))
+    apart, angle = pairs.distance[other], np.degrees(np.arcsin(pairs.sine[other]))
+    assert apart > 0.1
+
+    def given(first, second, distance, sigma):
+        return DistancesFile((first,), (second,), np.array([distance]), np.array([sigma]), "bars.csv")
+
+    one, two = f"line:{ids[0]}", f"line:{ids[other]}"
+    found = with_survey(truth, Survey(distances=given(one, two, 1.25 * apart, 0.001)))
+    assert any(f"{one} and {two} are {angle:.0f} degrees from parallel" in note for note in found.notes)
+    assert found.similarity.scale == pytest.approx(1.25) and found.scene.distances.is_shortest.all()
+    np.testing.assert_allclose(residuals(found.scene, "distance"), 0.0, atol=1e-9)
+    slid = found.scene.replace(distances=found.scene.distances.replace(anchor=[[9.0, -5.0, 3.0]]))
+    np.testing.assert_allclose(residuals(slid, "distance"), 0.0, atol=1e-9)
+    with pytest.raises(InputError, match="does not say on which side"):
+        with_survey(truth, Survey(distances=given(one, two, apart, apart / 3)))
+    across = int(np.argmax(np.abs(lines[:, 3:] @ truth.planes.hesse[0, :3])))
+    with pytest.raises(InputError, match="they meet, so they have no distance"):
+        with_survey(truth, Survey(distances=given(f"line:{ids[across]}", plane, 1.0, 0.001)))
     marks = DistancesFile(("p0", "00001.png"), ("p1", plane), np.ones(2), np.ones(2), "bars.csv")
     assert not any("parallel" in note for note in with_survey(truth, Survey(distances=marks)).notes)
 

@@ -11,6 +11,7 @@ import pytest
 
 from groma.cli.app import app
 from groma.cli.main import run
+from groma.cli.shared.console import Console
 from groma.cli.shared.guard import guard
 from groma.errors import InputError, OutputError
 
@@ -111,13 +112,13 @@ def test_our_own_errors_keep_their_traceback():
 @pytest.mark.parametrize("quiet", [False, True])
 def test_warnings_of_the_library_are_lines(capsys, quiet):
     @guard
-    def command(quiet: bool) -> None:
+    def command(console: Console) -> None:
         warnings.warn("2 lines were left out.", stacklevel=2)
         warnings.warn("for developers", DeprecationWarning, stacklevel=2)
 
     with warnings.catch_warnings():
         warnings.simplefilter("default")
-        command(quiet=quiet)
+        command(console=Console(quiet, False, None))
     assert capsys.readouterr().err == ("" if quiet else "warning: 2 lines were left out.\n")
 
 

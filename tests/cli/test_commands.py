@@ -188,6 +188,7 @@ def test_compilation_is_measured():
     assert spent(1.5, 1.25, compiled=False) == "0.25 s, and 1.25 s to load compiled code"
     assert spent(1.5, 1.25, compiled=True) == "0.25 s, and 1.25 s to compile"
     assert spent(1.5, 0.0, compiled=False) == "1.50 s"
+    assert spent(0.9, 1.25, compiled=True) == "1.25 s, nearly all to compile"
 
 
 def test_compiling_is_told_from_loading(monkeypatch):

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 import groma
-from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
+from groma.adjustment.adjust import AdjustOptions
 from groma.adjustment.report import why_steps_ran_out
+from groma.adjustment.stages import STAGES
 from groma.cli.main import run
 from groma.errors import ProblemError
 from groma.factors.losses import Cauchy, GemanMcClure, Huber
@@ -184,4 +185,4 @@ def test_steps_that_run_out_along_what_is_open_say_so(here, capsys):
 def test_a_map_is_diagnosed_with_its_last_loss():
     assert last_loss(AdjustOptions(loss="cauchy", loss_scale=4.0)) == Cauchy(4.0)
     assert last_loss(AdjustOptions(loss="huber")) == Huber(1.0)
-    assert last_loss(AdjustOptions()) == GemanMcClure(LAST_SCALE_SIGMAS)
+    assert last_loss(AdjustOptions()) == GemanMcClure(STAGES.last_scale)

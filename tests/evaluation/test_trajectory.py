@@ -85,6 +85,17 @@ def test_drift_of_a_wrong_scale():
     assert scores.segment_lengths[0] == pytest.approx(2.0)
 
 
+def test_a_camera_that_only_turns_has_no_drift():
+    rng = np.random.default_rng(0)
+    turns = quaternion.exp(np.outer(0.03 * np.arange(60), [0.0, 1.0, 0.0]))
+    truth = Trajectory(np.arange(60) / 30, np.hstack([turns, rng.normal(0, 0.0005, (60, 3))]))
+    noise = np.hstack([np.zeros((60, 4)), rng.normal(0, 0.002, (60, 3))])
+    scores = score_trajectory(truth.replace(world_from_cam=truth.world_from_cam + noise), truth)
+    assert (scores.drift_percent, scores.drift_deg_per_metre, scores.segment_lengths) == (None, None, ())
+    less = score_trajectory(truth.replace(world_from_cam=truth.world_from_cam + 0.05 * noise), truth)
+    assert less.drift_percent > 0.0
+
+
 def test_steps_in_metres_and_seconds():
     straight = Trajectory(
         np.arange(21) * 0.1, np.hstack([np.tile([0, 0, 0, 1.0], (21, 1)), np.arange(21.0)[:, None] * [[0, 0, 1]]])

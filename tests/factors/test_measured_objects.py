@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Factors of what other instruments measured of objects of many kinds: derivatives, and values by plain geometry."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from groma.factors import Distance, KnownDirection, OnKnownPlane, Ref
 from groma.factors.checks.check import compare_jacobians
 from groma.factors.priors.known_direction import CameraDirection
-from groma.geometry import quaternion, se3
+from groma.geometry import incidence, quaternion, se3
 from groma.geometry.charts import charts_of
 from groma.problem.residuals import residuals_of
 from groma.problem.variables import Variables
@@ -25,6 +27,20 @@ FLOOR, WALL = np.array([[0.0, 0.0, 2.0, 0.0]]), np.array([[-3.0, 0.0, 0.0, 12.0]
 def test_derivatives_of_distances(first, second, seed):
     for block in compare_jacobians(Distance.between(np.random.default_rng(seed), first, second)):
         assert block.passed, block
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_distances_of_skew_lines(seed):
+    """Derivatives against central differences, values against the geometry of two lines."""
+    example = Distance.between(np.random.default_rng(seed), "line", "line")
+    factor = replace(example.factor, is_shortest=np.ones(6, bool))
+    for block in compare_jacobians(replace(example, factor=factor)):
+        assert block.passed, block
+    variables = {name: Variables(*given) for name, given in example.variables.items()}
+    first = variables["first"].ambient()[factor.first_line.index]
+    second = variables["second"].ambient()[factor.second_line.index]
+    apart = residuals_of(factor, variables)[:, 0] + factor.distances
+    np.testing.assert_allclose(apart, incidence.distance(first, second), rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -8,7 +8,7 @@ import numpy as np
 from groma import cameras as camera_models
 from groma.features.matches import LineMatches
 from groma.features.segments import Segments
-from groma.geometry import quaternion
+from groma.geometry import quaternion, se3
 from groma.mapping.lines.build import LineMap
 from groma.scene import Cameras, PointObservations, Points, Scene
 
@@ -29,15 +29,6 @@ class Wireframe:
         return LineMatches(np.array(pairs, np.int64).reshape(-1, 2), np.ones(len(pairs)))
 
 
-def look_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Pose (7,) of a camera that looks at a target, world z up."""
-    z = (target - center) / np.linalg.norm(target - center)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    return np.concatenate([quaternion.from_matrix(R[None])[0], -R @ center])
-
-
 def wireframe(
     centers: np.ndarray,
     lines: np.ndarray,
@@ -51,7 +42,7 @@ def wireframe(
 ) -> Wireframe:
     camera = camera_models.model(model)
     targets = np.zeros_like(centers) if targets is None else targets
-    poses = np.array([look_at(c, t) for c, t in zip(centers, targets, strict=True)])
+    poses = se3.looking_at(centers, targets)
     xyz = rng.uniform(-1.2, 1.2, (num_points, 3))
     segments, truth, seen = [], [], []
     for i, pose in enumerate(poses):

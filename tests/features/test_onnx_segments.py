@@ -143,12 +143,28 @@ def test_another_file_is_another_detector(tmp_path, runtime):
         ({"inputs": [["image", [1, SIZE, SIZE, 4], "tensor(uint8)"]]}, "all float32"),
         ({"outputs": [["scores", [1, 64, 64, 1], FLOAT]]}, r"outputs \(1, 64, 64, 1\)"),
         ({"outputs": []}, "outputs none"),
+        ({"inputs": [["image", [1, 1 << 15, 1 << 15, 4], FLOAT]]}, "takes images of 32768 x 32768 pixels; expected at"),
     ],
 )
 def test_networks_of_another_form_are_refused(tmp_path, runtime, changes, said):
     with pytest.raises(InputError, match=said) as caught:
         DETECTORS.make(network(tmp_path, **changes), min_length=12.0, max_segments=0)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (lambda names, given: [np.zeros((1, 64, 64, 1)), np.zeros((1, 32, 64, 4))], r"64, 1\) and \(1, 32, 64, 4\)"),
+        (lambda names, given: [np.zeros((2, 8, 8, 1)), np.zeros((2, 8, 8, 4))], "gives arrays of shape"),
+        (lambda names, given: [][0], "fails on an image: list index out of range. Use another network"),
+    ],
+)  # fmt: skip
+def test_networks_that_fail_on_an_image_are_named(tmp_path, runtime, monkeypatch, answer, said):
+    monkeypatch.setattr(Session, "run", lambda self, names, given: answer(names, given))
+    detector = DETECTORS.make(network(tmp_path), min_length=12.0, max_segments=0)
+    with pytest.raises(InputError, match=said):
+        detector.detect(picture())
 
 
 def test_what_is_no_network_is_refused(tmp_path, runtime):

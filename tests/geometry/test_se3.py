@@ -143,3 +143,18 @@ def test_wrong_shapes_are_named():
         se3.exp(np.zeros(7))
     with pytest.raises(ShapeError, match=r"\(\.\.\., 3, 4\) or"):
         se3.from_matrix(np.zeros((3, 3)))
+
+
+def test_a_camera_looks_at_its_target_and_stands_upright():
+    centers, targets = np.random.default_rng(11).normal(size=(2, 20, 3))
+    poses = se3.looking_at(centers, targets)
+    seen = se3.transform_points(poses, targets)
+    np.testing.assert_allclose(seen[:, :2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(seen[:, 2], np.linalg.norm(targets - centers, axis=1))
+    above = se3.transform_points(poses, targets + np.array([0.0, 0.0, 0.1]))
+    np.testing.assert_allclose(above[:, 0], 0.0, atol=1e-12)
+    assert (above[:, 1] < 0.0).all()  # y points down
+    np.testing.assert_allclose(se3.transform_points(poses, centers), 0.0, atol=1e-12)
+    np.testing.assert_allclose(se3.looking_at(centers[0], targets[0]), poses[0], atol=1e-14)
+    below = se3.looking_at(centers, targets, up=(0.0, 0.0, -1.0))
+    assert (se3.transform_points(below, targets + np.array([0.0, 0.0, 0.1]))[:, 1] > 0.0).all()

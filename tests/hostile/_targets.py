@@ -50,11 +50,12 @@ def targets(home: Path) -> list[Target]:
 def _all(home: Path) -> Iterator[Made]:
     import _targets_frames
     import _targets_kept
+    import _targets_networks
     import _targets_scenes
     import _targets_surveys
     import _targets_tables
 
-    for kind in (_targets_scenes, _targets_tables, _targets_frames, _targets_surveys, _targets_kept):
+    for kind in (_targets_scenes, _targets_tables, _targets_frames, _targets_surveys, _targets_kept, _targets_networks):
         yield from kind.made(home)
 
 

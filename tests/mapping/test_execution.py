@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Work in independent pieces: its order, its end, and the same result whoever does it."""
 
+import ctypes
 import importlib.util
 import multiprocessing
 import os
@@ -160,3 +161,40 @@ if __name__ == "__main__":
         number = ranks.num_workers
         same_lines_as_alone(ranks)
         print(number, "workers agree")
+
+
+ARENAS = """
+import ctypes, sys, threading
+from groma.execution import share_memory
+if sys.argv[1] == "shared":
+    share_memory()
+libc = ctypes.CDLL(None)
+libc.malloc.restype, libc.fopen.restype = ctypes.c_void_p, ctypes.c_void_p
+all_there = threading.Barrier(4)
+def take():
+    all_there.wait()  # threads that live at the same time
+    libc.malloc(5000)
+    all_there.wait()
+threads = [threading.Thread(target=take) for _ in range(4)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+file = ctypes.c_void_p(libc.fopen(sys.argv[2].encode(), b"w"))
+libc.malloc_info(0, file)
+libc.fclose(file)
+print(open(sys.argv[2]).read().count("<heap nr="))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a matter of glibc")
+def test_threads_take_memory_from_one_place(tmp_path):
+    """Counted by glibc itself: one arena, where four threads at once have several otherwise."""
+    if not hasattr(ctypes.CDLL(None), "malloc_info"):
+        pytest.skip("not glibc")
+    environment = {name: value for name, value in os.environ.items() if name != "MALLOC_ARENA_MAX"}
+
+    def arenas(how):
+        call = [sys.executable, "-c", ARENAS, how, str(tmp_path / how)]
+        return int(subprocess.run(call, capture_output=True, text=True, check=True, env=environment).stdout)
+
+    assert arenas("shared") == 1
+    assert arenas("apart") > 1

@@ -16,15 +16,6 @@ from groma.scene import Cameras, LineObservations, Lines, Relations, Scene
 NOISE = 0.3
 
 
-def looking(center):
-    """Pose of a camera that looks at the origin."""
-    z = -center / np.linalg.norm(center)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    return np.concatenate([quaternion.from_matrix(R[None])[0], -R @ center])
-
-
 @cache
 def boxes():
     """Edges of boxes in random places, lines across them that meet nothing; true pairs; the scene seen with noise."""
@@ -40,7 +31,7 @@ def boxes():
     meeting = np.argwhere(np.triu(gap < 1e-9, 1))
     angles = np.linspace(0.0, 2.0 * np.pi, 10, endpoint=False)
     centers = np.column_stack([6 * np.cos(angles), 6 * np.sin(angles), 2.5 * np.cos(2 * angles) + 1.0])
-    poses = np.array([looking(center) for center in centers])
+    poses = se3.looking_at(centers, np.zeros(3))
     camera = np.array([900.0, 900.0, 500.0, 400.0])
     image, line = np.repeat(np.arange(10), len(ends)), np.tile(np.arange(len(ends)), 10)
     local = quaternion.rotate(poses[image, None, :4], ends[line]) + poses[image, None, 4:]

@@ -13,9 +13,11 @@ from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.errors import InputError
 from groma.evaluation import evaluate_poses
+from groma.geometry import quaternion
+from groma.mapping.noise.landmarks import point_noise
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.problem.residuals import residuals_of
-from groma.scene import Relations, Similarity, synthetic
+from groma.scene import PointDepths, Relations, Similarity, synthetic
 
 pytestmark = pytest.mark.kernels
 
@@ -159,3 +161,18 @@ def test_what_images_see_does_not_move_with_the_frame():
     assert moved_px(truth, turned, 0.1) < 1e-9
     assert moved_px(truth, start, 0.5) > 1.0
     assert moved_px(truth, start, 0.1) > moved_px(truth, start, 0.5)
+
+
+def test_a_depth_tells_where_a_point_is():
+    """Along the axis of the camera that measured it, a point is known as well as its depth, far better than before."""
+    truth, _, _ = scene_with(lambda rng, count: np.full(count, NOISE))
+    point = np.arange(truth.num_points)
+    axis = quaternion.to_matrix(truth.cam_from_world[:1, :4])[0, 2]
+    depth = truth.points.xyz @ axis + truth.cam_from_world[0, 6]
+    image = np.zeros(len(point), np.int64)
+    before = point_noise(truth, 1.0).covariance
+    after = point_noise(truth.replace(point_depths=PointDepths(image, point, depth, np.full(len(point), 1e-4))), 1.0)
+    along = np.sqrt(np.einsum("i,nij,j->n", axis, after.covariance, axis))
+    assert (along < 1e-4).all()
+    assert np.median(along) > 0.9e-4
+    assert (np.sqrt(np.einsum("i,nij,j->n", axis, before, axis)) > 2e-4).all()

@@ -6,7 +6,7 @@ import pytest
 
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.errors import InputError
-from groma.geometry import quaternion
+from groma.geometry import quaternion, se3
 from groma.io import read_scene, write_scene
 from groma.mapping import refine_points as refining
 from groma.mapping.noise.observations import noise_px
@@ -25,15 +25,6 @@ def wall(places):
     return 127.0 + 10.0 * np.cos(places @ waves + phase).sum(axis=-1)
 
 
-def look(center, target):
-    z = np.asarray(target, float) - center
-    z /= np.linalg.norm(z)
-    x = np.cross([0.0, 1.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    return np.concatenate([quaternion.from_matrix(R[None])[0], -R @ center])
-
-
 def picture(pose, rng):
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     rays = np.stack([(u - CAMERA[2]) / FOCAL, (v - CAMERA[3]) / FOCAL, np.ones_like(u)], axis=-1)
@@ -48,7 +39,7 @@ def world():
     """Truth, the truth seen with noisy keypoints, and the pictures."""
     rng = np.random.default_rng(3)
     centers = [[x, y, -5.0 + 0.2 * x] for x in (-1.5, -0.5, 0.5, 1.5) for y in (-0.6, 0.6)]
-    poses = np.array([look(np.array(center), [0.2 * center[0], 0.0, 0.0]) for center in centers])
+    poses = se3.looking_at(centers, np.multiply(centers, [0.2, 0.0, 0.0]), up=[0.0, -1.0, 0.0])
     images = [picture(pose, rng) for pose in poses]
     xyz = np.column_stack([rng.uniform([-1.8, -1.2], [1.8, 1.2], (150, 2)), np.zeros(150)])
     rows = []

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from groma.geometry import quaternion
+from groma.geometry import quaternion, se3
 from groma.scene import Cameras, LineObservations, Lines, PointObservations, Points, Scene
 
 FOCAL, WIDTH, HEIGHT = 500.0, 640, 480
@@ -11,12 +11,9 @@ FOCAL, WIDTH, HEIGHT = 500.0, 640, 480
 
 def look(centers, targets, roll):
     """Poses (N, 7) of cameras that look at targets, turned about their axes."""
-    forward = targets - centers
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    turned = quaternion.from_matrix(np.stack([right, np.cross(forward, right), forward], axis=1))
-    turned = quaternion.multiply(quaternion.exp(np.outer(roll, [0.0, 0.0, 1.0])), turned)
+    turned = quaternion.multiply(
+        quaternion.exp(np.outer(roll, [0.0, 0.0, 1.0])), se3.looking_at(centers, targets)[:, :4]
+    )
     return np.hstack([turned, -quaternion.rotate(turned, centers)])
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from groma.factors import LineReprojection, PointOnPlane, PointReprojection
 from groma.factors.contract import Ref
 from groma.factors.losses import Trivial
-from groma.geometry import quaternion, se3
+from groma.geometry import se3
 from groma.geometry.charts.line_charts import LINE_CHARTS
 from groma.geometry.charts.plane_charts import PLANE_CHARTS
 from groma.geometry.charts.pose_charts import POSE_CHARTS
@@ -38,12 +38,7 @@ def cameras_on_a_ring(rng, count: int, radius: float = 6.0):
     """Poses (count, 7) that look at the origin from a ring, slightly disturbed."""
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
     centers = np.stack([radius * np.cos(angle), radius * np.sin(angle), rng.normal(0, 0.5, count)], axis=1)
-    z = -centers / np.linalg.norm(centers, axis=1, keepdims=True)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    R = np.stack([x, np.cross(z, x), z], axis=1)
-    t = -(R @ centers[:, :, None])[:, :, 0]
-    return np.hstack([quaternion.from_matrix(R), t])
+    return se3.looking_at(centers, np.zeros(3))
 
 
 def pixels_of(poses, points):

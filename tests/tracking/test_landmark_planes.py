@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import groma
+from groma.adjustment.assemble import assemble
 from groma.geometry import quaternion, se3
 from groma.scene import Cameras, PointObservations, Points, RightColumns, Scene, Similarity
 from groma.tracking import Tracker, TrackOptions
@@ -238,7 +239,7 @@ def test_the_unit_of_a_map_of_one_camera_is_held(mono):
     for relations in (True, False):
         job = job_of(tracker.map, TrackCamera.of(_room.camera()), living, held, relations)
         assert job is not None
-        constant.append(np.asarray(job.problem.variables["frames"].constant))
+        constant.append(np.asarray(assemble(job.scene, job.options).problem.variables["frames"].constant))
     assert constant[0].sum() == 7
     assert constant[0][0].all()
     np.testing.assert_array_equal(constant[1], held)

@@ -244,6 +244,19 @@ class _Cache(FunctionCache):
         kernel_turns.give_back(folder, key.name)
         return False
 
+    def is_kept(self, sig: Any, target_context: Any) -> bool:
+        """Whether the function lies on disk, so that it need only be loaded."""
+        key = self._index_key(sig, target_context.codegen())
+        return key is not None and (self._cache_file.has(key) or self._from_shipped(sig, _Files.has) is True)
+
+    def _from_shipped(self, sig: Any, ask: Callable[[_Files, _Key], Any]) -> Any:
+        """Ask the functions that came with the installation for one; None where there are none."""
+        shipped = _shipped()
+        if shipped is None:
+            return None
+        place = _Files(str(shipped.folder / self._function.__module__), self._stem)
+        return ask(place, self._key(sig, shipped.processor))
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load, without making the compiler ready to compile, which Numba does first and which takes longer."""
         rtsys.initialize(target_context)
@@ -262,9 +275,8 @@ class _Cache(FunctionCache):
         if key is None:
             return None
         data = self._cache_file.load(key)
-        if data is None and (shipped := _shipped()) is not None:
-            place = _Files(str(shipped.folder / self._function.__module__), self._stem)
-            data = place.load(self._key(sig, shipped.processor))
+        if data is None:
+            data = self._from_shipped(sig, _Files.load)
         if data is not None:
             return data
         if not kernel_inner.is_inside():

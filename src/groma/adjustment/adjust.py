@@ -27,7 +27,7 @@ from groma.adjustment.rescue.slips import without_slips
 from groma.adjustment.stages import (
     METRIC_LOSS,
     METRIC_RELATION_LOSS,
-    METRIC_START_TOLERANCE,
+    STAGES,
     combined,
     stage_entries,
     with_costs_at,
@@ -49,14 +49,6 @@ from groma.solver.solve import solve
 #: The default for what comes from matching: first a loss that pulls from afar, then one that ignores what stayed far.
 #: Losses by name and scale in pixels; see the page *How to choose* for the measurements behind them.
 ROBUST_STAGES = (("cauchy", 1.0), ("geman_mcclure", 2.0))
-#: The last scale is at least this many standard deviations of the residuals that the stage before left: a narrower
-#: loss would doubt good measurements.
-LAST_SCALE_SIGMAS = 12.0
-#: Relative decrease of the cost at which a stage that is not the last ends.
-STAGE_TOLERANCE = 1e-2
-#: The same for the first stage of plain least squares with lines, after which lines may be restarted. It also ends at
-#: the first step that is refused: mostly a single line in a wrong minimum is to blame.
-RESTART_TOLERANCE = 0.3
 #: Terms that a report counts among the observations, and among the relations.
 COUNTED_OTHERWISE = ("point observations", "line observations", "relations", "relations in pixels")
 
@@ -105,7 +97,7 @@ class AdjustOptions:
     structure_sigma_px: float = SURFACE_SIGMA_PX
     #: Hold lines together that meet: see :class:`groma.adjustment.assemble.AssemblyOptions`.
     meeting_lines: bool = False
-    #: Most steps tried.
+    #: Most steps tried (cost: time; most end before).
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in a step.
     function_tolerance: float = 1e-6
@@ -323,7 +315,7 @@ def start_tolerance_of(scene: Scene, options: AdjustOptions) -> float:
     """Return what the first step must promise for it to be taken."""
     if options.start_tolerance is not None:
         return options.start_tolerance
-    return METRIC_START_TOLERANCE if options.loss == "auto" and scene.is_metric else 0.0
+    return STAGES.metric_start if options.loss == "auto" and scene.is_metric else 0.0
 
 
 def _wide_enough(loss: Loss, assembly: Assembly) -> Loss:
@@ -332,12 +324,16 @@ def _wide_enough(loss: Loss, assembly: Assembly) -> Loss:
         return loss
     squares = squared_residuals_px(assembly, weighted=True)
     sigma = np.nan_to_num(noise_of(np.concatenate(list(squares.values())))) if squares else 0.0
-    return replace(loss, scale=max(loss.scale, LAST_SCALE_SIGMAS * float(sigma)))
+    return replace(loss, scale=max(loss.scale, STAGES.last_scale * float(sigma)))
 
 
 def stage_tolerance(loss: Loss) -> float:
-    """Return the relative decrease of the cost at which a stage that is not the last ends."""
-    return RESTART_TOLERANCE if isinstance(loss, Trivial) else STAGE_TOLERANCE
+    """Return the relative decrease of the cost at which a stage that is not the last ends.
+
+    The first stage of plain least squares with lines also ends at the first step that is refused: mostly a single line
+    in a wrong minimum is to blame.
+    """
+    return STAGES.restart_tolerance if isinstance(loss, Trivial) else STAGES.tolerance
 
 
 def damping_after(reports: list[SolveReport], loss: Loss) -> float | None:

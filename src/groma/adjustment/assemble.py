@@ -49,6 +49,7 @@ from groma.geometry.manifold import Euclidean
 from groma.problem.problem import Problem
 from groma.problem.variables import Variables
 from groma.scene import Scene
+from groma.scene.survey import accepted
 
 #: The kinds of measurements, in the order of their factors.
 TERMS: tuple[Term, ...] = (
@@ -115,6 +116,7 @@ def assemble(scene: Scene, options: AssemblyOptions, more: Sequence[Term] = ()) 
         Kinds of measurements besides :data:`TERMS`.
     """
     notes: list[str] = []
+    scene = accepted(scene)
     if options.gauge == "auto":
         options = replace(options, gauge=gauge_of(scene, options))
     variables = {**camera_variables(scene, options), **_landmark_variables(scene, options)}

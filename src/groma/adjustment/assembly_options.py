@@ -86,10 +86,10 @@ class AssemblyOptions:
     #: pixels (``pixels``, weighted by the noise of the images). Those with a standard deviation are always distances.
     structure_form: str = "metric"
     #: Points on lines tie points to lines, and only one of the two can be eliminated. With more lines than this they
-    #: are measured in pixels instead, which leaves points and lines uncoupled. The solver keeps no more unasked.
+    #: are measured in pixels instead, which leaves points and lines uncoupled. The solver keeps no more unasked. Cost:
+    #: memory and time.
     max_coupled_lines: int = 4000
-    #: Hold lines together that meet. This ties lines to lines, so that all lines stay in the reduced system: for scenes
-    #: of some hundred lines.
+    #: Hold lines together that meet. All of these stay in the reduced system: for scenes with some hundred of them.
     meeting_lines: bool = False
     #: Loss of what comes from matching, and of the relations between landmarks.
     loss: Loss = field(default_factory=Trivial)
@@ -135,6 +135,3 @@ class AssemblyOptions:
         fitted to many pixels has :math:`\rho = -1/2`: its places are those of the quadrature of Gauss.
         """
         return math.sqrt((1.0 + self.line_end_correlation) / (1.0 - self.line_end_correlation))
-
-
-__all__ = ["LINE_RESIDUALS", "PLANE_RESIDUALS", "SURFACE_SIGMA_PX", "AssemblyOptions", "RightTurnPrior"]

@@ -48,9 +48,9 @@ KINDS = {
     "directions": "directions",
     "intrinsics/PINHOLE": "intrinsics",
 }
-#: Probability of the band, and of the wider one outside of which the check fails.
+#: Probability of the band, and of the wider one outside of which the check fails (convention: levels of a test).
 BAND, LIMIT = 0.95, 0.999
-#: Runs of which the variance is taken to be that of all.
+#: Runs of which the variance is taken to be that of all (cost: an inversion each).
 SAMPLED = 5
 
 

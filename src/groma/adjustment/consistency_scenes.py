@@ -110,6 +110,3 @@ def _across(vectors: FloatArray, rng: np.random.Generator) -> FloatArray:
     unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     noise = rng.normal(size=unit.shape)
     return noise - np.einsum("ni,ni->n", noise, unit)[:, None] * unit
-
-
-__all__ = ["STRUCTURE_SIGMA_PX", "drawn"]

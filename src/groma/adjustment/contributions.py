@@ -20,9 +20,11 @@ from groma.scene import Relations, Scene
 
 #: What is added, one after the other.
 KINDS = ("points", "lines", "planes and directions", "points on lines")
-#: With more images than this the standard deviations are left out.
+#: With more images than this the standard deviations are left out (cost: they take memory with the square of the
+#: images).
 MAX_IMAGES = 300
-#: Where a distribution over the images is told: so many of a hundred are below.
+#: Where a distribution over the images is told: so many of a hundred are below (convention: quartiles, and the ends of
+#: a box plot).
 PERCENTILES = (5, 25, 50, 75, 95)
 
 

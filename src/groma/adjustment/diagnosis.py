@@ -10,7 +10,7 @@ from groma.scene import Scene
 from groma.scene.local_frame import local_frame
 from groma.solver.observability.diagnosis import Diagnosis, diagnose
 
-#: Larger scenes are diagnosed by commands only when asked for.
+#: Larger scenes are diagnosed by commands only when asked for (cost: time).
 MANY_IMAGES = 300
 
 
@@ -54,6 +54,3 @@ def diagnose_scene(
         return f"{group.removesuffix('s')} {index}"
 
     return diagnose(problem, name, threads=threads)
-
-
-__all__ = ["MANY_IMAGES", "diagnose_scene"]

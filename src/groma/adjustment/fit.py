@@ -23,9 +23,6 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.gates import chi_square_gate, gate
 
-#: The median of the squared norm of two normal coordinates, in variances.
-MEDIAN_SQUARE = 1.386
-
 
 @dataclass(frozen=True)
 class FitGates:
@@ -43,7 +40,7 @@ def noise_of(squares: FloatArray, redundancy: FloatArray | float = 1.0) -> float
     if not counting.any():
         return float("nan")
     share = np.broadcast_to(redundancy, squares.shape)[counting]
-    return float(np.sqrt(np.median(squares[counting] / share) / MEDIAN_SQUARE))
+    return float(np.sqrt(np.median(squares[counting] / share) / chi_square_gate(0.5, 2)))
 
 
 def inliers(
@@ -79,6 +76,3 @@ def inliers(
             },
         }  # fmt: skip
     return found
-
-
-__all__ = ["FIT", "MEDIAN_SQUARE", "FitGates", "inliers", "noise_of"]

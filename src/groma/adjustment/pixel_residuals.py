@@ -74,6 +74,3 @@ def at_ends(residual: FloatArray, reach: float) -> FloatArray:
     """Distances (N, 2) of a segment's ends from distances at two places, so far from its middle in half lengths."""
     middle, turn = residual.mean(axis=1), 0.5 * (residual[:, 1] - residual[:, 0]) / reach
     return np.stack([middle - turn, middle + turn], axis=1)
-
-
-__all__ = ["at_ends", "redundancy_of", "squared_residuals_px"]

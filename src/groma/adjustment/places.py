@@ -66,6 +66,3 @@ def _shifted(factor: Factor, shift: FloatArray) -> Factor:
         known[:, 3] -= known[:, :3] @ shift
         return replace(factor, known=known, arm=factor.arm if factor.camera is not None else factor.arm + shift)
     return factor
-
-
-__all__ = ["at_places_of"]

@@ -6,14 +6,12 @@ from __future__ import annotations
 import numpy as np
 
 from groma._typing import BoolArray
+from groma.adjustment.stages import STAGES
 from groma.adjustment.terms.relations import RELATION_FACTORS
 from groma.factors.losses import Trivial
 from groma.problem.problem import Problem
 from groma.problem.residuals import squared_norms
 from groma.scene import Scene
-
-#: A relation whose weight under its loss is less than this part of full weight was given up.
-MIN_WEIGHT = 0.05
 
 
 def drop_failed_relations(scene: Scene, problem: Problem) -> tuple[Scene, dict[str, dict[str, int]]]:
@@ -34,7 +32,7 @@ def drop_failed_relations(scene: Scene, problem: Problem) -> tuple[Scene, dict[s
         failed: BoolArray = np.zeros(len(factor), dtype=bool)
         if not isinstance(factor.loss, Trivial):
             squared = squared_norms(factor, problem.variables)
-            failed = np.asarray(factor.loss.evaluate(squared)[1] < MIN_WEIGHT)
+            failed = np.asarray(factor.loss.evaluate(squared)[1] < STAGES.given_up)
         outcome[name] = {"held": int((~failed).sum()), "dropped": int(failed.sum())}
         if failed.any():
             relations = relations.take(**{name: ~failed})

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from groma._counted import counted
+from groma.gates import gate
 from groma.problem.problem import Problem
 from groma.scene import Scene
 from groma.solver.report import SolveReport
@@ -18,8 +19,17 @@ if TYPE_CHECKING:
     from groma.adjustment.uncertainty import SceneUncertainty
     from groma.solver.observability.diagnosis import Diagnosis
 
-#: An adjustment creeps if, after so many accepted steps, one lowers the cost by less than this share.
-CREEPING_STEPS, CREEPING = 10, 0.2
+
+@dataclass(frozen=True)
+class CreepingGates:
+    """When an adjustment crept along what the data do not determine."""
+
+    steps: int = gate(10, "steps", "accepted before", "convention: more than an adjustment needs")
+    fall: float = gate(0.2, "share", "by which the last one lowered the cost, at most", "convention: no convergence")
+
+
+#: The defaults.
+CREEPING = CreepingGates()
 
 
 @dataclass(frozen=True)
@@ -186,12 +196,9 @@ def why_steps_ran_out(numbers: Mapping[str, Any]) -> list[str]:
     if numbers["termination"] != "max_iterations" or diagnosis is None or not diagnosis["num_unobservable_directions"]:
         return []
     costs = [step["cost"] for step in numbers["history"] if step["accepted"]]
-    if len(costs) < CREEPING_STEPS or costs[-1] < (1.0 - CREEPING) * costs[-2]:
+    if len(costs) < CREEPING.steps or costs[-1] < (1.0 - CREEPING.fall) * costs[-2]:
         return []
     return [
         "The steps ran out where cameras or calibrations are unobservable: along these the cost falls slowly, and "
         "wherever more steps end is one result of many. Hold them, or add data."
     ]
-
-
-__all__ = ["AdjustReport", "AdjustResult", "Progress", "not_converged", "why_steps_ran_out"]

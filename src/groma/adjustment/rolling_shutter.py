@@ -318,9 +318,3 @@ def _spread(scene: Scene, table: CameraMotions) -> float:
     turned = quaternion.conjugate(scene.cam_from_world[table.image_idx, :4])
     ways = quaternion.rotate(turned, axes)
     return float(np.arccos(np.clip(np.abs(ways @ ways.T).min(), 0.0, 1.0)))
-
-
-__all__ = [
-    "AXES", "GATES", "Motions", "RollingShutterGates", "RollingShutterResult", "adjust_rolling_shutter",
-    "motions_between", "motions_of", "noise_at_once", "with_rolling_shutter",
-]  # fmt: skip

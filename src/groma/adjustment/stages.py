@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from groma.adjustment.terms.relations import RELATION_FACTORS
 from groma.factors.contract import Factor
 from groma.factors.losses import Cauchy, Loss
 from groma.factors.losses import loss as make_loss
+from groma.gates import gate
 from groma.problem.problem import Problem
 from groma.solver.options import SolverOptions
 from groma.solver.report import Iteration, SolveReport
@@ -20,15 +21,41 @@ RELATION_SCALES = {"cauchy": 2.0, "geman_mcclure": 4.0}
 #: The loss of scenes with depths, stereo pairs or planes measured in the cameras, and that of their relations: each
 #: measurement has a standard deviation of its own, and what does not belong was left out in tracking.
 METRIC_LOSS, METRIC_RELATION_LOSS = Cauchy(2.0), Cauchy(1.0)
-#: Such a scene stays as it is if the first step promises to lower the cost by no more than this fraction: tracking ends
-#: there, and what is left is far below the noise of the measurements.
-METRIC_START_TOLERANCE = 1e-3
 
+
+@dataclass(frozen=True)
+class StageGates:
+    """When one stage of an adjustment gives way to the next, and what the last one lets go of."""
+
+    last_scale: float = gate(
+        12.0, "sigma", "of the residuals before, the least scale of the last loss: a narrower one doubts good matches",
+        "chosen on matches of photographs, whose tails are still right",
+    )  # fmt: skip
+    tolerance: float = gate(1e-2, "share", "fall of the cost at which a stage that is not the last ends", "cost: steps")
+    restart_tolerance: float = gate(
+        0.3, "share", "the same for plain least squares before lines are restarted", "cost: steps of lines gone astray"
+    )
+    metric_start: float = gate(
+        1e-3, "share", "a tracked scene stays as it is if the first step promises less",
+        "derived from where tracking ends, far below the noise of measurements",
+    )  # fmt: skip
+    given_up: float = gate(
+        0.05, "share", "of full weight; a relation with less was given up", "convention: of outliers of an M-estimator"
+    )
+
+
+#: The defaults.
+STAGES = StageGates()
 
 #: Factors that keep the loss they were made with: what is measured by other instruments than the cameras.
 OWN_LOSS = (
     "pose_prior", "position_prior", "vector_prior", "distance", "on_known_plane", "camera_direction", "known_direction",
 )  # fmt: skip
+
+
+def keeps_loss(factor: Factor) -> bool:
+    """Tell whether a factor is of what other instruments measured, or of marks that it was measured at."""
+    return factor.type_name in OWN_LOSS or any(ref.group == "control_points" for _, ref in factor.references())
 
 
 def with_loss(problem: Problem, loss: Loss, relation_loss: Loss | None = None) -> Problem:
@@ -40,7 +67,7 @@ def with_loss(problem: Problem, loss: Loss, relation_loss: Loss | None = None) -
         relation_loss = make_loss(loss.name, RELATION_SCALES[loss.name]) if loss.name in RELATION_SCALES else loss
 
     def of(factor: Factor) -> Loss:
-        if factor.type_name in OWN_LOSS:
+        if keeps_loss(factor):
             return factor.loss
         return relation_loss if factor.type_name in RELATION_FACTORS else loss
 

@@ -295,6 +295,3 @@ def _ends(scene: Scene, lines: FloatArray) -> FloatArray:
 
 def _hat(v: FloatArray) -> FloatArray:
     return np.cross(v[:, None, :], np.eye(3)[None]).swapaxes(1, 2)
-
-
-__all__ = ["SceneUncertainty", "pose_uncertainty", "position_sigma", "uncertainty"]

@@ -28,6 +28,7 @@ from groma.errors import FileFormatError
 Array = npt.NDArray[Any]
 
 _ENDING = ".npy"
+#: Bytes of a header: the format's own limit is 64 kB, no array of numbers needs as much.
 _HEADER_LIMIT = 4096
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -177,6 +178,3 @@ def _content(stream: IO[bytes], header: Header, size: int, where: str) -> Array:
     if header.dtype.kind == "U" and np.frombuffer(content, header.dtype.byteorder + "u4").max() > sys.maxunicode:
         raise FileFormatError(f"{where} holds text that is none. Save it with numpy.savez.")
     return flat.reshape(header.shape, order="F" if header.fortran else "C").copy()
-
-
-__all__ = ["ArrayMembers", "Check", "Header", "form", "opened_arrays", "read_array"]

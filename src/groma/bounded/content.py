@@ -74,6 +74,3 @@ def _raw(path: Path) -> bytes:
     if len(content) > READING.pipe:
         raise FileFormatError(f"{path} is no file and gives more than {READING.pipe} bytes. Pass a file.")
     return content
-
-
-__all__ = ["READING", "ReadingGates", "expanded_limit", "read_content"]

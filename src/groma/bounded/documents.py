@@ -21,7 +21,7 @@ from groma.errors import FileFormatError
 
 _Kind = TypeVar("_Kind", dict[str, Any], list[Any], str)
 _WORDS = {dict: "an object {...}", list: "a list [...]", str: "a text"}
-#: Longest text that is taken for a name, characters.
+#: Longest text that is taken for a name, characters (cost: length of a message).
 _LONGEST_NAME = 4096
 #: Numbers from here on are taken for infinite.
 _LARGEST_NUMBER = 1e300
@@ -136,6 +136,3 @@ def _seen(value: Any) -> str:
         return "nothing"
     text = repr(value) if not isinstance(value, dict | list) or len(value) < 20 else f"{type(value).__name__} of many"
     return text[:60] + ("..." if len(text) > 60 else "")
-
-
-__all__ = ["begins_with", "member", "number", "of_kind", "read_document", "size", "table"]

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 
 #: Markers of JPEG that hold the size: all starts of frames, of which C4, C8 and CC are none.
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-#: Tags of TIFF: width and height of the image and of its tiles, and samples of a pixel.
+#: Tags of TIFF: width and height of the image and of its tiles, and samples of a pixel (file format).
 _TIFF_WIDTHS, _TIFF_HEIGHTS, _TIFF_SAMPLES = (256, 322), (257, 323), 277
 _TIFF_TYPES: Mapping[int, str] = {1: "B", 3: "H", 4: "I", 16: "Q"}
+#: Channels of a pixel of the formats.
 _COLOURS = 4
 
 
@@ -165,5 +166,3 @@ _KINDS: Mapping[bytes, Callable[[bytes], tuple[int, int] | None]] = {
     **{b"P%d" % number: _pnm for number in range(1, 8)},
     **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), _tiff),
 }
-
-__all__ = ["decoded", "image_size"]

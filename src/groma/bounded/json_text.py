@@ -22,6 +22,3 @@ def plain(value: object) -> object:
     if isinstance(value, float):
         return value if value - value == 0 else None
     return str(value)
-
-
-__all__ = ["json_text", "plain"]

@@ -45,6 +45,3 @@ def listed_file(folder: Path, name: str, place: object) -> Path:
 def outside(names: Iterable[str]) -> list[str]:
     """Return the names that leave their folder."""
     return [name for name in names if not stays_inside(name)]
-
-
-__all__ = ["IMAGES", "VIDEOS", "listed_file", "outside", "stays_inside"]

@@ -90,6 +90,3 @@ def whole(word: str, place: object, expected: str = "a whole number") -> int:
 def shown(word: str | bytes | Sequence[str]) -> str:
     """Return what a file holds as it goes into a message: quoted, and cut where it is long."""
     return repr(word[:40]) + ("..." if len(word) > 40 else "")
-
-
-__all__ = ["finite", "read_lines", "read_text", "read_words", "shown", "whole"]

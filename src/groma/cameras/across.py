@@ -32,6 +32,3 @@ def pixels_across(model: CameraModel, params: FloatArray, first: FloatArray, sec
         along = unit(np.einsum("nij,nj->ni", by_ray, np.cross(normal, ray)))
         across.append(np.abs(along[:, 0] * moved[:, 1] - along[:, 1] * moved[:, 0]))
     return np.stack(across, axis=1)
-
-
-__all__ = ["pixels_across"]

@@ -55,6 +55,3 @@ def in_model(params: FloatArray, old: CameraModel, new: CameraModel, size: Float
 def _word(name: str) -> str:
     """SIMPLE_RADIAL calls k what others call k1."""
     return "k1" if name == "k" else name
-
-
-__all__ = ["SAME_PIXEL", "in_model"]

@@ -125,6 +125,3 @@ def _near(value: FloatArray, expected: FloatArray | float, tolerance: float, wha
             f"{what} differ by {difference[row].max():.3g} (allowed {tolerance:g}) at the point {points[row]}:\n"
             f"{value[row]}\nagainst\n{np.broadcast_to(expected, np.shape(value))[row]}"
         )
-
-
-__all__ = ["check_camera", "derivative_errors"]

@@ -141,16 +141,3 @@ def kernel_module(length: int) -> str:
 def has_pinhole_kernels(length: int) -> bool:
     """Whether a tag of ``length`` selects a model without distortion."""
     return length in _PINHOLE
-
-
-__all__ = [
-    "has_pinhole_kernels",
-    "kernel_module",
-    "pinhole_parameters",
-    "pinhole_parameters_jacobian",
-    "project",
-    "project_jacobian",
-    "set_kernels",
-    "unproject",
-    "wrap",
-]

@@ -153,5 +153,3 @@ DIVISION = register_camera(
     division_project_jacobian,
     division_unproject,
 )
-
-__all__ = ["DIVISION", "SIMPLE_DIVISION"]

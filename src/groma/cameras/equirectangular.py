@@ -91,5 +91,3 @@ EQUIRECTANGULAR = register_camera(
     equirectangular_unproject,
     wrap=equirectangular_wrap,
 )
-
-__all__ = ["EQUIRECTANGULAR"]

@@ -108,5 +108,3 @@ EUCM = register_camera(
     eucm_project_jacobian,
     eucm_unproject,
 )
-
-__all__ = ["EUCM"]

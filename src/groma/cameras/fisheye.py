@@ -36,7 +36,7 @@ from groma.cameras.registry import register_camera
 
 #: Directions with r below this part of |z| count as on the axis; the error is of the square of it.
 ON_AXIS = 1e-10
-#: Intervals from 0 to pi in which the walk looks for the wanted angle.
+#: Intervals from 0 to pi in which the walk looks for the wanted angle (cost: of a start value that Newton refines).
 WALK_STEPS = 128
 
 
@@ -187,5 +187,3 @@ OPENCV_FISHEYE = register_camera(
     opencv_fisheye_project_jacobian,
     opencv_fisheye_unproject,
 )
-
-__all__ = ["OPENCV_FISHEYE"]

@@ -27,7 +27,8 @@ from groma.cameras.registry import register_camera
 
 # --------------------------------------------------------------------------------------------------------- Kernels
 
-#: Below this omega its fourth power is lost in rounding, and series of second order take the place of the formula.
+#: Below this omega its fourth power is lost in rounding, and series of second order take the place of the formula
+#: (derived from the precision of doubles).
 SMALL_OMEGA = 1e-5
 #: Below this value of (2 r tan(omega / 2))^2 the derivative of r_d / r is taken at the axis.
 SMALL_SQUARE = 1e-8
@@ -116,5 +117,3 @@ FOV = register_camera(
     fov_project_jacobian,
     fov_unproject,
 )
-
-__all__ = ["FOV"]

@@ -35,7 +35,8 @@ from groma.cameras.registry import register_camera
 
 #: The smallest denominator of FULL_OPENCV that is divided by.
 MIN_DENOMINATOR = 1e-12
-#: Steps of the walk to the start value; each moves by (1 + r) / 32, so they reach a radius of about 2600.
+#: Steps of the walk to the start value; each moves by (1 + r) / 32, so they reach a radius of about 2600 (cost: of a
+#: start value that Newton refines).
 WALK_STEPS = 256
 
 
@@ -250,7 +251,8 @@ def full_opencv_unproject(params, uv, bearing):
 def opencv_unproject(params, uv, bearing):
     """Unit bearing with (fx, fy, cx, cy, k1, k2, p1, p2)."""
     full = np.zeros(12)
-    full[:8] = params[:8]
+    for k in range(8):
+        full[k] = params[k]
     return full_opencv_unproject(full, uv, bearing)
 
 
@@ -269,5 +271,3 @@ FULL_OPENCV = register_camera(
     full_opencv_project_jacobian,
     full_opencv_unproject,
 )
-
-__all__ = ["FULL_OPENCV", "OPENCV"]

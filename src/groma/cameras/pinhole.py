@@ -165,5 +165,3 @@ PINHOLE = register_camera(
     pinhole_parameters,
     pinhole_parameters_jacobian,
 )
-
-__all__ = ["PINHOLE", "SIMPLE_PINHOLE"]

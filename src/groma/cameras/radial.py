@@ -236,5 +236,3 @@ BAL = register_camera(
     bal_project_jacobian,
     bal_unproject,
 )
-
-__all__ = ["BAL", "RADIAL", "SIMPLE_RADIAL"]

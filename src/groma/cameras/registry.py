@@ -75,6 +75,3 @@ def model(name: str) -> CameraModel:
 def models() -> tuple[CameraModel, ...]:
     """All registered camera models, in the order of their registration."""
     return tuple(_MODELS.values())
-
-
-__all__ = ["model", "models", "register_camera"]

@@ -102,6 +102,3 @@ def _poses(array: FloatArray, name: str) -> FloatArray:
     if poses.ndim == 0 or poses.shape[-1] != 7:
         raise ShapeError(f"{name} must have shape (..., 7) = quaternion xyzw and translation; got {poses.shape}.")
     return poses
-
-
-__all__ = ["Rig", "cam_from_world", "rig_from_world"]

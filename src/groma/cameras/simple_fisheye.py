@@ -168,5 +168,3 @@ RADIAL_FISHEYE = register_camera(
     radial_fisheye_project_jacobian,
     radial_fisheye_unproject,
 )
-
-__all__ = ["FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE"]

@@ -38,10 +38,13 @@ from groma.cameras.registry import register_camera
 
 #: The equidistant projection to angles, as OPENCV_FISHEYE's parameters.
 _TO_ANGLES = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-#: Columns of k0 ... k5, t0, t1, s0 ... s3 among the parameters; -1 where the model has no such coefficient.
+#: Columns of k0 ... k5, t0, t1, s0 ... s3 among the parameters; -1 where the model has no such coefficient. The format
+#: of COLMAP.
 _THIN_PRISM_COLUMNS = (4, 5, 8, 9, -1, -1, 7, 6, 10, -1, 11, -1)
+#: The format of COLMAP: columns of the same.
 _RAD_TAN_COLUMNS = (4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
-#: Longest step of the undistorted angles on the way from the centre, radians, and the shortest part of the way.
+#: Longest step of the undistorted angles on the way from the centre, radians, and the shortest part of the way (cost:
+#: shorter ones reach the same angles).
 LONGEST_STEP, SHORTEST_PART = 0.1, 1e-6
 
 
@@ -250,5 +253,3 @@ RAD_TAN_THIN_PRISM_FISHEYE = register_camera(
     rad_tan_thin_prism_fisheye_project_jacobian,
     rad_tan_thin_prism_fisheye_unproject,
 )
-
-__all__ = ["RAD_TAN_THIN_PRISM_FISHEYE", "THIN_PRISM_FISHEYE"]

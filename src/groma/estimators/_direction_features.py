@@ -76,6 +76,3 @@ def crossings(pool: Perpendicular, count: int, min_sine: float, rng: np.random.G
     pairs = rng.choice(len(pool), (count, 2), p=certainty / certainty.sum())
     crossed = np.cross(pool.normals[pairs[:, 0]], pool.normals[pairs[:, 1]])
     return unit(crossed[norm(crossed) > min_sine])
-
-
-__all__ = ["Parallel", "Perpendicular", "crossings"]

@@ -293,6 +293,3 @@ def _covariance(pool: Parallel, weight: FloatArray, direction: FloatArray) -> Fl
     information = np.einsum("n,nka,nkb->ab", weight, slope, slope)
     information += 1e-6 * max(np.trace(information), 1e-300) * np.eye(2)
     return basis.T @ np.linalg.inv(information) @ basis
-
-
-__all__ = ["Acceptance", "ParallelGates", "ParallelLines", "parallel_lines"]

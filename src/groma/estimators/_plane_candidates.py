@@ -21,9 +21,9 @@ from groma.estimators._plane_options import PLANE_SEARCH
 from groma.execution import map_in_threads, num_threads
 from groma.geometry.algebra import dot, norm
 
-#: Pairs looked at together.
+#: Pairs looked at together (cost: memory).
 _CHUNK = 4096
-#: Candidates that are worth a thread.
+#: Candidates that are worth a thread (cost: time only).
 _SCORED_AT_ONCE = 8
 
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from groma._numba import kernel, loop
 
-#: Points in a ball.
+#: Points in a ball (cost: time only).
 BALL = 64
-#: Sweeps of Jacobi rotations: convergence is quadratic, four are enough.
+#: Sweeps of Jacobi rotations: convergence is quadratic, four are enough (cost: none are made after convergence).
 _SWEEPS = 12
 
 

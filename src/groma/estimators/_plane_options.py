@@ -10,7 +10,8 @@ from groma.gates import gate
 class PlaneOptions:
     """What counts as a plane."""
 
-    #: A point lies on a plane when the chi-square test of its distance passes at this level.
+    #: A point lies on a plane when the chi-square test of its distance passes at this level (convention: level of a
+    #: test).
     level: float = 0.95
     #: Least number of points; a segment counts as two.
     min_support: int = 10
@@ -18,7 +19,7 @@ class PlaneOptions:
     max_tilt: float = 0.0087
     #: Least part of the features in the layer around a plane that lie on it.
     min_share: float = 0.2
-    #: Expected number of planes found where there are none.
+    #: Expected number of planes found where there are none (convention: of tests by meaningfulness).
     max_false_alarms: float = 1e-4
     #: Where the random choice of candidates begins.
     seed: int = 0
@@ -76,5 +77,3 @@ class PlaneSearchGates:
 
 #: The numbers in use.
 PLANE_SEARCH = PlaneSearchGates()
-
-__all__ = ["PLANE_SEARCH", "PlaneOptions", "PlaneSearchGates"]

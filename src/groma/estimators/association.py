@@ -24,7 +24,11 @@ from groma._numba import loop
 from groma._typing import FloatArray, IntArray
 from groma.errors import ShapeError
 
+#: Cost: rounds of expectation maximisation.
 _ROUNDS = 30
+#: Squared distances beyond this count as this, in variances: a density does not become zero (derived from the range of
+#: doubles).
+MAX_SQUARE = 1400.0
 
 
 @loop
@@ -81,7 +85,7 @@ def inlier_probability(
             f"{owner.shape}."
         )
     spread = np.maximum(sigma, 1e-12 * band[owner] if len(band) else 0.0)
-    noise = np.sqrt(2.0 / np.pi) / spread * np.exp(-0.5 * np.minimum((distance / spread) ** 2, 1400.0))
+    noise = np.sqrt(2.0 / np.pi) / spread * np.exp(-0.5 * np.minimum((distance / spread) ** 2, MAX_SQUARE))
     clutter = 1.0 / band[owner] if len(band) else np.zeros(0)
     count = np.bincount(owner, minlength=len(band))
     if pooled > 0.0 and len(distance):
@@ -121,6 +125,3 @@ def log10_poisson_tail(count: float, mean: float) -> float:
     first = math.floor(count) + 1
     log_tail = math.log(tail) if tail > 0.0 else first * math.log(mean) - mean - math.lgamma(first + 1)
     return log_tail / math.log(10.0)
-
-
-__all__ = ["inlier_probability", "log10_poisson_tail", "maximise_shares"]

@@ -52,10 +52,11 @@ _FRAME: ByLength[Callable[..., None]] = ByLength()
 _RESIDUALS: ByLength[Callable[..., None]] = ByLength()
 _MOVE: ByLength[Callable[..., None]] = ByLength()
 
+#: Damping of the first step, at least, and refused steps after which a problem is left (cost: steps).
 FIRST_DAMPING, MIN_DAMPING, MAX_ATTEMPTS = 1e-4, 1e-12, 8
 #: A pivot below this fraction of its diagonal entry means a singular system.
 PIVOT_TOLERANCE = 1e-12
-#: Problems, or lines, that one piece of work solves; a problem takes some ten microseconds.
+#: Problems, or lines, that one piece of work solves; a problem takes some ten microseconds (cost: time only).
 PROBLEMS_AT_ONCE = 512
 
 
@@ -194,7 +195,8 @@ def _solve_all(
                     better = after <= before
                     done = after >= before * (1.0 - tolerance) - floor
                 if better:
-                    x[n] = trial
+                    for k in range(trial.size):
+                        here.flat[k] = trial.flat[k]
                     damping = max(damping * 0.1, MIN_DAMPING)
                     break
                 damping *= 10.0
@@ -317,14 +319,3 @@ def solve_batch(
 
     map_ranges(solve, count, PROBLEMS_AT_ONCE)
     return BatchSolution(found, frames, cost, information, steps, converged)
-
-
-__all__ = [
-    "PROBLEMS_AT_ONCE",
-    "BatchSolution",
-    "Observations",
-    "ProblemKind",
-    "problem_kind",
-    "solve_batch",
-    "solve_damped",
-]

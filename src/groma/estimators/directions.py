@@ -78,16 +78,16 @@ class DirectionOptions:
 
     #: How parallel things are that are meant to be, radians; added to the measured noise. 0.05 degrees.
     parallel_sigma: float = 8.7e-4
-    #: A feature agrees when the chi-square test of its residual passes at this level.
+    #: A feature agrees when the chi-square test of its residual passes at this level (convention: level of a test).
     level: float = 0.95
     #: Least number of features that agree beyond those that determine a direction, one line or two segments: four
     #: parallel lines are enough, if they are long enough not to be parallel by chance.
     min_coincidences: int = 3
     #: Least number of groups (images, for segments) among them.
     min_groups: int = 1
-    #: Expected number of directions found where there are none.
+    #: Expected number of directions found where there are none (convention: of tests by meaningfulness).
     max_false_alarms: float = 1e-4
-    #: Most directions.
+    #: Most directions (cost: time).
     max_directions: int = 24
     #: Directions whose standard deviation is larger are dropped, radians. 2 degrees.
     max_sigma: float = 0.035

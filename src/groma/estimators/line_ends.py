@@ -18,10 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._numba import kernel, loop
+from groma._ordering import ascending, median
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.batch_least_squares import PROBLEMS_AT_ONCE
 from groma.execution import map_ranges
 from groma.gates import gate, numbers
+from groma.geometry.incidence import MIN_SINE
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ def _along(center, ray, X):
     dw = d0 * w0 + d1 * w1 + d2 * w2
     fw = ray[0] * w0 + ray[1] * w1 + ray[2] * w2
     determinant = dd * ff - df * df
-    if not determinant > 4e-4 * dd * ff:
+    if not determinant > MIN_SINE**2 * dd * ff:
         return np.nan, -1.0
     return (df * fw - ff * dw) / determinant, (dd * fw - df * dw) / determinant
 
@@ -61,7 +63,7 @@ def _along(center, ray, X):
 def _seen_twice(first, last):
     """From where to where at least two of the intervals cover a line; empty (inf, -inf) if no two overlap."""
     count = len(first)
-    by_first, by_last = np.argsort(first), np.argsort(last)
+    by_first, by_last = ascending(first), ascending(last)
     depth, low, high = 0, np.inf, -np.inf
     i = j = 0
     while j < count:
@@ -87,7 +89,7 @@ def _end_of(last, size, limit, stop, gates):
     same_end, majority, quantile = gates
     count = len(last)
     place = limit
-    order = np.argsort(-last)
+    order = ascending(-last)
     for k in order:
         if last[k] > limit:
             continue
@@ -104,7 +106,7 @@ def _end_of(last, size, limit, stop, gates):
             break
         if majority * beyond > count:
             break
-    reach = same_end * np.median(size)
+    reach = same_end * median(size)
     total = 0.0
     for k in order:
         if abs(last[k] - place) <= reach:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from groma._numba import kernel, loop
+from groma._ordering import ascending, median, sort_by
 from groma._typing import FloatArray, IntArray
 from groma.estimators.line_ends import LINE_ENDS, LineEndGates
 from groma.gates import numbers
@@ -32,8 +33,8 @@ def _joined(image, low, high, size, same_end):
     count = len(image)
     owner, first, last = np.empty(count, np.int64), np.empty(count), np.empty(count)
     found = 0
-    by_place = np.argsort(low)
-    order = by_place[np.argsort(image[by_place], kind="mergesort")]
+    order = ascending(low)
+    sort_by(image, order)
     for k in order:
         if found and owner[found - 1] == image[k] and low[k] <= last[found - 1] + same_end * size[k]:
             last[found - 1] = max(last[found - 1], high[k])
@@ -68,11 +69,14 @@ def _intervals(image, low, high, size, gates, begins, ends):
     """Write the supported intervals of a line between 0 and 1; return their number."""
     same_end, majority, _ = gates
     owner, first, last = _joined(image, low, high, size, same_end)
-    noise = same_end * np.median(size)
-    cuts = np.sort(np.concatenate((first, last)))
+    noise = same_end * median(size)
+    cuts = np.empty(2 * len(first))
+    for k in range(len(first)):
+        cuts[2 * k], cuts[2 * k + 1] = first[k], last[k]
+    order = ascending(cuts)
     found, bridged = 0, False
     for k in range(len(cuts) - 1):
-        begin, end = max(cuts[k], 0.0), min(cuts[k + 1], 1.0)
+        begin, end = max(cuts[order[k]], 0.0), min(cuts[order[k + 1]], 1.0)
         if not begin < end:
             continue
         shown, denied = _votes(owner, first, last, 0.5 * (begin + end))
@@ -141,6 +145,3 @@ def supported_intervals(
     line = np.repeat(np.arange(num_lines), count)
     row = pointers[line] + np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
     return line, np.column_stack([begins[row], ends[row]])
-
-
-__all__ = ["supported_intervals"]

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators.association import maximise_shares
+from groma.estimators.association import MAX_SQUARE, maximise_shares
 from groma.gates import chi_square_gate, gate
 
 
@@ -36,6 +36,7 @@ class MembershipGates:
         4.0, "features", "that the share of all counts in that of each", "chosen on walls full of points"
     )
     tried: int = gate(12, "deviations", "that are tried", "cost: each two fifths larger than the one before")
+    least: float = gate(0.02, "share", "of the largest deviation, the least that is tried", "cost: tells from none")
     significance: float = gate(0.05, "probability", "to find a deviation where there is none", "convention: 5 %")
 
 
@@ -83,7 +84,7 @@ def memberships(found: Candidates, most: FloatArray, gates: MembershipGates = Me
     num, rows = len(most), np.flatnonzero(found.counted)
     if len(found.owner) == 0:
         return Membership(np.zeros(0), np.zeros(num))
-    shrink = np.concatenate([[0.0], np.geomspace(0.02, 1.0, gates.tried)])
+    shrink = np.concatenate([[0.0], np.geomspace(gates.least, 1.0, gates.tried)])
     likelihood, shares = np.zeros((len(shrink), num)), []
     groups = int(found.group.max()) + 1
     for k, part in enumerate(shrink):
@@ -108,8 +109,5 @@ def memberships(found: Candidates, most: FloatArray, gates: MembershipGates = Me
 def _density(found: Candidates, deviation: FloatArray) -> FloatArray:
     """Density of members; far away it is small, not zero."""
     variance = found.variance + (deviation[:, None] * found.unit.reshape(len(deviation), -1)) ** 2
-    squared = np.minimum((found.offset**2 / variance).sum(axis=1), 1400.0)
+    squared = np.minimum((found.offset**2 / variance).sum(axis=1), MAX_SQUARE)
     return np.exp(-0.5 * squared) / np.sqrt((2.0 * np.pi * variance).prod(axis=1))
-
-
-__all__ = ["Candidates", "Membership", "MembershipGates", "memberships"]

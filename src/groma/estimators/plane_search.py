@@ -36,7 +36,7 @@ from groma.geometry.algebra import vectors
 
 #: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
 BAND = PLANE_SEARCH.band
-#: Candidates whose scores are brought up to date together.
+#: Candidates whose scores are brought up to date together (cost: time only).
 _SCORED_TOGETHER = 16
 
 

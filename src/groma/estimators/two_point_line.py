@@ -86,5 +86,3 @@ def _move(X, U, step, out):
 #: Lines through points (2, 3). Observations share cameras (3, 4); their own are two end points and sigma (5,). The
 #: frame (2, 3) is what :func:`across_basis` writes.
 TWO_POINT_LINE = problem_kind(1, 4, 2, (2, 3), across_basis, line_residuals, _move)
-
-__all__ = ["TWO_POINT_LINE", "across_basis", "line_residuals"]

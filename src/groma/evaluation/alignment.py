@@ -173,6 +173,3 @@ def _rank(points: FloatArray) -> int:
     singular = np.linalg.svd(points - points.mean(0), compute_uv=False)
     noise = max(_COLLINEAR * singular[0], 1e-13 * np.abs(points).max() * np.sqrt(len(points)))
     return int((singular > noise).sum())
-
-
-__all__ = ["PoseAlignment", "align_points", "align_poses", "camera_centers", "pose_alignment"]

@@ -15,20 +15,29 @@ from typing import Any
 import numpy as np
 
 from groma.evaluation.poses import evaluate_poses
+from groma.gates import gate
 from groma.scene import Scene, Similarity
 
 #: The cabinet in the frame of the motion capture: centre, heading about the vertical z, half sizes. Metres, radians.
+#: Derived from the motion capture.
 CENTER = np.array([-1.52988, 0.456476, 0.281575])
+#: Derived from the motion capture, as above.
 HEADING = 3.10232
+#: Derived from the motion capture, as above.
 HALF_SIZE = np.array([0.396318, 0.222742, 0.272709])
 
-#: A line belongs to an edge of the cabinet if its middle is so near (metres), it is so parallel (degrees), and it
-#: covers this part of the edge at least.
-_NEAR = 0.08
-_PARALLEL_DEG = 5.0
-_COVERED = 0.3
-#: Planes and directions within so many degrees of a right angle are counted as meeting at one.
-_RIGHT_DEG = 2.0
+
+@dataclass(frozen=True)
+class CabinetGates:
+    """Which lines belong to an edge of the cabinet, and which planes and directions meet at a right angle."""
+
+    near: float = gate(0.08, "m", "from the edge to the middle of a line", "convention: a fifth of the least half size")
+    parallel_deg: float = gate(5.0, "degrees", "between an edge and its line", "convention: of this measure")
+    covered: float = gate(0.3, "share", "of an edge that a line covers", "convention: of this measure")
+    right_deg: float = gate(2.0, "degrees", "from a right angle", "convention: of this measure")
+
+
+GATES = CabinetGates()
 
 
 @dataclass(frozen=True)
@@ -108,9 +117,9 @@ def score_cabinet(scene: Scene, measured_from_scene: Similarity) -> CabinetScore
     away = np.abs(middle - corner)
     away[rows, axis] = 0.0
     on_edge = (
-        (np.abs(along)[rows, axis] > np.cos(np.deg2rad(_PARALLEL_DEG)) * length)
-        & (length > _COVERED * 2 * HALF_SIZE[axis])
-        & (away.max(1) < _NEAR)
+        (np.abs(along)[rows, axis] > np.cos(np.deg2rad(GATES.parallel_deg)) * length)
+        & (length > GATES.covered * 2 * HALF_SIZE[axis])
+        & (away.max(1) < GATES.near)
         & (np.abs(middle[rows, axis]) < HALF_SIZE[axis])
     )
     side = middle > 0
@@ -130,4 +139,4 @@ def right_angles(scene: Scene) -> list[float]:
     vectors = np.concatenate([scene.planes.hesse[:, :3], scene.directions.vectors])
     first, second = np.triu_indices(len(vectors), 1)
     angles = np.rad2deg(np.arccos(np.clip(np.abs(np.einsum("ij,ij->i", vectors[first], vectors[second])), 0.0, 1.0)))
-    return angles[angles > 90.0 - _RIGHT_DEG].tolist()
+    return angles[angles > 90.0 - GATES.right_deg].tolist()

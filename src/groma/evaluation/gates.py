@@ -60,5 +60,3 @@ class AlignmentGates:
 
 #: The numbers in use.
 SCORES, ALIGNMENT = ScoreGates(), AlignmentGates()
-
-__all__ = ["ALIGNMENT", "SCORES", "AlignmentGates", "ScoreGates"]

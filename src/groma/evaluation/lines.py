@@ -329,6 +329,3 @@ def triangle_distance(places: FloatArray, triangles: FloatArray) -> FloatArray:
     inside &= size > 0
     height = np.abs(np.einsum("ij,ij->i", places - triangles[:, 0], normal)) / np.where(size > 0, size, 1)
     return np.where(inside, height, result)
-
-
-__all__ = ["LineScores", "evaluate_lines", "score_lines"]

@@ -242,13 +242,3 @@ def _unit_planes(name: str, planes: npt.ArrayLike) -> FloatArray:
     if not (length > 0).all():
         raise InputError(f"{name} holds a plane without a normal, row {int(length.argmin())}. Remove it.")
     return hesse / length
-
-
-__all__ = [
-    "PlaneScores",
-    "PointPlaneScores",
-    "evaluate_planes",
-    "match_planes",
-    "score_planes",
-    "score_planes_by_points",
-]

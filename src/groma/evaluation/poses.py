@@ -206,14 +206,3 @@ def pairwise_auc(
         for threshold in thresholds_deg:
             sums[threshold] += float(np.maximum(0, 1 - degrees / threshold).sum())
     return {threshold: total / pairs for threshold, total in sums.items()}
-
-
-__all__ = [
-    "THRESHOLDS_DEG",
-    "PoseScores",
-    "evaluate_poses",
-    "pairwise_auc",
-    "rotation_angle",
-    "score_poses",
-    "unrelated",
-]

@@ -25,9 +25,9 @@ from groma.geometry import quaternion
 from groma.scene import Scene
 from groma.scene.line_intervals import line_pieces
 
-#: Places along a line that are looked up in a view.
+#: Places along a line that are looked up in a view (cost: time).
 _PLACES = 100
-#: Distances at which lines are counted, pixels.
+#: Distances at which lines are counted, pixels (convention: rows of the report).
 LIMITS = (1.0, 3.0, 10.0)
 
 
@@ -108,6 +108,3 @@ def read_silhouettes(folder: str | os.PathLike[str], names: tuple[str, ...]) -> 
                 raise InputError(f"{files[0]} is not an image that can be read. Save the silhouette as PNG.")
             masks[name] = picture > 0
     return masks
-
-
-__all__ = ["LIMITS", "SilhouetteScores", "evaluate_silhouettes", "read_silhouettes"]

@@ -71,7 +71,8 @@ class TrajectoryScores:
     #: Number of pairs behind the relative errors.
     num_pairs: int
     #: Mean relative translation error over the segments, percent, and rotation error, degrees by unit of length;
-    #: None if the reference does not move.
+    #: None if the reference moves no farther
+    #: than its positions err after an alignment.
     drift_percent: float | None
     drift_deg_per_metre: float | None
     #: Lengths of the segments: those of the KITTI benchmark, or tenths of a path shorter than 100.
@@ -179,6 +180,8 @@ def score_trajectory(
     first, second = _steps(times, aligned[:, 4:], float(rpe_delta), rpe_unit)
     translation, rotation = _relative_errors(aligned, truth, first, second)
     drift, turn, lengths, path = _drift(aligned, truth)
+    if align != "none" and np.linalg.norm(errors) >= np.linalg.norm(truth[:, 4:] - truth[:, 4:].mean(axis=0)):
+        drift, turn, lengths = None, None, ()  # its way is no longer than the noise of its positions
     doubts = (_few_in_common(ours, theirs, len(i)), unrelated(errors, truth[:, 4:], np.degrees(angles)))
     return TrajectoryScores(
         ate=Spread.of(errors),
@@ -343,17 +346,3 @@ def _drift(poses: FloatArray, truth: FloatArray) -> tuple[float | None, float | 
     translation, rotation = _relative_errors(poses, truth, rows, np.concatenate(second).astype(np.int64))
     size = np.concatenate(by)
     return float((translation / size).mean() * 100), float(np.degrees(rotation / size).mean()), lengths, path
-
-
-__all__ = [
-    "SEGMENT_LENGTHS",
-    "Alignment",
-    "Spread",
-    "StepUnit",
-    "TrajectoryScores",
-    "apply_similarity",
-    "associate",
-    "counts_lines",
-    "in_order",
-    "score_trajectory",
-]

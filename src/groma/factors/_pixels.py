@@ -126,13 +126,3 @@ def pixel_example(factor: PixelFactor, rng: np.random.Generator) -> Example:
         parameters = np.array([[500.0, 320.0, 240.0, -0.1, 0.02], [400.0, 300.0, 200.0, 0.05, -0.01]])
     manifolds = {"intrinsics": Euclidean(parameters.shape[1], "intrinsics")}
     return make_example(factor, rng, manifolds=manifolds, states={**visible_scene(rng), "intrinsics": parameters})
-
-
-__all__ = [
-    "PixelFactor",
-    "StereoFactor",
-    "as_camera_model",
-    "load_row",
-    "pixel_example",
-    "put_parameters",
-]

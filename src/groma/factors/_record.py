@@ -12,6 +12,10 @@ from groma._typing import FloatArray
 from groma.errors import ShapeError
 from groma.geometry import se3
 
+#: Squared angle below which coefficients come from their series, as the closed forms lose up to theta^-5 eps to
+#: cancellation (derived from the precision of doubles).
+SMALL_TURN = 0.01
+
 
 # ------------------------------------------------------------------------------------------------------------ Kernels
 @kernel

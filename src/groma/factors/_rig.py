@@ -327,20 +327,3 @@ def normalize_rows(factor: Any, field: str, size: int) -> None:
             raise InputError(f"{type(factor).__name__}.{field} must {told}. Leave these observations out.")
     norm[np.abs(norm - 1.0) < 1e-15] = 1.0
     object.__setattr__(factor, field, rows / norm[:, None])
-
-
-__all__ = [
-    "EXTRINSICS",
-    "MOTION",
-    "POSE",
-    "CameraFactor",
-    "clear_block",
-    "clear_record",
-    "normalize_rows",
-    "put_line",
-    "put_line_pose",
-    "put_point",
-    "put_point_pose",
-    "transform_line",
-    "transform_point",
-]

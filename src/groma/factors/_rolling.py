@@ -97,6 +97,3 @@ def split_rows(
                     _move_back(S, 0, mounted[mounted_index[begin + i]], 0)
                 for j in range(6):
                     line[pose_column + j] = S[j]
-
-
-__all__ = ["compose_rows", "split_rows"]

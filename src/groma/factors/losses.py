@@ -353,21 +353,3 @@ def loss(name: str, scale: float = 1.0, *, alpha: float | None = None) -> Loss:
             raise InputError(f"The loss {name!r} has no shape alpha, as 'barron' has; got alpha={alpha}. Leave it out.")
         given["alpha"] = float(alpha)
     return LOSSES[key](**{key: value for key, value in given.items() if key in names})
-
-
-__all__ = [
-    "LOSSES",
-    "Barron",
-    "Cauchy",
-    "GemanMcClure",
-    "Huber",
-    "Loss",
-    "SoftL1",
-    "Trivial",
-    "Truncated",
-    "Tukey",
-    "loss",
-    "loss_derivatives",
-    "loss_value",
-    "register_loss",
-]

@@ -254,6 +254,3 @@ def factor(
         return register(name)(cls)
 
     return decorate
-
-
-__all__ = ["UserFactor", "factor", "transform"]

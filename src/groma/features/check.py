@@ -157,6 +157,3 @@ def check_retrieval(retrieval: ImageRetrieval) -> None:
 def _require(condition: object, name: str, message: str) -> None:
     if not condition:
         raise AssertionError(f"{name}: {message}.")
-
-
-__all__ = ["check_detector", "check_matcher", "check_retrieval", "picture"]

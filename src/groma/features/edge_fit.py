@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 
 from groma._numba import inline_kernel, kernel, loop
+from groma._ordering import median
 from groma._typing import FloatArray
 from groma.features.images import GrayImage
 from groma.gates import gate, numbers
@@ -142,11 +143,11 @@ def _mean_gradient(image, u1, v1, u2, v2, dx, dy, count):
 def _robust_line(s, e, w, spread, n, outlier, line):
     """Fit offsets e at places s by a line, with weights w that let go of what is far; False where it fails."""
     # Start from the median offset: half of the samples may belong to a neighbouring edge.
-    line[0], line[1] = np.median(e[:n]), 0.0
+    line[0], line[1] = median(e[:n]), 0.0
     for _ in range(4):
         for k in range(n):
             spread[k] = abs(e[k] - line[0] - line[1] * s[k])
-        cut = outlier * max(1.4826 * np.median(spread[:n]), 0.05)
+        cut = outlier * max(1.4826 * median(spread[:n]), 0.05)
         for k in range(n):
             ratio = spread[k] / cut
             w[k] = (1.0 - ratio * ratio) ** 2 if ratio < 1.0 else 0.0
@@ -254,6 +255,3 @@ def measure_edges(
         smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
         _measure_all(smooth, ends, fit, numbers(gates), new_ends, sigma, strength)
     return new_ends, sigma, strength
-
-
-__all__ = ["EDGES", "EdgeGates", "measure_edges"]

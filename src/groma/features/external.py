@@ -120,6 +120,3 @@ def write_matches(path: str | Path, external: ExternalMatches) -> None:
         arrays[f"scores|{first}|{second}"] = found.score
     with Path(path).open("wb") as file:
         np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
-
-
-__all__ = ["ExternalMatches", "read_matches", "write_matches"]

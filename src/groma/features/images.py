@@ -11,6 +11,9 @@ from groma.errors import InputError, ShapeError
 
 GrayImage = npt.NDArray[np.uint8]
 
+#: Smaller images show no segment, pixels: a detector needs a few gradients (derived from their support).
+MIN_SIDE = 8
+#: Largest level in the format of 12 bits.
 _FULL_12_BITS = 4095
 
 
@@ -57,6 +60,3 @@ def to_gray(image: npt.NDArray[np.generic]) -> GrayImage:
             code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
             image = cv2.cvtColor(np.ascontiguousarray(image, dtype=np.uint8), code)
     return np.ascontiguousarray(image, dtype=np.uint8)
-
-
-__all__ = ["GrayImage", "to_gray"]

@@ -16,11 +16,9 @@ import numpy.typing as npt
 
 from groma.errors import InputError
 from groma.features.edge_fit import measure_edges
-from groma.features.images import to_gray
+from groma.features.images import MIN_SIDE, to_gray
 from groma.features.merging import MERGES, merge_collinear
-from groma.features.segments import Segments
-
-MIN_IMAGE = 8  # pixels; LSD needs a few gradients, and no segment fits in less
+from groma.features.segments import MIN_LENGTH, MIN_STRENGTH, Segments
 
 
 @dataclass(frozen=True)
@@ -28,10 +26,10 @@ class LsdDetector:
     """Line segment detector (Grompone von Gioi et al., 2010) without its refinement, then fitted to the grey levels."""
 
     #: Shortest segment, pixels.
-    min_length: float = 20.0
+    min_length: float = MIN_LENGTH
     #: Smallest mean gradient across a segment, grey levels (of 255) per pixel.
-    min_strength: float = 3.0
-    #: Reduction of the image before detection.
+    min_strength: float = MIN_STRENGTH
+    #: Reduction of the image before detection (convention: LSD's own).
     scale: float = 0.8
     #: Fit the end points to the grey levels across the segment (see :mod:`groma.features.edge_fit`).
     fit: bool = True
@@ -64,7 +62,7 @@ class LsdDetector:
             None for images without edges or smaller than 8 x 8.
         """
         gray = to_gray(image)
-        if min(gray.shape) < MIN_IMAGE or gray.min() == gray.max():
+        if min(gray.shape) < MIN_SIDE or gray.min() == gray.max():
             return Segments.empty()
         detected = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD, self.scale).detect(gray)[0]
         if detected is None or np.size(detected) == 0:
@@ -89,6 +87,3 @@ class LsdDetector:
 
 def _keep_long(ends: npt.NDArray[np.float64], shortest: float) -> npt.NDArray[np.float64]:
     return ends[np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]) >= shortest]
-
-
-__all__ = ["LsdDetector"]

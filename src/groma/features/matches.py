@@ -126,6 +126,3 @@ def _best_and_rival(
     rival = np.full(len(best), -np.inf)
     np.maximum.at(rival, owner[is_rival], evidence[is_rival])
     return best, rival
-
-
-__all__ = ["LineMatches", "RivalGates", "mutual_best"]

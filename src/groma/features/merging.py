@@ -92,6 +92,3 @@ def merge_collinear(ends: FloatArray, gates: MergeGates = MERGES) -> FloatArray:
     straight = (size > 1) & (worst <= gates.distance)
     whole = np.hstack([mean + low[:, None] * axis, mean + high[:, None] * axis])[straight]
     return np.vstack([ends[~straight[group]], whole])
-
-
-__all__ = ["MERGES", "MergeGates", "merge_collinear"]

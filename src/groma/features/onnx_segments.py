@@ -32,14 +32,13 @@ import numpy.typing as npt
 from groma._typing import BoolArray, FloatArray
 from groma.errors import InputError
 from groma.features.edge_fit import EDGES, measure_edges
-from groma.features.images import GrayImage, to_gray
+from groma.features.images import MIN_SIDE, GrayImage, to_gray
 from groma.features.merging import merge_collinear
-from groma.features.segments import Segments
+from groma.features.segments import MIN_LENGTH, MIN_STRENGTH, Segments
 from groma.gates import gate
 
-#: Largest file of a network, bytes.
+#: Largest file of a network, bytes (cost: memory).
 _LARGEST = 1 << 28
-_SMALLEST_IMAGE = 8
 _FORM = "input (1, H, W, 3 or 4), outputs (1, h, w, 1) and (1, h, w, 4), all float32, as M-LSD has them"
 
 
@@ -58,6 +57,9 @@ class NetworkGates:
     same: float = gate(
         1.5, "px", "distance of the ends of a segment from a longer one on it", "derived from edges a pixel wide"
     )
+    largest: int = gate(
+        1 << 22, "pixels", "of the network's input", "cost: 100 bytes of memory for each; those of M-LSD have 1 << 18"
+    )
     covered: float = gate(0.8, "share", "of a segment that a longer one covers, for it to go", "convention: most of it")
 
 
@@ -71,9 +73,9 @@ class OnnxDetector:
     #: The ONNX file.
     file: str
     #: Shortest segment, pixels.
-    min_length: float = 20.0
+    min_length: float = MIN_LENGTH
     #: Smallest mean gradient across a segment, grey levels (of 255) per pixel.
-    min_strength: float = 3.0
+    min_strength: float = MIN_STRENGTH
     #: Keep at most so many, the longest; 0 keeps all.
     max_segments: int = 0
     #: Hash of the content of the file, so that results are not taken for those of another one.
@@ -96,7 +98,7 @@ class OnnxDetector:
     def detect(self, image: npt.NDArray[np.generic]) -> Segments:
         """Segments of an image (H, W) or (H, W, 3), 8 bit, longest first."""
         gray = to_gray(image)
-        if min(gray.shape) < _SMALLEST_IMAGE or gray.min() == gray.max():
+        if min(gray.shape) < MIN_SIDE or gray.min() == gray.max():
             return Segments.empty()
         network = _network(self.file, self.content)
         rough = [network.segments(gray, tile) for tile in _tiles(gray.shape, network.size)]
@@ -192,6 +194,8 @@ class _Network:
     """A session of onnxruntime, and what its input and outputs are called."""
 
     session: Any
+    #: Where it came from.
+    file: str
     name: str
     #: Width, height and channels of the input.
     size: tuple[int, int]
@@ -206,12 +210,27 @@ class _Network:
         small = cv2.resize(part, self.size, interpolation=cv2.INTER_AREA).astype(np.float32)
         image = np.ones((1, *small.shape, self.channels), np.float32)
         image[0, :, :, :3] = small[:, :, None]
-        scores, offsets = self.session.run([self.scores, self.offsets], {self.name: image})
+        scores, offsets = self._run(image)
         row, column = np.nonzero(scores[0, :, :, 0] > gates.min_score)
         cell = np.column_stack([column, row, column, row]) + 0.5 + offsets[0, row, column]
         rows, columns = scores.shape[1:3]
         ends = cell * np.tile([width / columns, height / rows], 2) + np.tile([left, top], 2)
         return _clipped(ends[np.isfinite(ends).all(axis=1)].astype(np.float64), np.array(core))
+
+    def _run(self, image: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], ...]:
+        """Return scores and offsets; InputError if the network cannot, or gives arrays that do not fit each other."""
+        try:
+            scores, offsets = self.session.run([self.scores, self.offsets], {self.name: image})
+        except Exception as error:  # of onnxruntime, of many classes
+            raise InputError(f"{self.file} fails on an image: {_first_line(error)}. Use another network.") from error
+        if (*scores.shape[:3], 4) != offsets.shape or scores.shape[0] != 1 or scores.shape[3:] != (1,):
+            raise InputError(f"{self.file} gives arrays of shape {scores.shape} and {offsets.shape}; expected {_FORM}.")
+        return scores, offsets
+
+
+def _first_line(error: Exception) -> str:
+    """Return what an error says first."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
 
 
 @lru_cache(maxsize=4)
@@ -232,12 +251,11 @@ def _network(file: str, content: str) -> _Network:
     try:
         session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # of onnxruntime, of many classes
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise InputError(f"{file} cannot be loaded as an ONNX model: {reason.rstrip('.')}. Fetch it again.") from error
+        raise InputError(f"{file} cannot be loaded as an ONNX model: {_first_line(error)}. Fetch it again.") from error
     return _checked(session, file)
 
 
-def _checked(session: Any, file: str) -> _Network:
+def _checked(session: Any, file: str, gates: NetworkGates = NETWORK) -> _Network:
     """Return what input and outputs of a session are called; InputError if they are of another form."""
     inputs, outputs = session.get_inputs(), session.get_outputs()
     last = {output.shape[-1]: output for output in outputs if len(output.shape) == 4}
@@ -251,7 +269,9 @@ def _checked(session: Any, file: str) -> _Network:
             f"{file} is no detector of segments that is known: expected {_FORM}; got input {given or 'none'}, outputs "
             f"{made or 'none'}. Write an adapter as a detector of your own (docs/extending.md)."
         )
-    return _Network(session, inputs[0].name, (shape[2], shape[1]), shape[3], last[1].name, last[4].name)
-
-
-__all__ = ["NETWORK", "NetworkGates", "OnnxDetector", "covered"]
+    if shape[1] * shape[2] > gates.largest:
+        raise InputError(
+            f"{file} takes images of {shape[2]} x {shape[1]} pixels; expected at most {gates.largest} in all. Export "
+            "it for smaller ones: larger images are cut into tiles."
+        )
+    return _Network(session, file, inputs[0].name, (shape[2], shape[1]), shape[3], last[1].name, last[4].name)

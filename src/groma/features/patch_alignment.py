@@ -386,6 +386,3 @@ def align_templates(
         correlation,
     )  # fmt: skip
     return Alignment(found, covariance, correlation)
-
-
-__all__ = ["Alignment", "PatchGates", "Templates", "align_templates", "cut_templates", "smoothed"]

@@ -202,6 +202,3 @@ def image_noise(image: GrayImage) -> float:
     """Standard deviation of the noise of an image, grey levels, from differences that planes of grey do not make."""
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     return 1.4826 / 6.0 * float(np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, kernel)[::2, ::2])))
-
-
-__all__ = ["PointTrackGates", "corners", "follow", "image_noise", "spread"]

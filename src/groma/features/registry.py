@@ -122,5 +122,3 @@ MATCHERS = Table(
 RETRIEVAL = Table(
     "image retrieval", ImageRetrieval, "groma.retrieval", {"gradients": "groma.features.retrieval:GradientRetrieval"}
 )
-
-__all__ = ["DETECTORS", "MATCHERS", "RETRIEVAL", "Table"]

@@ -76,6 +76,3 @@ def most_similar(retrieval: ImageRetrieval, query: Any, others: Sequence[Any], c
     if not len(others):
         return np.zeros(0, np.int64)
     return np.argsort(-np.asarray(retrieval.similarity(query, others)), kind="stable")[:count]
-
-
-__all__ = ["GradientRetrieval", "most_similar"]

@@ -17,6 +17,10 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
 from groma.geometry import segment2
 
+#: Of segments that are detected unless the caller says so: shortest length, pixels, and smallest mean gradient across,
+#: grey levels (of 255) per pixel.
+MIN_LENGTH, MIN_STRENGTH = 20.0, 3.0
+
 
 @dataclass(frozen=True)
 class Segments:
@@ -86,6 +90,3 @@ class Segments:
     def empty() -> Segments:
         """No segments."""
         return Segments(np.zeros((0, 4)), np.zeros(0), np.zeros(0))
-
-
-__all__ = ["Segments"]

@@ -204,6 +204,3 @@ def consistent_directions(
     label = np.full(len(normals), -1)
     label[good] = found.label
     return replace(found, label=label)
-
-
-__all__ = ["VanishingPoints", "consistent_directions", "find_vanishing_points", "segment_normals"]

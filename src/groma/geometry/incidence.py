@@ -21,6 +21,9 @@ from groma._typing import FloatArray, IntArray
 from groma.geometry import line3
 from groma.geometry.algebra import cross, dot, norm, not_negative, ratio, stack, unit, vectors
 
+#: Lines, or a ray and a line, at an angle with a smaller sine do not tell where they pass each other.
+MIN_SINE = 0.02
+
 
 class LineRelation(IntEnum):
     """How two lines lie to each other, within the tolerances given."""
@@ -303,7 +306,7 @@ class LineMeet:
 
 
 def meet_lines(
-    first: FloatArray, second: FloatArray, distance_tolerance: float = 1e-9, min_sine: float = 0.02
+    first: FloatArray, second: FloatArray, distance_tolerance: float = 1e-9, min_sine: float = MIN_SINE
 ) -> LineMeet:
     r"""Point where two lines meet: the midpoint of their closest points.
 

@@ -35,6 +35,7 @@ from groma.errors import InputError
 from groma.geometry import line3, quaternion
 from groma.geometry.algebra import dot, matrices, norm, perpendicular, stack, unit, vectors
 
+#: Columns of the other format of quaternions.
 _WXYZ = (3, 0, 1, 2)
 #: Per order: which of (m0 m1 m2 d0 d1 d2) stands at each place, counted from 1, negative for the opposite sign.
 _ORDERS: dict[str, tuple[int, ...]] = {

@@ -25,12 +25,13 @@ deviation: the twist is (rho, omega) here.
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from groma._numba import kernel
 from groma._typing import FloatArray
 from groma.errors import ShapeError
 from groma.geometry import quaternion, so3
-from groma.geometry.algebra import matrices, vectors
+from groma.geometry.algebra import matrices, unit, vectors
 from groma.geometry.so3 import exp_kernel as rotation_exp_kernel
 from groma.geometry.so3 import left_jacobian_kernel
 
@@ -112,6 +113,28 @@ def transform_points(b_from_a: FloatArray, points_in_a: FloatArray) -> FloatArra
     """Points (..., 3) in the frame b; poses and points broadcast."""
     pose = _poses(b_from_a)
     return quaternion.rotate(pose[..., :4], points_in_a) + pose[..., 4:]
+
+
+def looking_at(centers: npt.ArrayLike, targets: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
+    """Poses ``cam_from_world`` of cameras that look at targets and are held upright.
+
+    Parameters
+    ----------
+    centers, targets : (..., 3) float64
+        Centres of the cameras, and what the middle of each image shows; either may be one for all.
+    up : (..., 3) float64
+        What is up in the world; not the direction of view, for which the pose is NaN.
+
+    Returns
+    -------
+    (..., 7) float64
+    """
+    centers, targets = np.broadcast_arrays(np.asarray(centers, np.float64), np.asarray(targets, np.float64))
+    ahead = unit(targets - centers)
+    right = unit(np.cross(ahead, np.asarray(up, np.float64)))
+    rotation = np.stack([right, np.cross(ahead, right), ahead], axis=-2)
+    q, t = quaternion.from_matrix(rotation), -(rotation @ centers[..., None])[..., 0]
+    return np.concatenate([q, t], axis=-1, dtype=np.float64)
 
 
 def hat(xi: FloatArray) -> FloatArray:
@@ -235,6 +258,7 @@ __all__ = [
     "left_jacobian",
     "left_jacobian_inverse",
     "log",
+    "looking_at",
     "right_jacobian",
     "right_jacobian_inverse",
     "to_matrix",

@@ -42,8 +42,9 @@ from groma._typing import FloatArray
 from groma.geometry import quaternion
 from groma.geometry.algebra import matrices, vectors
 
-#: Below this squared angle the coefficients are summed from their series.
+#: Below this squared angle the coefficients are summed from their series (derived from the precision of doubles).
 _SERIES = 4.0
+#: Derived from the precision of doubles: the first term that is left out is below it.
 _TERMS = 11
 _SERIES_D = tuple((-1.0) ** k / math.factorial(2 * k + 4) for k in range(_TERMS))
 _SERIES_E = tuple((-1.0) ** k / math.factorial(2 * k + 5) for k in range(_TERMS))

@@ -146,7 +146,7 @@ def _read_array(members: ArrayMembers, name: str, shape: tuple[int | None, ...])
         )
         if not fits:
             raise FileFormatError(f"Array {name} must have shape {shape} (None: any); got {header.shape}.")
-        if header.dtype.kind not in "iufU" or (header.fortran and len(shape) > 1):
+        if header.dtype.kind not in "biufU" or (header.fortran and len(shape) > 1):
             raise FileFormatError(f"Array {name} must hold numbers or text in C order; got dtype {header.dtype}.")
 
     if name not in members:
@@ -175,5 +175,3 @@ register_format(
         write=write_archive,
     )
 )
-
-__all__ = ["is_archive_name", "looks_like_archive", "read_archive", "write_archive"]

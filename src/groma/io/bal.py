@@ -241,5 +241,3 @@ register_format(
         check=check_bal,
     )
 )
-
-__all__ = ["bal_params", "check_bal", "looks_like_bal", "read_bal", "write_bal"]

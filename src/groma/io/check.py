@@ -80,6 +80,3 @@ def _compare(name: str, written: Scene, read: Scene, holds: Iterable[str], toler
 def _require(condition: bool, name: str, message: str) -> None:
     if not condition:
         raise AssertionError(f"Format {name!r}: {message}.")
-
-
-__all__ = ["check_format"]

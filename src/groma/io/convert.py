@@ -33,6 +33,3 @@ def convert(source: str | os.PathLike[str], target: str | os.PathLike[str], forc
     scene = read_scene(source)
     write_scene(scene, target, force=force, like=structures_of(source))
     return scene
-
-
-__all__ = ["convert"]

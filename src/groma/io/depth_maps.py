@@ -23,10 +23,11 @@ from groma.io.reading import reading
 
 #: Endings of depth maps, in small letters.
 ENDINGS = (".png", ".npy", ".npz")
-#: Whole numbers in files per unit of length: millimetres.
+#: Whole numbers in files per unit of length: millimetres (convention: of the format).
 WHOLE_NUMBERS = 1000.0
 #: The array of an ``.npz`` file that holds more than one.
 _ARRAY = "depth"
+#: What stands for "not measured" in the format of 16 bits.
 _UNKNOWN = 65535
 #: What a picture decoder gives: any number of channels and bits.
 _UNCHANGED = -1
@@ -149,6 +150,3 @@ def _check_size(path: Path, shape: tuple[int, ...], size: tuple[int, int]) -> No
         f"{path} has {shape[1]}x{shape[0]} pixels, its photograph {size[0]}x{size[1]}.{turned} Pass depth maps of the "
         "size of the photographs, registered to them."
     )
-
-
-__all__ = ["ENDINGS", "DepthMap", "DepthMaps"]

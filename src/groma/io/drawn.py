@@ -169,6 +169,3 @@ def _line_colours(scene: Scene) -> Colours:
     line, direction = scene.relations.line_along_direction.T
     colours[line] = PALETTE[direction % len(PALETTE)]
     return colours
-
-
-__all__ = ["PARTS", "Colours", "Drawn", "DrawnCameras", "Part", "drawn", "drawn_cameras", "middle_of", "openings"]

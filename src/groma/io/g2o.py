@@ -43,10 +43,10 @@ from groma.scene.pose_graph import GraphPoses, Motions, PoseGraph
 
 #: Numbers after the tag.
 _NUMBERS = {"VERTEX_SE3:QUAT": 8, "EDGE_SE3:QUAT": 30, "VERTEX_SE2": 4, "EDGE_SE2": 11}
-#: Larger numbers are not exact as floating point.
+#: Larger numbers are not exact as floating point (derived from the precision of doubles).
 _ID_LIMIT = 2.0**53
 _HALF_ANGLES = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
-#: Coordinates of a planar motion within (rho, omega).
+#: Coordinates of a planar motion within (rho, omega) (file format).
 _PLANAR = np.array([0, 1, 5])
 
 
@@ -202,6 +202,3 @@ def _planar(poses: FloatArray) -> FloatArray:
 
 def _join(numbers: Iterable[float]) -> str:
     return " ".join(map(repr, numbers))
-
-
-__all__ = ["looks_like_g2o", "read_g2o", "write_g2o"]

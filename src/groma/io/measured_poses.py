@@ -54,6 +54,3 @@ def _by_name(place: Path) -> bool:
         return is_measured_poses(next((line for _, line in read_lines(place)), ""))
     except (GromaError, OSError, UnicodeDecodeError):
         return False
-
-
-__all__ = ["holds_covariances", "read_camera_poses"]

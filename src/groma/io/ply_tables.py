@@ -142,6 +142,3 @@ class _PlyBytes:
                 values = self.array(np.dtype(self.order + kind), size)
                 table[name].append(values.tolist() if length else values[0])
         return table
-
-
-__all__ = ["ply_tables", "read_ply_points"]

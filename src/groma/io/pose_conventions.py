@@ -78,8 +78,3 @@ G2O = PoseConvention("g2o: VERTEX_SE3:QUAT id x y z qx qy qz qw", "world_from_ca
 POSE_CONVENTIONS = (
     COLMAP, TRANSFORMS, OPENSFM, OPENMVG, NVM, NVM_MATRIX, BUNDLER, BAL, NAMED, TUM, KITTI, EUROC, G2O,
 )  # fmt: skip
-
-__all__ = [
-    "BAL", "BUNDLER", "COLMAP", "EUROC", "FLIP", "G2O", "KITTI", "NAMED", "NVM", "NVM_MATRIX", "OPENMVG", "OPENSFM",
-    "POSE_CONVENTIONS", "TRANSFORMS", "TUM", "PoseConvention",
-]  # fmt: skip

@@ -40,9 +40,10 @@ from groma.io.survey.rows import is_measured_poses, read_measured_poses
 from groma.io.trajectories import read_trajectory
 from groma.scene import Cameras
 
-#: Seconds by which a time may miss that of a photograph: the convention of the TUM benchmark.
+#: Seconds by which a time may miss that of a photograph (convention: as in the TUM benchmark).
 NEAR_SECONDS = 0.02
-#: Digits from which a whole number is nanoseconds.
+#: Digits from which a whole number is nanoseconds (derived from Unix time: seconds have ten
+#: digits).
 _NANOSECOND_DIGITS = 16
 
 
@@ -238,6 +239,3 @@ def _numbers(names: Sequence[str]) -> IntArray | None:
         return None
     numbers = np.array([number for _, number in parts], np.int64)
     return numbers if len(np.unique(numbers)) == len(numbers) else None
-
-
-__all__ = ["NEAR_SECONDS", "PosesOfPhotographs", "read_poses"]

@@ -20,7 +20,7 @@ from groma.scene import Scene
 if TYPE_CHECKING:
     from groma.io.limap.structures import Structures
 
-#: Bytes that :attr:`SceneFormat.recognise` is given.
+#: Bytes that :attr:`SceneFormat.recognise` is given (cost: time only).
 HEAD_BYTES = 256
 
 
@@ -198,6 +198,3 @@ def _sources(readable: list[SceneFormat]) -> str:
 
 def _listed(words: list[str]) -> str:
     return f"{', '.join(words[:-1])} or {words[-1]}"
-
-
-__all__ = ["SceneFormat", "check_target", "formats", "read_scene", "register_format", "write_scene"]

@@ -263,14 +263,3 @@ for _format in (
     TrajectoryFormat("euroc", lambda line: "," in line and len(_words(line)) >= 8, _read_euroc, _write_euroc),
 ):
     register_trajectory_format(_format)
-
-__all__ = [
-    "Trajectory",
-    "TrajectoryFormat",
-    "read_times",
-    "read_trajectory",
-    "read_tum",
-    "register_trajectory_format",
-    "write_trajectory",
-    "write_tum",
-]

@@ -106,6 +106,3 @@ def _focal_length(path: Path) -> float | None:
         bitmap = pycolmap.Bitmap.read(str(path), False)
     focal = None if bitmap is None else bitmap.exif_focal_length()
     return float(focal) if focal and np.isfinite(focal) and focal > 0 else None
-
-
-__all__ = ["SOURCES", "Calibration", "CalibrationChoice", "calibration_of"]

@@ -22,9 +22,9 @@ from groma.localization.pose.matches import Matches
 from groma.localization.pose.refinement import Refined
 from groma.scene import Scene
 
-#: Images of a map that are asked how often points are found again, at most.
+#: Images of a map that are asked how often points are found again, at most (cost: time).
 _ASKED = 40
-#: Pieces that lines are cut into, to tell the parts that they cross.
+#: Pieces that lines are cut into, to tell the parts that they cross (cost: time).
 _PIECES = 16
 
 

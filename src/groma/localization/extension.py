@@ -107,6 +107,3 @@ def in_world_of(result: MapResult, before: Scene) -> MapResult:
     moved: Similarity = align_poses(result.scene.cam_from_world[now], before.cam_from_world[then])
     scenes = {name: getattr(result, name).transformed(moved) for name in ("scene", "before", "adjusted")}
     return replace(result, **scenes)
-
-
-__all__ = ["ExtendedModel", "extended_model", "in_world_of"]

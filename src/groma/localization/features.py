@@ -25,7 +25,7 @@ from groma.localization.pose.camera import QueryCamera
 from groma.mapping.image_segments import Straightener
 
 Bytes = npt.NDArray[np.uint8]
-#: A descriptor of length one, in bytes, has about this length.
+#: A descriptor of length one, in bytes, has about this length (the format of COLMAP's descriptors).
 _LENGTH = 512.0
 
 
@@ -174,18 +174,3 @@ def _straightener(model: str, params: tuple[float, ...], width: int, height: int
     from groma import cameras
 
     return Straightener.of(cameras.model(model), np.array(params), width, height)
-
-
-__all__ = [
-    "FEATURES",
-    "Bytes",
-    "DescribedImage",
-    "DescribedPoints",
-    "FeatureGates",
-    "describe_places",
-    "find_corners",
-    "find_features",
-    "find_points",
-    "mirrored",
-    "unit",
-]

@@ -104,6 +104,3 @@ def counted_in(index: MapIndex, images: IntArray, points: IntArray) -> IntArray:
 def _short(descriptors: Vectors, directions: Vectors) -> Vectors:
     short = descriptors @ directions
     return short / np.maximum(np.linalg.norm(short, axis=1, keepdims=True), np.float32(1e-6))
-
-
-__all__ = ["GATES", "DescribedLandmarks", "LandmarkGates", "coarsest", "counted_in", "seen_in"]

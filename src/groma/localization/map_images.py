@@ -50,6 +50,3 @@ def images_in_summary(map_: Path) -> Path | None:
         return Path(told) if isinstance(told, str) and Path(told).is_dir() else None
     except (OSError, ValueError, AttributeError, GromaError):
         return None
-
-
-__all__ = ["image_paths", "images_in_summary"]

@@ -22,7 +22,8 @@ class MatchGates:
 
 
 MATCHES = MatchGates()
-#: Rows and columns that are compared at a time: their products stay in the cache.
+#: Rows and columns that are compared at a time: their products stay in the cache (cost: the result does not depend on
+#: it).
 _ROWS, _COLUMNS = 128, 2048
 Vectors = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]

@@ -143,6 +143,3 @@ def read_placed(path: Path, digest: str) -> PlacedImage | None:
     except UNREADABLE:
         return None
     return found if found.is_whole else None
-
-
-__all__ = ["PlacedImage", "placed", "read_placed", "unreadable"]

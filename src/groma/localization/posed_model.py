@@ -143,6 +143,3 @@ def gather_photographs(folder: Path, files: Mapping[str, Path]) -> None:
             place.symlink_to(os.path.abspath(file))
         except OSError:
             shutil.copyfile(file, place)
-
-
-__all__ = ["gather_photographs", "with_photographs"]

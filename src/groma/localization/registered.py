@@ -116,6 +116,3 @@ def joined(table: _Table, other: _Table) -> _Table:
             part[(slice(None), *(slice(0, size) for size in values.shape[1:]))] = values
         columns[item.name] = np.concatenate(parts)
     return type(table)(**columns)
-
-
-__all__ = ["joined", "with_queries"]

@@ -108,6 +108,3 @@ def _table(queries: Sequence[PlacedImage]) -> str:
         "localised. The images show what of the map was found in each.</p><table><thead><tr><th>photograph</th>"
         f"<th>status</th><th>points</th><th>lines</th><th></th></tr></thead><tbody>{rows}</tbody></table></section>"
     )
-
-
-__all__ = ["LocalizeResult"]

@@ -21,7 +21,7 @@ from groma._typing import FloatArray
 from groma.features.images import to_gray
 from groma.localization.features import Bytes, find_points, unit
 
-#: Words of a vocabulary, and descriptors that it is made from at most.
+#: Words of a vocabulary, and descriptors that it is made from at most (cost: time of making and comparing).
 WORDS, _SAMPLE = 32, 20_000
 
 

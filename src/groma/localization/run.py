@@ -94,6 +94,3 @@ def _state_of(path: Path) -> str:
     except OSError:
         return str(path)
     return f"{path.absolute()} {state.st_size} {state.st_mtime_ns}"
-
-
-__all__ = ["localize_images", "query_files"]

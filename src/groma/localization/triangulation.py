@@ -212,6 +212,3 @@ def _rows_of(factor: Factor, seen: _Observed, scene: Scene) -> IntArray:
     models = np.array(scene.cameras.models, dtype=object)[scene.images.camera_idx[seen.image]]
     name = factor.camera_model.name  # type: ignore[attr-defined]  # of points seen at pixels
     return np.flatnonzero(models == name)
-
-
-__all__ = ["PointMap", "triangulate_features"]

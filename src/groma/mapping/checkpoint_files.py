@@ -168,5 +168,3 @@ ADJUSTED = FileKind(_write_adjusted, _read_adjusted)
 PLACED = FileKind(_write_placed, _read_placed)
 DEPTHS = FileKind(_write_depths, _read_depths)
 ARRAY = FileKind(_write_array, _read_array)
-
-__all__ = ["ADJUSTED", "ARRAY", "DEPTHS", "LINE_MAP", "PLACED", "SCENE", "SEGMENTS", "FileKind"]

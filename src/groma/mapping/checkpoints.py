@@ -27,6 +27,7 @@ from groma.mapping.folder_lock import LOCK, lock_folder
 
 _Options = TypeVar("_Options")
 _Result = TypeVar("_Result")
+#: Characters of a key in the format of names of files.
 _KEY_LENGTH = 12
 
 
@@ -257,16 +258,3 @@ def _remove(entry: Path) -> None:
     else:
         with suppress(OSError):
             entry.unlink()
-
-
-__all__ = [
-    "Stage",
-    "Stages",
-    "check_free",
-    "digest",
-    "digest_files",
-    "has_stages",
-    "remove_stages",
-    "stage",
-    "system_reason",
-]

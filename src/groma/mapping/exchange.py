@@ -117,6 +117,3 @@ def similar_neighbors(
 
 def _described(retrieval: ImageRetrieval, image: ImageReader, i: int) -> Any:
     return retrieval.describe(image(i))
-
-
-__all__ = ["NeighborChooser", "matches_for", "neighbors_for", "similar_neighbors", "with_parts"]

@@ -66,6 +66,3 @@ def _take(file: IO[str]) -> bool:
     except (BlockingIOError, PermissionError):
         return False
     return True
-
-
-__all__ = ["LOCK", "lock_folder"]

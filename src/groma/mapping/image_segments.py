@@ -47,7 +47,7 @@ class LensGates:
 
 
 GATES = LensGates()
-#: Places looked at along a segment, to find the part of it inside the image.
+#: Places looked at along a segment, to find the part of it inside the image (cost: time).
 _SAMPLES = 65
 
 
@@ -192,6 +192,3 @@ def given_segments(
 def _given_in(folder: Path, known: set[str], external: ExternalMatches, name: str) -> Segments:
     """The given segments of an image, none where they are not known."""
     return external.segments_of(name, read_gray(folder / name)) if name in known else Segments.empty()
-
-
-__all__ = ["Straightener", "detect_segments", "given_segments"]

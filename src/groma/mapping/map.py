@@ -51,6 +51,7 @@ from groma.mapping.lines.build import LineMap, MapLinesOptions, MatchProvider
 from groma.mapping.lines.confidence import DEFAULT_CONFIDENCE
 from groma.mapping.lines.hypotheses.earlier import EarlierMap
 from groma.mapping.lines.in_views import map_lines_in_views
+from groma.mapping.lines.options import MIN_LENGTH
 from groma.mapping.noise.observations import line_end_correlation, moved_px, noise_px, with_point_noise
 from groma.mapping.noise.shared import with_shared_noise
 from groma.mapping.photographs import check_images, check_number, image_files, image_reader, images_left_out
@@ -103,7 +104,7 @@ class MapOptions:
     """Options of :func:`map_images`."""
 
     #: Shortest segment, pixels.
-    min_segment_length: float = 12.0
+    min_segment_length: float = MIN_LENGTH
     #: What finds the segments: an object, or a name of :data:`groma.features.registry.DETECTORS`.
     detector: str | SegmentDetector = "lsd"
     #: What matches them, likewise; None: the geometry of the poses alone.
@@ -124,7 +125,7 @@ class MapOptions:
     #: Estimate focal lengths and distortion too; None: where ``camera_model`` changes the given cameras.
     refine_intrinsics: bool | None = None
     threads: int | None = None
-    #: Most steps of each adjustment.
+    #: Most steps of each adjustment (cost: time; most end before).
     max_iterations: int = 50
     #: The camera model: where points are reconstructed, of all cameras (None: SIMPLE_RADIAL); else the model that the
     #: given cameras are changed to (None: they keep theirs), and what it adds is estimated with the calibration.

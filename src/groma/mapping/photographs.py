@@ -198,15 +198,3 @@ def _sizes(model: Scene) -> dict[str, tuple[int, int]]:
     cameras = model.cameras
     of_camera = list(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
     return {name: of_camera[camera] for name, camera in zip(model.images.names, model.images.camera_idx, strict=True)}
-
-
-__all__ = [
-    "check_cameras",
-    "check_images",
-    "check_names",
-    "check_number",
-    "image_files",
-    "image_reader",
-    "images_left_out",
-    "read_gray",
-]

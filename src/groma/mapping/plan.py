@@ -62,6 +62,3 @@ def planned_stages(
         "adjusting everything",
         *(("adjusting with motions",) if rolling else ()),
     )
-
-
-__all__ = ["Start", "planned_stages"]

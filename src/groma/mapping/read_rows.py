@@ -220,9 +220,3 @@ def _find(wanted: Any, known: Any) -> IntArray:
     if not len(wanted):
         return np.zeros(0, np.int64)
     return order[np.searchsorted(known, wanted, sorter=order)]
-
-
-__all__ = [
-    "GATES", "ReadRowsGates", "TakenAtOnce", "adjust_read_rows", "as_measured", "check_read_rows", "mapped_as_measured",
-    "read_by_rows", "taken_at_once",
-]  # fmt: skip

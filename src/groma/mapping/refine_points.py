@@ -247,6 +247,3 @@ def _sum(rows: FloatArray, owner: IntArray, count: int) -> FloatArray:
     for column in range(rows.shape[1]):
         total[:, column] = np.bincount(owner, weights=rows[:, column], minlength=count)
     return total
-
-
-__all__ = ["PointRefinement", "PointRefinementOptions", "refine_points"]

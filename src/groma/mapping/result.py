@@ -13,14 +13,15 @@ from typing import Any
 import numpy as np
 
 from groma._typing import FloatArray
-from groma.adjustment.adjust import LAST_SCALE_SIGMAS, AdjustOptions
+from groma.adjustment.adjust import AdjustOptions
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.contributions import Contribution, contributions
 from groma.adjustment.diagnosis import diagnose_scene
 from groma.adjustment.report import AdjustReport, AdjustResult
 from groma.adjustment.rolling_shutter import motions_of
-from groma.adjustment.stages import with_loss
+from groma.adjustment.stages import STAGES, with_loss
 from groma.adjustment.survey.attach import Surveyed
+from groma.adjustment.survey.gross_errors import reliability_of
 from groma.adjustment.survey.protocol import protocol
 from groma.adjustment.uncertainty import pose_uncertainty
 from groma.bounded.json_text import json_text
@@ -31,7 +32,7 @@ from groma.mapping.depth.points import MeasuredDepths
 from groma.mapping.lines.confidence import left_out, with_confidence
 from groma.mapping.lines.intervals import with_supported_intervals
 from groma.mapping.lines.line_map import LineMap, explain
-from groma.mapping.surveyed import reliability_of, survey_numbers
+from groma.mapping.surveyed import survey_numbers
 from groma.mapping.unused import without_unused
 from groma.problem.problem import Problem
 from groma.scene import Scene
@@ -124,9 +125,9 @@ class MapResult:
         if len(self.scene.camera_motions):
             problem = _problem_of(self.scene, self.adjusted_with)
             numbers["rolling_shutter"] = motions_of(self.scene, problem).to_dict()
-        if self.scene.has_survey:
+        if self.scene.has_survey or len(self.scene.pose_priors):
             found = reliability_of(self.scene, _problem_of(self.scene, self.adjusted_with))
-            numbers["survey"] = survey_numbers(self.surveyed, found)
+            numbers["survey"] = survey_numbers(self.surveyed, found, self.scene)
         return numbers
 
     def write(
@@ -217,7 +218,7 @@ def _problem_of(scene: Scene, told: AdjustOptions) -> Problem:
 def last_loss(told: AdjustOptions) -> Loss:
     """Return the loss that an adjustment of photographs ends with."""
     if told.loss == "auto":
-        return GemanMcClure(LAST_SCALE_SIGMAS)
+        return GemanMcClure(STAGES.last_scale)
     return loss(told.loss, 1.0 if told.loss_scale is None else told.loss_scale)
 
 
@@ -247,6 +248,3 @@ def result_of(
         outcomes={outcome.name.lower(): count for outcome, count in line_map.outcome_counts().items()},
         warnings=(*missing, *adjusted.report.warnings),
     )
-
-
-__all__ = ["SCENES_OF_RESULT", "MapResult", "last_loss", "result_of"]

@@ -57,6 +57,3 @@ def place_at_poses(
     """Points at given poses, and what these are worth."""
     refine = (options.refine_poses, bool(options.refine_intrinsics))
     return place_photographs(folder, place("sfm"), given, options.point_model(), *refine, say)
-
-
-__all__ = ["find_start", "place_at_poses", "start_of"]

@@ -2,7 +2,7 @@
 """Adjusting a scene with measurements of other instruments: pixels have to be weighed against them.
 
 Standard deviations of positions and distances are stated, those of observations in images are estimated from their
-residuals, which the frame of the scene does not change.
+residuals, which the frame of the scene does not change. Gross errors among the measurements are taken out.
 """
 
 from __future__ import annotations
@@ -14,15 +14,14 @@ from typing import Any
 from groma.adjustment.adjust import AdjustOptions, adjust
 from groma.adjustment.report import AdjustResult, Progress
 from groma.adjustment.survey.attach import Survey, Surveyed, with_survey
+from groma.adjustment.survey.given_poses import given_poses_of
+from groma.adjustment.survey.gross_errors import without_gross_errors
 from groma.adjustment.survey.records import Reliability
-from groma.adjustment.survey.reliability import reliability
-from groma.errors import ProblemError
 from groma.gates import gate
 from groma.io.survey import WorldFrame
 from groma.mapping.checkpoint_files import SCENE
 from groma.mapping.checkpoints import stage
 from groma.mapping.noise.observations import noise_px
-from groma.problem.problem import Problem
 from groma.scene import Scene, Similarity
 from groma.scene.local_frame import usual_frame
 
@@ -55,12 +54,12 @@ class SurveyedResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values: the entry ``survey`` of ``summary.json``."""
-        return survey_numbers(self.surveyed, self.reliability)
+        return survey_numbers(self.surveyed, self.reliability, self.result.scene)
 
 
-def survey_numbers(surveyed: Surveyed | None, found: Reliability | None) -> dict[str, Any]:
+def survey_numbers(surveyed: Surveyed | None, found: Reliability | None, scene: Scene) -> dict[str, Any]:
     """Return what a summary says of measurements, as plain values."""
-    return (surveyed.to_dict() if surveyed else {}) | (found.to_dict() if found else {})
+    return (surveyed.to_dict() if surveyed else {}) | (found.to_dict() if found else {}) | given_poses_of(scene)
 
 
 def adjust_surveyed(
@@ -99,7 +98,8 @@ def adjust_surveyed(
             break
         chosen = better
         result = adjust(surveyed.scene, chosen, progress)
-    return SurveyedResult(result, surveyed, reliability_of(result.scene, result.problem))
+    result, found = without_gross_errors(result, lambda scene: adjust(scene, chosen, progress))
+    return SurveyedResult(result, surveyed, found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,15 +137,8 @@ def adjust_with_survey(points: Scene, options: Any, say: Callable[[str, int, int
     def tell(event: Progress) -> None:
         say("adjusting with measurements", event.iteration, event.max_iterations)
 
-    return adjust(points, weighted(points, told), tell).scene
-
-
-def reliability_of(scene: Scene, problem: Problem | None) -> Reliability | None:
-    """Return :func:`~groma.adjustment.survey.reliability.reliability`; None where the poses are not determined."""
-    try:
-        return reliability(scene, problem)
-    except ProblemError:
-        return None
+    told = weighted(points, told)
+    return without_gross_errors(adjust(points, told, tell), lambda scene: adjust(scene, told, tell))[0].scene
 
 
 def weighted(scene: Scene, options: AdjustOptions) -> AdjustOptions:
@@ -156,9 +149,3 @@ def weighted(scene: Scene, options: AdjustOptions) -> AdjustOptions:
     if options.lines and scene.num_line_observations:
         sigma["line_sigma_px"] = noise_px(scene, "lines")
     return replace(options, **sigma)
-
-
-__all__ = [
-    "SurveyedResult", "Tied", "adjust_surveyed", "adjust_with_survey", "reliability_of",
-    "survey_numbers", "tied", "weighted",
-]  # fmt: skip

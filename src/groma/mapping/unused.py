@@ -8,7 +8,7 @@ import numpy as np
 from groma.scene import Scene
 from groma.scene.survey import Kind
 
-#: Points that determine a plane, a line counting twice; lines that share a direction.
+#: Points that determine a plane, a line counting twice; lines that share a direction (derived from geometry).
 _MIN_ON_PLANE, _MIN_ALONG = 3, 2
 
 
@@ -39,6 +39,3 @@ def without_unused(scene: Scene, *others: Scene) -> tuple[Scene, ...]:
     if all(mask.all() for mask in kept.values()):
         return scene, *others
     return tuple(one.keep(**kept) for one in (scene, *others))
-
-
-__all__ = ["without_unused"]

@@ -42,9 +42,9 @@ class WideGates:
 
 
 GATES = WideGates()
-#: Places looked at along a segment, to find the part of it that belongs to a view.
+#: Places looked at along a segment, to find the part of it that belongs to a view (cost: time).
 _SAMPLES = 65
-#: Places looked at along each side of an image.
+#: Places looked at along each side of an image (cost: time).
 _GRID = 128
 #: Directions of the views, camera frame, and which way is right in them.
 _AXES = np.array([[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
@@ -212,6 +212,3 @@ def _is_wide(model: camera_models.CameraModel, params: FloatArray, pixels: Float
     straight, whole = model.undistort_pixels(params, pixels), np.array(size, float)
     kept = np.all((straight >= -0.5 * whole) & (straight <= 1.5 * whole), axis=1)
     return bool(kept.mean() < 1.0 - GATES.max_lost)
-
-
-__all__ = ["WideDetection", "WideGates", "WideViews"]

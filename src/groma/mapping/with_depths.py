@@ -88,6 +88,3 @@ def find_segment_depths(
 ) -> FloatArray:
     """Depths of segments."""
     return segment_depths(scene, segments, maps, measured, partial(say, "reading depths of segments"))
-
-
-__all__ = ["WithDepths", "find_segment_depths", "with_depths"]

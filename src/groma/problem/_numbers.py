@@ -61,6 +61,3 @@ def _refuse_focal_lengths(factor: Factor, slot: str, group: str, parameters: Flo
         f"{group!r} ({model.name}) are {focals[bad].tolist()} (factor {row}). "
         f"Give the camera its {whole} in pixels."
     )
-
-
-__all__ = ["refuse_unusable_numbers"]

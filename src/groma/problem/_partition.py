@@ -12,11 +12,13 @@ from groma.problem.problem import Problem
 
 #: Kinds of variables that are eliminated where possible.
 LANDMARK_KINDS = ("point", "line")
-#: Largest number of variables that may be moved to the reduced system without being asked.
+#: Largest number of variables that may be moved to the reduced system without being asked (cost: the reduced system
+#: grows with the square).
 MAX_KEPT_LANDMARKS = 4000
 
 
-def _free_groups(problem: Problem) -> list[str]:
+def free_groups(problem: Problem) -> list[str]:
+    """Return the groups that factors refer to and that may move."""
     used = {ref.group for factor in problem.factors if len(factor) for _, ref in factor.references()}
     return [name for name, group in problem.variables.items() if name in used and not group.is_constant]
 
@@ -41,7 +43,7 @@ def choose_landmarks(problem: Problem, eliminate: str | tuple[str, ...], warning
     ProblemError
         If ``eliminate`` names a group that is not there, or two that a factor couples.
     """
-    free = _free_groups(problem)
+    free = free_groups(problem)
     if eliminate == "auto":
         if not _couplings(problem, set(free)):
             return tuple(free)  # nothing is coupled: every variable is a small problem of its own
@@ -109,7 +111,7 @@ def kept_classes(
     problem: Problem, landmarks: tuple[str, ...]
 ) -> tuple[tuple[KeptClass, ...], dict[str, tuple[int, int]]]:
     """Return the kept classes, and for each kept group its (class, member)."""
-    kept = [name for name in _free_groups(problem) if name not in landmarks]
+    kept = [name for name in free_groups(problem) if name not in landmarks]
     rank = {"pose": 0, "intrinsics": 1}
     kept.sort(key=lambda name: rank.get(problem.variables[name].manifold.kind, 2))
     hosts: dict[str, list[tuple[str, IntArray]]] = {}

@@ -24,7 +24,7 @@ from groma.problem.layout import (
 from groma.problem.problem import Problem
 from groma.problem.sorting import PairTable, argsort_by, distinct_pairs, first_and_last
 
-#: Factors per chunk: their records (a few hundred bytes each) should fit the second-level cache.
+#: Factors per chunk: their records (a few hundred bytes each) should fit the second-level cache (cost: time alone).
 CHUNK_SIZE = 4096
 
 

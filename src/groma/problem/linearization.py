@@ -11,7 +11,7 @@ V, W and the landmarks' gradient belong to a chunk alone; H and the cameras' gra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -138,26 +138,37 @@ class NormalEquations:
 
         def work(share: int) -> tuple[list[float], list[int]]:
             sums, hidden = [0.0] * len(self.layout.factors), [0] * len(self.layout.factors)
-            for chunk in self.shares[share]:
-                if wanted is not None and not wanted(chunk):
-                    continue
-                for f, begin, end in chunk.factors:
-                    if begin == end:
-                        continue
-                    value, rho, degenerate = self._chunk_cost(share, f, inputs[f], begin, end)
-                    sums[f] += value
-                    hidden[f] += degenerate
-                    if landmark_costs is not None and chunk.eliminated is not None:
-                        landmark = self.layout.factors[f].landmark[begin:end] - chunk.begin
-                        landmark_costs[chunk.eliminated][chunk.begin : chunk.end] += 0.5 * np.bincount(
-                            landmark, weights=rho, minlength=chunk.end - chunk.begin
-                        )
+            for f, begin, end in self._runs(share, wanted):
+                value, rho, degenerate = self._chunk_cost(share, f, inputs[f], begin, end)
+                sums[f] += value
+                hidden[f] += degenerate
+                layout = self.layout.factors[f]
+                if landmark_costs is not None and layout.eliminated is not None:
+                    landmark = layout.landmark[begin:end]
+                    first, last = int(landmark[0]), int(landmark[-1]) + 1
+                    costs = np.bincount(landmark - first, weights=rho, minlength=last - first)
+                    landmark_costs[layout.eliminated][first:last] += 0.5 * costs
             return sums, hidden
 
         parts = self.workers.map(work, len(self.shares))
         self.costs = [0.5 * sum(part[0][f] for part in parts) for f in range(len(self.layout.factors))]
         self.hidden = [sum(part[1][f] for part in parts) for f in range(len(self.layout.factors))]
         return float(sum(self.costs))
+
+    def _runs(self, share: int, wanted: Callable[[Chunk], bool] | None) -> Iterator[tuple[int, int, int]]:
+        """Yield factor group, begin and end of factors of many chunks: costs need less room than records."""
+        runs: dict[int, tuple[int, int]] = {}
+        for chunk in self.shares[share]:
+            if wanted is not None and not wanted(chunk):
+                continue
+            for f, begin, end in (piece for piece in chunk.factors if piece[1] < piece[2]):
+                first, last = runs.get(f, (begin, begin))
+                size = self.layout.factors[f].factor.residual_size
+                if last != begin or (end - first) * (size + 1) > len(self._record(share, f)):
+                    yield f, first, last
+                    first = begin
+                runs[f] = first, end
+        yield from ((f, *run) for f, run in runs.items())
 
     def cost_of(self, inputs: list[tuple], eliminated: set[int], costs: list[float], hidden: list[int]) -> float:
         """Return the total cost where only factors of some groups of landmarks have moved; see :meth:`cost`.

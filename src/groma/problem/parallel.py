@@ -60,12 +60,13 @@ class Workers:
             self._pool = None
 
 
-#: Problems with fewer factors are one share: they are not worth a thread.
+#: Problems with fewer factors are one share: they are not worth a thread (cost: time only).
 FACTORS_FOR_THREADS = 50_000
 #: Most shares, and most bytes that their copies of the reduced system take for every factor, about twice what its
-#: measurement does, unless two copies take more: even one thread has them all.
+#: measurement does, unless two copies take more: even one thread has them all (cost: memory).
 MAX_SHARES, MAX_BYTES = 16, 96
-#: Landmarks add to each block of a copy so many times on average, or clearing and adding the copies takes too long.
+#: Landmarks add to each block of a copy so many times on average, or clearing and adding the copies takes too long
+#: (cost: time alone).
 USES_OF_A_BLOCK = 20
 
 
@@ -87,14 +88,25 @@ def num_shares(layout: Layout) -> int:
 
 
 def shares_of(layout: Layout) -> list[list[Chunk]]:
-    """Divide consecutive chunks into shares, about equal in the number of factors."""
-    chunks, count = layout.chunks, num_shares(layout)
+    """Divide chunks into shares: of each kind consecutive ones, about equal in the number of factors.
+
+    A factor of one kind takes other work than one of another, and each share has some of all.
+    """
+    count = num_shares(layout)
     if count == 1:
-        return [list(chunks)]
-    done = np.concatenate([[0], np.cumsum([max(chunk.size, 1) for chunk in chunks])])
-    cuts = np.searchsorted(done, done[-1] * np.arange(count + 1) / count)
-    cuts[0], cuts[-1] = 0, len(chunks)
-    return [list(chunks[cuts[i] : cuts[i + 1]]) for i in range(count)]
+        return [list(layout.chunks)]
+    kinds: dict[tuple[int | None, ...], list[Chunk]] = {}
+    for chunk in layout.chunks:
+        alone = () if chunk.eliminated is not None else tuple(f for f, begin, end in chunk.factors if begin < end)
+        kinds.setdefault((chunk.eliminated, *alone), []).append(chunk)
+    shares: list[list[Chunk]] = [[] for _ in range(count)]
+    for chunks in kinds.values():
+        done = np.concatenate([[0], np.cumsum([max(chunk.size, 1) for chunk in chunks])])
+        cuts = np.searchsorted(done, done[-1] * np.arange(count + 1) / count)
+        cuts[0], cuts[-1] = 0, len(chunks)
+        for k, share in enumerate(shares):
+            share += chunks[cuts[k] : cuts[k + 1]]
+    return shares
 
 
 #: Sums of arrays shorter than this are not worth a thread.

@@ -46,6 +46,3 @@ def _check_objects(scene: Scene) -> None:
             rows = getattr(table, kinds) == number
             target = OBJECTS[number]
             check_index(f"{name}.{column}", getattr(table, column)[rows], len(getattr(scene, target)), target)
-
-
-__all__ = ["check_scene"]

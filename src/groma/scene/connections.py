@@ -46,6 +46,3 @@ def connected_images(scene: Scene) -> list[IntArray]:
     _, label = connected_components(coo_matrix((np.ones(len(rows)), rows.T), (size, size)), directed=False)
     groups = [np.flatnonzero(label[: scene.num_images] == one) for one in np.unique(label[: scene.num_images])]
     return sorted(groups, key=len, reverse=True)
-
-
-__all__ = ["connected_images"]

@@ -21,6 +21,7 @@ from groma.cameras import model as camera_model
 from groma.errors import InputError
 from groma.geometry import quaternion
 from groma.geometry.algebra import dot, ratio
+from groma.geometry.incidence import MIN_SINE
 from groma.scene.landmarks import Lines
 from groma.scene.table import Table, column
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from groma.scene.scene import Scene
 
 #: A ray whose angle with a line has a smaller sine (squared) does not say where on the line it passes.
-MIN_SQUARED_SINE = 4e-4
+MIN_SQUARED_SINE = MIN_SINE**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,14 +189,3 @@ def _common(one: FloatArray, other: FloatArray) -> FloatArray:
 def _beyond(place: FloatArray, interval: FloatArray) -> FloatArray:
     """How far places (N,) lie outside of intervals (N, 2)."""
     return np.maximum(np.maximum(interval[:, 0] - place, place - interval[:, 1]), 0.0)
-
-
-__all__ = [
-    "MIN_SQUARED_SINE",
-    "LineIntervals",
-    "line_pieces",
-    "observed_shares",
-    "one_line_per_interval",
-    "shares_on_lines",
-    "supported_lengths",
-]

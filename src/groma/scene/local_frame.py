@@ -65,6 +65,3 @@ def _middle_and_extent(scene: Scene) -> tuple[FloatArray, float]:
         return np.zeros(3), 0.0
     middle = np.median(places, axis=0)
     return middle, float(np.median(np.linalg.norm(places - middle, axis=1)))
-
-
-__all__ = ["FAR", "local_frame", "usual_frame"]

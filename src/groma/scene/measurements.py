@@ -117,6 +117,3 @@ class PosePriors(Table):
 
     def _check(self) -> None:
         check_sigma("PosePriors.sigma", self.sigma)
-
-
-__all__ = ["LineDepths", "PlaneObservations", "PointDepths", "PosePriors", "RightColumns"]

@@ -43,6 +43,3 @@ class CameraMotions(Table):
         check_sigma("CameraMotions.sigma", self.sigma)
         if len(self) and not np.isin(self.axis, (ROWS, COLUMNS)).all():
             raise InputError(f"CameraMotions.axis must be 0 or 1; got {sorted(set(self.axis.tolist()))}.")
-
-
-__all__ = ["COLUMNS", "ROWS", "CameraMotions"]

@@ -12,16 +12,7 @@ from groma.scene.scene import Scene
 _FAR = 3.0
 #: Colours that are told apart by most eyes, the first ones best.
 PALETTE = np.array(
-    [
-        [214, 75, 54],
-        [44, 122, 196],
-        [58, 158, 92],
-        [226, 160, 40],
-        [138, 99, 201],
-        [38, 170, 178],
-        [205, 92, 154],
-        [130, 104, 66],
-    ],
+    [list(bytes.fromhex(colour)) for colour in "d64b36 2c7ac4 3a9e5c e2a028 8a63c9 26aab2 cd5c9a 826842".split()],
     np.uint8,
 )
 
@@ -106,6 +97,3 @@ def _hull(places: FloatArray) -> FloatArray | None:
     from scipy.spatial import ConvexHull
 
     return places[ConvexHull(places).vertices]
-
-
-__all__ = ["PALETTE", "patch_area", "patch_groups", "plane_patches", "triangle_fans"]

@@ -35,6 +35,3 @@ def standing_alone(
         "frames": Frames(np.arange(count) + 1, index, np.asarray(cam_from_world, float)),
         "images": Images(np.arange(count) + 1, tuple(names), index, np.arange(count), index),
     }
-
-
-__all__ = ["standing_alone"]

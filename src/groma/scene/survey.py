@@ -8,9 +8,10 @@ points of the scene: it is found in images by hand or by its target, and it has 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +21,14 @@ from groma.errors import InputError
 from groma.scene.landmarks import check_unit
 from groma.scene.table import OBJECTS, Table, check_sigma, check_unique, column, text_column
 
+if TYPE_CHECKING:
+    from groma.scene.scene import Scene
+
 #: What is done with the coordinates of a :class:`ControlPoints`: nothing is known of the place; it is measured, and
-#: holds the scene; it is measured, and kept back to check the result.
-UNKNOWN, CONTROL, CHECK = 0, 1, 2
+#: holds the scene; it is measured, and kept back to check the result; it was measured, and is wrong.
+UNKNOWN, CONTROL, CHECK, REJECTED = 0, 1, 2, 3
+#: Tables whose rows may be rejected: they stay in the scene, and take no part.
+REJECTABLE = ("camera_positions", "camera_poses", "marks", "distances", "known_planes", "known_directions")
 
 
 class Kind(IntEnum):
@@ -70,6 +76,8 @@ class CameraPositions(Table):
     xyz: FloatArray = column(np.float64, 3, world="points", measured=True)
     #: (N, 3, 3) its covariance, scene units squared.
     covariance: FloatArray = column(np.float64, 3, 3, world="covariances", measured=True)
+    #: (N,) whether the row is a gross error that takes no part.
+    rejected: BoolArray = column(np.bool_, fill=False)
 
     def _check(self) -> None:
         check_covariance("CameraPositions.covariance", self.covariance)
@@ -88,14 +96,14 @@ class ControlPoints(Table):
     #: (N, 3) measured place and (N, 3, 3) its covariance, scene units; of points of unknown place any numbers.
     measured: FloatArray = column(np.float64, 3, world="points", measured=True)
     covariance: FloatArray = column(np.float64, 3, 3, world="covariances", measured=True)
-    #: (N,) :data:`UNKNOWN`, :data:`CONTROL` or :data:`CHECK`.
+    #: (N,) :data:`UNKNOWN`, :data:`CONTROL`, :data:`CHECK` or :data:`REJECTED`.
     role: IntArray = column(np.int64)
 
     def _check(self) -> None:
         check_covariance("ControlPoints.covariance", self.covariance)
         check_unique("ControlPoints.names", np.unique(np.asarray(self.names, str), return_inverse=True)[1])
-        if len(self) and not np.isin(self.role, (UNKNOWN, CONTROL, CHECK)).all():
-            raise InputError(f"ControlPoints.role must be 0, 1 or 2; got {sorted(set(self.role.tolist()))}.")
+        if len(self) and not np.isin(self.role, (UNKNOWN, CONTROL, CHECK, REJECTED)).all():
+            raise InputError(f"ControlPoints.role must be 0, 1, 2 or 3; got {sorted(set(self.role.tolist()))}.")
 
     @property
     def is_control(self) -> BoolArray:
@@ -122,6 +130,8 @@ class Marks(Table):
     pixel: FloatArray = column(np.float64, 2)
     #: (N,) standard deviation of a coordinate, pixels.
     sigma: FloatArray = column(np.float64)
+    #: (N,) whether the row is a gross error that takes no part.
+    rejected: BoolArray = column(np.bool_, fill=False)
 
     def _check(self) -> None:
         check_sigma("Marks.sigma", self.sigma)
@@ -132,7 +142,7 @@ class Distances(Table):
     """Measured distances between two objects each: scale bars, tapes, bases of stereo heads, heights above a floor.
 
     Objects are camera centres, control points, lines and planes. From a line or plane it is measured at the foot of a
-    place.
+    place; between skew lines where they are nearest.
     """
 
     noun: ClassVar[str] = "distance"
@@ -142,13 +152,20 @@ class Distances(Table):
     first_idx: IntArray = column(np.int64, kinds="first_kind")
     second_kind: IntArray = column(np.int64)
     second_idx: IntArray = column(np.int64, kinds="second_kind")
-    #: (N, 3) of a line or plane that is the first: near where it is measured; else any place.
+    #: (N, 3) of a line or plane that is the first: near where it is measured; else any place. It does not count where
+    #: ``is_shortest``.
     anchor: FloatArray = column(np.float64, 3, world="points")
     #: (N,) distance and its standard deviation, scene units.
     distance: FloatArray = column(np.float64, length=1, measured=True)
     sigma: FloatArray = column(np.float64, length=1, measured=True)
+    #: (N,) whether the row is a gross error that takes no part.
+    rejected: BoolArray = column(np.bool_, fill=False)
+    #: (N,) of two lines: whether it is the shortest between them, wherever that is.
+    is_shortest: BoolArray = column(np.bool_, fill=False)
 
     def _check(self) -> None:
+        if (self.is_shortest & ((self.first_kind != Kind.LINE) | (self.second_kind != Kind.LINE))).any():
+            raise InputError("Distances.is_shortest is of two lines; other kinds have a place. Set it to False.")
         check_sigma("Distances.distance", self.distance)
         check_sigma("Distances.sigma", self.sigma)
         for side in ("first", "second"):
@@ -186,6 +203,8 @@ class KnownPlanes(Table):
     hesse: FloatArray = column(np.float64, 4, world="planes", measured=True)
     #: (N,) standard deviation of the distance from it, scene units.
     sigma: FloatArray = column(np.float64, length=1, measured=True)
+    #: (N,) whether the row is a gross error that takes no part.
+    rejected: BoolArray = column(np.bool_, fill=False)
 
     def _check(self) -> None:
         check_kinds("KnownPlanes.kind", self.kind, LOCATED)
@@ -208,6 +227,8 @@ class KnownDirections(Table):
     in_camera: FloatArray = column(np.float64, 3)
     #: (N,) standard deviation of a component, radians.
     sigma: FloatArray = column(np.float64)
+    #: (N,) whether the row is a gross error that takes no part.
+    rejected: BoolArray = column(np.bool_, fill=False)
 
     def _check(self) -> None:
         check_kinds("KnownDirections.kind", self.kind, DIRECTED)
@@ -230,6 +251,8 @@ class CameraPoses(Table):
     covariance: FloatArray = column(
         np.float64, 6, 6, length=((2, 2, 2, 1, 1, 1),) * 3 + ((1, 1, 1, 0, 0, 0),) * 3, measured=True
     )
+    #: (N,) whether the row is a gross error that takes no part.
+    rejected: BoolArray = column(np.bool_, fill=False)
 
     def _check(self) -> None:
         check_covariance("CameraPoses.covariance", self.covariance)
@@ -249,29 +272,44 @@ class Held(Table):
         check_kinds("Held.kind", self.kind, tuple(Kind))
 
 
+def accepted(scene: Scene) -> Scene:
+    """Return a scene without the measurements that are rejected."""
+    tables = {name: getattr(scene, name) for name in REJECTABLE}
+    kept = {name: table.take(~table.rejected) for name, table in tables.items() if table.rejected.any()}
+    return scene.replace(**kept) if kept else scene
+
+
+def only_rejected(scene: Scene) -> Scene:
+    """Return a scene with the measurements that are rejected in place of those that are not."""
+    tables = {name: getattr(scene, name) for name in REJECTABLE}
+    taken = {name: table.take(table.rejected).replace(rejected=[]) for name, table in tables.items()}
+    role = scene.control_points.role
+    role = np.where(role == REJECTED, CONTROL, np.where(role == CONTROL, UNKNOWN, role))
+    return scene.replace(**taken, control_points=scene.control_points.replace(role=role))
+
+
+def rejected_rows(scene: Scene) -> set[tuple[str, int]]:
+    """Return table and row of all measurements that are rejected."""
+    rows = {name: np.flatnonzero(getattr(scene, name).rejected) for name in REJECTABLE}
+    rows["control_points"] = np.flatnonzero(scene.control_points.role == REJECTED)
+    return {(name, row) for name, found in rows.items() for row in found.tolist()}
+
+
+def with_rejected(scene: Scene, rows: Collection[tuple[str, int]]) -> Scene:
+    """Return a scene in which these measurements are rejected, by table and row, and no others."""
+    tables, points = {}, scene.control_points
+    for name in REJECTABLE:
+        mask = np.zeros(len(getattr(scene, name)), bool)
+        mask[[row for table, row in rows if table == name]] = True
+        tables[name] = getattr(scene, name).replace(rejected=mask)
+    role = np.where(points.role == REJECTED, CONTROL, points.role)
+    role[[row for name, row in rows if name == "control_points"]] = REJECTED
+    return scene.replace(**tables, control_points=points.replace(role=role))
+
+
 def check_kinds(name: str, kinds: IntArray, allowed: tuple[int, ...]) -> None:
     """Raise where a kind of object is not allowed."""
     if len(kinds) and not (known := np.isin(kinds, allowed)).all():
         row = int(np.argmin(known))
         names = ", ".join(f"{int(kind)} ({OBJECTS[kind]})" for kind in allowed)
         raise InputError(f"{name} must be one of {names}; row {row} is {kinds[row]}.")
-
-
-__all__ = [
-    "CHECK",
-    "CONTROL",
-    "DIRECTED",
-    "LOCATED",
-    "UNKNOWN",
-    "CameraPoses",
-    "CameraPositions",
-    "ControlPoints",
-    "Distances",
-    "Held",
-    "Kind",
-    "KnownDirections",
-    "KnownPlanes",
-    "Marks",
-    "check_covariance",
-    "diagonal_covariance",
-]

@@ -14,6 +14,3 @@ def upward(down: FloatArray) -> FloatArray:
     if np.linalg.norm(up) < 0.3 * max(len(down), 1):
         return np.array([0.0, 0.0, 1.0])
     return up / np.linalg.norm(up)
-
-
-__all__ = ["upward"]

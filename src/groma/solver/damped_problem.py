@@ -115,6 +115,3 @@ class DampedProblem(Protocol[T]):
     def refuse(self, trial: T) -> Termination | None:
         """Keep the states and raise the damping; return why to stop where that is of no use."""
         ...
-
-
-__all__ = ["DampedProblem", "Trial"]

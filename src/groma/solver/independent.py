@@ -15,6 +15,7 @@ import numpy as np
 
 from groma._simd import width
 from groma._typing import BoolArray, FloatArray
+from groma.gates import gate
 from groma.problem.layout import Chunk, Layout
 from groma.problem.linearization import NormalEquations, to_solver_order
 from groma.problem.parallel import Workers
@@ -28,10 +29,30 @@ from groma.solver.termination import Termination
 #: A variable whose damping exceeds this has reached its minimum to machine precision.
 MAX_DAMPING = 1e12
 MIN_DAMPING = 1e-15
-#: A gain ratio above this means the cost falls faster than the quadratic model says, and a longer step may do better;
-#: one below the other, that it is more bent than the model says, and a shorter step may.
-STRETCH_GAIN_RATIO, SHORTEN_GAIN_RATIO = 1.5, 0.5
-MAX_STRETCH = 8.0
+
+
+@dataclass(frozen=True)
+class StretchGates:
+    """When a step is tried at another length, and the damping of variables that are not coupled."""
+
+    longer: float = gate(
+        1.5,
+        "1",
+        "gain ratio from which the cost falls faster than the model says",
+        "derived from half its curvature along the step",
+    )
+    shorter: float = gate(
+        0.5,
+        "1",
+        "gain ratio below which it is more bent than the model",
+        "derived from one and a half times its curvature",
+    )
+    most: float = gate(8.0, "times", "a step gets as long, or as short", "cost: further steps")
+    lowered: float = gate(5.0, "times", "less damping after a step that helped", "cost: further steps")
+
+
+#: The defaults.
+STRETCH = StretchGates()
 
 
 def stretch_factor(gain_ratio: Any) -> Any:
@@ -40,7 +61,7 @@ def stretch_factor(gain_ratio: Any) -> Any:
     If the curvature along a step is c times the model's, the gain ratio is 2 - c, and the minimum lies at 1 / c times
     the step. Robust losses bend the cost down (c < 1): reweighted least squares overestimates the curvature.
     """
-    return 1.0 / np.clip(2.0 - gain_ratio, 1.0 / MAX_STRETCH, MAX_STRETCH)
+    return 1.0 / np.clip(2.0 - gain_ratio, 1.0 / STRETCH.most, STRETCH.most)
 
 
 @dataclass(frozen=True)
@@ -148,7 +169,7 @@ class IndependentBlocks:
     def _adapt(self, e: int, better: BoolArray) -> None:
         """Lower the damping of variables whose cost fell, and raise that of the others."""
         raised = np.minimum(self.damping[e] * self._growth[e], self._max_damping)
-        lowered = np.maximum(self.damping[e] / 5.0, min(MIN_DAMPING, self._max_damping))
+        lowered = np.maximum(self.damping[e] / STRETCH.lowered, min(MIN_DAMPING, self._max_damping))
         self.damping[e] = np.where(better, lowered, raised)
         self._growth[e] = np.where(better, 2.0, np.minimum(2.0 * self._growth[e], 1e6))
 
@@ -174,7 +195,7 @@ class IndependentBlocks:
             decrease = costs[e] - new_costs[e]
             ratio = decrease / np.maximum(promised[e], 1e-300)
             counts = self._unfinished[e] & (np.maximum(np.abs(decrease), promised[e]) > self._tolerance * costs[e])
-            wrong = counts & ((ratio > STRETCH_GAIN_RATIO) | (ratio < SHORTEN_GAIN_RATIO))
+            wrong = counts & ((ratio > STRETCH.longer) | (ratio < STRETCH.shorter))
             factors.append(np.where(wrong, stretch_factor(ratio), 1.0))
 
         def concerned(chunk: Chunk) -> bool:

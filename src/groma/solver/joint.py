@@ -21,7 +21,8 @@ from groma.solver.steps import States, Step, landmark_slopes, largest_slope, rel
 from groma.solver.termination import Termination
 from groma.solver.trial import JointTrial, evaluated
 
-#: Where the blocks between landmarks and kept blocks would take more bytes than this, single precision keeps them.
+#: Where the blocks between landmarks and kept blocks would take more bytes than this, single precision keeps them
+#: (cost: memory).
 COMPACT_FROM = 2**28
 
 
@@ -139,6 +140,3 @@ def _bytes_of_blocks(layout: Layout) -> int:
         for e in layout.eliminated
         for c, incidences in e.incidences.items()
     )
-
-
-__all__ = ["COMPACT_FROM", "JointProblem"]

@@ -112,6 +112,3 @@ def predicted_decrease(
     if residual is not None:
         total += sum(float(r @ delta) for r, (_, _, delta) in zip(residual, kept, strict=True))
     return 0.5 * (total + held), held
-
-
-__all__ = ["MAX_DAMPING", "MIN_DAMPING", "Damping", "NielsenDamping", "NoDamping", "damping_from", "predicted_decrease"]

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import InitVar, dataclass
 
 from groma.errors import InputError, did_you_mean
+from groma.gates import gate
 from groma.problem.variables import Variables
 from groma.solver.linear.choice import linear_solver_names
 
@@ -18,7 +19,7 @@ SHARED_SYSTEMS = ("auto", "formed", "products")
 class SolverOptions:
     """How a problem is solved. The defaults suit bundle adjustment."""
 
-    #: Most steps tried, accepted or not.
+    #: Most steps tried, accepted or not (cost: time; most end before).
     max_iterations: int = 50
     #: Stop when the cost falls by less than this fraction in an accepted step.
     function_tolerance: float = 1e-6
@@ -86,6 +87,19 @@ class SolverOptions:
             raise InputError(f"threads must be at least 1, or None; got {self.threads}.")
 
 
+@dataclass(frozen=True)
+class DampingGates:
+    """Damping of the first step, relative to the diagonal of the normal equations."""
+
+    poses: float = gate(1e-8, "1", "where there are motions alone", "cost: steps; they are nearly linear")
+    points: float = gate(1e-5, "1", "where there are landmarks, but no lines", "cost: steps")
+    lines: float = gate(1e-4, "1", "where lines move", "cost: steps; smaller ones throw lines into minima of their own")
+
+
+#: The defaults.
+DAMPING = DampingGates()
+
+
 def first_damping(variables: Mapping[str, Variables], options: SolverOptions) -> float:
     """Return the damping of the first step; 0 for steps without damping.
 
@@ -97,6 +111,6 @@ def first_damping(variables: Mapping[str, Variables], options: SolverOptions) ->
         return options.initial_damping
     groups = variables.values()
     if all(group.manifold.kind == "pose" for group in groups):
-        return 1e-8
+        return DAMPING.poses
     moving_lines = any(group.manifold.kind == "line" and not group.is_constant for group in groups)
-    return 1e-4 if moving_lines else 1e-5
+    return DAMPING.lines if moving_lines else DAMPING.points

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -29,8 +30,9 @@ from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations, to_original_order, to_solver_order
 from groma.problem.parallel import FACTORS_FOR_THREADS, Workers
 from groma.problem.problem import Problem
+from groma.problem.tied import find_tied
 from groma.solver.damped_problem import DampedProblem, T
-from groma.solver.independent import STRETCH_GAIN_RATIO, IndependentProblem, stretch_factor
+from groma.solver.independent import STRETCH, IndependentProblem, stretch_factor
 from groma.solver.joint import JointProblem
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.options import SolverOptions
@@ -81,7 +83,9 @@ def solve(problem: Problem, options: SolverOptions | None = None, progress: Prog
     report = SolveReport(num_factors=sum(map(len, problem.factors)), num_residuals=problem.num_residuals)
     watch = Stopwatch(report)
     with watch("setup"):
-        layout = lay_out(problem, options.eliminate)
+        tied = find_tied(problem) if options.eliminate == "auto" else []
+        divided = reduce(lambda whole, group: group.divide(whole), tied, problem)
+        layout = lay_out(divided, options.eliminate)
     report.notes += layout.warnings
     report.num_unknowns = count_unknowns(problem)
     if not layout.factors:
@@ -97,7 +101,8 @@ def solve(problem: Problem, options: SolverOptions | None = None, progress: Prog
         workers.close()
     warn_of_oddities(report)
     report.seconds["total"] = watch.elapsed()
-    return Solution(problem.with_states(to_original_order(layout, states)), report)
+    found = reduce(lambda parts, group: group.join(parts), tied, to_original_order(layout, states))
+    return Solution(problem.with_states(found), report)
 
 
 def minimise(
@@ -170,7 +175,7 @@ def _improved(problem: DampedProblem[T], trial: T, best: T, share: float) -> tup
     if not trial.lowers(best, share):
         rescued = problem.rescue(trial)
         return (rescued, True) if rescued.lowers(best, share) else (trial, False)
-    if trial.gain_ratio > STRETCH_GAIN_RATIO:
+    if trial.gain_ratio > STRETCH.longer:
         longer = problem.stretch(trial, stretch_factor(trial.gain_ratio))
         trial = longer if longer.cost < trial.cost else trial
     return problem.refine(trial), True

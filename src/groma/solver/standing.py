@@ -20,6 +20,3 @@ class Standing:
     history: tuple[Iteration, ...]
     #: Why the loop ended with this step; None if it goes on.
     ended: Termination | None = None
-
-
-__all__ = ["Standing"]

@@ -14,7 +14,7 @@ from groma.problem.layout import Layout
 from groma.problem.linearization import NormalEquations
 
 States = dict[str, FloatArray]
-#: About so many states of a group are looked at for the one of middle length.
+#: About so many states of a group are looked at for the one of middle length (Cost: time only).
 SAMPLE = 4096
 
 

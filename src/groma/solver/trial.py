@@ -34,6 +34,3 @@ def evaluated(equations: NormalEquations, states: States) -> dict:
 def counted_in(equations: NormalEquations) -> dict:
     """Return what the last evaluation of the cost left behind, as fields of :class:`JointTrial`."""
     return {"costs": equations.costs, "hidden": equations.hidden, "num_hidden": equations.num_hidden}
-
-
-__all__ = ["JointTrial", "counted_in", "evaluated"]

@@ -161,6 +161,3 @@ def _left_out(what: str, error: Exception) -> str:
     return (
         f"Left out at the end of the track: {what}, which failed ({type(error).__name__}: {error}). Please report it."
     )
-
-
-__all__ = ["Ending"]

@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from groma.io.sequences.frame import Frame
     from groma.tracking.tracker import TrackedFrame, Tracker
 
-#: The frame of the moment is written every so many seconds, reduced to at most so many columns.
+#: The frame of the moment is written every so many seconds, reduced to at most so many columns (cost: time of writing).
 GLANCE, COLUMNS = 0.4, 640
-#: The whole map is written when this many seconds have passed, and writing took less than this share of the time.
+#: The whole map is written when this many seconds have passed, and writing took less than this share of the time (cost:
+#: of writing).
 EVERY, SHARE = 2.0, 0.03
 
 
@@ -85,6 +86,3 @@ class Journal:
         write_scene(tracker.scene(), self._folder / "scene.npz", force=True)
         took = time.monotonic() - began
         self._next = time.monotonic() + max(EVERY, took / SHARE)
-
-
-__all__ = ["Journal"]

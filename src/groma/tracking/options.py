@@ -19,11 +19,11 @@ class TrackOptions:
     points: bool = True
     lines: bool = True
     planes: bool = True
-    #: Points followed at a time.
+    #: Points followed at a time (cost: time).
     num_points: int = 450
-    #: Features described in each keyframe, for finding the place again.
+    #: Features described in each keyframe, for finding the place again (cost: time).
     num_features: int = 1000
-    #: Lines followed at a time, the longest.
+    #: Lines followed at a time, the longest (cost: time).
     num_lines: int = 100
     #: Shortest segment, pixels.
     min_segment_length: float = 30.0
@@ -38,7 +38,7 @@ class TrackOptions:
     #: ... or the camera moved by this share of the median depth, or turned by this many radians.
     keyframe_motion: float = 0.12
     keyframe_turn: float = 0.2
-    #: Keyframes adjusted together after each new one; older ones that see the same are held.
+    #: Keyframes adjusted together after each new one; older ones that see the same are held (cost: time).
     window: int = 7
     #: Look for places seen before, and close loops.
     close_loops: bool = True
@@ -65,6 +65,3 @@ class TrackOptions:
         for name in ("min_segment_length", "max_depth", "point_sigma_px", "keyframe_motion", "keyframe_turn"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} must be positive; got {getattr(self, name)}.")
-
-
-__all__ = ["TrackOptions"]

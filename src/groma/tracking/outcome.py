@@ -158,17 +158,3 @@ def _as_adjusted(times: FloatArray, poses: FloatArray, near: IntArray, own: IntA
     out = se3.compose(se3.exp((1.0 - share) * start + share * end), poses)
     out[rows] = adjusted
     return out
-
-
-__all__ = [
-    "FOUND",
-    "LOST",
-    "SKIPPED",
-    "STARTING",
-    "TRACKED",
-    "WEAK",
-    "Entry",
-    "History",
-    "TrackResult",
-    "TrackedFrame",
-]

@@ -68,6 +68,3 @@ def map_to_scene(track_map: TrackMap, camera: TrackCamera, relations: bool = Tru
         SeenPlanes(plane_ids, replace(planes, index=np.searchsorted(plane_ids, planes.index)), image["planes"]),
         relations=find_relations(track_map, point_ids, line_ids, plane_ids) if relations else Relations(),
     )
-
-
-__all__ = ["map_to_scene"]

@@ -155,6 +155,3 @@ def sources_of(
     if source is not None:
         kept.append(source.with_images(tuple(name for name in names if name not in known), frames))
     return [asdict(one) for one in kept if one.images]
-
-
-__all__ = ["FrameSource", "SavedMap", "read_saved_map", "sources_of"]

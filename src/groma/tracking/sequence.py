@@ -32,9 +32,10 @@ from groma.tracking.tracker import Tracker
 from groma.viz.pictures import ImageFiles
 from groma.viz.report.trajectory import write_track_report
 
-#: Frames without a pose that are named in a warning.
+#: Frames without a pose that are named in a warning (convention: what a sentence can hold).
 NAMED = 5
-#: Largest difference between the times of a frame and of a pose of the reference, seconds.
+#: Largest difference between the times of a frame and of a pose of the reference, seconds (convention: of the TUM
+#: benchmark).
 MAX_TIME_DIFFERENCE = 0.02
 
 
@@ -338,6 +339,3 @@ def _failure(what: str, step: Callable[[], object]) -> str | None:
     except Exception as error:
         return f"Not written: {what}, which failed ({type(error).__name__}: {error}). Please report it."
     return None
-
-
-__all__ = ["SequenceResult", "TrackProgress", "track"]

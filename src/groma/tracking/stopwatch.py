@@ -24,6 +24,3 @@ class Stopwatch:
     def __exit__(self, *error: object) -> None:
         stage, began = self._stack.pop()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
-
-
-__all__ = ["Stopwatch"]

@@ -37,7 +37,7 @@ from groma.solver.report import Iteration, SolveReport
 from groma.solver.solve import solve
 
 #: Where a robust loss begins to bend unless the caller says so, in standard deviations: the length that the error of a
-#: right motion (six numbers) exceeds once in a hundred.
+#: right motion (six numbers) exceeds once in a hundred (derived from the chi-square distribution of six).
 LOSS_SCALE = 4.1
 #: Increments (rho, omega) of cam_from_world that leave the plane z = 0.
 _OUT_OF_PLANE = np.array([False, False, True, True, True, False])
@@ -54,7 +54,7 @@ class PoseGraphOptions:
     #: No loss for motions from one pose to the next (ids that follow each other): odometry errs a little all the time,
     #: place recognition much now and then.
     trust_odometry: bool = True
-    #: Most steps.
+    #: Most steps (cost: time; most end before).
     max_iterations: int = 100
     #: ``auto``, ``dense``, ``sparse``, ``pcg``, or a solver that was registered.
     linear_solver: str = "auto"
@@ -198,14 +198,19 @@ def motion_problem(
     losses : sequence of (rows, loss)
         The loss of some motions each: one group of factors.
     """
-    every = PoseBetween(
-        first=Ref("poses", motions.first_idx),
-        second=Ref("poses", motions.second_idx),
+    every = motion_factors(motions, "poses")
+    factors = [replace(every.take(rows), loss=loss) for rows, loss in losses]
+    return Problem({"poses": Variables(POSE_CHARTS["left"], body_from_world, constant)}, factors)
+
+
+def motion_factors(motions: Motions, group: str) -> PoseBetween:
+    """Return the factors of motions between poses (body_from_world) of a group of variables, without a loss."""
+    return PoseBetween(
+        first=Ref(group, motions.first_idx),
+        second=Ref(group, motions.second_idx),
         first_from_second=motions.first_from_second,
         sqrt_information=_roots(motions.information),
     )
-    factors = [replace(every.take(rows), loss=loss) for rows, loss in losses]
-    return Problem({"poses": Variables(POSE_CHARTS["left"], body_from_world, constant)}, factors)
 
 
 def _rows(graph: PoseGraph, options: PoseGraphOptions) -> tuple[IntArray, IntArray]:
@@ -226,6 +231,3 @@ def _roots(information: FloatArray) -> FloatArray:
     """Return R (E, 6, 6) with R^T R the information, which may be semidefinite."""
     values, vectors = np.linalg.eigh(information)
     return np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
-
-
-__all__ = ["PoseGraphOptions", "PoseGraphResult", "adjust_pose_graph", "motion_problem", "pose_graph_problem"]

@@ -21,10 +21,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.execution import map_in_threads
 from groma.factors.contract import Factor
 from groma.gates import gate
 from groma.problem.problem import Problem
@@ -33,8 +35,8 @@ from groma.solver.covariance.marginals import Covariances
 
 #: What is left out, one after the other, and what only relations refer to.
 _LANDMARKS, _STRUCTURE = ("points", "lines"), ("planes", "directions")
-#: Numbers in the largest arrays of one batch of landmarks.
-_BATCH = 2_000_000
+#: Numbers in the largest arrays of one batch of landmarks, and batches that are worked on before they are added.
+_BATCH, _AT_ONCE = 300_000, 16
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ def landmark_jackknife(covariances: Covariances) -> tuple[FloatArray, FloatArray
         rows = [_rows_of(factor, kind, problem, first, size - 1, curvature) for factor in problem.factors]
         together = _joined([one for one in rows if one is not None], size - 1)
         for moved in _pulls(together, stated) if together is not None else ():
-            summed += moved.T @ moved
+            summed += moved.T @ moved  # in their order, whoever made them
     share = max(curvature[0] / max(curvature[1], 1e-300), 0.1)
     found = stated @ summed @ stated / share**2
     at = first["frames"] + sizes["frames"] * np.arange(len(problem.variables["frames"]))[:, None] + np.arange(6)
@@ -168,36 +170,39 @@ def _pulls(rows: _Rows, stated: FloatArray) -> Iterator[FloatArray]:
     """Yield for batches of landmarks what each pulls at the unknowns of cameras with (B, U)."""
     begin = np.flatnonzero(np.r_[True, np.diff(rows.landmark) > 0])
     count = np.diff(np.r_[begin, len(rows.landmark)])
+    batches = []
     for number in np.unique(count):
         starts, wide = begin[count == number], int(number) * rows.columns.shape[1]
         step = max(1, _BATCH // max(wide**2, len(stated)))
-        for some in range(0, len(starts), step):
-            taken = starts[some : some + step, None] + np.arange(number)
-            yield _pull(rows, taken, stated)
+        batches += [starts[some : some + step, None] + np.arange(number) for some in range(0, len(starts), step)]
+    for some in range(0, len(batches), _AT_ONCE):
+        yield from map_in_threads(partial(_pull, rows, stated), batches[some : some + _AT_ONCE])
 
 
-def _pull(rows: _Rows, taken: IntArray, stated: FloatArray) -> FloatArray:
+def _pull(rows: _Rows, stated: FloatArray, taken: IntArray) -> FloatArray:
     """Pulls (B, U) of landmarks that have the same number of observations, ``taken`` (B, n)."""
     batch, number = taken.shape
-    high, wide = rows.by_camera.shape[1:]
-    columns = rows.columns[taken].reshape(batch, -1)
-    J = np.zeros((batch, number, high, number, wide))
-    each = np.arange(number)
-    J[:, each, :, each] = np.swapaxes(rows.by_camera[taken], 0, 1)
-    J = J.reshape(batch, number * high, number * wide)
-    own = rows.by_landmark[taken].reshape(batch, number * high, -1)
-    residual = rows.residual[taken].reshape(batch, -1, 1)
+    columns, J = rows.columns[taken], rows.by_camera[taken]
+    own = rows.by_landmark[taken].reshape(batch, -1, rows.by_landmark.shape[2])
     V = np.swapaxes(own, 1, 2) @ own
     V += 1e-12 * (np.trace(V, axis1=1, axis2=2)[:, None, None] + 1e-300) * np.eye(V.shape[1])
-    along = own @ np.linalg.solve(V, np.swapaxes(own, 1, 2))
-    J, residual = J - along @ J, residual - along @ residual
-    leverage = J @ stated[columns[:, :, None], columns[:, None, :]] @ np.swapaxes(J, 1, 2)
-    shares, axes = np.linalg.eigh(leverage)
-    error = (np.swapaxes(axes, 1, 2) @ residual)[:, :, 0] / (1.0 - np.minimum(shares, GATES.max_leverage))
-    pull = (np.swapaxes(J, 1, 2) @ (axes @ error[:, :, None]))[:, :, 0]
-    flat = (columns + len(stated) * np.arange(batch)[:, None]).ravel()
-    sums = np.bincount(flat, pull.ravel(), batch * len(stated)).astype(np.float64, copy=False)
+    free = np.eye(own.shape[1]) - own @ np.linalg.solve(V, np.swapaxes(own, 1, 2))
+    between = stated[columns[:, :, None, :, None], columns[:, None, :, None, :]]
+    shared = J[:, :, None] @ between @ np.swapaxes(J, 2, 3)[:, None]
+    leverage = free @ np.swapaxes(shared, 2, 3).reshape(free.shape) @ free
+    error = _without_own(leverage, free @ rows.residual[taken].reshape(batch, -1, 1))
+    pull = np.swapaxes(J, 2, 3) @ error.reshape(batch, number, -1, 1)
+    flat = columns.reshape(batch, -1) + len(stated) * np.arange(batch)[:, None]
+    sums = np.bincount(flat.ravel(), pull.ravel(), batch * len(stated)).astype(np.float64, copy=False)
     return sums.reshape(batch, len(stated))
 
 
-__all__ = ["GATES", "JackknifeGates", "landmark_jackknife", "observations_alone"]
+def _without_own(leverage: FloatArray, residual: FloatArray) -> FloatArray:
+    """Residuals (B, R, 1) as they would be without what the cameras follow them; leverage (B, R, R)."""
+    bold = np.trace(leverage, axis1=1, axis2=2) > GATES.max_leverage  # no share of the others exceeds it
+    error = np.linalg.solve(np.eye(leverage.shape[1]) - np.where(bold[:, None, None], 0.0, leverage), residual)
+    if bold.any():
+        shares, axes = np.linalg.eigh(leverage[bold])
+        along = np.swapaxes(axes, 1, 2) @ residual[bold]
+        error[bold] = axes @ (along / (1.0 - np.minimum(shares, GATES.max_leverage))[:, :, None])
+    return error

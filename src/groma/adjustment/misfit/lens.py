@@ -166,6 +166,7 @@ def _wide(group: str) -> str:
 
 
 def median_px(factors: list[PointReprojection], problem: Problem) -> float:
+    """Return the median reprojection error of points, pixels."""
     squares = [np.einsum("ni,ni->n", r, r) for r in (residuals_of(f, problem.variables) for f in factors)]
     return float(np.sqrt(np.median(np.concatenate(squares))))
 
@@ -178,6 +179,3 @@ def _sentence(groups: dict[str, CameraModel], begun: Problem, freed: Problem, be
         f"The residuals show lens distortion that the cameras ({names}) do not have: with it the median residual of "
         f"points would fall from {before:.2f} to {after:.2f} px. Repeat with {remedy}, or undistort the photographs."
     )
-
-
-__all__ = ["LENS", "LensGates", "radial_field", "unmodelled_distortion"]

@@ -145,6 +145,3 @@ def _moved(held: FloatArray, found: FloatArray) -> str:
     centers = [-quaternion.rotate(quaternion.conjugate(pose[:, :4]), pose[:, 4:]) for pose in (held, found)]
     shift = np.linalg.norm(centers[1] - centers[0], axis=1)
     return f"turn by up to {angle.max():.2g} degrees and shift by up to {shift.max():.2g} units of length"
-
-
-__all__ = ["GATES", "RigGates", "rig_that_does_not_fit"]

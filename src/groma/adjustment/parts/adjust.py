@@ -190,6 +190,3 @@ def _kinds(squares: Squares) -> list[str]:
 def _rms(squares: Squares, kind: str) -> float:
     total, count = np.sum([part[kind] for part in squares if kind in part], axis=0)
     return float(np.sqrt(total / count))
-
-
-__all__ = ["PartsResult", "adjust_parts"]

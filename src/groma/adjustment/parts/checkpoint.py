@@ -188,6 +188,3 @@ def _history(records: list[dict[str, Any]]) -> list[Iteration]:
 
 def _ended(key: str | None) -> Termination | None:
     return next((reason for reason in Termination if reason.key == key), None)
-
-
-__all__ = ["FOLDER", "Checkpoint", "Progressed", "key_of", "reports_of"]

@@ -163,6 +163,3 @@ def _joined(scenes: Sequence[Scene], name: str) -> Any:
             shift += [0 if table in SHARED else len(getattr(scene, table)) for table in item.metadata["refers"]]
         columns[item.name] = np.concatenate(values)
     return kind(**columns)
-
-
-__all__ = ["PART_NAMES", "PART_SIZE", "is_parts_folder", "join_parts", "num_ties_cut", "parts_of", "write_parts"]

@@ -56,6 +56,3 @@ def _limit_of_group(folder: Path = Path("/sys/fs/cgroup")) -> float | None:
         return float(int((place / "memory.max").read_text()) - int((place / "memory.current").read_text()))
     except (OSError, ValueError):  # no group, or no limit: the file then says "max"
         return None
-
-
-__all__ = ["KEEP", "free_memory", "room_for_parts"]

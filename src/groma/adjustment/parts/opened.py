@@ -266,6 +266,3 @@ def _joined(groups: list[Variables]) -> Variables:
     constant = [np.broadcast_to(group.constant, len(group)) for group in groups]
     state = np.concatenate([group.state for group in groups])
     return Variables(groups[0].manifold, state, np.concatenate(constant) if np.any(np.concatenate(constant)) else False)
-
-
-__all__ = ["LANDMARKS", "OpenParts", "Part", "open_parts"]

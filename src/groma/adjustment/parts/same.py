@@ -50,6 +50,3 @@ def _digest(names: str, *arrays: np.ndarray) -> str:
     for array in arrays:
         state.update(np.ascontiguousarray(array).tobytes())
     return state.hexdigest()
-
-
-__all__ = ["check_same_scene"]

@@ -38,6 +38,3 @@ def settings_of(
     )
     values = {item.name: getattr(assembly, item.name) for item in fields(assembly) if item.name != "loss"}
     return losses, solver, values
-
-
-__all__ = ["settings_of"]

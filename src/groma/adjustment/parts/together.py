@@ -39,6 +39,3 @@ def agreed(reducer: Reducer) -> Iterator[None]:
         return
     text = told[first] if all(told) else f"Rank {first} of {reducer.size}: {told[first]}"
     raise ToldByAllError(text) from own
-
-
-__all__ = ["ToldByAllError", "agreed", "exchange"]

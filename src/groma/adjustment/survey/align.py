@@ -116,6 +116,3 @@ def _to_survey(scene: Scene, survey: Survey) -> Alignment:
     names += [points.names[row] for row in rows]
     moved = scene.transformed(found.similarity)
     return Alignment(moved, found.similarity, tuple(names), fit.residuals, fit.inliers, None, found.notes)
-
-
-__all__ = ["Alignment", "align"]

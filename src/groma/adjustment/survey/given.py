@@ -45,6 +45,3 @@ class Survey:
     def __bool__(self) -> bool:
         files = (self.positions, self.control, self.distances, self.planes, self.directions, self.poses)
         return bool(self.hold) or any(part is not None for part in files)
-
-
-__all__ = ["Survey"]

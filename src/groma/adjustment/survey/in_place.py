@@ -16,6 +16,7 @@ from groma._typing import FloatArray
 from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.level import level
 from groma.adjustment.survey.names import rows_by_name
+from groma.adjustment.survey.place import measured_at_places
 from groma.adjustment.survey.similarity import GATES, RobustSimilarity, robust_similarity, upright
 from groma.adjustment.survey.tables import listed
 from groma.adjustment.survey.triangulate import triangulated
@@ -173,7 +174,7 @@ def _scaled(scene: Scene, notes: list[str]) -> Similarity:
 
 def _ratios(scene: Scene) -> FloatArray:
     """Return by which factors measured distances differ from those of the scene, where it has them."""
-    table = scene.distances
+    table = measured_at_places(scene)
     points, _ = triangulated(scene, scene.marks, len(scene.control_points))
     places = {Kind.IMAGE: scene.cam_centers_in_world, Kind.CONTROL_POINT: points}
     ratios = []

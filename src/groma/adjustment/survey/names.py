@@ -64,6 +64,3 @@ def _stem(name: str) -> str:
     return (
         path.stem if path.suffix in (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".dng", ".heic", ".webp") else path.name
     )
-
-
-__all__ = ["nearest", "require_some", "rows_by_name"]

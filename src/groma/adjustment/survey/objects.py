@@ -18,6 +18,7 @@ from groma._counted import counted
 from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
+from groma.adjustment.fit import noise_of
 from groma.adjustment.pixel_residuals import squared_residuals_px
 from groma.adjustment.survey.given import Survey
 from groma.adjustment.survey.names import nearest, rows_by_name
@@ -48,13 +49,14 @@ class ObjectGates:
     """What is said of measured objects."""
 
     parallel_deg: float = gate(
-        10.0, "degrees", "from parallel, from which a distance of two lines or planes is doubtful", "cost: a sentence"
+        10.0, "degrees", "from parallel, from which two lines have a shortest distance and no width", "cost: a meaning"
+    )
+    apart: float = gate(
+        5.0, "sigma", "that two skew lines must be apart, for their distance to have a side", "convention: five sigma"
     )
 
 
 GATES = ObjectGates()
-#: The median of a squared residual of two coordinates, in variances.
-_MEDIAN_SQUARE = 1.386
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,14 +131,15 @@ def with_measured_points(scene: Scene, survey: Survey, notes: list[str]) -> Scen
     of[rows] = count + np.arange(len(rows))
     mine = np.flatnonzero(of[seen.point_idx] >= 0)
     squares = squared_residuals_px(assemble(scene.keep(lines=[]), AssemblyOptions()))["points"]
-    sigma = max(float(np.sqrt(np.median(squares) / _MEDIAN_SQUARE)), 0.05) * seen.sigma[mine]
+    sigma = max(noise_of(squares), 0.05) * seen.sigma[mine]
     xyz, unit = scene.points.xyz[rows], np.tile(np.eye(3), (len(rows), 1, 1))
     points, marks = scene.control_points, scene.marks
-    marked = marks.replace(
-        image_idx=np.append(marks.image_idx, seen.image_idx[mine]),
-        point_idx=np.append(marks.point_idx, of[seen.point_idx[mine]]),
-        pixel=np.concatenate([marks.pixel, seen.pixel[mine]]),
-        sigma=np.append(marks.sigma, sigma),
+    marked = Marks(
+        np.append(marks.image_idx, seen.image_idx[mine]),
+        np.append(marks.point_idx, of[seen.point_idx[mine]]),
+        np.concatenate([marks.pixel, seen.pixel[mine]]),
+        np.append(marks.sigma, sigma),
+        np.append(marks.rejected, np.zeros(len(mine), bool)),
     )
     notes.append(f"Made control points, with their observations as marks: {', '.join(named)}.")
     return scene.keep(points=of < 0).replace(
@@ -144,7 +147,7 @@ def with_measured_points(scene: Scene, survey: Survey, notes: list[str]) -> Scen
             (*points.names, *named), np.concatenate([points.xyz, xyz]), np.concatenate([points.measured, xyz]),
             np.concatenate([points.covariance, unit]), np.append(points.role, np.full(len(rows), UNKNOWN)),
         ),
-        marks=Marks(marked.image_idx, marked.point_idx, marked.pixel, marked.sigma),
+        marks=marked,
     )  # fmt: skip
 
 
@@ -158,14 +161,23 @@ def distance_table(scene: Scene, given: DistancesFile, stated: float | None, not
     if (same := (first.kind == second.kind) & (first.idx == second.idx)).any():
         row = int(np.argmax(same))
         raise InputError(f"{given.source}: {given.first[row]} and {given.second[row]} are the same. Drop that line.")
+    is_shortest = np.zeros(len(first.kind), bool)
     for row, ends in enumerate(zip(first.kind, first.idx, second.kind, second.idx, strict=True)):
         if (apart := _from_parallel(scene, *ends)) > GATES.parallel_deg:
-            notes.append(
-                f"{given.first[row]} and {given.second[row]} are {apart:.0f} degrees from parallel: their distance is "
-                "measured from the middle of the first that was mapped, which is no exact place. Measure between marks."
-            )
+            words = f"{given.first[row]} and {given.second[row]} are {apart:.0f} degrees from parallel"
+            if Kind.PLANE in (ends[0], ends[2]):
+                raise InputError(f"{given.source}: {words}: they meet, so they have no distance. Measure from a mark.")
+            if given.distance[row] < GATES.apart * sigma[row]:
+                raise InputError(
+                    f"{given.source}: {words} and as good as meet: {given.distance[row]:.3g} with a standard deviation "
+                    f"of {sigma[row]:.3g} does not say on which side. Drop that line."
+                )
+            is_shortest[row] = True
+            notes.append(f"{words}: their distance is the shortest one, of the lines without ends.")
     anchor = np.array([_middle(scene, *ends) for ends in zip(first.kind, first.idx, strict=True)]).reshape(-1, 3)
-    return Distances(first.kind, first.idx, second.kind, second.idx, anchor, given.distance, sigma)
+    return Distances(
+        first.kind, first.idx, second.kind, second.idx, anchor, given.distance, sigma, is_shortest=is_shortest
+    )
 
 
 def _from_parallel(scene: Scene, kind: int, idx: int, other_kind: int, other_idx: int) -> float:
@@ -281,8 +293,3 @@ def _spread_on(scene: Scene, plane: int) -> FloatArray:
     first /= np.linalg.norm(first)
     angles = 2.0 * np.pi / 3.0 * np.arange(3)[:, None]
     return middle + size * (np.cos(angles) * first + np.sin(angles) * np.cross(n, first))
-
-
-__all__ = [
-    "direction_table", "distance_table", "find", "held_table", "plane_table", "pose_table", "with_measured_points",
-]  # fmt: skip

@@ -32,17 +32,21 @@ from groma.adjustment.terms.contract import Draft
 from groma.factors.contract import Factor
 from groma.geometry import line3, so3
 from groma.geometry.charts.line_charts import LINE_CHARTS
+from groma.geometry.incidence import closest_points
 from groma.geometry.manifold import Euclidean
 from groma.problem.gauge import world_motions
 from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of, residuals_of
 from groma.problem.variables import Variables
-from groma.scene import ControlPoints, Keypoints, Scene, Similarity
-from groma.scene.survey import UNKNOWN, Kind
+from groma.scene import ControlPoints, Distances, Keypoints, Scene, Similarity
+from groma.scene.survey import UNKNOWN, Kind, accepted
 
+#: Cost: steps of a fit that ends before, and where it has converged.
 _STEPS, _TOLERANCE = 50, 1e-6
 #: Directions of less than this share of the information of others are not known.
 _UNKNOWN = 1e-13
+#: What is left by rounding of numbers that cancel.
+_ROUNDING = 1e-12
 #: Terms whose measurements notice where the scene is.
 _TERMS = (
     pose_priors.TERM, camera_poses.POSITIONS, camera_poses.POSES, control_points.CONTROL, distances.TERM,
@@ -62,7 +66,7 @@ def settled(scene: Scene) -> Scene:
 
 def _best(scene: Scene) -> Similarity:
     """Return the similarity to where a scene fits best."""
-    light = _with_places(scene.keep(points=[], line_observations=[]).replace(keypoints=Keypoints()))
+    light = _with_places(accepted(scene).keep(points=[], line_observations=[]).replace(keypoints=Keypoints()))
     centers = light.cam_centers_in_world
     middle, total = centers.mean(axis=0), Similarity()
     length = float(np.median(np.linalg.norm(centers - middle, axis=1))) or 1.0
@@ -93,6 +97,7 @@ def _with_places(scene: Scene) -> Scene:
 
     With the whole scene these places move as points do; on a line that moves alone they stay at the foot of an anchor.
     """
+    scene = scene.replace(distances=measured_at_places(scene))
     places, tables = [scene.control_points.xyz], {}
     for name, kinds, column in (("distances", "first_kind", "first_idx"), ("known_planes", "kind", "idx")):
         table = getattr(scene, name)
@@ -114,6 +119,16 @@ def _with_places(scene: Scene) -> Scene:
         np.append(points.role, np.full(count, UNKNOWN)),
     )
     return scene.replace(control_points=points, **tables)
+
+
+def measured_at_places(scene: Scene) -> Distances:
+    """Return the distances, the shortest between two lines as measured where the first is nearest to the second now."""
+    table, lines = scene.distances, scene.lines.plucker
+    if not (rows := np.flatnonzero(table.is_shortest)).size:
+        return table
+    anchor = table.anchor.copy()
+    anchor[rows] = closest_points(lines[table.first_idx[rows]], lines[table.second_idx[rows]]).first
+    return table.replace(anchor=anchor, is_shortest=np.zeros(len(table), bool))
 
 
 def _feet(places: FloatArray, objects: FloatArray) -> FloatArray:
@@ -151,7 +166,10 @@ def _normal_equations(problem: Problem, center: FloatArray, length: float) -> tu
 def moved(motions: dict[str, FloatArray], factor: Factor, problem: Problem) -> FloatArray:
     """Return how residuals change with world motions (count, dof, k) of the groups, (N, m, k)."""
     blocks = jacobians_of(factor, problem.variables)
-    return np.sum([blocks[slot.name] @ motions[ref.group][ref.index] for slot, ref in factor.references()], axis=0)
+    parts = np.stack([blocks[slot.name] @ motions[ref.group][ref.index] for slot, ref in factor.references()])
+    total = parts.sum(axis=0)
+    rounding = _ROUNDING * np.abs(parts).sum(axis=0).max(axis=-1, keepdims=True, initial=0.0)
+    return np.where(np.abs(total) > rounding, total, 0.0)  # two ends that move as one
 
 
 def weighted(factor: Factor, problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -164,6 +182,3 @@ def weighted(factor: Factor, problem: Problem) -> tuple[FloatArray, FloatArray, 
         information = np.swapaxes(root, 1, 2) @ root
     squares = np.einsum("ni,nij,nj->n", residual, information, residual)
     return residual, information, factor.loss.evaluate(squares)[1]
-
-
-__all__ = ["moved", "settled", "weighted"]

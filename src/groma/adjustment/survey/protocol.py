@@ -17,13 +17,15 @@ _TITLES = {
     "known plane": "Distances from known planes",
     "known direction": "Turn from known directions, in two axes across them (degrees)",
 }
+#: What is written behind a measurement that is rejected, or suspect.
+_MARKS = {(True, True): "<- taken out", (True, False): "<- taken out", (False, True): "<- suspect", (False, False): ""}
 _EXPLAINED = """
 residual    measured less computed
 r           redundancy number: how far the others check the measurement (1 fully, 0 not at all)
 w           normalised residual, residual / (sigma sqrt r); standard normal without gross errors
 MDE         smallest error that the test finds
 effect      most that an error of that size moves the result, in standard deviations of the result
-weight      what a robust loss left of the weight
+weight      what a robust loss left of the weight; 0 of what was taken out, which is tested against the others
 """
 
 
@@ -43,6 +45,8 @@ def protocol(summary: Mapping[str, Any]) -> str:
             rows = [one for one in survey["measurements"] if one["kind"] == kind]
             if rows:
                 parts.append(_section(title, _table(rows) + "\n" + _EXPLAINED))
+    if survey.get("given_poses"):
+        parts.append(_section("Given poses", _given_poses(survey["given_poses"])))
     if survey.get("held"):
         parts.append(_section("Held as they are", ", ".join(survey["held"])))
     if survey.get("check_points"):
@@ -78,8 +82,18 @@ def _tests(survey: Mapping[str, Any]) -> str:
     suspects = [one for one in survey["measurements"] if one["is_suspect"]]
     for one in sorted(suspects, key=lambda one: -abs(one["normalized"])):
         name = f"{one['kind']} {one['name']} {one['coordinate']}".rstrip()
-        lines.append(f"Suspect: {name}, residual {one['residual']:.4g}, w {one['normalized']:.1f}")
+        verdict = "Taken out" if one["is_rejected"] else "Suspect"
+        lines.append(f"{verdict}: {name}, residual {one['residual']:.4g}, w {one['normalized']:.1f}")
     return _section("Test for gross errors", "\n".join(lines if suspects else [*lines, "No measurement is suspect."]))
+
+
+def _given_poses(told: Mapping[str, Any]) -> str:
+    """Return what poses without a stated noise were found to be worth."""
+    rows = [("", "sigma, estimated", "rms residual")]
+    rows += [("shift along an axis", f"{told['sigma']:.4g}", f"{told['rms']:.4g}")]
+    rows += [("turn about an axis (degrees)", f"{told['sigma_deg']:.4g}", f"{told['rms_deg']:.4g}")]
+    without = f"\nWithout a given pose, or with a wrong one: {', '.join(told['without'])}." if told["without"] else ""
+    return f"{told['number']} images, with the noise that the photographs show.\n{aligned(rows)}{without}"
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -89,7 +103,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
         tests = [f"{one['normalized']:.2f}", f"{one['detectable']:.4f}", f"{one['external']:.1f}"] if checked else "---"
         cells.append((
             one["name"], one["coordinate"], f"{one['sigma']:.4f}", f"{one['residual']:.4f}", f"{one['redundancy']:.3f}",
-            *tests, f"{one['weight']:.2f}", "<- suspect" if one["is_suspect"] else "",
+            *tests, f"{one['weight']:.2f}", _MARKS[one["is_rejected"], one["is_suspect"]],
         ))  # fmt: skip
     return aligned(cells)
 
@@ -114,6 +128,3 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
         cells = [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
         lines.append("  ".join([first.ljust(widths[0]), *cells]).rstrip())
     return "\n".join(lines)
-
-
-__all__ = ["aligned", "protocol"]

@@ -6,12 +6,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import numpy as np
 from scipy.special import ndtri
 
 from groma.gates import gate
+
+#: The median of the size of a standard normal number.
+_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True)
@@ -20,12 +25,27 @@ class ReliabilityGates:
 
     level: float = gate(1e-3, "probability", "of calling a good measurement wrong", "convention: Baarda")
     power: float = gate(0.8, "probability", "of finding an error of the size told", "convention: Baarda")
-    outliers: float = gate(
-        0.25, "share", "of a kind that may be wrong; of more, the kind is worse than stated", "cost: a wrong sentence"
+    false_alarm: float = gate(
+        0.01, "probability", "of taking anything out where nothing is wrong", "convention: one in a hundred"
     )
+    few: int = gate(
+        5, "coordinates", "of a kind, from which on their scatter tells its noise", "cost: whether a kind is doubted"
+    )
+    checked: float = gate(0.01, "share", "below which nothing checks a measurement", "convention: of geodesy")
+    at_once: float = gate(
+        0.5, "share", "of the largest normalised residual of a kind, for what is rejected with it", "cost: rounds"
+    )
+    max_rounds: int = gate(10, "rounds", "of rejecting and accepting again", "cost: most need two")
 
 
 GATES = ReliabilityGates()
+
+
+#: Tables of the scene by kind of measurement.
+TABLES = {
+    "camera position": "camera_positions", "camera pose": "camera_poses", "control point": "control_points",
+    "mark": "marks", "distance": "distances", "known plane": "known_planes", "known direction": "known_directions",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -55,6 +75,14 @@ class Measurement:
     is_suspect: bool
     #: Weight that the robust loss left it.
     weight: float = 1.0
+    #: Its row in the table of the scene, and whether it was rejected as a gross error: it then took no part.
+    row: int = 0
+    is_rejected: bool = False
+
+    @property
+    def place(self) -> tuple[str, int]:
+        """Table of the scene and row in it."""
+        return TABLES[self.kind], self.row
 
 
 @dataclass(frozen=True)
@@ -75,8 +103,8 @@ class Reliability:
 
     measurements: tuple[Measurement, ...]
     check_points: tuple[CheckPoint, ...]
-    #: Standard deviations that the residuals show over those stated, by kind, without suspects if these are few; None
-    #: where nothing is redundant.
+    #: Standard deviations that the residuals show over those stated, by kind, without gross errors; None where
+    #: nothing is redundant.
     components: dict[str, float | None] = field(default_factory=dict)
     #: Sums of redundancy numbers by kind.
     redundancy: dict[str, float] = field(default_factory=dict)
@@ -106,12 +134,34 @@ class Reliability:
             "measurements": [asdict(one) for one in self.measurements],
             "check_points": [asdict(one) for one in self.check_points],
             "suspects": [f"{one.kind} {one.name} {one.coordinate}".rstrip() for one in self.suspects],
+            "rejected": list(dict.fromkeys(f"{one.kind} {one.name}" for one in self.suspects if one.is_rejected)),
         }
+
+
+def rejection_limit(measurements: Sequence[Measurement]) -> float:
+    """Return the normalised residual that none of so many good measurements exceeds, but for a small probability."""
+    tests = sum(one.normalized is not None for one in measurements)
+    return float(-ndtri(GATES.false_alarm / (2.0 * max(tests, 1))))
+
+
+def gross_errors(measurements: Sequence[Measurement]) -> dict[tuple[str, int], float]:
+    """Return by table and row the measurements beyond what the noise of their kind explains, all tests taken together.
+
+    That noise is the stated one, or a larger one that the kind itself shows by the median of its normalised residuals:
+    where all are worse than stated, none is a gross error for that. The values are the largest normalised residuals.
+    """
+    tests = [(one.kind, one.place, abs(one.normalized)) for one in measurements if one.normalized is not None]
+    limit = rejection_limit(measurements)
+    found: dict[tuple[str, int], float] = {}
+    for kind in dict.fromkeys(kind for kind, _, _ in tests):
+        sizes = [(place, size) for of, place, size in tests if of == kind]
+        shown = float(np.median([size for _, size in sizes])) / _MEDIAN if len(sizes) >= GATES.few else 1.0
+        for place, size in sizes:
+            if size > limit * max(1.0, shown):
+                found[place] = max(size, found.get(place, 0.0))
+    return found
 
 
 def noncentrality(level: float = GATES.level, power: float = GATES.power) -> float:
     """Return by how many standard deviations a mean must be off for a two-sided test to find it with a power."""
     return float(ndtri(power) - ndtri(level / 2.0))
-
-
-__all__ = ["GATES", "CheckPoint", "Measurement", "Reliability", "ReliabilityGates", "noncentrality"]

@@ -17,6 +17,7 @@ the redundancy number (1: checked fully, 0: not at all), the normalised residual
 errors), and the error that a test at the level :math:`\alpha` finds with the power :math:`1 - \beta`. For C diagonal
 these are :math:`w_i = v_i / (\sigma_i \sqrt{r_i})` and :math:`\nabla_i = \delta_0 \sigma_i / \sqrt{r_i}`. The sum of
 :math:`v_+^\top P v_+` over that of r is the variance component of a kind: 1 where standard deviations are right.
+What was rejected before took part with :math:`\omega = 0` and is tested by the same formulas.
 
 References
 ----------
@@ -26,7 +27,7 @@ estimation in linear models*, 1987; Foerstner and Wrobel, *Photogrammetric compu
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,7 +37,17 @@ from groma._typing import FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble
 from groma.adjustment.places import at_places_of
 from groma.adjustment.survey.place import moved, weighted
-from groma.adjustment.survey.records import GATES, CheckPoint, Measurement, Reliability, noncentrality
+from groma.adjustment.survey.records import (
+    GATES,
+    TABLES,
+    CheckPoint,
+    Measurement,
+    Reliability,
+    gross_errors,
+    noncentrality,
+)
+from groma.adjustment.terms import camera_poses, control_points, distances, known_geometry
+from groma.adjustment.terms.contract import Draft
 from groma.adjustment.terms.objects import name_of, rows_by_kind
 from groma.errors import ProblemError
 from groma.factors.contract import Factor
@@ -44,8 +55,10 @@ from groma.factors.losses import Trivial
 from groma.problem.gauge import world_motions
 from groma.problem.problem import Problem
 from groma.problem.residuals import jacobians_of
+from groma.problem.variables import Variables
 from groma.scene import Scene
 from groma.scene.local_frame import local_frame
+from groma.scene.survey import accepted, only_rejected
 from groma.solver.covariance.marginals import Covariances
 
 #: Names of coordinates by kind of measurement. Angles are told in degrees: which coordinates are angles.
@@ -54,6 +67,11 @@ _COORDINATES = {
     "mark": "uv", "distance": ("",), "known plane": ("",), "known direction": ("a", "b"),
 }  # fmt: skip
 _ANGLES = {"camera pose": (False,) * 3 + (True,) * 3, "known direction": (True, True)}
+#: Terms that make factors of measurements.
+_TERMS = (
+    camera_poses.POSITIONS, camera_poses.POSES, control_points.MARKS, control_points.CONTROL, distances.TERM,
+    known_geometry.PLANES, known_geometry.DIRECTIONS,
+)  # fmt: skip
 #: A redundancy number below this says that nothing checks a measurement.
 _UNCHECKED = 1e-6
 
@@ -90,14 +108,17 @@ def reliability(
         problem = assemble(scene, AssemblyOptions()).problem
     elif near is not None:
         problem = at_places_of(problem, scene)
-    entries = list(_entries(scene, problem))
+    entries = list(_entries(accepted(scene), problem.factors, problem.variables))
     frame = _frame(problem, [factor for _, _, factor in entries])
     tests = [_tested(frame, *entry) for entry in entries]
-    measurements = [row for test in tests for row in _rows(test, level, power)]
-    wrong = _outliers(measurements)
+    apart = only_rejected(scene)
+    rejected = _entries(apart, _factors_of(apart, problem.variables), problem.variables)
+    tests += [_tested(frame, *entry, takes_part=False) for entry in rejected]
+    measurements = [row for test in tests for row in _rows(scene, test, level, power)]
+    wrong = gross_errors(measurements)
     components, redundancy = {}, {}
     for kind in dict.fromkeys(test.kind for test in tests):
-        parts = [_squares_and_shares(test, wrong) for test in tests if test.kind == kind]
+        parts = [_squares_and_shares(scene, test, wrong) for test in tests if test.kind == kind]
         squares, redundancy[kind] = (float(sum(part)) for part in zip(*parts, strict=True))
         components[kind] = float(np.sqrt(squares / redundancy[kind])) if redundancy[kind] > _UNCHECKED else None
     return Reliability(tuple(measurements), _checked(frame, scene), components, redundancy, level, power)
@@ -145,7 +166,9 @@ class _Test:
     """One group of measurements: arrays by measurement and coordinate."""
 
     kind: str
-    names: list[str]
+    #: (N,) rows: of all such measurements that take part, or of all that are rejected.
+    rows: IntArray
+    takes_part: bool
     residual: FloatArray
     #: (N, m) residuals at full weight, (N, m, m) information and covariances of the residuals, (N, m) r_i, (N,) weights
     full: FloatArray
@@ -155,10 +178,12 @@ class _Test:
     weight: FloatArray
 
 
-def _entries(scene: Scene, problem: Problem) -> Iterator[tuple[str, list[str], Factor]]:
-    """Yield kind, names and factors of the measurements, as the terms made them."""
-    names = {kind: iter(list(rows)) for kind, rows in _names(scene, problem).items()}
-    for factor in problem.factors:
+def _entries(
+    scene: Scene, factors: Iterable[Factor], groups: Collection[str]
+) -> Iterator[tuple[str, IntArray, Factor]]:
+    """Yield kind, rows in its table and factors of the measurements, as the terms made them."""
+    rows = _rows_of(scene, groups)
+    for factor in factors:
         groups = {ref.group for _, ref in factor.references()}
         kind = _KINDS.get(factor.type_name, "")
         if factor.type_name == "point_reprojection" and "control_points" in groups:
@@ -168,7 +193,7 @@ def _entries(scene: Scene, problem: Problem) -> Iterator[tuple[str, list[str], F
         elif factor.type_name == "pose_prior":  # poses that the scene knows of its frames come first
             kind = "camera pose" if not isinstance(factor.loss, Trivial) else ""
         if kind:
-            yield kind, next(names[kind]), factor
+            yield kind, next(rows[kind]), factor
 
 
 #: Kinds of measurements by their factors.
@@ -178,41 +203,51 @@ _KINDS = {
 }  # fmt: skip
 
 
-def _names(scene: Scene, problem: Problem) -> dict[str, Iterator[list[str]]]:
-    """Return by kind the names of the measurements of each factor, in the order in which the terms make them."""
-    images, points, groups = scene.images.names, scene.control_points.names, problem.variables.keys()
-    apart, plane, turned = scene.distances, scene.known_planes, scene.known_directions
-    marks = ((scene.marks.point_idx[rows], scene.marks.image_idx[rows]) for rows in _rows_of_marks(scene))
+def _factors_of(scene: Scene, variables: Mapping[str, Variables]) -> list[Factor]:
+    """Return the factors of all measurements of a scene, as the terms make them beside those of the images."""
+    draft = Draft(scene, AssemblyOptions(), dict(variables), [])
+    terms = [
+        term
+        for term in _TERMS
+        if len(getattr(scene, term.tables[0])) and all(name in variables for name in term.landmarks)
+    ]
+    return [group.factor for term in terms for group in term.factors(draft)]
 
-    def told(kind: IntArray, index: IntArray) -> list[str]:
-        return [name_of(scene, *one) for one in zip(kind.tolist(), index.tolist(), strict=True)]
 
-    first, second = told(apart.first_kind, apart.first_idx), told(apart.second_kind, apart.second_idx)
-    ends = [f"{one} to {other}" for one, other in zip(first, second, strict=True)]
-    on_plane, along = told(plane.kind, plane.idx), told(turned.kind, turned.idx)
+def _rows_of(scene: Scene, groups: Collection[str]) -> dict[str, Iterator[IntArray]]:
+    """Return by kind the rows of the measurements of each factor, in the order in which the terms make them."""
+    apart, plane, turned, marks = scene.distances, scene.known_planes, scene.known_directions, scene.marks
+    camera = scene.images.camera_idx[marks.image_idx]
+    by_model = [np.flatnonzero(np.isin(camera, members)) for members in scene.cameras.by_model().values()]
     return {
-        "camera position": iter([[images[row] for row in scene.camera_positions.image_idx]]),
-        "camera pose": iter([[images[row] for row in scene.camera_poses.image_idx]]),
-        "control point": iter([[points[row] for row in np.flatnonzero(scene.control_points.is_control)]]),
-        "mark": ([f"{points[p]} in {images[i]}" for p, i in zip(*rows, strict=True)] for rows in marks),
-        "distance": (
-            [ends[row] for row in rows] for _, rows in rows_by_kind(groups, apart.first_kind, apart.second_kind)
-        ),
-        "known plane": ([on_plane[row] for row in rows] for _, rows in rows_by_kind(groups, plane.kind)),
-        "known direction": ([along[row] for row in rows] for _, rows in rows_by_kind(groups, turned.kind)),
+        "camera position": iter([np.arange(len(scene.camera_positions))]),
+        "camera pose": iter([np.arange(len(scene.camera_poses))]),
+        "control point": iter([np.flatnonzero(scene.control_points.is_control)]),
+        "mark": (rows for rows in by_model if len(rows)),
+        "distance": (rows for _, rows in rows_by_kind(groups, apart.first_kind, apart.second_kind)),
+        "known plane": (rows for _, rows in rows_by_kind(groups, plane.kind)),
+        "known direction": (rows for _, rows in rows_by_kind(groups, turned.kind)),
     }
 
 
-def _rows_of_marks(scene: Scene) -> Iterator[IntArray]:
-    """Yield the rows of marks by camera model, in the order in which their factors are made."""
-    camera = scene.images.camera_idx[scene.marks.image_idx]
-    for members in scene.cameras.by_model().values():
-        if len(rows := np.flatnonzero(np.isin(camera, members))):
-            yield rows
+def _name(scene: Scene, kind: str, row: int) -> str:
+    """Return what a person calls a measurement."""
+    table = getattr(scene, TABLES[kind])
+    if kind in ("camera position", "camera pose"):
+        return scene.images.names[table.image_idx[row]]
+    if kind == "control point":
+        return table.names[row]
+    if kind == "mark":
+        return f"{scene.control_points.names[table.point_idx[row]]} in {scene.images.names[table.image_idx[row]]}"
+    if kind == "distance":
+        ends = (table.first_kind, table.first_idx), (table.second_kind, table.second_idx)
+        return " to ".join(name_of(scene, int(of[row]), int(idx[row])) for of, idx in ends)
+    return name_of(scene, int(table.kind[row]), int(table.idx[row]))
 
 
-def _tested(frame: _Frame, kind: str, names: list[str], factor: Factor) -> _Test:
+def _tested(frame: _Frame, kind: str, rows: IntArray, factor: Factor, takes_part: bool = True) -> _Test:
     residual, information, weight = weighted(factor, frame.covariances.problem)
+    weight = weight * takes_part
     spread = _spread(frame, factor)
     eye = np.eye(residual.shape[1])
     without = np.linalg.pinv(eye - weight[:, None, None] * spread @ information, rcond=1e-12)
@@ -220,7 +255,9 @@ def _tested(frame: _Frame, kind: str, names: list[str], factor: Factor) -> _Test
     full = np.linalg.inv(eye + spread_alone @ information)
     cofactor = np.linalg.inv(information) - full @ spread_alone
     shares = np.clip(np.einsum("nij,nji->ni", cofactor, information), 0.0, 1.0)
-    return _Test(kind, names, residual, np.einsum("nij,nj->ni", full, alone), information, cofactor, shares, weight)
+    return _Test(
+        kind, rows, takes_part, residual, np.einsum("nij,nj->ni", full, alone), information, cofactor, shares, weight
+    )
 
 
 def _spread(frame: _Frame, factor: Factor) -> FloatArray:
@@ -251,14 +288,15 @@ def _spread_inside(covariances: Covariances, factor: Factor) -> FloatArray:
     return out
 
 
-def _rows(test: _Test, level: float, power: float) -> Iterator[Measurement]:
+def _rows(scene: Scene, test: _Test, level: float, power: float) -> Iterator[Measurement]:
     """Yield the measured coordinates of a group."""
     deviation = np.sqrt(np.einsum("nii->ni", np.linalg.inv(test.information)))
     scores = np.einsum("nij,nj->ni", test.information, test.full)
     of_scores = np.einsum("nij,njk,nki->ni", test.information, test.cofactor, test.information)
     limit, shift = float(-ndtri(level / 2.0)), noncentrality(level, power)
     angles = _ANGLES.get(test.kind, (False,) * 6)
-    for row, name in enumerate(test.names):
+    for row, index in enumerate(_rows_in_scene(scene, test).tolist()):
+        name = _name(scene, test.kind, index)
         for k, coordinate in enumerate(_COORDINATES[test.kind]):
             share, variance = float(test.shares[row, k]), float(of_scores[row, k])
             checked = share > _UNCHECKED and variance > 0.0
@@ -276,23 +314,21 @@ def _rows(test: _Test, level: float, power: float) -> Iterator[Measurement]:
                 external=float(shift * np.sqrt((1.0 - share) / share)) if checked else None,
                 is_suspect=normalized is not None and bool(abs(normalized) > limit),
                 weight=float(test.weight[row]),
+                row=index,
+                is_rejected=not test.takes_part,
             )
 
 
-def _outliers(measurements: Sequence[Measurement]) -> set[tuple[str, str]]:
-    """Return kind and name of suspect measurements, of kinds of which few are: where many are, all are worse."""
-    found = set()
-    for kind in {one.kind for one in measurements}:
-        names = {one.name for one in measurements if one.kind == kind}
-        suspect = {one.name for one in measurements if one.kind == kind and one.is_suspect}
-        if len(suspect) <= GATES.outliers * len(names):
-            found |= {(kind, name) for name in suspect}
-    return found
+def _rows_in_scene(scene: Scene, test: _Test) -> IntArray:
+    """Return the rows of a test in the table of the scene, which holds what takes part and what does not."""
+    rejected = getattr(getattr(scene, TABLES[test.kind]), "rejected", None)
+    return test.rows if rejected is None else np.flatnonzero(rejected != test.takes_part)[test.rows]
 
 
-def _squares_and_shares(test: _Test, wrong: set[tuple[str, str]]) -> tuple[float, float]:
+def _squares_and_shares(scene: Scene, test: _Test, wrong: Collection[tuple[str, int]]) -> tuple[float, float]:
     """Return the weighted squares and the redundancy of the measurements of a group that are not wrong."""
-    good = np.array([(test.kind, name) not in wrong for name in test.names], bool)
+    good = np.array([(TABLES[test.kind], row) not in wrong for row in _rows_in_scene(scene, test).tolist()], bool)
+    good &= test.takes_part
     squares = np.einsum("ni,nij,nj->n", test.full, test.information, test.full)
     return float(squares[good].sum()), float(test.shares[good].sum())
 

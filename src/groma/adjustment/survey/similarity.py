@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from math import comb
 
 import numpy as np
 
@@ -22,9 +23,6 @@ from groma.gates import chi_square_gate, gate
 from groma.geometry import quaternion, so3
 from groma.geometry.algebra import unit
 from groma.scene import Scene, Similarity
-
-#: The median of the squared norm of three normal coordinates, in variances.
-_MEDIAN_SQUARE = 2.366
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,7 @@ def _fitted(source: FloatArray, target: FloatArray, seed: int) -> RobustSimilari
         best = _of_line(x, y)
         least = float(np.median(np.sum((y - best.points(x)) ** 2, axis=1)))
     inliers = np.ones(len(x), bool)
-    scatter = _small_sample(len(x)) * np.sqrt(least / _MEDIAN_SQUARE)
+    scatter = _small_sample(len(x)) * np.sqrt(least / chi_square_gate(0.5, 3))
     limit = chi_square_gate(GATES.outlier, 3)
     for _ in range(20):
         squares = np.sum((y - best.points(x)) ** 2, axis=1)
@@ -130,7 +128,7 @@ def _fitted(source: FloatArray, target: FloatArray, seed: int) -> RobustSimilari
 
 
 def _triples(count: int, seed: int):
-    if count <= 14:
+    if comb(count, 3) <= GATES.draws:
         return [np.array(rows) for rows in combinations(range(count), 3)]
     random = np.random.default_rng(seed)
     return [random.choice(count, 3, replace=False) for _ in range(GATES.draws)]
@@ -202,6 +200,3 @@ def upright(found: RobustSimilarity, scene: Scene, target: FloatArray) -> Robust
     old, middle = found.similarity, places.mean(0)
     moved = Similarity(old.scale, turn @ old.rotation, turn @ (old.translation - middle) + middle)
     return RobustSimilarity(moved, found.residuals, found.inliers, found.scatter, True)
-
-
-__all__ = ["GATES", "RobustSimilarity", "SimilarityGates", "robust_similarity", "turn_between", "upright"]

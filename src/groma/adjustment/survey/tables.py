@@ -17,7 +17,7 @@ from groma.io.survey import ControlFile, Places
 from groma.scene import CameraPositions, ControlPoints, Marks, Scene
 from groma.scene.survey import CHECK, CONTROL, UNKNOWN, diagonal_covariance
 
-#: Names that a sentence lists at most.
+#: Names that a sentence lists at most (convention: what a sentence can hold).
 _LISTED = 5
 
 
@@ -120,6 +120,3 @@ def listed(names: Sequence[str], kind: str) -> str:
     """Return how many there are, and the first names."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return f"{counted(len(names), kind)}, {', '.join(names[:_LISTED])}{more}"
-
-
-__all__ = ["control_tables", "listed", "position_table", "sigma_of", "tell_unknown"]

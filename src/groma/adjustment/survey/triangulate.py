@@ -20,7 +20,7 @@ from groma.scene import Marks, Scene
 
 #: Rays farther from a point than this angle (radians) do not agree with it.
 _ANGLE = 0.01
-#: Pairs of marks that are tried at most.
+#: Pairs of marks that are tried at most (cost: time).
 _PAIRS = 200
 
 
@@ -79,6 +79,3 @@ def _nearest(centers: FloatArray, rays: FloatArray) -> FloatArray | None:
 def _angles(point: FloatArray, centers: FloatArray, rays: FloatArray) -> FloatArray:
     away = unit(point - centers)
     return np.arctan2(np.linalg.norm(np.cross(away, rays), axis=1), np.einsum("ni,ni->n", away, rays))
-
-
-__all__ = ["rays_of", "triangulated"]

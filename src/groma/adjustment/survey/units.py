@@ -111,6 +111,3 @@ def _fitting(source: FloatArray, target: FloatArray) -> int:
 def _rms(fit: RobustSimilarity, stretch: FloatArray) -> float:
     """Return the root mean square of the residuals that fit, in the units before their axes were stretched."""
     return float(np.sqrt(np.mean((fit.residuals[fit.inliers] / stretch) ** 2)))
-
-
-__all__ = ["GATES", "UnitGates", "check_lengths", "check_places", "unit_words"]

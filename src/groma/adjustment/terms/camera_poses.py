@@ -47,4 +47,3 @@ def _positions(draft: Draft) -> Iterator[Group]:
 
 POSITIONS = Term("camera positions", ("camera_positions",), (), _positions)
 POSES = Term("camera poses", ("camera_poses",), (), _poses)
-__all__ = ["POSES", "POSITIONS"]

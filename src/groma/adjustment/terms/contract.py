@@ -101,6 +101,3 @@ class Draft:
     def params(self, name: str, image_idx: IntArray) -> FloatArray:
         """Return the parameters (N, K) of the cameras of images, all of one model."""
         return self.scene.cameras.params[self.scene.images.camera_idx[image_idx], : camera_model(name).num_parameters]
-
-
-__all__ = ["Draft", "Group", "Term"]

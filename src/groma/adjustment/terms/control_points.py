@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Control points: their marks in the images, and the coordinates of those that hold the scene.
 
-The marks of check points count, as those of any point: what checks the result are the coordinates.
+The marks of check points count, as those of any point: what checks the result are the coordinates. Marks have the loss
+of what was measured and not that of matches: under one that lets go of what is far, a wrong distance would take a point
+away from all its marks.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ def _marks(draft: Draft) -> Iterator[Group]:
                 pixels=table.pixel[rows],
                 require_in_front=draft.options.require_in_front,
                 sqrt_information=1.0 / table.sigma[rows],
-                loss=draft.options.loss,
+                loss=survey_loss(2),
                 **draft.camera_refs(table.image_idx[rows]),
                 **point_refs(draft, name, table.image_idx[rows], xyz[table.point_idx[rows]], table.pixel[rows]),
             )
@@ -52,4 +54,3 @@ def _control(draft: Draft) -> Iterator[Group]:
 
 MARKS = Term("marks", ("marks",), ("control_points",), _marks)
 CONTROL = Term("control points", ("control_points", "marks"), ("control_points",), _control)
-__all__ = ["CONTROL", "MARKS"]

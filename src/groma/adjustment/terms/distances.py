@@ -27,6 +27,7 @@ def _factors(draft: Draft) -> Iterator[Group]:
                 **refs,
                 distances=table.distance,
                 first_arm=arms_of(scene, first, table.first_idx, table.anchor),
+                is_shortest=table.is_shortest,
                 second_arm=arms_of(scene, second, table.second_idx, table.anchor),
                 sqrt_information=1.0 / table.sigma,
                 loss=survey_loss(1),
@@ -35,4 +36,3 @@ def _factors(draft: Draft) -> Iterator[Group]:
 
 
 TERM = Term("distances", ("distances",), (), _factors)
-__all__ = ["TERM"]

@@ -43,4 +43,3 @@ def _planes(draft: Draft) -> Iterator[Group]:
 
 PLANES = Term("known planes", ("known_planes",), (), _planes)
 DIRECTIONS = Term("known directions", ("known_directions",), (), _directions)
-__all__ = ["DIRECTIONS", "PLANES"]

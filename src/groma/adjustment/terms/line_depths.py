@@ -97,4 +97,3 @@ def _diagonal(values: FloatArray) -> FloatArray:
 
 
 TERM = Term("line depths", ("line_depths",), ("lines",), _factors)
-__all__ = ["TERM"]

@@ -166,4 +166,3 @@ def _nearer(first: FloatArray, second: FloatArray, reach: float) -> tuple[FloatA
 
 
 TERM = Term("line observations", ("line_observations",), ("lines",), _factors)
-__all__ = ["TERM", "line_sigma_px"]

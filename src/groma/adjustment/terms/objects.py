@@ -87,6 +87,3 @@ def with_held_states(before: Problem, after: Problem, moved: IntArray) -> tuple[
     if not states:
         return after, moved
     return after.with_states(states), np.setdiff1d(moved, rows.get("lines", np.zeros(0, np.int64)))
-
-
-__all__ = ["GROUPS", "SLOTS", "arms_of", "name_of", "ref_of", "rows_by_kind", "with_held", "with_held_states"]

@@ -17,7 +17,7 @@ from groma._typing import BoolArray, FloatArray
 from groma.geometry.charts.pose_charts import POSE_CHARTS
 from groma.problem.gauge import gauge_directions
 from groma.scene import Scene
-from groma.scene.survey import Kind
+from groma.scene.survey import Kind, accepted
 
 #: Singular values below this fraction of the largest do not count.
 _RANK = 1e-6
@@ -37,10 +37,7 @@ def coordinates_to_hold(scene: Scene, usable: BoolArray) -> BoolArray:
     centers = scene.cam_centers_in_world
     middle = centers.mean(axis=0)
     length = float(np.median(np.linalg.norm(centers - middle, axis=1))) or 1.0
-    told = _told(scene, middle, length)
-    _, values, vectors = np.linalg.svd(told)
-    size = np.append(values, np.zeros(7 - len(values)))
-    motions = vectors[size <= _RANK * max(float(size.max(initial=0.0)), 1.0)].T
+    motions = _open(_told(scene, middle, length))
     held = np.zeros((len(frames), 6), bool)
     if motions.shape[1]:
         from scipy.linalg import qr  # takes a quarter of a second to import
@@ -51,6 +48,21 @@ def coordinates_to_hold(scene: Scene, usable: BoolArray) -> BoolArray:
         found: Any = qr(moved.reshape(-1, motions.shape[1]).T, mode="r", pivoting=True)
         held.reshape(-1)[found[-1][: motions.shape[1]]] = True
     return held
+
+
+def num_open_motions(scene: Scene) -> int:
+    """Return how many of the seven motions the measurements of a scene leave open."""
+    centers = scene.cam_centers_in_world
+    middle = centers.mean(axis=0)
+    length = float(np.median(np.linalg.norm(centers - middle, axis=1))) or 1.0
+    return _open(_told(accepted(scene), middle, length)).shape[1]
+
+
+def _open(told: FloatArray) -> FloatArray:
+    """Return the motions (7, k) that none of the rows (n, 7) notices."""
+    _, values, vectors = np.linalg.svd(told)
+    size = np.append(values, np.zeros(7 - len(values)))
+    return vectors[size <= _RANK * max(float(size.max(initial=0.0)), 1.0)].T
 
 
 def _told(scene: Scene, middle: FloatArray, length: float) -> FloatArray:
@@ -83,6 +95,3 @@ def _of_places(q: FloatArray) -> FloatArray:
     moved[:, :, :3], moved[:, :, 6] = np.eye(3), q
     moved[:, [0, 1, 2], [4, 5, 3]], moved[:, [1, 2, 0], [3, 4, 5]] = q[:, [2, 0, 1]], -q[:, [2, 0, 1]]
     return moved
-
-
-__all__ = ["coordinates_to_hold"]

@@ -63,4 +63,3 @@ def _residual_of_errors(poses: FloatArray, measured: PlaneObservation) -> FloatA
 
 
 TERM = Term("plane observations", ("plane_observations",), ("planes",), _factors)
-__all__ = ["TERM"]

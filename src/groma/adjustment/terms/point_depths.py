@@ -24,4 +24,3 @@ def _factors(draft: Draft) -> Iterator[Group]:
 
 
 TERM = Term("point depths", ("point_depths",), ("points",), _factors)
-__all__ = ["TERM"]

@@ -55,4 +55,3 @@ def _in_front(draft: Draft) -> BoolArray:
 
 
 TERM = Term("point observations", ("point_observations",), ("points",), _factors)
-__all__ = ["TERM"]

@@ -24,4 +24,3 @@ def _factors(draft: Draft) -> Iterator[Group]:
 
 
 TERM = Term("pose priors", ("pose_priors",), (), _factors)
-__all__ = ["TERM"]

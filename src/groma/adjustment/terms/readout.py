@@ -146,6 +146,3 @@ def _refs(
     row = np.full(scene.num_images, len(table))
     row[table.image_idx] = np.arange(len(table))
     return {"motion": Ref(MOTIONS, row[image_idx]), "offsets": np.stack(offsets, axis=1)}
-
-
-__all__ = ["GATES", "MOTIONS", "ReadoutGates", "line_refs", "motion_of", "offsets_of", "point_refs"]

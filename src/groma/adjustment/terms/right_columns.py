@@ -127,4 +127,3 @@ def _turned(draft: Draft, usable: IntArray, observation: IntArray, prior: RightT
 
 
 TERM = Term("right columns", ("right_columns",), ("points",), _factors)
-__all__ = ["RIGHT_CAMERAS", "TERM", "measured_in_pairs"]

@@ -37,6 +37,3 @@ def survey_loss(coordinates: int) -> Huber:
 def root_information(covariance: FloatArray) -> FloatArray:
     """Return square roots U (N, 3, 3) of the inverses of covariances, U^T U = C^-1."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
-
-
-__all__ = ["GATES", "SurveyGates", "root_information", "survey_loss"]

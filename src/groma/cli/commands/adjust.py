@@ -9,6 +9,7 @@ import typer
 from groma.cli.shared import command as _complete
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 from groma.errors import InputError, did_you_mean
 
 LineResidual = Literal["endpoints", "bearing", "normal"]
@@ -28,183 +29,137 @@ def _check_linear_solver(name: str) -> None:
 
 
 def adjust(
+    console: Console,
     source: _options.Input,
     output: Annotated[
         Path | None,
-        typer.Option(
+        _options.PLAIN.option(
+            "Result: a folder (COLMAP model and structures), a groma archive (.npz) or a BAL file (.txt, .bz2, "
+            ".gz). Without it nothing but the report is written.",
             "--output",
             "-o",
             metavar="OUT",
-            help="Result: a folder (COLMAP model and structures), a groma archive (.npz) or a BAL file (.txt, .bz2, "
-            ".gz). Without it nothing but the report is written.",
         ),
     ] = None,
     loss: Annotated[
         str,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.LOSSES),
+        _options.ADJUSTMENT.option(
+            "auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron, truncated, or one of an installed "
+            "package. auto: robust (Cauchy, then Geman-McClure) for what comes from matching, none for BAL files.",
+            choices=_complete.LOSSES,
             metavar="NAME",
-            help="auto, none, huber, soft_l1, cauchy, tukey, geman_mcclure, barron, truncated, or one of an installed "
-            "package. auto: robust "
-            "(Cauchy, then Geman-McClure) for what comes from matching, none for BAL files.",
-            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = "auto",
     loss_scale: Annotated[
         float | None,
-        typer.Option(
-            metavar="S",
-            help="Scale of the loss, in units of the noise (pixels for images). Default: 1.",
-            rich_help_panel=_options.ADJUSTMENT,
+        _options.ADJUSTMENT.option(
+            "Scale of the loss, in units of the noise (pixels for images). Default: 1.", metavar="S"
         ),
     ] = None,
     camera_model: Annotated[
         str | None,
-        typer.Option(
-            "--camera-model",
-            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
+        _options.CAMERAS.option(
+            "Change the lens model of all cameras first (PINHOLE to OPENCV, ...); what it adds starts at 0 and is"
+            " estimated.",
+            choices=_complete.CAMERA_MODELS,
             metavar="NAME",
-            help="Change the lens model of all cameras first (PINHOLE to OPENCV, ...); what it adds starts at 0 and is "
-            "estimated.",
-            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     refine_intrinsics: Annotated[
         bool | None,
-        typer.Option(
+        _options.CAMERAS.option(
+            "Estimate the calibration too. Default: for BAL files and with --camera-model.",
             "--refine-intrinsics/--fix-intrinsics",
-            help="Estimate the calibration too. Default: for BAL files and with --camera-model.",
-            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     refine_principal_point: Annotated[
-        bool,
-        typer.Option(
-            "--refine-principal-point",
-            help="With the intrinsics: principal points too.",
-            rich_help_panel=_options.CAMERAS,
-        ),
+        bool, _options.CAMERAS.option("With the intrinsics: principal points too.", "--refine-principal-point")
     ] = False,
     refine_rigs: Annotated[
-        bool,
-        typer.Option(
-            "--refine-rigs", help="Estimate where the cameras sit on their rig.", rich_help_panel=_options.CAMERAS
-        ),
+        bool, _options.CAMERAS.option("Estimate where the cameras sit on their rig.", "--refine-rigs")
     ] = False,
     rolling_shutter: _options.RollingShutter = None,
-    points: Annotated[
-        bool, typer.Option("--points/--no-points", help="Use points.", rich_help_panel=_options.ADJUSTMENT)
-    ] = True,
-    lines: Annotated[
-        bool, typer.Option("--lines/--no-lines", help="Use lines.", rich_help_panel=_options.ADJUSTMENT)
-    ] = True,
-    planes: Annotated[
-        bool, typer.Option("--planes/--no-planes", help="Use planes.", rich_help_panel=_options.ADJUSTMENT)
-    ] = True,
+    points: Annotated[bool, _options.ADJUSTMENT.option("Use points.", "--points/--no-points")] = True,
+    lines: Annotated[bool, _options.ADJUSTMENT.option("Use lines.", "--lines/--no-lines")] = True,
+    planes: Annotated[bool, _options.ADJUSTMENT.option("Use planes.", "--planes/--no-planes")] = True,
     max_iterations: Annotated[
         int | None,
-        typer.Option(
-            min=0,
-            metavar="N",
-            help="Stop after N steps. Default: 50, for pose graphs 100.",
-            rich_help_panel=_options.ADJUSTMENT,
-        ),
+        _options.ADJUSTMENT.option("Stop after N steps. Default: 50, for pose graphs 100.", min=0, metavar="N"),
     ] = None,
     linear_solver: Annotated[
         str,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.LINEAR_SOLVERS),
+        _options.ADJUSTMENT.option(
+            "How each step is solved: auto, dense, sparse, pcg, or a solver of an installed package.",
+            choices=_complete.LINEAR_SOLVERS,
             metavar="NAME",
-            help="How each step is solved: auto, dense, sparse, pcg, or a solver of an installed package.",
-            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = "auto",
     line_chart: Annotated[
         str | None,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.LINE_CHARTS),
-            metavar="NAME",
-            help="Line parametrisation: cartesian (default), orthonormal_left, orthonormal_right, free_left, "
+        _options.ADJUSTMENT.option(
+            "Line parametrisation: cartesian (default), orthonormal_left, orthonormal_right, free_left, "
             "free_right, or one of an installed package.",
-            rich_help_panel=_options.ADJUSTMENT,
+            choices=_complete.LINE_CHARTS,
+            metavar="NAME",
         ),
     ] = None,
     line_residual: Annotated[
         LineResidual,
-        typer.Option(
-            help="How segments are compared with lines: endpoints, distances in the image; bearing, angles of rays; "
-            "normal, the plane through camera and segment, also against the ray to the line's anchor.",
-            rich_help_panel=_options.ADJUSTMENT,
+        _options.ADJUSTMENT.option(
+            "How segments are compared with lines: endpoints, distances in the image; bearing, angles of rays; "
+            "normal, the plane through camera and segment, also against the ray to the line's anchor."
         ),
     ] = "endpoints",
     plane_residual: Annotated[
         PlaneResidual,
-        typer.Option(
-            help="How measured planes are compared: normal_offset, in the camera; quaternion, in the world.",
-            rich_help_panel=_options.ADJUSTMENT,
+        _options.ADJUSTMENT.option(
+            "How measured planes are compared: normal_offset, in the camera; quaternion, in the world."
         ),
     ] = "normal_offset",
     gauge: Annotated[
         str | None,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.GAUGES),
+        _options.ADJUSTMENT.option(
+            "free; first_camera, to hold the first camera and the scale; or auto (default): free, unless "
+            "distances between landmarks are in scene units.",
+            choices=_complete.GAUGES,
             metavar="NAME",
-            help="free; first_camera, to hold the first camera and the scale; or auto (default): free, unless distances"
-            " between landmarks are in scene units.",
-            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = None,
     page: Annotated[
-        Path | None,
-        typer.Option(
-            "--report",
-            metavar="FILE",
-            help="Also write an HTML page: before and after.",
-            rich_help_panel=_options.RESULTS,
-        ),
+        Path | None, _options.RESULTS.option("Also write an HTML page: before and after.", "--report", metavar="FILE")
     ] = None,
     covariance: Annotated[
         Path | None,
-        typer.Option(
-            "--covariance",
-            metavar="FILE",
-            help="Also write how certain the result is: covariances (.npz) or standard deviations (.json) of images, "
+        _options.RESULTS.option(
+            "Also write how certain the result is: covariances (.npz) or standard deviations (.json) of images, "
             "points, lines, planes and directions.",
-            rich_help_panel=_options.RESULTS,
+            metavar="FILE",
         ),
     ] = None,
     covariance_gauge: Annotated[
         CovarianceGauge,
-        typer.Option(
-            "--covariance-gauge",
-            help="What it refers to: inner, all camera centres together; held, the first camera and the scale.",
-            rich_help_panel=_options.RESULTS,
+        _options.RESULTS.option(
+            "What it refers to: inner, all camera centres together; held, the first camera and the scale."
         ),
     ] = "auto",
     sigma0: Annotated[
         float,
-        typer.Option(
-            "--sigma0",
-            metavar="S",
-            help="With --covariance: the noise of the measurements in units of that stated (1 pixel unless the scene "
+        _options.RESULTS.option(
+            "With --covariance: the noise of the measurements in units of that stated (1 pixel unless the scene "
             "says otherwise).",
-            rich_help_panel=_options.RESULTS,
+            metavar="S",
         ),
     ] = 1.0,
     diagnosis: Annotated[
         bool | None,
-        typer.Option(
-            "--diagnosis/--no-diagnosis",
-            help="Say what the data do not determine. Default: yes up to 300 images.",
-            rich_help_panel=_options.RESULTS,
+        _options.RESULTS.option(
+            "Say what the data do not determine. Default: yes up to 300 images.", "--diagnosis/--no-diagnosis"
         ),
     ] = None,
     keep: Annotated[
         Keep,
-        typer.Option(
-            "--keep",
-            help="With a folder of parts: keep them in memory from one step to the next; auto: where they fit.",
-            rich_help_panel=_options.ADJUSTMENT,
+        _options.ADJUSTMENT.option(
+            "With a folder of parts: keep them in memory from one step to the next; auto: where they fit."
         ),
     ] = "auto",
     positions: _measured.Positions = None,
@@ -225,21 +180,15 @@ def adjust(
     crs: _measured.Crs = None,
     protocol: Annotated[
         Path | None,
-        typer.Option(
-            "--protocol",
+        _measured.PANEL.option(
+            "Also write the measurements with residuals, redundancy and tests, as text (adjustment.txt).",
             metavar="FILE",
-            help="Also write the measurements with residuals, redundancy and tests, as text (adjustment.txt).",
-            rich_help_panel=_measured.PANEL,
         ),
     ] = None,
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
     seed: _options.NoSeed = 0,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Adjust cameras, points, lines and planes together (bundle adjustment).
 
@@ -250,18 +199,16 @@ def adjust(
     """
     from groma.cli.shared import output as _output
     from groma.cli.shared.adjusting import Wanted, adjust_and_write
-    from groma.cli.shared.console import Console
     from groma.cli.shared.input import check_inputs, refuse_idle
     from groma.cli.shared.parts import PartsWanted, adjust_parts_and_write, has_company, is_parts
     from groma.cli.shared.pose_graph import adjust_graph_and_write, is_pose_graph
 
     if linear_solver != "auto":
         _check_linear_solver(linear_solver)
-    console = Console(quiet, verbose, json_target, threads)
     measured = _measured.given(locals())
     in_parts = has_company() or is_parts(source)
     if not in_parts:
-        _output.check_outputs(force, output, page, covariance, protocol, json_target=json_target)
+        _output.check_outputs(force, output, page, covariance, protocol, json_target=console.json_target)
     if covariance is not None and covariance.suffix not in (".npz", ".json"):
         raise InputError(f"--covariance must end in .npz or .json; got {covariance}.")
     if not 0.0 < sigma0 < float("inf"):
@@ -283,10 +230,10 @@ def adjust(
         }  # fmt: skip
         graph_options = _chosen(
             loss="none" if loss == "auto" else loss, loss_scale=loss_scale, linear_solver=linear_solver,
-            max_iterations=max_iterations, threads=threads,
+            max_iterations=max_iterations, threads=console.threads,
         )  # fmt: skip
         numbers = adjust_graph_and_write(source, output, console, force, graph_options, refused)
-        _output.write_json(json_target, numbers, force)
+        _output.write_json(console.json_target, numbers, force)
         return
 
     from groma.adjustment.adjust import AdjustOptions
@@ -295,14 +242,14 @@ def adjust(
         loss=loss, loss_scale=loss_scale, camera_model=camera_model, refine_intrinsics=refine_intrinsics,
         refine_principal_point=refine_principal_point, refine_rigs=refine_rigs, points=points, lines=lines,
         planes=planes, max_iterations=max_iterations, linear_solver=linear_solver, line_chart=line_chart, gauge=gauge,
-        line_residual=line_residual, plane_residual=plane_residual, threads=threads,
+        line_residual=line_residual, plane_residual=plane_residual, threads=console.threads,
     ))  # fmt: skip
     if in_parts:
         refused = {
             "--report": page, "--covariance": covariance, "--contributions": contributions, "--diagnosis": diagnosis,
             "--camera-model": camera_model, "--rolling-shutter": rolling_shutter, **measured.given,
         }  # fmt: skip
-        adjust_parts_and_write(source, console, options, PartsWanted(output, json_target, force, keep), refused)
+        adjust_parts_and_write(source, console, options, PartsWanted(output, console.json_target, force, keep), refused)
         return
     wanted = Wanted(
         output,
@@ -313,7 +260,7 @@ def adjust(
         diagnosis,
         contributions,
         truth,
-        json_target,
+        console.json_target,
         force,
         measured,
         protocol,

@@ -8,34 +8,31 @@ import typer
 
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 from groma.errors import InputError
 
 if TYPE_CHECKING:
     from groma.adjustment.survey.align import Alignment
-    from groma.cli.shared.console import Console
 
-#: Places with the largest residuals that are told.
+#: Places with the largest residuals that are told (convention: what a table on a screen can hold).
 _TOLD = 5
 
 
 def align(
+    console: Console,
     source: _options.Input,
     reference: Annotated[
         Path | None,
         typer.Argument(metavar="[REFERENCE]", help="A scene with images of the same names, of any format."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="OUT", help="Folder or file for the moved scene.")
+        Path | None, _options.PLAIN.option("Folder or file for the moved scene.", "--output", "-o", metavar="OUT")
     ] = None,
     positions: _measured.Positions = None,
     control: _measured.Control = None,
     crs: _measured.Crs = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
     seed: _options.NoSeed = 0,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Bring a scene into the frame of a reference by a similarity, which ignores gross errors.
 
@@ -43,7 +40,6 @@ def align(
     that take part in an adjustment, pass them to groma adjust or groma map.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
     from groma.cli.shared.input import check_inputs
 
     measured = _measured.Measured(
@@ -52,8 +48,7 @@ def align(
     )  # fmt: skip
     if (reference is None) == (not measured):
         raise InputError("Pass either a REFERENCE scene, or --positions or --control.")
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
+    _output.check_outputs(force, output, json_target=console.json_target)
     check_inputs(source, reference, *measured.files)
 
     from groma.adjustment.survey.align import align as aligned
@@ -71,10 +66,10 @@ def align(
         console.wrote(output)
     else:
         console.say("No -o given: the moved scene was not written.")
-    _output.write_json(json_target, found.to_dict(), force)
+    _output.write_json(console.json_target, found.to_dict(), force)
 
 
-def _say(console: "Console", found: "Alignment") -> None:
+def _say(console: Console, found: "Alignment") -> None:
     import numpy as np
 
     distance = np.linalg.norm(found.residuals, axis=1)

@@ -15,6 +15,7 @@ from groma.errors import InputError
 
 
 def convert(
+    console: Console,
     source: _options.Input,
     target: Annotated[
         Path,
@@ -27,30 +28,24 @@ def convert(
     ],
     parts: Annotated[
         bool,
-        typer.Option(
-            "--parts",
-            help="Cut the scene into parts in the folder OUTPUT, which groma adjust adjusts one by one, or by many "
+        _options.PLAIN.option(
+            "Cut the scene into parts in the folder OUTPUT, which groma adjust adjusts one by one, or by many "
             "processes together.",
+            "--parts",
         ),
     ] = False,
     part_size: Annotated[
-        int | None,
-        typer.Option("--part-size", min=1, metavar="N", help="With --parts: observations of a part. Default: 1000000."),
+        int | None, _options.PLAIN.option("With --parts: observations of a part. Default: 1000000.", min=1, metavar="N")
     ] = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Read a scene and write it in another format, or cut it into parts; a folder of parts is joined to one scene."""
-    console = Console(quiet, verbose, json_target, threads)
     if part_size is not None and not parts:
         raise InputError("--part-size is the size of parts. Add --parts, or leave it out.")
-    _output.check_outputs(force, None if parts and force else target, json_target=json_target)
+    _output.check_outputs(force, None if parts and force else target, json_target=console.json_target)
     check_inputs(source)
     numbers = _cut(source, target, console, force, part_size) if parts else _convert(source, target, console, force)
-    _output.write_json(json_target, {"input": str(source), "output": str(target), **numbers}, force)
+    _output.write_json(console.json_target, {"input": str(source), "output": str(target), **numbers}, force)
 
 
 def _convert(source: Path, target: Path, console: Console, force: bool) -> dict[str, Any]:

@@ -4,23 +4,20 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from groma.cli.shared import options as _options
 from groma.cli.shared import output as _output
 from groma.cli.shared.console import Console
 
 
 def demo(
+    console: Console,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR", help="Folder for the results. Default: groma_demo, replaced."),
+        _options.PLAIN.option(
+            "Folder for the results. Default: groma_demo, replaced.", "--output", "-o", metavar="DIR"
+        ),
     ] = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Map 58 real photographs of a filing cabinet: points, lines and planes, adjusted together.
 
@@ -28,10 +25,9 @@ def demo(
     model with the lines and planes beside it (structures/), scene.npz, lines.obj and summary.json, as after groma map.
     The result is compared with poses by motion capture and with the size of the cabinet.
     """
-    console = Console(quiet, verbose, json_target, threads)
     replace, output = force or output is None, output or Path("groma_demo")
     _output.check_outputs(replace, output)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
 
     from groma.cli.shared.diagnosis import try_diagnosis
     from groma.cli.shared.mapping import run_map, say_map, write_map
@@ -43,7 +39,7 @@ def demo(
     folder, work = cabinet.folder(), output.with_name(output.name + ".work")
     images, reference = folder / "images", read_scene(folder / "motion_capture")
     # Blurred frames of a video show few lines, and some of them barely; all are kept to show what there is.
-    options = MapOptions(threads=threads, min_confidence=0.0)
+    options = MapOptions(threads=console.threads, min_confidence=0.0)
     result = run_map(console, images, work, read_scene(folder / "model"), options)
     found = try_diagnosis(result.diagnose, result.scene.num_images, console)
     numbers = result.summary(found) | cabinet.evaluate_cabinet(result.start, result.scene, reference)
@@ -54,4 +50,4 @@ def demo(
         console.say(sentence)
     console.say(f"Open {(output / 'report.html').absolute()} in a browser to walk around it, before and after.")
     console.say("With photographs of your own: groma map IMAGES -o OUT")
-    _output.write_json(json_target, numbers, force)
+    _output.write_json(console.json_target, numbers, force)

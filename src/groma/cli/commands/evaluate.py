@@ -20,17 +20,13 @@ _StepUnit = Literal["frames", "metres", "seconds"]
 
 
 def poses(
+    console: Console,
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to judge.")],
     reference: Annotated[Path, typer.Argument(metavar="REF", help="Scene taken for true.")],
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Compare the camera poses of two scenes after similarity alignment; images are matched by name."""
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
     check_inputs(estimate, reference)
 
     from groma.evaluation.poses import evaluate_poses
@@ -56,20 +52,21 @@ def poses(
         ("pose error within", *(f"{degrees:g}°" for degrees in scores.auc)),
         [["area under curve", *(f"{value:.3f}" for value in scores.auc.values())]],
     )
-    _output.write_json(json_target, scores.to_dict(), force)
+    _output.write_json(console.json_target, scores.to_dict(), force)
 
 
 _Thresholds = Annotated[
     list[float] | None,
-    typer.Option(
+    _options.PLAIN.option(
+        "Distance in units of REF; may be repeated. By default 1, 5 and 10 thousandths of its extent.",
         "--threshold",
         metavar="TAU",
-        help="Distance in units of REF; may be repeated. By default 1, 5 and 10 thousandths of its extent.",
     ),
 ]
 
 
 def lines(
+    console: Console,
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene or line set to judge.")],
     reference: Annotated[
         Path | None,
@@ -82,27 +79,22 @@ def lines(
     threshold: _Thresholds = None,
     silhouettes: Annotated[
         Path | None,
-        typer.Option(
+        _options.PLAIN.option(
+            "Masks of the object, named like the images of EST: how far lines leave them. REF is then optional.",
             metavar="FOLDER",
-            help="Masks of the object, named like the images of EST: how far lines leave them. REF is then optional.",
         ),
     ] = None,
     align: Annotated[
-        bool, typer.Option("--align", help="First align EST to REF by the poses of images in both scenes.")
+        bool, _options.PLAIN.option("First align EST to REF by the poses of images in both scenes.", "--align")
     ] = False,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Compare 3D line segments with a reference: how much of it is covered, how much of the lines is right.
 
     With --silhouettes also, or only, with the silhouettes of the object, into which a true line projects from
     everywhere.
     """
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
     check_inputs(estimate, reference, silhouettes)
     if reference is None and silhouettes is None:
         raise InputError("There is nothing to compare with. Pass a reference, --silhouettes FOLDER, or both.")
@@ -112,7 +104,7 @@ def lines(
         numbers |= _compare_lines(console, estimate, reference, threshold, align)
     if silhouettes is not None:
         numbers["silhouettes"] = _compare_silhouettes(console, estimate, silhouettes)
-    _output.write_json(json_target, numbers, force)
+    _output.write_json(console.json_target, numbers, force)
 
 
 def _compare_lines(
@@ -162,6 +154,7 @@ def _compare_silhouettes(console: Console, estimate: Path, folder: Path) -> dict
 
 
 def planes(
+    console: Console,
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Scene to judge.")],
     reference: Annotated[
         Path,
@@ -169,21 +162,15 @@ def planes(
     ],
     threshold: _Thresholds = None,
     max_angle: Annotated[
-        float, typer.Option("--max-angle", metavar="DEG", help="Largest angle between planes that match.")
+        float, _options.PLAIN.option("Largest angle between planes that match.", metavar="DEG")
     ] = 10.0,
     max_offset: Annotated[
-        float | None,
-        typer.Option("--max-offset", metavar="D", help="Largest offset of planes that match; by default 1 % of REF."),
+        float | None, _options.PLAIN.option("Largest offset of planes that match; by default 1 % of REF.", metavar="D")
     ] = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Compare planes with reference planes (angles and offsets of matches) or with points (share explained)."""
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
     check_inputs(estimate, reference)
 
     from groma.evaluation.planes import evaluate_planes, score_planes_by_points
@@ -208,7 +195,7 @@ def planes(
                 ["offsets, units of the reference", f"{found.offset_mean:.4g}", f"{found.offset_max:.4g}"],
             ]
             console.table(("", "mean", "largest"), rows)
-        _output.write_json(json_target, found.to_dict(), force)
+        _output.write_json(console.json_target, found.to_dict(), force)
         return
     shares = score_planes_by_points(scene.planes.hesse, read_reference(reference).surface_points(), threshold)
     console.say(f"{counted(shares.num_planes, 'planes')}, {counted(shares.num_points, 'points')}")
@@ -216,39 +203,33 @@ def planes(
         [f"{tau:.4g}", _percent(share), f"{shares.inlier_rmse[tau]:.4g}"] for tau, share in shares.inlier_share.items()
     ]
     console.table(("within", "of the points", "rms"), rows)
-    _output.write_json(json_target, shares.to_dict(), force)
+    _output.write_json(console.json_target, shares.to_dict(), force)
 
 
 def trajectory(
+    console: Console,
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory to judge.")],
     reference: Annotated[Path, typer.Argument(metavar="REF", help="Trajectory taken for true.")],
-    format: Annotated[_Format, typer.Option("--format", help="Format of both files; .gz is unpacked.")] = "auto",
-    align: Annotated[_Alignment, typer.Option("--align", help="Alignment of EST to REF; sim3 for monocular.")] = "se3",
+    format: Annotated[_Format, _options.PLAIN.option("Format of both files; .gz is unpacked.")] = "auto",
+    align: Annotated[_Alignment, _options.PLAIN.option("Alignment of EST to REF; sim3 for monocular.")] = "se3",
     max_time_difference: Annotated[
-        float, typer.Option("--max-time-difference", metavar="S", help="Largest difference of associated times, s.")
+        float, _options.PLAIN.option("Largest difference of associated times, s.", metavar="S")
     ] = 0.01,
     times: Annotated[
         Path | None,
-        typer.Option(
-            "--times",
-            metavar="FILE",
-            help="Times of a REF without any (KITTI), one a line; by default times.txt beside it.",
+        _options.PLAIN.option(
+            "Times of a REF without any (KITTI), one a line; by default times.txt beside it.", metavar="FILE"
         ),
     ] = None,
-    rpe_delta: Annotated[float, typer.Option("--rpe-delta", metavar="D", help="Step of the relative errors.")] = 1.0,
-    rpe_unit: Annotated[_StepUnit, typer.Option("--rpe-unit", help="Unit of the step.")] = "frames",
+    rpe_delta: Annotated[float, _options.PLAIN.option("Step of the relative errors.", metavar="D")] = 1.0,
+    rpe_unit: Annotated[_StepUnit, _options.PLAIN.option("Unit of the step.")] = "frames",
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Compare a trajectory with a reference: absolute and relative errors, and drift; poses are matched by time.
 
     Two files of equal length of which one has no times (KITTI) are matched by line.
     """
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
     check_inputs(estimate, reference)
 
     from groma.evaluation.trajectory import Spread, counts_lines, score_trajectory
@@ -300,7 +281,9 @@ def trajectory(
             f"Drift {scores.drift_percent:.4g} % and {scores.drift_deg_per_metre:.4g} deg/m, mean over segments of "
             f"{scores.segment_lengths[0]:.4g} to {scores.segment_lengths[-1]:.4g} m."
         )
-    _output.write_json(json_target, scores.to_dict(), force)
+    else:
+        console.say("No drift by length of the way: the camera moved no farther than its positions err.")
+    _output.write_json(console.json_target, scores.to_dict(), force)
 
 
 def _percent(share: float) -> str:

@@ -9,62 +9,58 @@ import typer
 from groma._counted import counted
 from groma.cli.shared import command as _complete
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 
 if TYPE_CHECKING:
-    from groma.cli.shared.console import Console
     from groma.localization.placed import PlacedImage
     from groma.localization.result import LocalizeResult
 
-#: Localised photographs in the table; those that are not are always told.
+#: Localised photographs in the table; those that are not are always told (convention: what a table on a screen can
+#: hold).
 _SHOWN = 12
 _MIN_LENGTH = 15.0
 
 
 def localize(
+    console: Console,
     map_: Annotated[
         Path,
         typer.Argument(metavar="MAP", help="OUT of groma map or groma track, a COLMAP model, or an archive (.npz)."),
     ],
     queries: Annotated[list[Path], typer.Argument(metavar="QUERIES", help="Photographs, and folders of them.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")],
+    output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     images: Annotated[
         Path | None,
-        typer.Option(
-            "--images",
-            metavar="FOLDER",
-            help="The photographs of the map. Needed unless an earlier run described the map.",
+        _options.PLAIN.option(
+            "The photographs of the map. Needed unless an earlier run described the map.", metavar="FOLDER"
         ),
     ] = None,
     calibration: Annotated[
         str,
-        typer.Option(
-            "--calibration",
-            autocompletion=_complete.one_of(*_complete.CALIBRATIONS),
+        _options.PLAIN.option(
+            "Of the queries: map, exif, unknown; or auto, the first of these that fits.",
+            choices=_complete.CALIBRATIONS,
             metavar="SOURCE",
-            help="Of the queries: map, exif, unknown; or auto, the first of these that fits.",
         ),
     ] = "auto",
     camera_model: Annotated[
         str | None,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
+        _options.PLAIN.option(
+            "Lens model of the queries, by COLMAP's name; with its parameters.",
+            choices=_complete.CAMERA_MODELS,
             metavar="NAME",
-            help="Lens model of the queries, by COLMAP's name; with its parameters.",
         ),
     ] = None,
     camera_params: Annotated[
-        str | None, typer.Option(metavar="F,CX,CY,...", help="The parameters, if they are known; they are then kept.")
+        str | None,
+        _options.PLAIN.option("The parameters, if they are known; they are then kept.", metavar="F,CX,CY,..."),
     ] = None,
-    lines: Annotated[bool, typer.Option("--lines/--no-lines", help="Use lines besides points.")] = True,
+    lines: Annotated[bool, _options.PLAIN.option("Use lines besides points.", "--lines/--no-lines")] = True,
     min_length: Annotated[
-        float, typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.")
+        float, _options.PLAIN.option("Shortest line segment, pixels.", min=5.0, metavar="PX")
     ] = _MIN_LENGTH,
     force: _options.Force = False,
-    threads: _options.Threads = None,
     seed: _options.Seed = 0,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Localise photographs in a map.
 
@@ -74,11 +70,9 @@ def localize(
     Finished queries are kept in OUT.work until the end: after an interruption the same command goes on from there.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
     from groma.cli.shared.input import camera_parameters, check_inputs, refuse_idle
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
+    _output.check_outputs(force, output, json_target=console.json_target)
     check_inputs(map_, *queries, images)
     refuse_idle(("--min-length", min_length != _MIN_LENGTH and not lines, "with lines"))
 
@@ -117,10 +111,10 @@ def localize(
     shutil.rmtree(work, ignore_errors=True)
     _say(console, result)
     console.wrote_page(output)
-    _output.write_json(json_target, result.to_dict(), force)
+    _output.write_json(console.json_target, result.to_dict(), force)
 
 
-def _say(console: "Console", result: "LocalizeResult") -> None:
+def _say(console: Console, result: "LocalizeResult") -> None:
     """A row for every photograph, at most a dozen of those that are localised; why the others are not; a count."""
     found = result.queries
     localized = [one for one in found if one.status == "localized"]

@@ -11,11 +11,11 @@ from groma.cli.shared import command as _complete
 from groma.cli.shared import depth as _depth
 from groma.cli.shared import measurements as _measured
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 from groma.cli.shared.ranks import led_by_first_rank
 from groma.errors import InputError
 
 if TYPE_CHECKING:
-    from groma.cli.shared.console import Console
     from groma.io.colmap.rigs import RigDescription
     from groma.mapping.map import MapOptions
     from groma.scene import Scene
@@ -23,170 +23,121 @@ if TYPE_CHECKING:
 
 @led_by_first_rank
 def map_(
+    console: Console,
     images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of photographs, and of folders of them.")],
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="OUT", help="Folder for the results."),
-    ],
+    output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     model: Annotated[
         Path | None,
-        typer.Option(
-            "--model",
-            metavar="MODEL",
-            help="Poses, cameras and points: a COLMAP model, an archive (.npz) or the OUT of a map. Without it they "
+        _options.CAMERAS.option(
+            "Poses, cameras and points: a COLMAP model, an archive (.npz) or the OUT of a map. Without it they "
             "are reconstructed.",
-            rich_help_panel=_options.CAMERAS,
+            metavar="MODEL",
         ),
     ] = None,
     poses: Annotated[
         Path | None,
-        typer.Option(
-            "--poses",
+        _options.CAMERAS.option(
+            "Poses from elsewhere, without points: a model, transforms.json, reconstruction.json, a trajectory "
+            "(TUM, KITTI), a g2o graph, or name x y z qx qy qz qw. Points are found, poses improved, wrong ones "
+            "named.",
             metavar="FILE",
-            help="Poses from elsewhere, without points: a model, transforms.json, reconstruction.json, a trajectory "
-            "(TUM, KITTI), a g2o graph, or name x y z qx qy qz qw. Points are found, poses improved, wrong ones named.",
-            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     extend: Annotated[
         Path | None,
-        typer.Option(
-            "--extend",
-            metavar="MAP",
-            help="Place the photographs in this map, OUT of groma map or a COLMAP model, and map all of both.",
-            rich_help_panel=_options.CAMERAS,
+        _options.CAMERAS.option(
+            "Place the photographs in this map, OUT of groma map or a COLMAP model, and map all of both.", metavar="MAP"
         ),
     ] = None,
     map_images: Annotated[
         Path | None,
-        typer.Option(
-            "--map-images",
-            metavar="FOLDER",
-            help="With --extend: the photographs of MAP, where it does not tell.",
-            rich_help_panel=_options.CAMERAS,
-        ),
+        _options.CAMERAS.option("With --extend: the photographs of MAP, where it does not tell.", metavar="FOLDER"),
     ] = None,
     camera_model: Annotated[
         str | None,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
-            metavar="NAME",
-            help="Lens model, by COLMAP's name. Without --model the one to estimate (SIMPLE_RADIAL); with it the one "
+        _options.CAMERAS.option(
+            "Lens model, by COLMAP's name. Without --model the one to estimate (SIMPLE_RADIAL); with it the one "
             "that its cameras are changed to, and what it adds is estimated.",
-            rich_help_panel=_options.CAMERAS,
+            choices=_complete.CAMERA_MODELS,
+            metavar="NAME",
         ),
     ] = None,
     camera_params: Annotated[
         str | None,
-        typer.Option(
-            metavar="F,CX,CY,...",
-            help="Without --model: the calibration, if it is known; it is then kept.",
-            rich_help_panel=_options.CAMERAS,
+        _options.CAMERAS.option(
+            "Without --model: the calibration, if it is known; it is then kept.", metavar="F,CX,CY,..."
         ),
     ] = None,
     mapper: Annotated[
         str,
-        typer.Option(
-            autocompletion=_complete.one_of(*_complete.MAPPERS),
+        _options.CAMERAS.option(
+            "Without --model and --poses: place cameras incremental(ly) or global(ly).",
+            choices=_complete.MAPPERS,
             metavar="NAME",
-            help="Without --model and --poses: place cameras incremental(ly) or global(ly).",
-            rich_help_panel=_options.CAMERAS,
         ),
     ] = "incremental",
     rig: Annotated[
         Path | None,
-        typer.Option(
-            "--rig",
-            metavar="FILE",
-            help="Images taken at the same moment by cameras fixed to each other: COLMAP's rig_config.json. Found by "
+        _options.CAMERAS.option(
+            "Images taken at the same moment by cameras fixed to each other: COLMAP's rig_config.json. Found by "
             "itself in IMAGES.",
-            rich_help_panel=_options.CAMERAS,
+            metavar="FILE",
         ),
     ] = None,
     refine_rig: Annotated[
-        bool,
-        typer.Option(
-            "--refine-rig/--fix-rig",
-            help="Estimate where the cameras sit on their rig.",
-            rich_help_panel=_options.CAMERAS,
-        ),
+        bool, _options.CAMERAS.option("Estimate where the cameras sit on their rig.", "--refine-rig/--fix-rig")
     ] = False,
     rolling_shutter: _options.RollingShutter = None,
     line_matches: Annotated[
         Path | None,
-        typer.Option(
-            metavar="NPZ",
-            help="Segments and their matches from elsewhere; the documentation has the layout.",
-            rich_help_panel=_options.LANDMARKS,
+        _options.LANDMARKS.option(
+            "Segments and their matches from elsewhere; the documentation has the layout.", metavar="NPZ"
         ),
     ] = None,
     line_detector: _options.LineDetector = "lsd",
     line_matcher: Annotated[
         str | None,
-        typer.Option(
-            "--line-matcher",
-            autocompletion=_complete.one_of(*_complete.MATCHERS),
+        _options.LANDMARKS.option(
+            "Match segments by wide_baseline, flow, or a matcher of an installed package. Default: poses alone.",
+            choices=_complete.MATCHERS,
             metavar="NAME",
-            help="Match segments by wide_baseline, flow, or a matcher of an installed package. Default: poses alone.",
-            rich_help_panel=_options.LANDMARKS,
         ),
     ] = None,
     min_length: Annotated[
-        float,
-        typer.Option(min=5.0, metavar="PX", help="Shortest line segment, pixels.", rich_help_panel=_options.LANDMARKS),
+        float, _options.LANDMARKS.option("Shortest line segment, pixels.", min=5.0, metavar="PX")
     ] = 12.0,
     min_confidence: Annotated[
         float,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            metavar="P",
-            help="Leave out lines less probably right than this; 0 keeps all.",
-            rich_help_panel=_options.LANDMARKS,
+        _options.LANDMARKS.option(
+            "Leave out lines less probably right than this; 0 keeps all.", min=0.0, max=1.0, metavar="P"
         ),
     ] = 0.5,
     planes: Annotated[
-        bool,
-        typer.Option(
-            "--planes/--no-planes", help="Look for planes and directions.", rich_help_panel=_options.LANDMARKS
-        ),
+        bool, _options.LANDMARKS.option("Look for planes and directions.", "--planes/--no-planes")
     ] = True,
     refine_poses: Annotated[
-        bool,
-        typer.Option(
-            "--refine-poses/--fix-poses",
-            help="Move the cameras too, or the landmarks alone.",
-            rich_help_panel=_options.ADJUSTMENT,
-        ),
+        bool, _options.ADJUSTMENT.option("Move the cameras too, or the landmarks alone.", "--refine-poses/--fix-poses")
     ] = True,
     refine_intrinsics: Annotated[
         bool | None,
-        typer.Option(
+        _options.ADJUSTMENT.option(
+            "Estimate the calibration too. Default: where --camera-model changes it.",
             "--refine-intrinsics/--fix-intrinsics",
-            help="Estimate the calibration too. Default: where --camera-model changes it.",
-            rich_help_panel=_options.ADJUSTMENT,
         ),
     ] = None,
     max_iterations: Annotated[
-        int,
-        typer.Option(
-            min=1, metavar="N", help="Stop each adjustment after N steps.", rich_help_panel=_options.ADJUSTMENT
-        ),
+        int, _options.ADJUSTMENT.option("Stop each adjustment after N steps.", min=1, metavar="N")
     ] = 50,
     refine_points: Annotated[
         bool,
-        typer.Option(
-            "--refine-points/--keep-points",
-            help="Measure the points of the model again in the images.",
-            rich_help_panel=_options.ADJUSTMENT,
+        _options.ADJUSTMENT.option(
+            "Measure the points of the model again in the images.", "--refine-points/--keep-points"
         ),
     ] = False,
     diagnosis: Annotated[
         bool | None,
-        typer.Option(
-            "--diagnosis/--no-diagnosis",
-            help="Say what the data do not determine. Default: yes up to 300 images.",
-            rich_help_panel=_options.ADJUSTMENT,
+        _options.ADJUSTMENT.option(
+            "Say what the data do not determine. Default: yes up to 300 images.", "--diagnosis/--no-diagnosis"
         ),
     ] = None,
     positions: _measured.Positions = None,
@@ -210,11 +161,7 @@ def map_(
     contributions: _options.Contributions = False,
     truth: _options.Truth = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
     seed: _options.Seed = 0,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Map photographs: points, lines and planes, adjusted together.
 
@@ -223,12 +170,10 @@ def map_(
     the end: after an interruption the same command goes on from there.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
     from groma.cli.shared.extending import check_extension
     from groma.cli.shared.input import camera_parameters, check_inputs, refuse_idle
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
+    _output.check_outputs(force, output, json_target=console.json_target)
     measured = _measured.given(locals() | {"poses": poses if _has_noise(poses, pose_sigma) else None})
     check_inputs(images, model, poses, rig, line_matches, truth, extend, map_images, depth, *measured.files)
     maps = _depth.depth_maps(depth, depth_scale, relative_depth, images)
@@ -269,7 +214,7 @@ def map_(
         rigs=() if any(given is not None for given in (model, poses, extend)) else _rigs(console, images, rig),
         refine_rigs=refine_rig,
         rolling_shutter=rolling_shutter,
-        threads=threads,
+        threads=console.threads,
         seed=seed,
     )
     start, options = _start(console, images, model, poses, options)
@@ -282,7 +227,7 @@ def map_(
         extended = extend_map(console, extend, images, map_images, output, force, stages)
         photographs, start = extended.folder, extended.scene
     survey = measured.read(photographs, lambda: _names_in(photographs)) if measured else None
-    with work_with(threads):
+    with work_with(console.threads):
         result = run_map(console, photographs, work, start, options, matches, survey, maps)
         if extended is not None and survey is None:
             result = in_world_of(result, extended.map)
@@ -293,7 +238,7 @@ def map_(
     end_queries(output)
     say_map(console, result, numbers)
     console.wrote_page(output)
-    _output.write_json(json_target, numbers, force)
+    _output.write_json(console.json_target, numbers, force)
 
 
 def _names_in(folder: Path) -> list[str]:
@@ -318,7 +263,7 @@ def _check_start(model: Path | None, poses: Path | None, rig: Path | None) -> No
         raise InputError("--rig is for images without a model: a model has its own rigs. Leave it out.")
 
 
-def _rigs(console: "Console", images: Path, path: Path | None) -> "tuple[RigDescription, ...]":
+def _rigs(console: Console, images: Path, path: Path | None) -> "tuple[RigDescription, ...]":
     """Return the rigs of a file, or of the one in the folder of photographs, and say what they hold."""
     from groma.io.colmap.rigs import RIG_FILE, check_rigs, read_rigs
     from groma.mapping.photographs import image_files
@@ -334,7 +279,7 @@ def _rigs(console: "Console", images: Path, path: Path | None) -> "tuple[RigDesc
 
 
 def _start(
-    console: "Console", images: Path, model: Path | None, poses: Path | None, options: "MapOptions"
+    console: Console, images: Path, model: Path | None, poses: Path | None, options: "MapOptions"
 ) -> "tuple[Scene | None, MapOptions]":
     """Return the scene to start from, None where the photographs must do; and options that know its calibration."""
     from groma.io import read_scene

@@ -9,29 +9,27 @@ import typer
 
 from groma._counted import counted
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 
 
 def merge(
+    console: Console,
     first: Annotated[Path, typer.Argument(metavar="A", help="OUT of groma map, or a COLMAP model.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="Another one, of a place that overlaps.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")],
+    output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     first_images: Annotated[
         Path | None,
-        typer.Option("--images-a", metavar="FOLDER", help="The photographs of A, where it does not tell."),
+        _options.PLAIN.option("The photographs of A, where it does not tell.", "--images-a", metavar="FOLDER"),
     ] = None,
     second_images: Annotated[
         Path | None,
-        typer.Option("--images-b", metavar="FOLDER", help="The photographs of B, where it does not tell."),
+        _options.PLAIN.option("The photographs of B, where it does not tell.", "--images-b", metavar="FOLDER"),
     ] = None,
     scale: Annotated[
-        bool, typer.Option("--scale/--no-scale", help="B may have another scale; without, both have the same.")
+        bool, _options.PLAIN.option("B may have another scale; without, both have the same.", "--scale/--no-scale")
     ] = True,
     force: _options.Force = False,
-    threads: _options.Threads = None,
     seed: _options.Seed = 0,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Join two maps of one place.
 
@@ -40,11 +38,9 @@ def merge(
     kept. OUT is that of groma map; OUT.images holds links to the photographs of both.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
     from groma.cli.shared.input import check_inputs
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
+    _output.check_outputs(force, output, json_target=console.json_target)
     check_inputs(first, second, first_images, second_images)
 
     from groma.cli.shared.extending import merge_maps
@@ -52,7 +48,7 @@ def merge(
     from groma.localization.extension import in_world_of
     from groma.mapping.map import MapOptions
 
-    options = MapOptions(threads=threads, seed=seed)
+    options = MapOptions(threads=console.threads, seed=seed)
     stages = stages_of_map(options)
     merged = merge_maps(console, (first, second), (first_images, second_images), scale, output, force, stages)
     work = output.with_name(output.name + ".work")
@@ -68,4 +64,4 @@ def merge(
     if kept:
         console.say(f"{counted(kept, 'lines')} of the two maps, not found anew, are kept as their images show them.")
     console.wrote_page(output)
-    _output.write_json(json_target, numbers, force)
+    _output.write_json(console.json_target, numbers, force)

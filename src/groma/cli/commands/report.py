@@ -4,48 +4,40 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 
 
 def report(
+    console: Console,
     source: _options.Input,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The HTML file.")] = Path(
+    output: Annotated[Path, _options.PLAIN.option("The HTML file.", "--output", "-o", metavar="FILE")] = Path(
         "report.html"
     ),
     images: Annotated[
-        Path | None,
-        typer.Option("--images", metavar="DIR", help="Folder of the photographs, with what was measured in them."),
+        Path | None, _options.PLAIN.option("Folder of the photographs, with what was measured in them.", metavar="DIR")
     ] = None,
     before: Annotated[
-        Path | None, typer.Option(metavar="SCENE", help="The same scene before adjustment, to compare with.")
+        Path | None, _options.PLAIN.option("The same scene before adjustment, to compare with.", metavar="SCENE")
     ] = None,
     covariance: Annotated[
         Path | None,
-        typer.Option(
-            "--covariance",
-            metavar="FILE",
-            help="Arrays of groma adjust --covariance FILE.npz: lengths and angles measured on the page get standard "
+        _options.PLAIN.option(
+            "Arrays of groma adjust --covariance FILE.npz: lengths and angles measured on the page get standard "
             "deviations.",
+            metavar="FILE",
         ),
     ] = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Write a self-contained HTML page of a scene: 3D view, photographs, residuals, numbers. It needs no network.
 
     For the folder of a finished map the page also says how the adjustment went and what became of the segments.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
     from groma.cli.shared.input import check_inputs, whole_scene
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target, file=True)
+    _output.check_outputs(force, output, json_target=console.json_target, file=True)
     check_inputs(source, images, before, covariance)
 
     from groma.errors import InputError
@@ -69,4 +61,4 @@ def report(
         contents = PageContents(**told, covariances=found)
         write_report(draft, earlier, scene, saved, images, source.absolute().name, contents)
     console.wrote(output)
-    _output.write_json(json_target, {"output": str(output), **counts_of(scene)}, force)
+    _output.write_json(console.json_target, {"output": str(output), **counts_of(scene)}, force)

@@ -2,38 +2,35 @@
 """``groma selfcheck``: every derivative, and the covariances, checked on this machine."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from groma._counted import counted
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 from groma.errors import InputError
-
-if TYPE_CHECKING:
-    from groma.cli.shared.console import Console
 
 _RUNS = 100
 
 
 def selfcheck(
+    console: Console,
     golden: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder of reference values (*.json) to compare with as well."),
+        _options.PLAIN.option("Folder of reference values (*.json) to compare with as well.", metavar="DIR"),
     ] = None,
     nees: Annotated[
         bool,
-        typer.Option("--nees", help="Check covariances instead: errors of simulated scenes against what they predict."),
+        _options.PLAIN.option(
+            "Check covariances instead: errors of simulated scenes against what they predict.", "--nees"
+        ),
     ] = False,
     runs: Annotated[
-        int, typer.Option(min=2, metavar="N", help="Scenes simulated with --nees, for either gauge.")
+        int, _options.PLAIN.option("Scenes simulated with --nees, for either gauge.", min=2, metavar="N")
     ] = _RUNS,
     seed: _options.Seed = 0,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Compare the analytic derivatives of every factor with numeric ones, and with reference values.
 
@@ -42,11 +39,9 @@ def selfcheck(
     something is too large.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
     from groma.cli.shared.input import refuse_idle
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
     refuse_idle(
         ("--runs", runs != _RUNS and not nees, "with --nees"),
         ("--golden", golden is not None and nees, "without --nees"),
@@ -55,12 +50,12 @@ def selfcheck(
         raise InputError(f"--golden must be a folder of reference values; there is none at {golden}. Check the path.")
     console.expect_compilation("selfcheck")
     passed, numbers = _check_covariances(console, runs, seed) if nees else _check_derivatives(console, golden, seed)
-    _output.write_json(json_target, numbers, force)
+    _output.write_json(console.json_target, numbers, force)
     if not passed:
         raise typer.Exit(1)
 
 
-def _check_derivatives(console: "Console", golden: Path | None, seed: int) -> tuple[bool, dict[str, Any]]:
+def _check_derivatives(console: Console, golden: Path | None, seed: int) -> tuple[bool, dict[str, Any]]:
     from groma.factors import selfcheck as run_selfcheck
 
     outcome = run_selfcheck(golden, seed)
@@ -73,7 +68,7 @@ def _check_derivatives(console: "Console", golden: Path | None, seed: int) -> tu
     return outcome.passed, outcome.to_dict()
 
 
-def _check_covariances(console: "Console", runs: int, seed: int) -> tuple[bool, dict[str, Any]]:
+def _check_covariances(console: Console, runs: int, seed: int) -> tuple[bool, dict[str, Any]]:
     from groma.adjustment.consistency import ConsistencyReport, consistency
     from groma.localization.pose.consistency import localization_consistency
 

@@ -4,32 +4,32 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
-
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 
 Kind = Literal["holistic", "corridor"]
 
 
 def synth(
+    console: Console,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for truth.npz and start.npz (made anew).")
+        Path, _options.PLAIN.option("Folder for truth.npz and start.npz (made anew).", "--output", "-o", metavar="OUT")
     ],
     kind: Annotated[
         Kind,
-        typer.Option(help="holistic: cameras on a sphere look into a cube of points, lines, planes. corridor: a walk."),
+        _options.PLAIN.option(
+            "holistic: cameras on a sphere look into a cube of points, lines, planes. corridor: a walk."
+        ),
     ] = "holistic",
-    cameras: Annotated[int, typer.Option("--cameras", "-n", min=2, metavar="N", help="Number of cameras.")] = 50,
+    cameras: Annotated[int, _options.PLAIN.option("Number of cameras.", "--cameras", "-n", min=2, metavar="N")] = 50,
     noise: Annotated[
         float | None,
-        typer.Option(min=0.0, metavar="PX", help="Noise of the measurements, pixels. Default: 1; in a corridor 0.5."),
+        _options.PLAIN.option(
+            "Noise of the measurements, pixels. Default: 1; in a corridor 0.5.", min=0.0, metavar="PX"
+        ),
     ] = None,
     seed: _options.Seed = 0,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Make a scene of points, lines and planes whose exact truth is known.
 
@@ -37,10 +37,8 @@ def synth(
     landmarks, as an adjustment would meet it.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
+    _output.check_outputs(force, output, json_target=console.json_target)
 
     from groma.io import write_scene
     from groma.scene import synthetic
@@ -54,5 +52,5 @@ def synth(
         write_scene(made.start, draft / "start.npz")
     console.wrote(f"{output / 'truth.npz'} and {output / 'start.npz'}: {sentence_of(made.truth)}")
     _output.write_json(
-        json_target, {"kind": kind, "seed": seed, "noise_px": made.noise_px, **counts_of(made.truth)}, force
+        console.json_target, {"kind": kind, "seed": seed, "noise_px": made.noise_px, **counts_of(made.truth)}, force
     )

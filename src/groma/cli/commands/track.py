@@ -2,109 +2,77 @@
 """``groma track``: follow a camera through a sequence, and map points, lines and planes on the way."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import typer
 
 from groma.cli.shared import command as _complete
 from groma.cli.shared import options as _options
-
-if TYPE_CHECKING:
-    from groma.cli.shared.console import Console
+from groma.cli.shared.console import Console
 
 #: As :func:`groma.tracking.track` names them.
 _STAGES = ("tracking frame", "adjusting all keyframes")
 
 
 def track(
+    console: Console,
     sequence: Annotated[
         Path,
         typer.Argument(
             metavar="SEQUENCE", help="Folder of TUM RGB-D, 7-Scenes, KITTI, EuRoC or plain images; or a video."
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="Folder for the results.")],
+    output: Annotated[Path, _options.PLAIN.option("Folder for the results.", "--output", "-o", metavar="OUT")],
     map_: Annotated[
         Path | None,
-        typer.Option(
-            "--map", metavar="MAP", help="OUT of an earlier track: begin lost in it, go on in its world, and add to it."
+        _options.PLAIN.option(
+            "OUT of an earlier track: begin lost in it, go on in its world, and add to it.", "--map", metavar="MAP"
         ),
     ] = None,
     camera: Annotated[
         str | None,
-        typer.Option(
-            "--camera",
-            metavar="CAMERA",
-            help="Calibration file, or its numbers as OpenCV has them: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: what "
+        _options.CAMERAS.option(
+            "Calibration file, or its numbers as OpenCV has them: fx fy cx cy [k1 k2 p1 p2 [k3]]. Default: what "
             "the sequence says.",
-            rich_help_panel=_options.CAMERAS,
+            metavar="CAMERA",
         ),
     ] = None,
     camera_model: Annotated[
         str | None,
-        typer.Option(
-            "--camera-model",
-            autocompletion=_complete.one_of(*_complete.CAMERA_MODELS),
+        _options.CAMERAS.option(
+            "Lens model, by COLMAP's name; with its parameters, in place of --camera.",
+            choices=_complete.CAMERA_MODELS,
             metavar="NAME",
-            help="Lens model, by COLMAP's name; with its parameters, in place of --camera.",
-            rich_help_panel=_options.CAMERAS,
         ),
     ] = None,
     camera_params: Annotated[
-        str | None,
-        typer.Option(
-            "--camera-params",
-            metavar="F,CX,CY,...",
-            help="The parameters, pixels counted as COLMAP does.",
-            rich_help_panel=_options.CAMERAS,
-        ),
+        str | None, _options.CAMERAS.option("The parameters, pixels counted as COLMAP does.", metavar="F,CX,CY,...")
     ] = None,
     kind: Annotated[
         str | None,
-        typer.Option(
-            "--kind",
-            autocompletion=_complete.one_of(*_complete.SEQUENCES),
-            metavar="KIND",
-            help="rgbd, stereo or mono; told by the files otherwise.",
-            rich_help_panel=_options.CAMERAS,
+        _options.CAMERAS.option(
+            "rgbd, stereo or mono; told by the files otherwise.", choices=_complete.SEQUENCES, metavar="KIND"
         ),
     ] = None,
-    points: Annotated[
-        bool, typer.Option("--points/--no-points", help="Follow points.", rich_help_panel=_options.LANDMARKS)
-    ] = True,
-    lines: Annotated[
-        bool, typer.Option("--lines/--no-lines", help="Follow line segments.", rich_help_panel=_options.LANDMARKS)
-    ] = True,
+    points: Annotated[bool, _options.LANDMARKS.option("Follow points.", "--points/--no-points")] = True,
+    lines: Annotated[bool, _options.LANDMARKS.option("Follow line segments.", "--lines/--no-lines")] = True,
     line_detector: _options.LineDetector = "lsd",
     planes: Annotated[
-        bool,
-        typer.Option(
-            "--planes/--no-planes",
-            help="Find planes in depth images, or in points and lines.",
-            rich_help_panel=_options.LANDMARKS,
-        ),
+        bool, _options.LANDMARKS.option("Find planes in depth images, or in points and lines.", "--planes/--no-planes")
     ] = True,
-    loops: Annotated[bool, typer.Option("--loops/--no-loops", help="Close loops.")] = True,
+    loops: Annotated[bool, _options.PLAIN.option("Close loops.", "--loops/--no-loops")] = True,
     max_frames: Annotated[
-        int | None, typer.Option("--max-frames", min=1, metavar="N", help="Stop after N frames. Default: all.")
+        int | None, _options.PLAIN.option("Stop after N frames. Default: all.", min=1, metavar="N")
     ] = None,
-    stride: Annotated[int, typer.Option("--stride", min=1, metavar="N", help="Take every N-th frame.")] = 1,
-    max_depth: Annotated[
-        float, typer.Option("--max-depth", min=0.1, metavar="M", help="Ignore depths beyond, metres.")
-    ] = 6.0,
+    stride: Annotated[int, _options.PLAIN.option("Take every N-th frame.", min=1, metavar="N")] = 1,
+    max_depth: Annotated[float, _options.PLAIN.option("Ignore depths beyond, metres.", min=0.1, metavar="M")] = 6.0,
     depth_scale: Annotated[
         float | None,
-        typer.Option(
-            "--depth-scale",
-            metavar="S",
-            help="Depth in files per metre. Default: that of the layout (TUM 5000, else 1000).",
+        _options.PLAIN.option(
+            "Depth in files per metre. Default: that of the layout (TUM 5000, else 1000).", metavar="S"
         ),
     ] = None,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Track a camera through a sequence.
 
@@ -114,12 +82,10 @@ def track(
     was lost for long and no place was recognised later, further maps are in OUT/submap_2, submap_3, ...
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
     from groma.cli.shared.input import camera_line, refuse_idle
     from groma.errors import InputError, did_you_mean
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_outputs(force, output, json_target=json_target)
+    _output.check_outputs(force, output, json_target=console.json_target)
     if kind not in (None, *_complete.SEQUENCES):
         raise InputError(f"--kind must be rgbd, stereo or mono; got {kind!r}.{did_you_mean(kind, _complete.SEQUENCES)}")
     line = camera_line(camera_model, camera_params)
@@ -173,10 +139,10 @@ def track(
     numbers = result.summary()
     _say(console, numbers)
     console.wrote_page(output)
-    _output.write_json(json_target, numbers, force)
+    _output.write_json(console.json_target, numbers, force)
 
 
-def _say(console: "Console", numbers: dict[str, Any]) -> None:
+def _say(console: Console, numbers: dict[str, Any]) -> None:
     statuses = [[f"frames {status}", f"{count:,}"] for status, count in sorted(numbers["frames"].items())]
     kinds = ("keyframes", "points", "lines", "planes", "loops")
     console.table(("", "number"), [*statuses, *([kind, f"{numbers[kind]:,}"] for kind in kinds)])
@@ -192,6 +158,9 @@ def _say(console: "Console", numbers: dict[str, Any]) -> None:
             for name, angle, sigma in zip(("pitch", "yaw", "roll"), turn["angles_deg"], turn["sigma_deg"], strict=True)
         )
         console.say(f"The right camera is turned by {angles} degrees; this is taken into account.")
+    if numbers.get("depth_camera", {}).get("used"):
+        offset, sigma = (numbers["depth_camera"][key] for key in ("inverse_offset", "sigma"))
+        console.say(f"Inverse depths are off by {offset:+.4f} ± {sigma:.4f}; this is taken into account.")
     scores = numbers.get("reference", {})
     if "ate_rmse" in scores:
         drift = scores["drift_percent"]

@@ -2,36 +2,32 @@
 """``groma view``: a scene in the browser."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from groma.cli.shared import options as _options
-
-if TYPE_CHECKING:
-    from groma.cli.shared.console import Console
+from groma.cli.shared.console import Console
 
 
 def view(
+    console: Console,
     source: Annotated[Path, typer.Argument(metavar="INPUT", help="Model to look at; with --live the OUT of a track.")],
     images: Annotated[
         Path | None,
-        typer.Option(
-            "--images",
+        _options.PLAIN.option(
+            "Folder of the photographs. Default: the one that groma map noted, or a folder images near INPUT.",
             metavar="DIR",
-            help="Folder of the photographs. Default: the one that groma map noted, or a folder images near INPUT.",
         ),
     ] = None,
     port: Annotated[
-        int, typer.Option("--port", "-p", min=0, max=65535, metavar="N", help="Port, or the next free one; 0: any.")
+        int, _options.PLAIN.option("Port, or the next free one; 0: any.", "--port", "-p", min=0, max=65535, metavar="N")
     ] = 8080,
-    live: Annotated[bool, typer.Option("--live", help="Follow groma track while it runs: INPUT is its OUT.")] = False,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
+    live: Annotated[
+        bool, _options.PLAIN.option("Follow groma track while it runs: INPUT is its OUT.", "--live")
+    ] = False,
+    browser: Annotated[bool, _options.PLAIN.option("Open a browser.", "--browser/--no-browser")] = True,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Look at a scene in the browser: cameras, points, lines, planes. Click a line for its observations.
 
@@ -41,15 +37,13 @@ def view(
     import contextlib
 
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
     from groma.cli.shared.input import check_inputs, refuse_idle, whole_scene
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
 
     refuse_idle(("--images", images is not None and live, "without --live"))
     if live:
-        _follow(source, port, browser, console, json_target, force)
+        _follow(source, port, browser, console, force)
         return
     check_inputs(source, images)
 
@@ -68,14 +62,14 @@ def view(
         if images is not None and shown.num_pictures == 0:
             console.warn(f"{images} holds none of the images of the scene, such as {scene.images.names[0]!r}.")
         console.say(f"Open {address} in a browser. Ctrl-C ends.")
-        _output.write_json(json_target, {"address": address, **counts_of(scene)}, force)
+        _output.write_json(console.json_target, {"address": address, **counts_of(scene)}, force)
         if browser:
             _open_browser(address)
         wait_for_interrupt()
     console.say("\nClosed.")
 
 
-def _follow(output: Path, port: int, browser: bool, console: "Console", json_target: str | None, force: bool) -> None:
+def _follow(output: Path, port: int, browser: bool, console: Console, force: bool) -> None:
     """Serve a running track until Ctrl-C."""
     import contextlib
     import time
@@ -97,7 +91,7 @@ def _follow(output: Path, port: int, browser: bool, console: "Console", json_tar
         address = f"http://localhost:{shown.server.get_port()}"
         console.say(f"Open {address} in a browser. Ctrl-C ends.")
         console.say(sentence(shown.state))
-        _output.write_json(json_target, {"address": address, "state": shown.state}, force)
+        _output.write_json(console.json_target, {"address": address, "state": shown.state}, force)
         if browser:
             _open_browser(address)
         before = shown.state

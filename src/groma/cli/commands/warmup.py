@@ -8,9 +8,11 @@ import typer
 from groma._counted import counted
 from groma.cli.shared import command as _complete
 from groma.cli.shared import options as _options
+from groma.cli.shared.console import Console
 
 
 def warmup(
+    console: Console,
     parts: Annotated[
         list[str] | None,
         typer.Argument(
@@ -19,12 +21,8 @@ def warmup(
             help="What to compile for; everything if left out.",
         ),
     ] = None,
-    again: Annotated[bool, typer.Option("--again", help="Run even if everything is there.")] = False,
+    again: Annotated[bool, _options.PLAIN.option("Run even if everything is there.", "--again")] = False,
     force: _options.Force = False,
-    threads: _options.Threads = None,
-    json_target: _options.Json = None,
-    quiet: _options.Quiet = False,
-    verbose: _options.Verbose = False,
 ) -> None:
     """Compile and keep what groma adjust, groma map and groma track need on this machine.
 
@@ -33,10 +31,8 @@ def warmup(
     after an installation, an upgrade or a change of the processor, and when an image of a machine is built.
     """
     from groma.cli.shared import output as _output
-    from groma.cli.shared.console import Console
 
-    console = Console(quiet, verbose, json_target, threads)
-    _output.check_json(json_target, force)
+    _output.check_json(console.json_target, force)
 
     from groma.compilation.warmup import PARTS, warm_up
 
@@ -47,7 +43,7 @@ def warmup(
         console.say(sentence)
     if numbers["unsaved"]:
         console.warn(f"{counted(numbers['unsaved'], 'functions')} could not be written; is the disk full?")
-    _output.write_json(json_target, numbers, force)
+    _output.write_json(console.json_target, numbers, force)
     if numbers["unsaved"]:
         raise typer.Exit(1)
 

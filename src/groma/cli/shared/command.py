@@ -9,21 +9,43 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, get_args
 
 import typer
 from typer.core import TyperCommand
 
+from groma.cli.shared.console import Console
 from groma.errors import did_you_mean
 
-#: Heading of ``--help`` for what every command takes; options without a heading come first.
-GENERAL = "General"
-NoColor = Annotated[
-    bool,
-    typer.Option(
-        "--no-color", help="Use no colours; so does the environment variable NO_COLOR.", rich_help_panel=GENERAL
-    ),
+
+def one_of(*names: str) -> Callable[[str], Sequence[str]]:
+    """Return a completion by names; parts of installed packages are not among them."""
+    return lambda incomplete: [name for name in names if name.lower().startswith(incomplete.lower())]
+
+
+class Panel(str):
+    """A heading of ``--help``; makes the options under it. Those without a heading come first."""
+
+    def option(self, text: str, *flags: str, choices: Sequence[str] = (), **settings: Any) -> Any:
+        """Declare an option with its help; ``--name`` of the argument unless flags say otherwise."""
+        if choices:
+            settings["autocompletion"] = one_of(*choices)
+        return typer.Option(*flags, help=text, rich_help_panel=self or None, **settings)
+
+
+#: What every command takes, and what stands under no heading.
+GENERAL, PLAIN = Panel("General"), Panel("")
+Json = Annotated[
+    str | None,
+    GENERAL.option("Write a machine-readable report to FILE; '-' is standard output.", "--json", metavar="FILE"),
 ]
+Quiet = Annotated[bool, GENERAL.option("Say nothing but errors.", "--quiet", "-q")]
+Verbose = Annotated[bool, GENERAL.option("Say more.", "--verbose", "-v")]
+Threads = Annotated[
+    int | None,
+    GENERAL.option("Use at most N threads. Default: one per core, where that pays.", "--threads", min=1, metavar="N"),
+]
+NoColor = Annotated[bool, GENERAL.option("Use no colours; so does the environment variable NO_COLOR.", "--no-color")]
 
 
 class Command(TyperCommand):
@@ -60,24 +82,32 @@ def _heading(parameter: Any) -> str:
     return getattr(parameter, "rich_help_panel", None) or default
 
 
+def console_of(
+    threads: Threads = None, json_target: Json = None, quiet: Quiet = False, verbose: Verbose = False,
+    no_color: NoColor = False,
+) -> Console:  # fmt: skip
+    """Return the console that obeys the options that every command takes."""
+    forbid_colours(no_color)
+    return Console(quiet, verbose, json_target, threads)
+
+
 def with_common_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command --no-color, and let the shell complete the files that it takes."""
-    signature = inspect.signature(command)
-    hints = get_type_hints(command, include_extras=True)
-    for name in signature.parameters:
-        kind, *infos = get_args(hints[name]) or (hints[name],)
+    """Give a command a console and the options of :func:`console_of`, and let the shell complete files it takes."""
+    own, common = inspect.signature(command, eval_str=True), inspect.signature(console_of, eval_str=True).parameters
+    for parameter in own.parameters.values():
+        kind, *infos = get_args(parameter.annotation) or (parameter.annotation,)
         if Path in (kind, *get_args(kind)) and infos and infos[0].autocompletion is None:
             infos[0].autocompletion = left_to_shell
 
     @functools.wraps(command)
-    def prepared(*args: Any, no_color: bool = False, **kwargs: Any) -> None:
-        forbid_colours(no_color)
-        command(*args, **kwargs)
+    def prepared(**options: Any) -> None:
+        console = console_of(**{name: options.pop(name) for name in common})
+        command(console=console, **options)
 
-    own = inspect.Parameter("no_color", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=NoColor)
-    parameters = [*(parameter.replace(annotation=hints[parameter.name]) for parameter in signature.parameters.values())]
-    prepared.__signature__ = signature.replace(parameters=[*parameters, own])  # type: ignore[attr-defined]
-    prepared.__annotations__ = {**hints, "no_color": NoColor}
+    parameters = [parameter for name, parameter in own.parameters.items() if name != "console"] + [*common.values()]
+    parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
+    prepared.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    prepared.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return prepared
 
 
@@ -90,11 +120,6 @@ def forbid_colours(wanted: bool) -> None:
 def left_to_shell(incomplete: str) -> list[str]:
     """Complete nothing: shells complete files themselves then."""
     return []
-
-
-def one_of(*names: str) -> Callable[[str], Sequence[str]]:
-    """Return a completion by names; parts of installed packages are not among them."""
-    return lambda incomplete: [name for name in names if name.lower().startswith(incomplete.lower())]
 
 
 #: What options may be given, as far as groma itself has it; tests compare them with the registries, which take a second
@@ -111,5 +136,3 @@ CAMERA_MODELS = (
 DETECTORS, MATCHERS = ["lsd"], ["wide_baseline", "flow"]
 MAPPERS, CALIBRATIONS = ["incremental", "global"], ["auto", "map", "exif", "unknown"]
 SEQUENCES, COMPILED = ["rgbd", "stereo", "mono"], ["adjust", "map", "track"]
-
-__all__ = ["Command", "NoColor", "forbid_colours", "left_to_shell", "one_of", "with_common_options"]

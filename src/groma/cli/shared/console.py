@@ -18,7 +18,10 @@ class Console:
     def __init__(self, quiet: bool, verbose: bool, json_target: str | None, threads: int | None = None) -> None:
         self.quiet = quiet
         self.verbose = verbose and not quiet
-        self._threads = threads
+        #: Where a machine-readable report goes; None for no report.
+        self.json_target = json_target
+        #: The most threads that may be used; None for as many as pay.
+        self.threads = threads
         self._stream = sys.stderr if json_target == "-" else sys.stdout
         self._plan = Plan()
         if threads is not None:
@@ -67,7 +70,7 @@ class Console:
         """
         from groma.compilation import ahead
 
-        ahead.expect(work, self._announce_compilation, self._threads)
+        ahead.expect(work, self._announce_compilation, self.threads)
 
     def _announce_compilation(self) -> None:
         if not self.quiet and is_terminal(sys.stderr):
@@ -102,6 +105,3 @@ def complain(what: str, text: str, style: Style) -> None:
     if is_terminal(sys.stderr):
         line = wrapped(line, terminal_width()).replace(what, paint(what, style, sys.stderr), 1)
     print(line, file=sys.stderr, flush=True)
-
-
-__all__ = ["Console", "complain", "warn"]

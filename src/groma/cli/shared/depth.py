@@ -6,9 +6,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from groma._counted import counted
+from groma.cli.shared.command import Panel
 from groma.cli.shared.input import refuse_idle
 from groma.errors import InputError
 
@@ -16,32 +15,29 @@ if TYPE_CHECKING:
     from groma.cli.shared.console import Console
     from groma.io.depth_maps import DepthMaps
 
-PANEL = "Depth maps"
+PANEL = Panel("Depth maps")
 Depth = Annotated[
     Path | None,
-    typer.Option(
+    PANEL.option(
+        "Depth maps of the photographs, of their names and sizes: 16-bit PNG (millimetres), .npy or .npz "
+        "(metres); they give the map its unit of length.",
         "--depth",
         metavar="FOLDER",
-        help="Depth maps of the photographs, of their names and sizes: 16-bit PNG (millimetres), .npy or .npz "
-        "(metres); they give the map its unit of length.",
-        rich_help_panel=PANEL,
     ),
 ]
 DepthScale = Annotated[
     float | None,
-    typer.Option(
+    PANEL.option(
+        "Numbers in depth maps per metre. Default: 1000 for whole numbers, 1 for fractions.",
         "--depth-scale",
         metavar="S",
-        help="Numbers in depth maps per metre. Default: 1000 for whole numbers, 1 for fractions.",
-        rich_help_panel=PANEL,
     ),
 ]
 RelativeDepth = Annotated[
     bool,
-    typer.Option(
+    PANEL.option(
+        "Each depth map has a scale of its own, as guessed from one photograph; it is estimated.",
         "--relative-depth/--metric-depth",
-        help="Each depth map has a scale of its own, as guessed from one photograph; it is estimated.",
-        rich_help_panel=PANEL,
     ),
 ]
 

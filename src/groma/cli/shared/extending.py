@@ -108,14 +108,3 @@ def _with_progress(console: Console, made: Callable[[Callable[[str, int, int], N
             return made(interruption.checking(stages))
     except KeyboardInterrupt:
         raise typer.Exit(PROCESS.tell(f"{kept}: the same command goes on from there.")) from None
-
-
-__all__ = [
-    "DESCRIBING",
-    "LOCALIZING",
-    "check_extension",
-    "end_queries",
-    "extend_map",
-    "merge_maps",
-    "photograph_folder",
-]

@@ -24,7 +24,7 @@ def guard(command: Callable[P, None]) -> Callable[P, None]:
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
             with warnings.catch_warnings():
-                if not kwargs.get("quiet"):
+                if not getattr(kwargs.get("console"), "quiet", False):
                     warnings.showwarning = _show
                     warnings.simplefilter("always", UserWarning)
                 else:

@@ -100,6 +100,3 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__
-
-
-__all__ = ["INTERRUPTED", "PROCESS", "Interruption", "answer_signals", "ignore_signals", "interruptible"]

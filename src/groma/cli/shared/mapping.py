@@ -41,10 +41,13 @@ def run_map(
 ) -> MapResult:
     """Map a folder of photographs; Ctrl-C ends the command and keeps the finished stages in ``work``."""
     from groma.cli.shared.interrupt import interruptible
+    from groma.compilation.loading import loading
+    from groma.execution import share_memory
     from groma.mapping.checkpoints import check_free, has_stages
     from groma.mapping.map import map_images
 
     check_free(work)
+    share_memory()
     console.expect_compilation("map")
     start: Start = "photographs" if model is None else "model" if model.num_point_observations else "poses"
     console.expect_stages(
@@ -53,7 +56,7 @@ def run_map(
     if has_stages(work):
         console.say(f"Going on from the finished stages in {work}, as far as they fit.")
     try:
-        with interruptible() as interruption, console.stages() as stages:
+        with interruptible() as interruption, console.stages() as stages, loading("map", options.threads):
             return map_images(images, work, model, options, interruption.checking(stages), line_matches, survey, depth)
     except KeyboardInterrupt:
         words = f"finished stages are kept in {work}: the same command goes on from there."

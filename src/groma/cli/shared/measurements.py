@@ -8,161 +8,129 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+from groma.cli.shared.command import Panel
 from groma.errors import InputError
 
 if TYPE_CHECKING:
     from groma.adjustment.survey.given import Survey
     from groma.cli.shared.console import Console
 
-PANEL = "Measurements"
+PANEL = Panel("Measurements")
 #: Residuals so many times as large as stated are told.
 WORSE = 2.0
+#: Wrong measurements that are named.
+_LISTED = 5
 Positions = Annotated[
     str | None,
-    typer.Option(
+    PANEL.option(
+        "Measured camera positions: name, coordinates, standard deviations (CSV, or geo.txt of OpenDroneMap),"
+        " or exif for the GPS of the photographs. The scene is brought into their frame.",
         "--positions",
         metavar="FILE",
-        help="Measured camera positions: name, coordinates, standard deviations (CSV, or geo.txt of OpenDroneMap), or "
-        "exif for the GPS of the photographs. The scene is brought into their frame.",
-        rich_help_panel=PANEL,
     ),
 ]
 PositionSigma = Annotated[
     str | None,
-    typer.Option(
+    PANEL.option(
+        "Standard deviation of positions where the file states none; or horizontal, vertical.",
         "--position-sigma",
         metavar="S[,S[,S]]",
-        help="Standard deviation of positions where the file states none; or horizontal, vertical.",
-        rich_help_panel=PANEL,
     ),
 ]
 Control = Annotated[
     Path | None,
-    typer.Option(
+    PANEL.option(
+        "Control points with their marks in the images: gcp_list.txt of OpenDroneMap, or OpenSfM's "
+        "ground_control_points.json.",
         "--control",
         metavar="FILE",
-        help="Control points with their marks in the images: gcp_list.txt of OpenDroneMap, or OpenSfM's "
-        "ground_control_points.json.",
-        rich_help_panel=PANEL,
     ),
 ]
 ControlSigma = Annotated[
     str | None,
-    typer.Option(
-        "--control-sigma",
-        metavar="S[,S[,S]]",
-        help="Standard deviation of their coordinates; or horizontal, vertical.",
-        rich_help_panel=PANEL,
+    PANEL.option(
+        "Standard deviation of their coordinates; or horizontal, vertical.", "--control-sigma", metavar="S[,S[,S]]"
     ),
 ]
 MarkSigma = Annotated[
-    float,
-    typer.Option(
-        "--mark-sigma", metavar="PX", help="Standard deviation of marks, pixels.", rich_help_panel=PANEL, min=1e-3
-    ),
+    float, PANEL.option("Standard deviation of marks, pixels.", "--mark-sigma", metavar="PX", min=1e-3)
 ]
 Check = Annotated[
-    str | None,
-    typer.Option(
-        "--check",
-        metavar="NAME,...",
-        help="Control points that are kept back to check the result.",
-        rich_help_panel=PANEL,
-    ),
+    str | None, PANEL.option("Control points that are kept back to check the result.", "--check", metavar="NAME,...")
 ]
 Distances = Annotated[
     Path | None,
-    typer.Option(
+    PANEL.option(
+        "Measured distances: name, name, distance, standard deviation; between images, control points and "
+        "landmarks (line:5, plane:2, point:17).",
         "--distances",
         metavar="FILE",
-        help="Measured distances: name, name, distance, standard deviation; between images, control points and "
-        "landmarks (line:5, plane:2, point:17).",
-        rich_help_panel=PANEL,
     ),
 ]
 DistanceSigma = Annotated[
     float | None,
-    typer.Option(
-        "--distance-sigma",
-        metavar="S",
-        help="Standard deviation of distances where the file states none.",
-        rich_help_panel=PANEL,
-    ),
+    PANEL.option("Standard deviation of distances where the file states none.", "--distance-sigma", metavar="S"),
 ]
 Directions = Annotated[
     Path | None,
-    typer.Option(
+    PANEL.option(
+        "Known directions: photograph, where down is in the axes of its camera (x right, y down, z forward), "
+        "degrees; or line:5 vertical 0.5.",
         "--directions",
         metavar="FILE",
-        help="Known directions: photograph, where down is in the axes of its camera (x right, y down, z forward), "
-        "degrees; or line:5 vertical 0.5.",
-        rich_help_panel=PANEL,
     ),
 ]
 DirectionSigma = Annotated[
     float | None,
-    typer.Option(
-        "--direction-sigma",
-        metavar="DEG",
-        help="Standard deviation of directions where the file states none, degrees.",
-        rich_help_panel=PANEL,
+    PANEL.option(
+        "Standard deviation of directions where the file states none, degrees.", "--direction-sigma", metavar="DEG"
     ),
 ]
 KnownPlanes = Annotated[
     Path | None,
-    typer.Option(
+    PANEL.option(
+        "What is on planes with known coordinates: p1 z 12.3 0.01, or plane:2 0 0 1 -12.3 0.01 (n.X + w = 0).",
         "--known-planes",
         metavar="FILE",
-        help="What is on planes with known coordinates: p1 z 12.3 0.01, or plane:2 0 0 1 -12.3 0.01 (n.X + w = 0).",
-        rich_help_panel=PANEL,
     ),
 ]
 PlaneSigma = Annotated[
     float | None,
-    typer.Option(
-        "--plane-sigma",
-        metavar="S",
-        help="Standard deviation of the distance from known planes where the file states none.",
-        rich_help_panel=PANEL,
+    PANEL.option(
+        "Standard deviation of the distance from known planes where the file states none.", "--plane-sigma", metavar="S"
     ),
 ]
 Poses = Annotated[
     Path | None,
-    typer.Option(
+    PANEL.option(
+        "Measured poses: name x y z qx qy qz qw and standard deviations or a covariance; or any file of "
+        "poses, with --pose-sigma.",
         "--poses",
         metavar="FILE",
-        help="Measured poses: name x y z qx qy qz qw and standard deviations or a covariance; or any file of poses, "
-        "with --pose-sigma.",
-        rich_help_panel=PANEL,
     ),
 ]
 PoseSigma = Annotated[
     str | None,
-    typer.Option(
+    PANEL.option(
+        "Standard deviations of poses where the file states none: of positions, and of orientations in degrees.",
         "--pose-sigma",
         metavar="S,DEG",
-        help="Standard deviations of poses where the file states none: of positions, and of orientations in degrees.",
-        rich_help_panel=PANEL,
     ),
 ]
 Hold = Annotated[
     str | None,
-    typer.Option(
+    PANEL.option(
+        "Images (also old/*), control points and landmarks (line:5) that keep the place they have.",
         "--hold",
         metavar="NAME,...",
-        help="Images (also old/*), control points and landmarks (line:5) that keep the place they have.",
-        rich_help_panel=PANEL,
     ),
 ]
 Crs = Annotated[
     str | None,
-    typer.Option(
+    PANEL.option(
+        "Frame of the result: enu (default for longitude and latitude), utm, or a code such as EPSG:25832.",
         "--crs",
         metavar="NAME",
-        help="Frame of the result: enu (default for longitude and latitude), utm, or a code such as EPSG:25832.",
-        rich_help_panel=PANEL,
     ),
 ]
 
@@ -319,17 +287,20 @@ def say_survey(console: Console, numbers: dict[str, Any]) -> None:
             "larger ones, or look for what is wrong with all of them."
         )
     suspects = [one for one in numbers.get("measurements", ()) if one["is_suspect"] and one["kind"] not in worse]
-    for one in sorted(suspects, key=lambda one: -abs(one["normalized"]))[:5]:
+    suspects = sorted(suspects, key=lambda one: -abs(one["normalized"]))
+    first = {(one["kind"], one["name"]): one for one in reversed(suspects) if one["is_rejected"]}
+    rejected = sorted(first.values(), key=lambda one: -abs(one["normalized"]))
+    left = [one for one in suspects if not one["is_rejected"]]
+    _warn_of(console, "Taken out as wrong", rejected, "Correct or delete it.")
+    _warn_of(console, "Probably wrong", left, "Check it.")
+
+
+def _warn_of(console: Console, what: str, measurements: Sequence[Mapping[str, Any]], advice: str) -> None:
+    """Name the worst measurements, the worst first."""
+    for one in measurements[:_LISTED]:
         console.warn(
-            f"Probably wrong: {one['kind']} {one['name']} {one['coordinate']}".rstrip()
-            + f" (residual {one['residual']:.4g}, {abs(one['normalized']):.1f} standard deviations). Check it."
+            f"{what}: {one['kind']} {one['name']} {one['coordinate']}".rstrip()
+            + f" (residual {one['residual']:.4g}, {abs(one['normalized']):.1f} standard deviations). {advice}"
         )
-    if len(suspects) > 5:
-        console.warn(f"The protocol lists {len(suspects) - 5} more that are probably wrong.")
-
-
-__all__ = [
-    "Check", "Control", "ControlSigma", "Crs", "DirectionSigma", "Directions", "DistanceSigma", "Distances", "Hold",
-    "KnownPlanes", "MarkSigma", "Measured", "PlaneSigma", "PoseSigma", "Poses", "PositionSigma", "Positions",
-    "given", "say_survey",
-]  # fmt: skip
+    if len(measurements) > _LISTED:
+        console.warn(f"{what}: {len(measurements) - _LISTED} more, listed in the protocol.")

@@ -7,73 +7,44 @@ from typing import Annotated
 import typer
 
 from groma.cli.shared import command as _complete
-from groma.cli.shared.command import GENERAL
+from groma.cli.shared.command import GENERAL, PLAIN, Panel
 
 #: Headings of ``--help`` under which the options of the long commands stand.
-CAMERAS, LANDMARKS, ADJUSTMENT, RESULTS = "Cameras and poses", "Points, lines and planes", "Adjustment", "Results"
+CAMERAS, LANDMARKS = Panel("Cameras and poses"), Panel("Points, lines and planes")
+ADJUSTMENT, RESULTS = Panel("Adjustment"), Panel("Results")
 
-Json = Annotated[
-    str | None,
-    typer.Option(
-        "--json",
-        metavar="FILE",
-        help="Write a machine-readable report to FILE; '-' is standard output.",
-        rich_help_panel=GENERAL,
-    ),
-]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.", rich_help_panel=GENERAL)]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more.", rich_help_panel=GENERAL)]
-Threads = Annotated[
-    int | None,
-    typer.Option(
-        "--threads",
-        min=1,
-        metavar="N",
-        help="Use at most N threads. Default: one per core, where that pays.",
-        rich_help_panel=GENERAL,
-    ),
-]
-Seed = Annotated[
-    int, typer.Option("--seed", min=0, metavar="N", help="Seed of the random numbers.", rich_help_panel=GENERAL)
-]
+Seed = Annotated[int, GENERAL.option("Seed of the random numbers.", "--seed", min=0, metavar="N")]
 #: Of commands that draw no random numbers: accepted, so that a script can pass it to every command, and not shown.
 NoSeed = Annotated[int, typer.Option("--seed", min=0, hidden=True)]
-Force = Annotated[bool, typer.Option("--force", "-f", help="Replace what is there.")]
+Force = Annotated[bool, PLAIN.option("Replace what is there.", "--force", "-f")]
 Contributions = Annotated[
     bool,
-    typer.Option(
-        "--contributions",
-        help="Also adjust by points alone, with lines, with planes, and say what each of them changes.",
-        rich_help_panel=RESULTS,
+    RESULTS.option(
+        "Also adjust by points alone, with lines, with planes, and say what each of them changes.", "--contributions"
     ),
 ]
 Truth = Annotated[
     Path | None,
-    typer.Option(
-        "--truth",
-        metavar="SCENE",
-        help="With --contributions: a scene to compare the camera poses with, by name.",
-        rich_help_panel=RESULTS,
+    RESULTS.option(
+        "With --contributions: a scene to compare the camera poses with, by name.", "--truth", metavar="SCENE"
     ),
 ]
 LineDetector = Annotated[
     str,
-    typer.Option(
+    LANDMARKS.option(
+        "What finds line segments: lsd, onnx:FILE (a network like M-LSD), or a detector of an installed package.",
         "--line-detector",
-        autocompletion=_complete.one_of(*_complete.DETECTORS),
+        choices=_complete.DETECTORS,
         metavar="NAME",
-        help="What finds line segments: lsd, onnx:FILE (a network like M-LSD), or a detector of an installed package.",
-        rich_help_panel=LANDMARKS,
     ),
 ]
 RollingShutter = Annotated[
     str | None,
-    typer.Option(
+    CAMERAS.option(
+        "Images were read row by row (or column by column: photographs turned upright): estimate how the "
+        "camera moved meanwhile.",
         "--rolling-shutter",
         metavar="rows|columns",
-        help="Images were read row by row (or column by column: photographs turned upright): estimate how the camera "
-        "moved meanwhile.",
-        rich_help_panel=CAMERAS,
     ),
 ]
 Input = Annotated[

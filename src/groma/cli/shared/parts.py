@@ -173,6 +173,3 @@ def _one_voice() -> Iterator[Reducer]:
             print(f"groma: rank {reducer.rank} of {reducer.size}: {text}", file=sys.stderr, flush=True)
             reducer.abort()
         raise
-
-
-__all__ = ["PartsWanted", "adjust_parts_and_write", "has_company", "is_parts"]

@@ -66,6 +66,3 @@ def adjust_graph_and_write(
     else:
         console.say("No -o given: the adjusted graph was not written.")
     return numbers
-
-
-__all__ = ["adjust_graph_and_write", "is_pose_graph"]

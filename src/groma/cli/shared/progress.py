@@ -156,6 +156,3 @@ def say_seconds(seconds: float) -> str:
         return f"{whole} s"
     minutes, rest = divmod(whole, 60)
     return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
-
-
-__all__ = ["Line", "Plan", "Progress", "Stages", "parts_done", "say_seconds", "screen_line"]

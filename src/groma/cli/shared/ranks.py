@@ -74,6 +74,3 @@ class _Everyone(Executor):
     def _done(self, executor: Executor) -> None:
         with self._lock:
             self._waiting[id(executor)] -= 1
-
-
-__all__ = ["led_by_first_rank", "ranks_as_workers"]

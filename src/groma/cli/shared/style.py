@@ -57,6 +57,3 @@ def aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
         (_GAP + _GAP.join([first.ljust(widths[0]), *map(str.rjust, rest, widths[1:])])).rstrip()
         for first, *rest in cells
     ]
-
-
-__all__ = ["Style", "aligned", "has_colours", "is_terminal", "paint", "terminal_width", "wrapped"]

@@ -53,6 +53,3 @@ def _common_point(place: FloatArray, unit: FloatArray, points: FloatArray) -> Fl
     """The point (3,) nearest to all lines."""
     across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
     return np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, place), rcond=None)[0]
-
-
-__all__ = ["what_is_common", "why_open"]

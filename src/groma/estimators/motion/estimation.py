@@ -42,6 +42,9 @@ class MotionGates:
     kept: int = gate(40, "proposals", "compared by all matches", "cost: linear in it")
     refined: int = gate(6, "proposals", "refined", "cost: linear in it")
     max_steps: int = gate(15, "steps", "of a refinement", "cost: usually five")
+    longest: float = gate(10.0, "1", "norm of a step, else the refinement is given up", "cost: it has gone astray")
+    converged: float = gate(1e-3, "1", "gain of chi square that ends it", "derived from the variance of a chi square")
+    damped: float = gate(10.0, "times", "less damping after a step that helped, more after another", "cost: steps")
     odds: float = gate(
         9.2, "1", "least gain over another motion", "derived from odds of 100 to 1: twice their logarithm"
     )
@@ -209,16 +212,16 @@ class _Search:
             normal, right = self._normal(motion, self.prepared, self.agreeing(motion))
             scaled = normal + damping * np.diag(np.diag(normal) + 1e-12)
             step = np.asarray(-np.linalg.lstsq(scaled, right, rcond=None)[0], np.float64)
-            if not np.isfinite(step).all() or np.linalg.norm(step) > 10.0:
+            if not np.isfinite(step).all() or np.linalg.norm(step) > self.gates.longest:
                 break
             tried = moved(self.kind, motion, step)
             other = self._truncated(tried)
             if other < cost:
-                gain, motion, cost, damping = cost - other, tried, other, max(damping / 10.0, 1e-12)
-                if gain < 1e-3:  # of a chi square
+                gain, motion, cost, damping = cost - other, tried, other, max(damping / self.gates.damped, 1e-12)
+                if gain < self.gates.converged:
                     break
             else:
-                damping *= 10.0
+                damping *= self.gates.damped
                 if damping > 1.0:
                     break
         return motion
@@ -282,6 +285,3 @@ class _Search:
 
 def _log_choose(n: int, k: int) -> float:
     return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
-
-
-__all__ = ["Motion", "MotionGates", "MotionOptions", "estimate_motion"]

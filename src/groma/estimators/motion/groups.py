@@ -70,6 +70,3 @@ def _coordinates(kind: Kind, near_identity: FloatArray) -> FloatArray:
         basis = np.concatenate([basis, np.eye(4).reshape(1, 16)])
     found = np.linalg.lstsq(basis.T, (near_identity - np.eye(4)).ravel(), rcond=None)[0]
     return np.asarray(found[: FREEDOM[kind]], np.float64)
-
-
-__all__ = ["FREEDOM", "Kind", "changed_frame", "generators", "moved", "tangent_between"]

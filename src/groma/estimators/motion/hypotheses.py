@@ -111,6 +111,3 @@ def _rotations(prepared: Prepared, samples: IntArray) -> tuple[FloatArray, IntAr
     u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
     sure = s[:, 1] > 1e-6
     return (u @ vt)[sure], of[sure]
-
-
-__all__ = ["SAMPLE", "propose"]

@@ -238,6 +238,3 @@ def _wrt_tangent(kind: Kind, y: FloatArray) -> FloatArray:
     G = generators(kind)
     turned = np.einsum("kij,...j->...ik", G[:, :, :3], y) + G[:, :, 3].T
     return turned[..., :3, :] - y[..., :, None] * turned[..., 3:, :]
-
-
-__all__ = ["LandmarkMatches", "Prepared"]

@@ -282,6 +282,3 @@ def check_golden(folder: Path | str) -> list[GoldenRow]:
             f"{', '.join(missing)}. Check the path."
         )
     return [row for name in FILES for row in _check_file(folder / f"{name}.json")]
-
-
-__all__ = ["GoldenRow", "check_golden"]

@@ -59,6 +59,3 @@ def _compare(loss: Loss, name: str, order: int, derivative: FloatArray, toleranc
 def _require(condition: bool, loss: Loss, message: str) -> None:
     if not condition:
         raise AssertionError(f"{loss!r}: {message}.")
-
-
-__all__ = ["check_loss"]

@@ -108,6 +108,3 @@ def check_invariance(
                 "Correct the class variable `invariance`, or mark slots that do not move with the world "
                 "(Slot(..., in_world=False))."
             )
-
-
-__all__ = ["WorldMotion", "check_invariance", "lives_in_the_world", "motions_of", "moved_world"]

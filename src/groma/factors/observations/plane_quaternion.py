@@ -38,7 +38,7 @@ import numpy as np
 
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
-from groma.factors._record import put_block, put_residual
+from groma.factors._record import SMALL_TURN, put_block, put_residual
 from groma.factors.contract import WORLD_FIXED, Invariance, register
 from groma.factors.observations.plane_observation import PlaneInCamera
 
@@ -55,7 +55,7 @@ def _log(e, r):
     scale = 2.0 * alpha / s if s > 0.0 else 2.0
     r[0], r[1], r[2] = scale * e[0], scale * e[1], scale * e[2]
     square = 4.0 * alpha * alpha
-    if square < 0.01:
+    if square < SMALL_TURN:
         return 1.0 / 12.0 + square * (1.0 / 720.0 + square * (1.0 / 30240.0 + square / 1209600.0))
     return (1.0 - alpha * e[3] / s) / square
 

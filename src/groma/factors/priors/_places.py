@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from groma._numba import loop
 
-CAMERA, POINT, LINE, PLANE = 0, 1, 2, 3
+CAMERA, POINT, LINE, PLANE = range(4)
 #: Kinds of variables by these codes.
 KINDS = ("pose", "point", "line", "plane")
 
@@ -83,6 +83,3 @@ def put_place(kind, row, a, q, g, out, c):
         for j in range(3):
             out[c + j] = -s * g[j] - across * (a[j] - 2.0 * s * row[j])
         out[c + 3] = -across
-
-
-__all__ = ["CAMERA", "KINDS", "LINE", "PLANE", "POINT", "place_on", "put_place"]

@@ -18,8 +18,13 @@ to a camera or point q', to a line and to a plane. With the unit vectors :math:`
           \frac{\partial r}{\partial (n, w)} = \frac{\sigma}{\lVert n\rVert}
           \left[(q - \sigma\delta\hat n)^\top,\; 1\right].
 
-Between two lines it is that from the place on the first, which has a meaning for parallel ones. Where the two touch the
-direction of the way is not defined, and the factor is degenerate.
+Between two lines it is that from the place on the first, which has a meaning for parallel ones; of skew lines it is
+the shortest of all, from where the first is nearest to the second,
+
+.. math:: q = \frac{k \cdot m'\, d - m \times (d' \times k)}{\lVert k\rVert^2}, \qquad k = d \times d' .
+
+The derivatives are those above: the way is at right angles to both lines, so it does not matter to first order that q
+moves along the first. Where two objects touch the direction of the way is not defined, and the factor is degenerate.
 """
 
 from __future__ import annotations
@@ -31,7 +36,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from groma._numba import loop
-from groma._typing import FloatArray
+from groma._typing import BoolArray, FloatArray
+from groma.errors import ShapeError
 from groma.factors._examples import make_example, random_poses
 from groma.factors._record import set_rows
 from groma.factors.contract import Example, Factor, Ref, Slot, register
@@ -87,13 +93,34 @@ def _to_second(kind, row, arm, q, p, u, out, c):
 
 
 @loop
-def _linearize_all(rows, index, kinds, first_arm, second_arm, distances, begin, end, columns, record):
+def _nearest_place(one, two, q):
+    """Write the place q on the first line that is nearest to the second; return whether there is one."""
+    m0, m1, m2, d0, d1, d2 = one[0], one[1], one[2], one[3], one[4], one[5]
+    e0, e1, e2 = two[3], two[4], two[5]
+    k0, k1, k2 = d1 * e2 - d2 * e1, d2 * e0 - d0 * e2, d0 * e1 - d1 * e0
+    kk = k0 * k0 + k1 * k1 + k2 * k2
+    if not kk > 1e-16 * (d0 * d0 + d1 * d1 + d2 * d2) * (e0 * e0 + e1 * e1 + e2 * e2):
+        return False
+    c0, c1, c2 = e1 * k2 - e2 * k1, e2 * k0 - e0 * k2, e0 * k1 - e1 * k0
+    along = k0 * two[0] + k1 * two[1] + k2 * two[2]
+    q[0] = (along * d0 - m1 * c2 + m2 * c1) / kk
+    q[1] = (along * d1 - m2 * c0 + m0 * c2) / kk
+    q[2] = (along * d2 - m0 * c1 + m1 * c0) / kk
+    return True
+
+
+@loop
+def _linearize_all(rows, index, kinds, first_arm, second_arm, is_shortest, distances, begin, end, columns, record):
     q, p, u = np.empty(3), np.empty(3), np.empty(3)
     degenerate, last = 0, record.shape[2] - 1
     for i in range(begin, end):
         out = record[i - begin, 0]
         first, second, a, b = rows[0][index[0][i]], rows[1][index[1][i]], first_arm[i], second_arm[i]
-        size = _to_second(kinds[1], second, b, q, p, u, out, columns[1]) if place_on(kinds[0], first, a, q) else 0.0
+        if is_shortest[i]:
+            found, a = _nearest_place(first, second, q), q
+        else:
+            found = place_on(kinds[0], first, a, q)
+        size = _to_second(kinds[1], second, b, q, p, u, out, columns[1]) if found else 0.0
         if size > 0.0:
             out[last] = size - distances[i]
             if columns[0] >= 0:
@@ -132,6 +159,8 @@ class Distance(Factor):
     #: the distance is measured from; of points any numbers.
     first_arm: FloatArray
     second_arm: FloatArray
+    #: (N,) of two lines: whether it is the shortest between them, wherever that is; None: never.
+    is_shortest: BoolArray | None = None
 
     slots: ClassVar[tuple[Slot, ...]] = tuple(
         Slot(f"{side}_{name}", kind, optional=True)
@@ -144,6 +173,10 @@ class Distance(Factor):
         set_rows(self, "distances")
         set_rows(self, "first_arm", 3)
         set_rows(self, "second_arm", 3)
+        shortest = np.zeros(len(self), bool) if self.is_shortest is None else np.asarray(self.is_shortest, bool)
+        if shortest.shape != (len(self),) or (shortest.any() and (self.first_line is None or self.second_line is None)):
+            raise ShapeError(f"Distance.is_shortest must be ({len(self)},) flags of two lines; got {shortest.shape}.")
+        object.__setattr__(self, "is_shortest", shortest)
 
     def prepare(self, ambients: tuple[FloatArray, ...]) -> tuple[Any, ...]:  # noqa: D102
         return tuple(np.ascontiguousarray(ambient) for ambient in ambients)
@@ -154,8 +187,8 @@ class Distance(Factor):
         (one, first), (two, second) = self.references()
         kinds = KINDS.index(one.kind), KINDS.index(two.kind)
         return _linearize_all(
-            (inputs[0], inputs[1]), (first.index, second.index), kinds, self.first_arm, self.second_arm, self.distances,
-            begin, end, columns, record,
+            (inputs[0], inputs[1]), (first.index, second.index), kinds, self.first_arm, self.second_arm,
+            self.is_shortest, self.distances, begin, end, columns, record,
         )  # fmt: skip
 
     @classmethod
@@ -172,6 +205,3 @@ class Distance(Factor):
         names = (("first", first), ("second", second))
         poses = {group: random_poses(rng, 4, rotation=0.7) for group, name in names if name == "camera"}
         return make_example(factor, rng, states=poses)
-
-
-__all__ = ["Distance"]

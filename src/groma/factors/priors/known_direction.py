@@ -192,6 +192,3 @@ class KnownDirection(Factor):
         """Return an example of one kind: ``line``, ``plane`` or ``direction``."""
         factor = cls(**{kind: Ref("objects", indices(rng, 4))}, known=rng.normal(size=(6, 3)))  # type: ignore[arg-type]
         return make_example(factor, rng)
-
-
-__all__ = ["CameraDirection", "KnownDirection", "bases_of"]

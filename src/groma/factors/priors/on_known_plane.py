@@ -91,6 +91,3 @@ class OnKnownPlane(Factor):
         factor = cls(**{kind: Ref("objects", indices(rng, 4))}, known=known, arm=arm)  # type: ignore[arg-type]
         poses = {"objects": random_poses(rng, 4, rotation=0.7)} if kind == "camera" else {}
         return make_example(factor, rng, states=poses)
-
-
-__all__ = ["OnKnownPlane"]

@@ -30,7 +30,7 @@ import numpy as np
 from groma._numba import kernel, loop
 from groma._typing import FloatArray
 from groma.factors._examples import indices, make_example, random_poses
-from groma.factors._record import poses_from_states, put_block, put_residual, set_rows
+from groma.factors._record import SMALL_TURN, poses_from_states, put_block, put_residual, set_rows
 from groma.factors.contract import WORLD_FIXED, Example, Factor, Invariance, Ref, Slot, register
 from groma.geometry.quaternion import log_kernel
 from groma.geometry.so3 import left_jacobian_inverse_kernel
@@ -90,7 +90,7 @@ def _add_hat(scale, a, M):
 def _q_matrix(rho, w, Q):
     """Write Q(rho, omega), the off-diagonal block of the left Jacobian of SE(3)."""
     t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    if t2 < 1e-2:  # series: the closed forms lose up to theta^-5 eps to cancellation
+    if t2 < SMALL_TURN:
         k1 = 1.0 / 6.0 - t2 * (1.0 / 120.0 - t2 * (1.0 / 5040.0 - t2 / 362880.0))
         k2 = 1.0 / 24.0 - t2 * (1.0 / 720.0 - t2 * (1.0 / 40320.0 - t2 / 3628800.0))
         k3 = 1.0 / 120.0 - t2 * (1.0 / 2520.0 - t2 * (1.0 / 120960.0 - t2 / 9979200.0))

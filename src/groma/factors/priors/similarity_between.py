@@ -117,7 +117,7 @@ def _linearize_all(firsts, seconds, inverses, first_index, second_index, begin, 
             degenerate += 1
             continue
         _predict_error(firsts[first_index[i]], seconds[second_index[i]], inverse, F, E, RZ, RE)
-        r[:3] = E[4:7]
+        r[0], r[1], r[2] = E[4], E[5], E[6]
         log_kernel(E[:4], r[3:6])
         r[6] = math.log(E[7])
         put_residual(r, row)
@@ -170,6 +170,3 @@ class SimilarityBetween(Factor):
         second = (first + rng.integers(1, 4, 6)) % 4
         factor = cls(first=Ref("cameras", first), second=Ref("cameras", second), first_from_second=some(6))
         return make_example(factor, rng, states={"cameras": some(4)})
-
-
-__all__ = ["SimilarityBetween"]

@@ -15,7 +15,7 @@ from groma._numba import inline_kernel, kernel, loop
 #: Values of ``DepthLines.support``.
 NONE, SURFACE, CREASE, LEFT, RIGHT = range(5)
 
-#: Samples along a segment at most, and across on either side: the size of arrays.
+#: Samples along a segment at most, and across on either side: the size of arrays (cost: memory and time).
 _ALONG, _ACROSS = 24, 3
 
 
@@ -143,8 +143,10 @@ def _agreement(x, inverse, spread, limits):
 def _join_sides(kind, A, b, joint, joint_b):
     """Write the normal equations of the line of both sides."""
     if kind == SURFACE:
-        joint[:] = A[0] + A[1]
-        joint_b[:] = b[0] + b[1]
+        for i in range(len(joint_b)):
+            joint_b[i] = b[0, i] + b[1, i]
+            for j in range(len(joint_b)):
+                joint[i, j] = A[0, i, j] + A[1, i, j]
         return
     # Each side keeps its slope: it is eliminated, and the informations on the line are added.
     joint[:, :] = 0.0
@@ -211,14 +213,13 @@ def fit_all(ends, depth, noise, correlation, gates, shares, inverse_depth, covar
             if good[0] and good[1] and x[1, 0] + x[1, 1] > x[0, 0] + x[0, 1]:
                 side = 1
             support[n] = LEFT + side
-            joint_x[:] = x[side]
-            joint_inverse[:] = inverse[side]
+            for i in range(len(joint_x)):
+                joint_x[i] = x[side, i]
+                for j in range(len(joint_x)):
+                    joint_inverse[i, j] = inverse[side, i, j]
             scale = correlation * max(chi[side], 1.0)
             share[n] = used[side] / (along * _ACROSS)
         for i in range(2):
             inverse_depth[n, i] = joint_x[i]
             for j in range(2):
                 covariance[n, i, j] = scale * joint_inverse[i, j]
-
-
-__all__ = ["CREASE", "LEFT", "NONE", "RIGHT", "SURFACE", "fit_all"]

@@ -28,11 +28,11 @@ class DepthNoise:
     and :math:`c_2 = \sigma_d / (f b)`.
     """
 
-    #: c0, metres.
+    #: c0, metres (convention: Nguyen et al. 2012).
     constant: float = 0.0012
-    #: c2, one over metres.
+    #: c2, one over metres (convention: Nguyen et al. 2012).
     quadratic: float = 0.0019
-    #: z0, metres.
+    #: z0, metres (convention: Nguyen et al. 2012).
     offset: float = 0.4
     #: Number of neighbouring pixels that err alike; covariances are multiplied by it.
     correlation: float = 1.0
@@ -78,6 +78,3 @@ def as_pinhole(params: npt.ArrayLike) -> FloatArray:
     if not (np.isfinite(pinhole).all() and (pinhole[:2] > 0).all()):
         raise InputError(f"pinhole must be finite, with positive focal lengths; got {pinhole.tolist()}.")
     return pinhole
-
-
-__all__ = ["DepthNoise", "as_depth", "as_pinhole"]

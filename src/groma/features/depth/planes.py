@@ -43,7 +43,7 @@ class PlaneSearchOptions:
     step: int = 2
     #: A plane covers at least this share of the image, blocks without depth not counted.
     min_share: float = 0.006
-    #: At most so many planes, the largest.
+    #: At most so many planes, the largest (cost: time).
     max_planes: int = 16
     #: Largest mean squared whitened distance of a block from the plane that grows over it.
     gate: float = 3.0
@@ -251,6 +251,3 @@ def _quadratic(sums: FloatArray, theta: FloatArray) -> FloatArray:
     s = sums.T
     value = a * a * s[3] + b * b * s[5] + c * c * s[0] + 2 * (a * b * s[4] + a * c * s[1] + b * c * s[2])
     return np.maximum(value - 2 * (a * s[7] + b * s[8] + c * s[6]) + s[9], 0.0)
-
-
-__all__ = ["DepthPlanes", "PlaneSearchOptions", "find_depth_planes"]

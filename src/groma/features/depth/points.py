@@ -69,6 +69,3 @@ def depth_at(
     limits = float(gates.min_known), float(gates.jump), float(gates.jump_share), float(max_depth)
     _depth_all(np.ascontiguousarray(image), np.ascontiguousarray(pixels, np.float64), limits, out)
     return out
-
-
-__all__ = ["DEPTH_POINTS", "DepthPointGates", "depth_at"]

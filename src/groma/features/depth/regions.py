@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._numba import inline_kernel, kernel, loop
+from groma._ordering import ascending, copy
 from groma.gates import gate
 
-#: Regions that are remembered: the size of an array.
+#: Regions that are remembered: the size of an array (cost: they fit in a byte).
 MAX_REGIONS = 120
 #: The normals of two regions are compared up to this angle, radians: beyond, noise tells nothing of them.
 _ANY_ANGLE = 1.5
@@ -164,7 +165,7 @@ def grow(sums, counts, noise, limits, gates, min_blocks, labels, regions, region
     thetas = np.zeros((rows, columns, 3))
     quality = np.full(rows * columns, np.inf)
     _fit_blocks(sums, counts, gate, min_count, flat, thetas, quality, labels)
-    order = np.argsort(quality)
+    order = ascending(quality)
     queue = np.empty((rows * columns, 2), np.int64)
     theta, region = np.empty(3), np.empty(10)
     floor = math.acos(cos_floor)
@@ -175,8 +176,8 @@ def grow(sums, counts, noise, limits, gates, min_blocks, labels, regions, region
         i, j = order[k] // columns, order[k] % columns
         if labels[i, j] != -1:
             continue
-        region[:] = sums[i, j]
-        theta[:] = thetas[i, j]
+        copy(sums[i, j], region)
+        copy(thetas[i, j], theta)
         pixels = counts[i, j]
         labels[i, j] = found
         queue[0, 0], queue[0, 1] = i, j
@@ -238,7 +239,8 @@ def join(regions, region_counts, count, noise, limits, gates, target):
                 limit = min(math.sqrt(floor * floor + turn * variance), _ANY_ANGLE)
                 if _cosine(thetas[a], thetas[b]) < math.cos(limit):
                     continue
-                both[:] = regions[a] + regions[b]
+                for k in range(len(both)):
+                    both[k] = regions[a, k] + regions[b, k]
                 if not _fit(both, theta):
                     continue
                 fits = True
@@ -314,6 +316,3 @@ def assign(depth, pinhole, noise, bend, inlier, size, step, blocks, thetas, labe
                     centers[best, 0] += x * z
                     centers[best, 1] += y * z
                     centers[best, 2] += z
-
-
-__all__ = ["MAX_REGIONS", "REGIONS", "RegionGates", "assign", "block_sums", "grow", "join"]

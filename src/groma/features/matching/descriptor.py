@@ -180,6 +180,3 @@ def describe(
 def _unit(vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     norm = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(norm > 1e-9, norm, np.inf)
-
-
-__all__ = ["DESCRIPTOR_SIZE", "DescriptorGates", "Descriptors", "describe"]

@@ -180,6 +180,3 @@ def _votes(source: Segments, target: Segments, forward: Flow, backward: Flow, op
     counts.sum_duplicates()
     counts.data /= total[np.repeat(np.arange(len(source)), np.diff(counts.indptr))]
     return counts
-
-
-__all__ = ["Flow", "FlowOptions", "dense_flow", "match_by_flow"]

@@ -76,6 +76,3 @@ class FlowMatcher:
         if first.image.shape != second.image.shape:
             return LineMatches.empty()
         return match_by_flow(first.image, second.image, first.segments, second.segments, self.options)
-
-
-__all__ = ["DescribedImage", "FlowMatcher", "WideBaselineMatcher"]

@@ -84,6 +84,3 @@ def nearby_points(segments: Segments, points: FloatArray, point_ids: IntArray, r
     column, distance = np.zeros(begin[-1], dtype=np.int64), np.zeros(begin[-1])
     _near_all(segments.ends, points, reach, 0.5, True, begin, column, distance)
     return NearbyPoints(begin, point_ids[column], distance)
-
-
-__all__ = ["NearbyPoints", "nearby_points"]

@@ -42,7 +42,7 @@ from groma.features.matching.nearby import NearbyPoints, nearby_points
 from groma.features.segments import Segments
 from groma.gates import gate
 
-#: Rows of the table of descriptor products held in memory.
+#: Rows of the table of descriptor products held in memory (cost: memory).
 ROWS_AT_ONCE = 512
 _SURVEYED = "chosen on Strecha's surveyed scenes"
 FEATURES = 6  # descriptor distance; points for, against, near one only; overlap on first, on second (-1: unknown)

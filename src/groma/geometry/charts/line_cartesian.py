@@ -145,6 +145,3 @@ class CartesianLine(Chart):
     def random(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Lines with unit direction, 0.5 to 2 units from the origin."""
         return random_lines(rng, count)
-
-
-__all__ = ["CartesianLine"]

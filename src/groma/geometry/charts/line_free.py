@@ -168,6 +168,3 @@ class FreeLineLeft(FreeLineRight):
 
     name: ClassVar[str] = "free_left"
     _left: ClassVar[bool] = True
-
-
-__all__ = ["FreeLineLeft", "FreeLineRight"]

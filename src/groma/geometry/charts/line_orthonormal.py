@@ -220,6 +220,3 @@ def moment_frame(moment: FloatArray, direction: FloatArray) -> tuple[FloatArray,
     length = np.linalg.norm(across, axis=1)
     m_hat = unit(np.where(length[:, None] > 0.0, across, perpendicular(d_hat)[0]))
     return m_hat, d_hat, length
-
-
-__all__ = ["OrthonormalLineLeft", "OrthonormalLineRight", "moment_frame"]

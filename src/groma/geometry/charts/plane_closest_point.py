@@ -99,6 +99,3 @@ class ClosestPointPlane(Chart):
     def basis(self, state: FloatArray) -> FloatArray:
         """Derivative of (n, w) with respect to the increment, (N, 4, 3)."""
         return self._basis_by(_basis_all, state)
-
-
-__all__ = ["MINIMUM_DISTANCE", "ClosestPointPlane"]

@@ -103,6 +103,3 @@ class NormalOffsetPlane(Chart):
     def random(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Planes 0.5 to 2 units from the origin."""
         return random_planes(rng, count)
-
-
-__all__ = ["NormalOffsetPlane"]

@@ -101,6 +101,3 @@ class QuaternionPlaneRight(QuaternionPlaneLeft):
 
     name: ClassVar[str] = "quaternion_right"
     _left: ClassVar[bool] = False
-
-
-__all__ = ["QuaternionPlaneLeft", "QuaternionPlaneRight"]

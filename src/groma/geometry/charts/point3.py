@@ -33,6 +33,3 @@ def from_homogeneous(point: FloatArray) -> FloatArray:
     point = vectors(point, 4, "A homogeneous point", "W last")
     scale = point[..., 3:]
     return point[..., :3] / np.where(scale == 0, np.nan, scale)
-
-
-__all__ = ["POINT_CHARTS", "from_homogeneous", "to_homogeneous"]

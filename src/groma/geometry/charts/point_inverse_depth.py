@@ -28,7 +28,7 @@ from groma._typing import FloatArray
 from groma.errors import ShapeError
 from groma.geometry.charts.chart import Chart
 
-#: Most that the distance from the anchor grows in one step.
+#: Most that the distance from the anchor grows in one step (cost: more steps for points that go farther).
 MAX_GROWTH = 10.0
 
 

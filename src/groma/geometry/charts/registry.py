@@ -43,6 +43,3 @@ def charts_of(kind: str) -> Mapping[str, Manifold]:
     The mapping is a view: charts that are registered later are in it too.
     """
     return MappingProxyType(_CHARTS.setdefault(kind, {}))
-
-
-__all__ = ["charts_of", "register_chart"]

@@ -20,7 +20,7 @@ from groma.geometry.charts.chart import as_steps
 from groma.geometry.charts.registry import charts_of, register_chart
 from groma.geometry.manifold import Manifold
 
-#: No step changes the logarithm of a scale by more: the next one may go on from there.
+#: No step changes the logarithm of a scale by more: the next one may go on from there (cost: another step).
 _MAX_SIGMA = 20.0
 
 

@@ -133,5 +133,3 @@ class Unit3(Manifold):
 
 #: Charts of directions by name, registered ones too.
 DIRECTION_CHARTS = charts_of("direction")
-
-__all__ = ["DIRECTION_CHARTS", "Unit3", "exp", "log", "tangent_basis"]

@@ -32,7 +32,7 @@ from groma.io.colmap.sfm import (
 )
 from groma.scene import PosePriors, Scene
 
-#: Matches that a pair of images, or an image and a map, must agree on: COLMAP's numbers.
+#: Matches that a pair of images, or an image and a map, must agree on: COLMAP's numbers (convention: as in COLMAP).
 MIN_MATCHES = 15
 
 
@@ -221,6 +221,3 @@ def _blocks(scene: Scene) -> list[list[tuple[int, int]]]:
     """Return the pairs to match, in blocks."""
     axes = quaternion.rotate(quaternion.conjugate(scene.cam_from_world[:, :4]), np.array([0.0, 0.0, 1.0]))
     return blocks_of_pairs(scene.num_images, scene.cam_centers_in_world, axes)
-
-
-__all__ = ["MatchedPair", "PosedPhotographs"]

@@ -68,6 +68,3 @@ def cameras_of_photographs(
         height=np.array([one[1] for one in cameras.values()], np.int64),
     )
     return table, np.array([row_of[key] for key in keys], np.int64)
-
-
-__all__ = ["cameras_of_photographs"]

@@ -22,6 +22,3 @@ def load_pycolmap() -> Any:
         if before is not None:
             signal.signal(signal.SIGTERM, before)
     return pycolmap
-
-
-__all__ = ["load_pycolmap"]

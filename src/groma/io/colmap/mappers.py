@@ -144,6 +144,3 @@ def _incremental(task: Task, options: Any, say: Say) -> list[Any]:
         next_image_callback=lambda: one_more(1),
     )
     return [found[number] for number in sorted(found)]
-
-
-__all__ = ["MAPPERS", "MapperGates", "Task", "map_globally", "map_incrementally"]

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 _KIND = "COLMAP model"
+#: Where the format has no point.
 _NO_POINT = 2**64 - 1
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 

@@ -11,14 +11,16 @@ from scipy.spatial import KDTree
 
 from groma._typing import FloatArray
 
-#: Up to this many images every pair is matched; beyond it each image is matched with its followers by name.
+#: Up to this many images every pair is matched; beyond it each image is matched with its followers by name (cost: time
+#: grows with the square).
 EXHAUSTIVE_LIMIT = 120
-#: Followers, and then every second power of two, so that a walk around a building is closed.
+#: Followers, and then every second power of two, so that a walk around a building is closed (cost: time grows with it).
 OVERLAP = 12
+#: Largest of these powers (cost: time).
 _FARTHEST = 2**9
-#: Images whose pairs are matched in one call; their features are loaded once for all of them.
+#: Images whose pairs are matched in one call; their features are loaded once for all of them (cost: time only).
 _BLOCK = 8
-#: Nearest places that are matched, and pairs in a call then.
+#: Nearest places that are matched, and pairs in a call then (cost: time).
 _NEAREST, _PAIRS_IN_A_CALL = 24, 200
 #: Metres of a degree of latitude.
 _DEGREE = 111_195.0
@@ -89,6 +91,3 @@ def places_by_gps(content: Any, names: Sequence[str]) -> FloatArray | None:
     return np.stack(
         [_DEGREE * places[:, 0], _DEGREE * np.cos(latitude) * places[:, 1], np.nan_to_num(0.0 * places[:, 2])], axis=1
     )
-
-
-__all__ = ["EXHAUSTIVE_LIMIT", "OVERLAP", "blocks_of_pairs", "pair_blocks", "places_by_gps"]

@@ -240,6 +240,3 @@ def _configured(pycolmap: Any, rig: RigDescription) -> Any:
     config = pycolmap.RigConfig()
     config.cameras = cameras
     return config
-
-
-__all__ = ["RIG_FILE", "RigCamera", "RigDescription", "by_frames", "camera_of", "check_rigs", "map_frames", "read_rigs"]

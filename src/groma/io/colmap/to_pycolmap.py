@@ -131,6 +131,3 @@ def _add_points(pycolmap: Any, reconstruction: pycolmap.Reconstruction, scene: S
 
 def _rigid(pycolmap: Any, pose: FloatArray) -> Any:
     return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:4]), pose[4:])
-
-
-__all__ = ["colmap_camera", "to_pycolmap"]

@@ -119,5 +119,3 @@ def _polygons(geometry: Drawn) -> Iterator[Group]:
 
 
 register_format(SceneFormat("dxf", target=".dxf", endings=(".dxf",), write=write_dxf, check=check_dxf))
-
-__all__ = ["check_dxf", "write_dxf"]

@@ -190,5 +190,3 @@ def _binary(text: bytes, data: bytes) -> bytes:
 
 
 register_format(SceneFormat("gltf", target=".glb or .gltf for glTF", endings=(".glb", ".gltf"), write=write_gltf))
-
-__all__ = ["write_gltf"]

@@ -114,5 +114,3 @@ register_format(
         check=check_recording,
     )
 )
-
-__all__ = ["check_recording", "write_recording"]

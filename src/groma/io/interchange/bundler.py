@@ -35,7 +35,7 @@ from groma.scene import Scene
 
 _NAME = "bundle.out"
 _FIRST_LINE = b"# Bundle file v0.3"
-#: Numbers of a camera.
+#: Numbers of a camera (file format).
 _CAMERA = 15
 
 
@@ -122,5 +122,3 @@ register_format(
         read=read_bundler,
     )
 )
-
-__all__ = ["read_bundler"]

@@ -140,6 +140,3 @@ def shared(calibrations: Sequence[Calibration]) -> tuple[list[Calibration], list
     rows: dict[Calibration, int] = {}
     index = [rows.setdefault(one, len(rows)) for one in calibrations]
     return list(rows), index
-
-
-__all__ = ["Calibration", "camera_table", "fisheye", "inverse_polynomial", "panorama", "polynomial", "shared"]

@@ -87,6 +87,3 @@ def centred_scene(
         points=points_table(np.arange(len(rows.xyz)) + 1, rows.xyz, rows.color, path),
         point_observations=PointObservations.numbered(image[kept], rows.point_idx[kept], pixel),
     )
-
-
-__all__ = ["PointRows", "centred_scene", "point_rows"]

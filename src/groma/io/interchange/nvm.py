@@ -167,5 +167,3 @@ register_format(
         read=read_nvm,
     )
 )
-
-__all__ = ["read_nvm"]

@@ -46,7 +46,7 @@ from groma.io.registry import SceneFormat, register_format
 from groma.scene import PointObservations, Scene
 
 _NAME = "sfm_data.json"
-#: What cereal adds to the number of a kind where its name is given.
+#: What cereal adds to the number of a kind where its name is given (file format).
 _FIRST_TIME = 1 << 31
 #: From the centre of the first pixel at (0, 0) to ours.
 _HALF = 0.5
@@ -206,5 +206,3 @@ register_format(
         read=read_openmvg,
     )
 )
-
-__all__ = ["read_openmvg"]

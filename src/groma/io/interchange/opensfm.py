@@ -240,5 +240,3 @@ register_format(
         read=read_opensfm,
     )
 )
-
-__all__ = ["OpenSfmReconstruction", "read_opensfm", "read_opensfm_reconstructions"]

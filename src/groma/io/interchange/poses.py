@@ -16,11 +16,12 @@ from groma.errors import FileFormatError
 from groma.io.pose_conventions import PoseConvention
 from groma.scene import Points
 
-#: Largest deviation of a rotation matrix from an orthonormal one: files hold three digits at least.
+#: Largest deviation of a rotation matrix from an orthonormal one: files hold three digits at least (derived from those
+#: digits).
 _ROTATION_SLIP = 5e-3
 #: Coordinates beyond this are no places; their squares leave the number range.
 _LARGEST = 1e100
-#: Bytes of a photograph that are looked at for its size before the rest is.
+#: Bytes of a photograph that are looked at for its size before the rest is (cost: time only).
 _HEADER_BYTES = 1 << 17
 
 
@@ -94,6 +95,3 @@ def size_of_image(folder: Path, name: str) -> tuple[int, int]:
     except OSError:
         return 0, 0
     return found if found is not None and 0 < min(found) and max(found) <= 10**6 else (0, 0)
-
-
-__all__ = ["checked_rows", "file_in", "points_table", "rigid", "size_of_image"]

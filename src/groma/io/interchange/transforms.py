@@ -310,5 +310,3 @@ register_format(
         check=check_transforms,
     )
 )
-
-__all__ = ["INTRINSICS", "Transforms", "check_transforms", "read_transforms", "write_transforms"]

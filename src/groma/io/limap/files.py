@@ -37,7 +37,7 @@ from groma._typing import FloatArray, IntArray
 Records = npt.NDArray[np.void]
 Form = Literal["binary", "text"]
 
-#: The identifier that means "none".
+#: The identifier that means "none" (file format).
 NONE = 2**64 - 1
 #: Kinds of groups and the number of their 3D parameters.
 VANISHING_POINT, PLANE = 0, 1

@@ -216,6 +216,3 @@ def _with_line_ids(images: tuple[Structure2d, ...], lines: Lines3d) -> tuple[Str
         if image_id in row and idx < len(tables[row[image_id]]):
             tables[row[image_id]]["line_id"][idx] = owner
     return tuple(replace(image, lines=table) for image, table in zip(images, tables, strict=True))
-
-
-__all__ = ["read_files"]

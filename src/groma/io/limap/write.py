@@ -141,6 +141,3 @@ def _put_groups(structures: Structures, target: _Target) -> None:
 def _put_wireframe(structures: Structures, target: _Target) -> None:
     target.put("Q", len(structures.wireframe))
     target.rows(structures.wireframe)
-
-
-__all__ = ["write_files"]

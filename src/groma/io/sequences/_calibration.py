@@ -28,7 +28,7 @@ CameraLike = SequenceCamera | Numbers[float] | str | os.PathLike[str]
 #: Names under which a calibration may lie in the folder of a sequence.
 FILE_NAMES = ("cameras.txt", "camera.txt", "calibration.txt", "calib.txt", "intrinsics.txt", "camera-intrinsics.txt")
 
-#: Pixels whose rays are computed at a time.
+#: Pixels whose rays are computed at a time (cost: memory).
 _BAND = 1 << 18
 
 _HELP = (
@@ -183,15 +183,3 @@ def _from_numbers(numbers: FloatArray, source: str) -> Calibration:
 
 def _checked(model: str, params: FloatArray, size: tuple[int, int] | None, source: str) -> Calibration:
     return Calibration(model, checked_params(model, params, source), size)
-
-
-__all__ = [
-    "Calibration",
-    "CameraLike",
-    "Rectification",
-    "calibration_of",
-    "find_calibration",
-    "from_opencv",
-    "read_calibration",
-    "rectification",
-]

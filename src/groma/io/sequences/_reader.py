@@ -82,7 +82,7 @@ class Preparation:
 
     gray: Rectification | None = None
     right: Rectification | None = None
-    #: Depth in files per metre.
+    #: Depth in files per metre (convention: millimetres).
     depth_scale: float = 1000.0
     #: Depth (metres) from the depth camera to the camera that took ``gray``.
     register: Callable[[npt.NDArray[np.float32]], npt.NDArray[np.float32]] | None = None
@@ -241,6 +241,3 @@ def _image(path: Path, shape: tuple[int, int], remarks: list[str], otherwise: st
         )
         return None
     return image
-
-
-__all__ = ["Entry", "FileSequence", "Preparation", "Selection", "file_size", "read_ahead", "simple_sequence"]

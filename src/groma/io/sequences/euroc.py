@@ -195,6 +195,3 @@ def _reference(root: Path, body_from_cam: FloatArray) -> Trajectory | None:
     body = read_trajectory(path, "euroc")
     pose = np.broadcast_to(se3.from_matrix(body_from_cam), body.world_from_cam.shape)
     return body.replace(world_from_cam=se3.compose(body.world_from_cam, pose))
-
-
-__all__ = ["euroc_root", "open_euroc"]

@@ -98,6 +98,3 @@ class Sequence(Protocol):
     num_frames: int | None
 
     def __iter__(self) -> Iterator[Frame]: ...
-
-
-__all__ = ["Frame", "Kind", "Sequence", "SequenceCamera", "checked_params"]

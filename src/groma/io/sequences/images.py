@@ -26,7 +26,7 @@ from groma.io.sequences._reader import Entry, FileSequence, Selection, read_ahea
 from groma.io.sequences.frame import Frame, Kind, SequenceCamera
 from groma.io.trajectories import Trajectory, read_trajectory
 
-#: Frames a second where nothing says it.
+#: Frames a second where nothing says it (convention: usual for video).
 RATE = 30.0
 
 _NO_CAMERA = (
@@ -154,6 +154,3 @@ def _times(folder: Path, images: list[Path]) -> list[float]:
 def _reference(folder: Path) -> Trajectory | None:
     path = folder / "groundtruth.txt"
     return read_trajectory(path, "tum") if path.is_file() else None
-
-
-__all__ = ["VideoSequence", "image_files", "open_images", "open_video"]

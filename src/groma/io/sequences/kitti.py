@@ -20,7 +20,7 @@ from groma.io.sequences._calibration import Calibration, from_opencv
 from groma.io.sequences._reader import Entry, FileSequence, Selection, simple_sequence
 from groma.io.trajectories import Trajectory, read_trajectory
 
-#: Frames a second where there is no ``times.txt``.
+#: Frames a second where there is no ``times.txt`` (convention: as in the benchmark).
 RATE = 10.0
 
 
@@ -103,6 +103,3 @@ def _reference(folder: Path, times: list[float] | None, count: int, warnings: li
                 poses = poses.take(np.arange(count))
             return poses.replace(timestamps=np.array([_time(times, number) for number in range(len(poses))]))
     return None
-
-
-__all__ = ["is_kitti", "open_kitti"]

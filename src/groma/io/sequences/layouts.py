@@ -59,6 +59,3 @@ def register_layout(layout: SequenceLayout) -> SequenceLayout:
 def layouts() -> tuple[SequenceLayout, ...]:
     """All layouts, in the order in which they are tried."""
     return tuple(_LAYOUTS.values())
-
-
-__all__ = ["SequenceLayout", "Wishes", "layouts", "register_layout"]

@@ -25,12 +25,15 @@ from groma.io.sequences._calibration import Calibration, from_opencv, read_calib
 from groma.io.sequences._reader import Entry, FileSequence, Preparation, Selection, simple_sequence
 from groma.io.trajectories import Trajectory
 
+#: Frames a second (convention: of the camera; the format says none).
 RATE = 30.0
+#: Numbers in the format per metre.
 DEPTH_SCALE = 1000.0
-#: fx, fy, cx, cy as OpenCV counts.
+#: fx, fy, cx, cy as OpenCV counts (belongs to the format).
 DEPTH_CAMERA = (585.0, 585.0, 320.0, 240.0)
+#: The same of the colour camera (belongs to the format).
 COLOR_CAMERA = (525.0, 525.0, 320.0, 240.0)
-#: color_from_depth of a Kinect, 3x4, metres.
+#: color_from_depth of a Kinect, 3x4, metres (belongs to the format).
 COLOR_FROM_DEPTH = np.array(
     [
         [0.99996518, 0.00267651, -0.00790410, -0.02555894],
@@ -131,6 +134,3 @@ def _reference(root: Path, colors: list[Path]) -> Trajectory | None:
     matrix[:3, :3], matrix[:3, 3] = u @ vt, COLOR_FROM_DEPTH[:, 3]
     depth_from_color = np.broadcast_to(se3.inverse(se3.from_matrix(matrix)), (len(poses), 7))
     return Trajectory(np.array(times), se3.compose(np.array(poses), depth_from_color))
-
-
-__all__ = ["open_seven_scenes", "register_depth", "seven_scenes_root"]

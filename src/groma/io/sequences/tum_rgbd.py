@@ -28,8 +28,9 @@ FREIBURG = {
     "2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
     "3": (535.4, 539.2, 320.1, 247.6),
 }
+#: Numbers in the format per metre.
 DEPTH_SCALE = 5000.0
-#: Largest difference in time of a pair, seconds.
+#: Largest difference in time of a pair, seconds (convention: as in the benchmark).
 TOLERANCE = 0.02
 
 
@@ -127,6 +128,3 @@ def _listed(path: Path, number: int, words: list[str]) -> tuple[float, Path]:
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     with reading(path, "list of images"):
         return list(read_words(path))
-
-
-__all__ = ["is_tum_rgbd", "open_tum_rgbd", "pair_by_time"]

@@ -136,6 +136,3 @@ def _position(one: dict[str, Any], where: str) -> list[float]:
         return [float("nan")] * 3
     given = member(one, "position", dict, where)
     return [number(given, "longitude", where), number(given, "latitude", where), number(given, "altitude", where, 0.0)]
-
-
-__all__ = ["ControlFile", "read_control"]

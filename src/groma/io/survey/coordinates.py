@@ -26,7 +26,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.errors import InputError
 
-#: Semi-major axis, metres, and squared eccentricity of WGS84.
+#: Semi-major axis, metres, and squared eccentricity of WGS84 (convention: the ellipsoid).
 _AXIS, _ECCENTRICITY2 = 6378137.0, 0.0066943799901413165
 _UTM_WORDS = re.compile(r"(?:WGS\s*84\s+)?UTM\s+(?:zone\s+)?(\d{1,2})\s*([NS])", re.IGNORECASE)
 _GEOGRAPHIC = ("EPSG:4326", "EPSG:4979", "EPSG:4258", "EPSG:4269")
@@ -247,8 +247,3 @@ def _projected(group: Places, target: str) -> FloatArray:
     if not np.isfinite(found[known]).all():
         raise InputError(f"{group.source}: places lie outside the area of {target}. Is that the right system?")
     return found
-
-
-__all__ = [
-    "CoordinateSystem", "Places", "WorldFrame", "common_frame", "described", "east_north_up", "geocentric",
-]  # fmt: skip

@@ -19,10 +19,12 @@ from groma._counted import counted
 from groma.errors import InputError
 from groma.io.survey.coordinates import CoordinateSystem, Places
 
-#: Bytes of a file that are read: EXIF stands in one of the first segments, of 64 kB at most.
+#: Bytes of a file that are read: EXIF stands in one of the first segments, of 64 kB at most (cost: time only).
 _HEAD = 1 << 18
+#: Tags of the format.
 _GPS, _RATIONAL = 0x8825, 5
-#: Standard deviations of receivers in cameras and phones, metres: east, north, height.
+#: Standard deviations of receivers in cameras and phones, metres: east, north, height (convention: of receivers without
+#: corrections).
 EXIF_SIGMA = (5.0, 5.0, 10.0)
 
 
@@ -125,6 +127,3 @@ def _rationals(block: bytes, order: str, entry: tuple[int, int, int], count: int
     start = struct.unpack_from(order + "I", block, place)[0]
     parts = struct.unpack_from(f"{order}{2 * count}I", block, start)
     return [above / below if below or above else 0.0 for above, below in zip(parts[::2], parts[1::2], strict=True)]
-
-
-__all__ = ["EXIF_SIGMA", "position_of", "read_exif_positions"]

@@ -153,6 +153,3 @@ def _after_z(rest: list[float], where: str) -> list[float]:
     if len(rest) in (0, 3):
         return [0.0] * 3
     return [rest[0]] * 3 if len(rest) == 1 else [rest[0], rest[0], rest[1]] if len(rest) == 2 else [rest[3]] * 3
-
-
-__all__ = ["read_positions", "split"]

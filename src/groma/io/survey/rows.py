@@ -259,9 +259,3 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-__all__ = [
-    "DirectionsFile", "DistancesFile", "PlanesFile", "PosesFile", "is_measured_poses", "read_directions",
-    "read_distances", "read_known_planes", "read_measured_poses",
-]  # fmt: skip

@@ -106,6 +106,3 @@ def segments_apart(first: FloatArray, second: FloatArray) -> FloatArray:
     across = np.abs(away @ np.array([[0.0, -1.0], [1.0, 0.0]]) @ (step / length[:, None])[None, :, :, None])[..., 0]
     along = (away.mean(axis=2) * step).sum(axis=-1) / length**2
     return np.where((along > 0) & (along < 1), across.max(axis=2), np.inf)
-
-
-__all__ = ["segments_apart", "with_lines_of"]

@@ -292,6 +292,3 @@ def _as_placed(scene: Scene, image: int, pose: FloatArray | None) -> PlacedImage
 
 def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-__all__ = ["GATES", "MergeGates", "MergedModel", "merged_model"]

@@ -119,6 +119,3 @@ def _row(kind: str, values: FloatArray) -> ConsistencyRow:
     low, high = (float(chi2.ppf(0.5 + side * BAND / 2, 6 * count) / count) for side in (-1, 1))
     least, most = (float(chi2.ppf(0.5 + side * LIMIT / 2, 6 * count) / count) for side in (-1, 1))
     return ConsistencyRow("query", kind, 6, count, average, low, high, low <= average <= high, least <= average <= most)
-
-
-__all__ = ["KINDS", "localization_consistency"]

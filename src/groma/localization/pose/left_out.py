@@ -91,6 +91,3 @@ def _moved(plucker: FloatArray, places: FloatArray) -> FloatArray:
     foot = np.cross(d, plucker[:, :3] / length)
     along = np.einsum("nki,ni->nk", places - foot[:, None], d)
     return foot[:, None] + along[..., None] * d[:, None]
-
-
-__all__ = ["without_image"]

@@ -118,6 +118,3 @@ def _shared_error(cases: Sequence[_Case | None], gates: MapErrorGates) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if median(middle) > gates.median else (low, middle)
     return float(np.sqrt(0.5 * (low + high)))
-
-
-__all__ = ["GATES", "MapErrorGates", "SeenByImage", "images_compared", "shared_errors"]

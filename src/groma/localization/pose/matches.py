@@ -114,6 +114,3 @@ def nearest_claims(claim: IntArray, distance: FloatArray, agrees: BoolArray) -> 
     kept = np.zeros(len(agrees), bool)
     kept[rows[np.unique(claim[rows], return_index=True)[1]]] = True
     return kept
-
-
-__all__ = ["Matches", "nearest_claims"]

@@ -48,6 +48,3 @@ def cells_elsewhere(refined: Refined, matches: Matches, beyond: float, gates: Ve
 
 def _length(vectors: FloatArray) -> FloatArray:
     return np.linalg.norm(vectors, axis=1)
-
-
-__all__ = ["cells_elsewhere"]

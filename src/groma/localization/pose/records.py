@@ -76,6 +76,3 @@ def motions_of_lines(lines: FloatArray) -> FloatArray:
     zero = np.zeros_like(d)
     held = np.stack([np.hstack([zero, d]), np.hstack([d, m])], axis=1)
     return np.swapaxes(np.linalg.svd(held)[2][:, 2:], 1, 2)
-
-
-__all__ = ["landmark_covariances", "landmark_rows", "motions_of_lines", "records", "residual_squares", "times"]

@@ -37,7 +37,6 @@ from groma._numba import loop
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import assemble
 from groma.adjustment.assembly_options import AssemblyOptions
-from groma.adjustment.fit import MEDIAN_SQUARE
 from groma.adjustment.stages import with_loss
 from groma.factors.contract import Factor
 from groma.factors.losses import Cauchy, GemanMcClure
@@ -367,7 +366,7 @@ def _noise(
     if not len(together):
         return 1.0
     free = max(1.0 - 3.0 / len(together), 0.1)  # six of two times so many numbers went into the pose
-    shown = float(np.median(together)) / (MEDIAN_SQUARE * free)
+    shown = float(np.median(together)) / (chi_square_gate(0.5, 2) * free)
     return float(np.sqrt((gates.stated_weight + len(together) * shown) / (gates.stated_weight + len(together))))
 
 

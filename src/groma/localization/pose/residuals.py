@@ -89,6 +89,3 @@ def _of_near(factor: Factor, near: dict[str, BoolArray]) -> Factor:
             weight = times(factor.sqrt_information, np.eye(2)[None])
             return replace(factor, sqrt_information=np.where(kept[rows, None, None], weight, 0.0))
     return factor
-
-
-__all__ = ["Residuals", "residual_squares_of", "residuals", "without_far"]

@@ -109,6 +109,3 @@ def cells_of(image_idx: IntArray, pixel: FloatArray, width: FloatArray) -> IntAr
     """Number (N,) the cells of pixels (N, 2) in images of a width (N,), over all images."""
     at = np.clip((pixel * (NOISE.cells / np.maximum(width, 1.0))[:, None]).astype(np.int64), 0, 10 * NOISE.cells)
     return np.unique(np.column_stack([image_idx, at]), axis=0, return_inverse=True)[1].ravel()
-
-
-__all__ = ["NOISE", "MapNoiseGates", "SharedErrors", "cells_of", "fitted_noise", "shared_errors"]

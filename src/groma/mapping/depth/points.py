@@ -178,6 +178,3 @@ def _depths_of_points(scene: Scene) -> tuple[FloatArray, FloatArray]:
     depth = np.einsum("ni,ni->n", axis, scene.points.xyz[seen.point_idx]) + poses[seen.image_idx, 6]
     covariance = point_noise(scene).covariance[seen.point_idx]
     return depth, np.sqrt(np.einsum("ni,nij,nj->n", axis, covariance, axis))
-
-
-__all__ = ["MeasuredDepths", "check_cameras", "image_sizes", "measure_depths", "read_map"]

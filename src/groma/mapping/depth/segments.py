@@ -116,6 +116,3 @@ def _misfit(difference: FloatArray, sigma: FloatArray) -> float:
     away = np.abs(difference / sigma)
     away = away[np.isfinite(away)]
     return max(1.0, ROBUST * float(np.median(away))) if len(away) else 1.0
-
-
-__all__ = ["segment_depths", "with_line_depths"]

@@ -17,7 +17,8 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError
 from groma.gates import gate
 
-#: A median absolute deviation of normal noise times this is a standard deviation.
+#: A median absolute deviation of normal noise times this is a standard deviation (derived from the normal
+#: distribution).
 ROBUST = 1.4826
 
 
@@ -135,6 +136,3 @@ def say_left_out(used: BoolArray, names: Sequence[str]) -> list[str]:
     more = "" if len(left) <= 3 else f" and {len(left) - 3} more"
     listed = ", ".join(left[:3]) + more
     return [f"{len(left)} of {counted(len(names), 'photographs')} without a depth map, or with an empty one: {listed}."]
-
-
-__all__ = ["ROBUST", "UNITS", "UnitGates", "common_unit", "own_units", "say_left_out"]

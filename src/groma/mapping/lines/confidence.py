@@ -32,6 +32,7 @@ from groma.gates import gate
 from groma.geometry import quaternion, segment2
 from groma.geometry.algebra import norm
 from groma.mapping.groups import num_distinct
+from groma.mapping.lines.options import MIN_LENGTH
 from groma.mapping.noise.landmarks import LineNoise, line_noise
 from groma.scene import Scene
 
@@ -58,8 +59,6 @@ class ConfidenceGates:
 GATES = ConfidenceGates()
 #: Lines of a smaller probability are no part of a map: they are more likely wrong than right.
 DEFAULT_CONFIDENCE = 0.5
-#: An image that would show less of a line than this, pixels, is not expected to show it: the default of detection.
-_MIN_LENGTH = 12.0
 #: Smallest misfit and spread, below which they say nothing more.
 _MIN_MISFIT, _MIN_SPREAD = 0.3, 1e-4
 
@@ -171,7 +170,7 @@ def _num_in_frame(scene: Scene) -> FloatArray:
         places = np.ascontiguousarray(in_cam.reshape(-1, 3))
         pixels = model.project(scene.cameras.params[camera, : model.num_parameters], places).reshape(-1, 4)
         front = np.ones(len(in_cam), bool) if model.sees_behind else (in_cam[..., 2] > 0.0).all(axis=1)
-        found += front & _inside(pixels, size) & (segment2.length(np.nan_to_num(pixels)) >= _MIN_LENGTH)
+        found += front & _inside(pixels, size) & (segment2.length(np.nan_to_num(pixels)) >= MIN_LENGTH)
     return found
 
 
@@ -179,17 +178,3 @@ def _inside(pixels: FloatArray, size: FloatArray) -> BoolArray:
     ends = pixels.reshape(-1, 2, 2)
     inside = ((ends >= 0.0) & (ends <= size)) if size.all() else np.isfinite(ends)
     return np.asarray(inside.all(axis=(1, 2)), np.bool_)
-
-
-__all__ = [
-    "DEFAULT_CONFIDENCE",
-    "GATES",
-    "WEIGHTS",
-    "ConfidenceGates",
-    "left_out",
-    "line_accuracy",
-    "line_confidence",
-    "line_evidence",
-    "usual_distance",
-    "with_confidence",
-]

@@ -31,5 +31,3 @@ class AgreementGates:
 
 
 AGREEMENT = AgreementGates()
-
-__all__ = ["AGREEMENT", "AgreementGates"]

@@ -227,6 +227,3 @@ def _turned(pose: FloatArray, view_from_cam: FloatArray | None) -> FloatArray:
         return pose
     rotation = view_from_cam @ quaternion.to_matrix(pose[None, :4])[0]
     return np.concatenate([quaternion.from_matrix(rotation[None])[0], view_from_cam @ pose[4:]])
-
-
-__all__ = ["map_lines_in_views", "wide_cameras"]

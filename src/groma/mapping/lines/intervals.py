@@ -38,6 +38,3 @@ def with_supported_intervals(scene: Scene) -> Scene:
         lines=scene.lines.replace(segments=np.where((hull == [0.0, 1.0])[..., None], segments, moved)),
         line_intervals=LineIntervals(line, found[:, 0], found[:, 1]),
     )
-
-
-__all__ = ["with_supported_intervals"]

@@ -17,7 +17,8 @@ from groma.scene import LineObservations, Lines, Relations, Scene
 if TYPE_CHECKING:
     from groma.features.segments import Segments
 
-#: Groups of segments that :func:`explain` names; the others are counted together.
+#: Groups of segments that :func:`explain` names; the others are counted together (convention: what a sentence can
+#: hold).
 _NAMED = 4
 
 
@@ -109,6 +110,3 @@ def _images(number: int) -> str:
 
 def _percent(part: int, total: int) -> str:
     return f"{100.0 * part / total:.0f} %" if 200 * part >= total else "under 1 %"
-
-
-__all__ = ["LineMap", "explain"]

@@ -123,6 +123,3 @@ def _match_of(names: Sequence[str], matches: ExternalMatches, i: int, j: int) ->
 def _one_per_image(scene: Scene, segments: Sequence[Segments]) -> None:
     if len(segments) != scene.num_images:
         raise InputError(f"segments must hold one set per image ({scene.num_images}); got {len(segments)}.")
-
-
-__all__ = ["ImageReader", "MatchProvider", "external_matches", "given_matches", "segment_matches"]

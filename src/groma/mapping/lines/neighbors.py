@@ -153,6 +153,3 @@ def _by_geometry(scene: Scene, num_neighbors: int, gates: NeighborGates) -> list
         return others[np.argsort(cost, kind="stable")[:num_neighbors]]
 
     return [of_image(i) for i in range(len(poses))]
-
-
-__all__ = ["NeighborGates", "covisible_neighbors"]

@@ -5,13 +5,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+#: Shortest segment unless the caller says so, pixels.
+MIN_LENGTH = 12.0
+
 
 @dataclass(frozen=True)
 class MapLinesOptions:
     """How to map lines."""
 
     #: Shortest segment used, pixels; detectors have a limit of their own.
-    min_length: float = 12.0
+    min_length: float = MIN_LENGTH
     #: A line needs a segment of this length, pixels; shorter segments can only join lines.
     min_longest: float = 0.0
     #: Neighbours per image.
@@ -50,9 +53,6 @@ class MapLinesOptions:
     use_directions: bool = True
 
     @staticmethod
-    def selective(min_length: float = 12.0) -> MapLinesOptions:
+    def selective(min_length: float = MIN_LENGTH) -> MapLinesOptions:
         """Fewer lines of higher precision: known to 2.5 thousandths of their distance, and 25 pixels long."""
         return MapLinesOptions(min_length=min_length, max_uncertainty=0.0025, min_longest=25.0)
-
-
-__all__ = ["MapLinesOptions"]

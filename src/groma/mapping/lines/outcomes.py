@@ -76,6 +76,3 @@ REMEDIES = {
     Outcome.REPEATED: "photographs from nearer, which show edges close to each other as two",
     Outcome.TEXTURE: "MapLinesOptions.min_repeatability = 0, if lines of texture are wanted",
 }
-
-
-__all__ = ["REMEDIES", "WORDS", "Outcome"]

@@ -211,6 +211,3 @@ def _range_near(ends: FloatArray, pixel: FloatArray, inverse: FloatArray, margin
     found = KDTree(pixel).query(places.reshape(-1, 2), k=near)[1].reshape(len(ends), -1)
     values = inverse[found]
     return np.column_stack([values.min(1) / margin, values.max(1) * margin])
-
-
-__all__ = ["LineViews", "ViewGates", "build_views"]

@@ -106,11 +106,11 @@ class LineNoise:
 def point_noise(scene: Scene, sigma_px: float | None = None) -> PointNoise:
     """Return the covariances of the points; ``sigma_px`` None estimates it from the residuals.
 
-    Columns in the right images of stereo pairs are observations, too.
+    Columns in the right images of stereo pairs, and depths, are observations, too.
     """
-    pixels, columns = _pixel_rows(scene), _column_rows(scene)
-    point = np.concatenate([pixels[0], columns[0]])
-    residual, by_world = np.concatenate([pixels[1], columns[1]]), np.concatenate([pixels[2], columns[2]])
+    parts = _pixel_rows(scene), _column_rows(scene), _depth_rows(scene)
+    point = np.concatenate([part[0] for part in parts])
+    residual, by_world = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
     good = np.asarray(np.isfinite(residual) & np.isfinite(by_world).all(axis=1))
     residual, by_world = np.where(good, residual, 0.0), np.where(good[:, None], by_world, 0.0)
     count = np.bincount(point[good], minlength=scene.num_points)
@@ -198,6 +198,15 @@ def _column_rows(scene: Scene) -> tuple[IntArray, FloatArray, FloatArray]:
     seen = scene.point_observations.take(table.observation_idx)
     pixels, by_world = project_points(scene, seen.image_idx, scene.points.xyz[seen.point_idx], table.baseline)
     return seen.point_idx, (pixels[:, 0] - table.u_right) / table.sigma, by_world[:, 0] / table.sigma[:, None]
+
+
+def _depth_rows(scene: Scene) -> tuple[IntArray, FloatArray, FloatArray]:
+    """The same of measured depths."""
+    table = scene.point_depths
+    poses = scene.cam_from_world[table.image_idx]
+    axis = quaternion.to_matrix(poses[:, :4])[:, 2]
+    residual = dot(axis, scene.points.xyz[table.point_idx]) + poses[:, 6] - table.depth
+    return table.point_idx, residual / table.sigma, axis / table.sigma[:, None]
 
 
 def pixel_differences(scene: Scene, image_idx: IntArray, first: FloatArray, second: FloatArray) -> FloatArray:

@@ -60,7 +60,7 @@ GATES = ObservationNoiseGates()
 _MEDIAN = 2.0 * math.log(2.0)
 #: Guards: smallest squared residual over the usual one (its logarithm is taken), bounds of half the degrees of freedom.
 _MIN_SQUARE, _SHAPES = 1e-4, (0.5, 1e4)
-#: Rounds of expectation maximisation.
+#: Rounds of expectation maximisation (cost: time).
 _STEPS = 20
 
 
@@ -167,6 +167,3 @@ def _inverse_trigamma(value: float) -> float:
     """Where the trigamma function, which falls, has a value; the nearer end where that is out of bounds."""
     shapes = np.geomspace(*_SHAPES, 1000)[::-1]
     return float(np.interp(value, polygamma(1, shapes), shapes))
-
-
-__all__ = ["line_end_correlation", "moved_px", "noise_px", "with_point_noise"]

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
+from groma.execution import map_in_threads
 from groma.gates import gate
 from groma.mapping.noise.landmarks import pixels_of
 from groma.scene import Scene
@@ -146,8 +147,9 @@ def _covariance(grid: _Grid, cells: IntArray, residual: FloatArray, sigma: Float
     """The shared variance by how far cells lie apart, pixels squared, of the shape of a grid; zero where it is none."""
     # Landmarks follow their observations: residuals are smaller than errors.
     residual = residual / np.sqrt(max(np.sum(residual**2) / max(residual.size, 1), GATES.min_share))
-    products = np.sum([grid.pairs(grid.sums(cells, along / sigma)) for along in residual.T], axis=0)
-    weights = grid.pairs(grid.sums(cells, 1.0 / sigma**2))
+    summed = [*(residual.T / sigma), 1.0 / sigma**2]
+    first, second, weights = map_in_threads(lambda values: grid.pairs(grid.sums(cells, values)), summed)
+    products = first + second
     # Without pairs of an observation with itself.
     products[0, 0] -= np.sum(residual**2 / sigma[:, None] ** 2)
     weights[0, 0] -= np.sum(1.0 / sigma**4)

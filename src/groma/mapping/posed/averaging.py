@@ -32,13 +32,11 @@ from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.gates import gate
+from groma.gates import chi_square_gate, gate
 from groma.geometry import quaternion
 from groma.mapping.posed.motions import Motions
 
-#: Median and lower quartile of a squared normalised residual of three coordinates.
-_MEDIAN, _QUARTILE = 2.366, 1.213
-#: Columns of an inverse that are computed at a time.
+#: Columns of an inverse that are computed at a time (cost: memory).
 _COLUMNS = 256
 
 
@@ -160,7 +158,7 @@ def _reweighted(
     for step in range(1, GATES.steps + 1):
         ratio = np.linalg.norm(off, axis=1) / sigma
         # Of repeated structure most motions are wrong: the quartile, not the median.
-        spread = max(1.0, float(np.sqrt(np.quantile(ratio**2, 0.25) / _QUARTILE)))
+        spread = max(1.0, float(np.sqrt(np.quantile(ratio**2, 0.25) / chi_square_gate(0.75, 3))))
         # A pose that claims to be far better than the motions would outvote any number of them.
         used = max(noise, spread * float(np.median(sigma * length)))
         kept = loss(ratio / spread)
@@ -173,7 +171,7 @@ def _reweighted(
         counted = counts & (redundancy > GATES.least_redundancy)
         if 2 * counted.sum() > counts.sum():  # else the given ones are too good for motions to tell their noise
             squares = np.sum(own[counted] ** 2, axis=1) / redundancy[counted]
-            noise = max(float(np.sqrt(np.median(squares) / _MEDIAN)), 1e-9)
+            noise = max(float(np.sqrt(np.median(squares) / chi_square_gate(0.5, 3))), 1e-9)
     return Averaged(values, own, noise, redundancy, kept)
 
 
@@ -281,6 +279,3 @@ def _disagreement(point: FloatArray, at: FloatArray, way: FloatArray) -> float:
     between = point - at
     size = np.maximum(np.linalg.norm(between, axis=1), 1e-12)
     return float(np.median(np.arccos(np.clip(np.einsum("ij,ij->i", between, way) / size, -1.0, 1.0))))
-
-
-__all__ = ["Averaged", "AveragingGates", "average_centers", "average_rotations"]

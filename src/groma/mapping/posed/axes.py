@@ -182,6 +182,3 @@ def _listed(axes: FloatArray) -> str:
     return ", ".join(
         ("-" if row[int(np.abs(row).argmax())] < 0 else "") + words[int(np.abs(row).argmax())] for row in axes
     )
-
-
-__all__ = ["AxesGates", "Reading", "check_axes", "readings", "score"]

@@ -59,6 +59,3 @@ def scene_at_poses(images: Path, poses: Path, options: PointModelOptions) -> Giv
         )
     scene = Scene.from_images(cameras, found.names, camera_idx, found.cam_from_world)
     return GivenScene(scene, calibrated, tuple(said))
-
-
-__all__ = ["GivenScene", "scene_at_poses"]

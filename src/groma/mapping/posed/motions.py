@@ -121,6 +121,3 @@ def _linearised(pose: FloatArray, first: FloatArray, second: FloatArray) -> tupl
     # y . (t x (w x Rx)) = w . (Rx x (y x t)), and y . (dt x Rx) = dt . (Rx x y).
     wrt_turn, wrt_shift = np.cross(turned, back), np.cross(turned, second) @ basis
     return value / size, np.hstack([wrt_turn, wrt_shift]) / size[:, None], basis
-
-
-__all__ = ["MotionGates", "Motions", "motions_of"]

@@ -81,6 +81,3 @@ def _truncated(share: float) -> float:
     from scipy.stats import chi2  # takes half a second to import
 
     return float(chi2.cdf(chi2.ppf(share, 3), 5) / share) if share < 1.0 else 1.0
-
-
-__all__ = ["GivenNoise", "GrossErrorGates", "noise_of_given"]

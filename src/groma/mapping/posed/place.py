@@ -226,6 +226,3 @@ def _check_motions(motions: Motions, scene: Scene) -> None:
             f"{len(motions)} pairs of the {scene.num_images} photographs match each other; points need more. They "
             "overlap too little, or show too little texture: take more, from places some steps apart."
         )
-
-
-__all__ = ["GivenPoses", "PlacingGates", "averaged", "place_photographs"]

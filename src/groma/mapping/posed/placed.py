@@ -17,6 +17,3 @@ class PlacedPhotographs:
     #: What was found out, and what was wrong.
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-
-
-__all__ = ["PlacedPhotographs"]

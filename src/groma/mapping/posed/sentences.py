@@ -12,7 +12,7 @@ from groma.evaluation.alignment import camera_centers
 from groma.geometry import quaternion
 from groma.scene import Scene
 
-#: Names in a sentence.
+#: Names in a sentence (convention: what a sentence can hold) (convention: a sentence holds no more).
 _NAMES = 12
 
 
@@ -60,6 +60,3 @@ def about_left_out(names: Sequence[str], seen: BoolArray) -> list[str]:
         f"{len(rows)} of {len(seen)} images see too few points of the others for their poses to be checked, and were "
         f"left out: {listed}{more}."
     ]
-
-
-__all__ = ["about_gross_errors", "about_left_out", "about_noise"]

@@ -109,7 +109,8 @@ def angles_between(
 
 def vertical_of(scene: Scene) -> Vector | None:
     """Return the direction that was measured in the cameras, if it is one and the same in all: gravity."""
-    table = scene.known_directions.take(scene.known_directions.kind == Kind.IMAGE)
+    table = scene.known_directions
+    table = table.take((table.kind == Kind.IMAGE) & ~table.rejected)
     if len(table) == 0 or np.abs(table.vector - table.vector[0]).max() > _SAME:
         return None
     vector, information = table.vector[0], float((table.sigma**-2.0).sum())
@@ -205,6 +206,3 @@ def _near(
     variance[rows], axes = np.linalg.eigh(noise)
     offset[rows] = np.einsum("nab,nai,ni->nb", axes, basis, other[rows])
     return np.column_stack([first, second]), offset, variance, right
-
-
-__all__ = ["AngleGates", "Angles", "right_angles"]

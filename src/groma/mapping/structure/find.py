@@ -52,7 +52,7 @@ class StructureOptions:
     directions: DirectionOptions = field(default_factory=partial(DirectionOptions, min_coincidences=2))
     #: Whether relations between points and lines are returned.
     points_on_lines: bool = True
-    #: Level of the chi-square tests of relations.
+    #: Level of the chi-square tests of relations (convention: level of a test).
     level: float = 0.99
     #: Least probability that a related landmark is no clutter.
     min_probability: float = 0.7

@@ -24,9 +24,9 @@ from groma.mapping.noise.landmarks import line_noise, point_noise
 from groma.mapping.structure.find import StructureOptions
 from groma.scene import Scene
 
-#: Deviations that are tried, each five per cent larger than the one before.
+#: Deviations that are tried, each five per cent larger than the one before (cost: time).
 _TRIED = 100
-#: Unknowns of a plane.
+#: Unknowns of a plane (derived from geometry).
 _UNKNOWNS = 3
 #: Plane, height, variance and length of a pixel of landmarks.
 _Heights = tuple[IntArray, FloatArray, FloatArray, FloatArray]
@@ -109,6 +109,3 @@ def _of_lines(scene: Scene, sigma_px: float | None) -> _Heights:
     height = np.einsum("nei,ni->ne", scene.lines.segments[line], normal) + offset[:, None]
     length = np.repeat(lengths_per_pixel(scene, "line")[line], 2)
     return np.repeat(plane, 2), height.ravel(), variance.ravel(), length
-
-
-__all__ = ["plane_noise_px", "surface_noise_px"]

@@ -121,6 +121,3 @@ def _neighbours(segments: FloatArray, pixel: FloatArray, gates: JunctionGates) -
     different = one != other
     low, high = np.minimum(one, other)[different], np.maximum(one, other)[different]
     return distinct_pairs(low, high)[0]
-
-
-__all__ = ["JunctionGates", "meetings"]

@@ -236,6 +236,3 @@ def _thin(rng: np.random.Generator, owner: IntArray, count: int, mean: int, leas
     kept = order[rank < cap[owner[order]]]
     alive = np.bincount(owner[kept], minlength=count) >= least
     return kept[alive[owner[kept]]], alive
-
-
-__all__ = ["corridor"]

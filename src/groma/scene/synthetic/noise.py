@@ -90,6 +90,3 @@ def rotated(rng: np.random.Generator, poses: FloatArray, sigma_deg: float) -> Fl
     turned[:, :4] = quaternion.multiply(turn, poses[:, :4])
     turned[:, :4] /= np.linalg.norm(turned[:, :4], axis=1, keepdims=True)
     return turned
-
-
-__all__ = ["Structure", "SyntheticScene", "assemble", "project_pinhole", "rotated"]

@@ -78,6 +78,3 @@ def _pushes(problem: Problem, factor: Factor, effect: dict[str, FloatArray], siz
         if ref.group in effect:
             out += np.einsum("nm,nmk,nkj->nj", pull, J, effect[ref.group][ref.index])
     return out
-
-
-__all__ = ["clustered", "with_kept"]

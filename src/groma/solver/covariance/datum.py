@@ -238,14 +238,3 @@ def _costs(
         gram += np.tensordot(blocks, V @ blocks, axes=((0, 1), (0, 1)))
         size += part.T @ (np.einsum("nii->ni", V).reshape(-1)[:, None] * part)
     return gram, size
-
-
-__all__ = [
-    "FREE_TOLERANCE",
-    "FreeMotions",
-    "constrained",
-    "free_motions",
-    "held_coordinates",
-    "middle_and_extent",
-    "unmoved",
-]

@@ -163,6 +163,3 @@ class Landmarks:
         dof = self._layout.eliminated[e].dof
         size = np.sqrt(np.einsum("nii->ni", self._equations.V[e].reshape(-1, dof, dof)))
         return (np.abs(self.followed(e, X)) * size[:, :, None] > threshold).any(axis=(1, 2))
-
-
-__all__ = ["Landmarks"]

@@ -395,6 +395,3 @@ class Covariances:
                 columns.append((ends[0] - ends[1]) / (2 * step))
         J = np.stack(columns, axis=1)
         return Derived(center, J @ self.joint(variables) @ J.T)
-
-
-__all__ = ["Covariances", "Derived"]

@@ -23,7 +23,7 @@ from groma.solver.linear.modes import MODES, Modes, smallest
 
 #: A variable that moves by more than this in a scaled mode of zero cost is loose; this share of the poses may be.
 LOOSE, MAX_LOOSE = 1e-6, 0.2
-#: Modes of zero cost that are sought at most.
+#: Modes of zero cost that are sought at most (cost: time and memory).
 MAX_MODES = 1024
 
 
@@ -123,6 +123,3 @@ def deficiency(layout: Layout, modes: Modes, num_free: int) -> ProblemError:
 
 def _kind(layout: Layout, kept: KeptClass) -> str:
     return layout.problem.variables[kept.members[0].group].manifold.kind
-
-
-__all__ = ["LOOSE", "deficiency", "hold_unobservable_blocks", "loses_the_cameras", "zero_modes"]

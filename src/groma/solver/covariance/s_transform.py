@@ -148,6 +148,3 @@ def _weight(layout: Layout, group: str, value: npt.ArrayLike) -> FloatArray:
     if not (weight >= 0).all():
         raise InputError(f"The weights of the datum must not be negative; those of {group!r} are.")
     return weight
-
-
-__all__ = ["Transformation", "datum_weights", "transformation"]

@@ -209,6 +209,3 @@ class BlockCholesky:
         flat = x.reshape(-1)
         _solve(self._first, self._rows, self._M, self._D, flat, width(self._width), width(1))
         return flat.reshape(x.shape)[self._position].reshape(-1)
-
-
-__all__ = ["BlockCholesky"]

@@ -55,6 +55,3 @@ def products(layout: Layout, blocks: Blocks, x: list[FloatArray], y: list[FloatA
 def split(layout: Layout, x: FloatArray) -> list[FloatArray]:
     """Return the parts of a flat vector by class, without a copy."""
     return [x[c.start : c.start + c.count * c.width] for c in layout.kept]
-
-
-__all__ = ["Blocks", "add_block_products", "multiply", "products", "split"]

@@ -35,6 +35,3 @@ def linear_solver(layout: Layout, name: str) -> LinearSolver:
             + did_you_mean(name, linear_solver_names())
         )
     return known[name](layout)
-
-
-__all__ = ["linear_solver", "linear_solver_names"]

@@ -30,14 +30,17 @@ from groma.problem.sorting import argsort_by
 from groma.solver.linear.elsewhere import Elsewhere
 from groma.solver.linear.lapack import potrf, potrs
 
-#: Cameras in a cluster, unless that makes more clusters than MAX_CLUSTERS.
+#: Cameras in a cluster, unless that makes more clusters than MAX_CLUSTERS (cost: of the coarse system; the solution is
+#: the same).
 CLUSTER_SIZE = 24
+#: Cost: time only.
 MAX_CLUSTERS = 64
-#: Fewer clusters than this are not worth it.
+#: Fewer clusters than this are not worth it (cost: time only).
 MIN_CLUSTERS = 4
 #: Added to the diagonal of the coarse system, relative: a camera alone cannot tell all seven motions apart.
 JITTER = 1e-10
-#: The coarse system is kept while the motions have changed by less than this share of the largest since it was formed.
+#: The coarse system is kept while the motions have changed by less than this share of the largest since it was formed
+#: (cost: time only).
 SAME_MOTIONS = 3e-3
 
 # ---------------------------------------------------------------------------------------------------------- Kernels

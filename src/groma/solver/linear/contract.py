@@ -87,13 +87,3 @@ def keeps_poses_alone(layout: Layout) -> bool:
 def is_pose_graph(layout: Layout) -> bool:
     """Whether nothing is eliminated, and what is kept are poses of one kind."""
     return not layout.eliminated and len(layout.kept) == 1 and keeps_poses_alone(layout)
-
-
-__all__ = [
-    "PIVOT_TOLERANCE",
-    "LinearSolver",
-    "is_pose_graph",
-    "keeps_poses_alone",
-    "register_linear_solver",
-    "registered_linear_solvers",
-]

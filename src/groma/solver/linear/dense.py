@@ -17,7 +17,8 @@ from groma.solver.linear.lapack import potrf, potrs
 
 #: Flops of a factorisation, measured on one core.
 DENSE_FLOPS_PER_SECOND = 2.5e10
-#: Up to this many unknowns a dense factorisation costs little, and is exact: where poses alone are kept, and otherwise.
+#: Up to this many unknowns a dense factorisation costs little, and is exact: where poses alone are kept, and otherwise
+#: (cost: time alone).
 DENSE_POSE_UNKNOWNS, DENSE_OTHER_UNKNOWNS = 360, 1000
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -77,6 +78,3 @@ class Dense:
         for (a, b), S in blocks.items():
             rows, columns = layout.blocks[a, b]
             _scatter(S, rows, columns, layout.kept[a].start, layout.kept[b].start, M)
-
-
-__all__ = ["DENSE_FLOPS_PER_SECOND", "Dense"]

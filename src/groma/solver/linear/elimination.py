@@ -98,6 +98,3 @@ def _roots(system: ReducedSystem, e: int) -> Roots:
         start = np.cumsum(count) - count
         incidences[c] = (np.arange(len(owner)) - np.repeat(start - all_of.pointer[few], count), owner)
     return Roots(few, vectors * root[:, None, :] / size[few][:, :, None], incidences)
-
-
-__all__ = ["ILL_CONDITIONED", "LANDMARK_TOLERANCE", "Roots", "eliminate", "scaled_blocks"]

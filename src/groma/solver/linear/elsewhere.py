@@ -22,6 +22,3 @@ class Elsewhere(Protocol):
     def coarse(self, c: int, cluster: IntArray, P: FloatArray) -> FloatArray:
         """Return what the blocks within a class add to :func:`groma.solver.linear.coarse.coarse_products`."""
         ...
-
-
-__all__ = ["Elsewhere"]

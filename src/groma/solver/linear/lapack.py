@@ -45,6 +45,3 @@ potrf, potrs, potri = _lapack.dpotrf, _lapack.dpotrs, _lapack.dpotri
 def solve_lower(L: FloatArray, rhs: FloatArray, transposed: bool = False) -> FloatArray:
     """Return L^-1 ``rhs``, or L^-T ``rhs``, for a lower triangle L of :func:`potrf`."""
     return _lapack.dtrtrs(L, rhs, lower=1, trans=int(transposed))[0]
-
-
-__all__ = ["potrf", "potri", "potrs", "solve_lower"]

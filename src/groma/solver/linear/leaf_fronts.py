@@ -191,6 +191,3 @@ class Leaves:
     def solve(self, x: FloatArray, back: bool = False) -> None:
         """Substitute forward in all leaves, or back."""
         solve_leaves(self.numbers, self.size, self.first, self.at, self.unknowns, self.L, x, back)
-
-
-__all__ = ["Leaves"]

@@ -19,8 +19,10 @@ from groma.solver.linear.fronts import Fronts
 
 #: Eigenvalues of the scaled system below this count as zero: rounding reaches about 1e-13.
 NULL_TOLERANCE = 1e-11
-#: Added to the diagonal while modes are sought; raised by tens until the factorisation succeeds.
+#: Added to the diagonal while modes are sought; raised by tens until the factorisation succeeds (cost: accuracy of
+#: modes that are nearly zero anyhow).
 SHIFT, MAX_SHIFT = 1e-10, 1e-5
+#: Modes sought at a time, and rounds of inverse iteration (cost: time and memory).
 MODES, ROUNDS = 16, 4
 
 
@@ -86,6 +88,3 @@ def _shifted(layout: Layout, S: Blocks, shift: float) -> Blocks:
 def _product(layout: Layout, S: Blocks, x: FloatArray) -> FloatArray:
     parts = [np.ascontiguousarray(x[c.start : c.start + c.count * c.width]) for c in layout.kept]
     return np.concatenate(multiply(layout, S, parts))
-
-
-__all__ = ["NULL_TOLERANCE", "Modes", "divided", "scaled", "smallest"]

@@ -34,6 +34,3 @@ def fill_reducing_order(rows: IntArray, columns: IntArray, count: int) -> IntArr
     )
     factors = splu(graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return np.asarray(factors.perm_c, np.int64)
-
-
-__all__ = ["fill_reducing_order"]

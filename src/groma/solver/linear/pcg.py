@@ -23,9 +23,10 @@ from groma.solver.linear.elsewhere import Elsewhere
 
 #: Bytes of a product with S, measured on one core.
 BYTES_PER_SECOND = 6e9
-#: Iterations in a step where poses alone are kept, and otherwise (calibration, planes).
+#: Iterations in a step where poses alone are kept, and otherwise (calibration, planes) (cost: a step that is not solved
+#: out is refused or followed by another).
 POSE_ITERATIONS, OTHER_ITERATIONS = 15, 60
-#: ... and where nothing is eliminated: motions between poses are hard for conjugate gradients.
+#: ... and where nothing is eliminated: motions between poses are hard for conjugate gradients. Cost: as above.
 GRAPH_ITERATIONS = 100
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -186,6 +187,3 @@ class ConjugateGradients:
             return float(r @ z)
 
         return precondition
-
-
-__all__ = ["ConjugateGradients"]

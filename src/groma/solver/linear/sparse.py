@@ -116,6 +116,3 @@ class SparseMatrix:
             return None
         x = factor.solve(np.concatenate(rhs))
         return split(self._layout, x) if np.isfinite(x).all() else None
-
-
-__all__ = ["SparseBlocks", "SparseMatrix", "sparse"]

@@ -176,6 +176,3 @@ def weakest(information: FloatArray, J: FloatArray) -> tuple[FloatArray, FloatAr
     sigma = 1.0 / np.sqrt(np.maximum(values, floor))
     sigma = np.where(values[:, -1:] > 0, sigma, np.inf)
     return sigma, J @ (inverse @ vectors)
-
-
-__all__ = ["SEEN", "Observers", "camera_centers", "distinct", "motion", "nearest_place", "observers", "weakest"]

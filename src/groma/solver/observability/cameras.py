@@ -66,6 +66,3 @@ def _suspicious(
     what = few([f"{inspection.names(name, int(i))} ({words.format(amount[i])})" for i in bad], 3)
     text = f"{counted(len(bad), 'cameras')} stand{'s' if len(bad) == 1 else ''} out: {what}. {remedy}"
     return Finding(kind, "warning", text, name, tuple(map(int, bad)), {"worst": float(amount[bad[0]])})
-
-
-__all__ = ["camera_findings"]

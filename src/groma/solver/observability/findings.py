@@ -49,6 +49,3 @@ def few(parts: list[str], most: int = DIAGNOSIS.examples) -> str:
 def first_upper(text: str) -> str:
     """Return a text that begins with a capital."""
     return text[:1].upper() + text[1:]
-
-
-__all__ = ["Finding", "few", "first_upper"]

@@ -66,5 +66,3 @@ class DiagnosisGates:
 
 #: The numbers in use.
 DIAGNOSIS = DiagnosisGates()
-
-__all__ = ["DIAGNOSIS", "DiagnosisGates"]

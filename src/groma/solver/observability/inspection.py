@@ -162,6 +162,3 @@ class Inspection:
             sums += np.bincount(index, weights=squares, minlength=len(sums))
             rows += factor.residual_rank * np.bincount(index, minlength=len(rows))
         return result
-
-
-__all__ = ["Inspection"]

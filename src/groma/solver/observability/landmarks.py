@@ -263,6 +263,3 @@ def _scatter(rows: FloatArray, index: IntArray, count: int) -> FloatArray:
         for j in range(i, 3):
             out[:, i, j] = out[:, j, i] = np.bincount(index, weights=rows[:, i] * rows[:, j], minlength=count)
     return out
-
-
-__all__ = ["landmark_findings"]

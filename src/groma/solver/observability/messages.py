@@ -114,6 +114,3 @@ def scene_freedom(combinations: FloatArray) -> list[str]:
 def _complement(unit: FloatArray) -> FloatArray:
     U, _, _ = np.linalg.svd(unit[:, None], full_matrices=True)
     return U[:, 1:]
-
-
-__all__ = ["Names", "axis", "camera_freedom", "listing", "plane_freedom", "scene_freedom", "split"]

@@ -189,6 +189,3 @@ def _whole_modes(inspection: Inspection, excursions: dict[str, FloatArray], whol
         )
     kind = "calibration_and_shape" if parameters else "loose_scene"
     return Finding(kind, "problem", text, listing(sorted(moved)) if moved else "", values={"count": count})
-
-
-__all__ = ["separate_parts", "unobservable_modes", "unseen_variables"]

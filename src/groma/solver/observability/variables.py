@@ -135,6 +135,3 @@ def _landmarks_on(inspection: Inspection, name: str, i: int) -> str:
         if found:
             parts.append(counted(len(found), f"{kind}s"))
     return listing(parts) if parts else ""
-
-
-__all__ = ["parameter_names", "variable_findings"]

@@ -21,7 +21,7 @@ from groma.solver.linear.modes import MAX_SHIFT, MODES, ROUNDS, SHIFT, Modes, sm
 if TYPE_CHECKING:
     from scipy.sparse import csc_array, csr_array
 
-#: Systems of up to so many unknowns are decomposed completely.
+#: Systems of up to so many unknowns are decomposed completely (cost: time alone).
 DENSE = 300
 #: Directions of a landmark whose scaled information is below this share of the largest are left alone.
 LANDMARK_TOLERANCE = 1e-11
@@ -211,6 +211,3 @@ def _by_iteration(matrix: csc_array) -> tuple[FloatArray, FloatArray]:
     product = X.T @ (matrix @ X)
     values, vectors = np.linalg.eigh(0.5 * (product + product.T))
     return values, X @ vectors
-
-
-__all__ = ["weak_modes"]

@@ -23,6 +23,3 @@ class Alone:
 
     def gather(self, text: str) -> list[str]:  # noqa: D102
         return [text]
-
-
-__all__ = ["Alone"]

@@ -33,6 +33,3 @@ class Reducer(Protocol):
     def gather(self, text: str) -> list[str]:
         """Return a text of every process, by rank."""
         ...
-
-
-__all__ = ["Reducer"]

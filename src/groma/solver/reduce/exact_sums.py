@@ -76,6 +76,3 @@ def rounded(sums: ComplexArray) -> FloatArray:
     if lost.any():
         total[lost] = sums.real[lost]
     return total
-
-
-__all__ = ["add", "add_sums", "rounded"]

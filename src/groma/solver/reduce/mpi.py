@@ -30,7 +30,7 @@ LAUNCHERS = (
     ("PMIX_RANK", "SLURM_STEP_NUM_TASKS"),
 )
 
-#: Numbers in one message, because MPI makes copies of it; and numbers added at once.
+#: Numbers in one message, because MPI makes copies of it; and numbers added at once (cost: memory).
 SUMMED_AT_ONCE, ADDED_AT_ONCE = 1 << 19, 1 << 14
 
 
@@ -129,6 +129,3 @@ def _add(others: Any, sums: Any, _datatype: Any) -> None:
     for first in range(0, len(total), ADDED_AT_ONCE):
         part = slice(first, first + ADDED_AT_ONCE)
         exact_sums.add_sums(total[part], more[part])
-
-
-__all__ = ["LAUNCHERS", "Ranks", "reducer_of_launcher", "started_as"]

@@ -91,6 +91,3 @@ class ScatteredBlocks:
 
     def _sum(self, total: ComplexArray) -> FloatArray:
         return exact_sums.rounded(self._reducer.sum(total))
-
-
-__all__ = ["ScatteredBlocks"]

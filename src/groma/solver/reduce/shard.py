@@ -96,6 +96,3 @@ def num_bytes(value: Any) -> int:
     if is_dataclass(value) and not isinstance(value, type):
         return sum(num_bytes(getattr(value, item.name)) for item in fields(value))
     return 0
-
-
-__all__ = ["OpenShard", "Shard", "Shelf", "num_bytes"]

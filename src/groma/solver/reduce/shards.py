@@ -35,7 +35,7 @@ from groma.solver.damped_problem import Trial
 from groma.solver.levenberg_marquardt import damping_from, predicted_decrease
 from groma.solver.linear.blas import one_blas_thread
 from groma.solver.linear.schur import ReducedSystem
-from groma.solver.options import SolverOptions, first_damping
+from groma.solver.options import DAMPING, SolverOptions, first_damping
 from groma.solver.reduce.alone import Alone
 from groma.solver.reduce.contract import Reducer
 from groma.solver.reduce.journal import Journal, Waypoint
@@ -47,9 +47,8 @@ from groma.solver.standing import Standing
 from groma.solver.steps import States, share_of_states, squares_of_states, squares_of_step
 from groma.solver.termination import Termination
 
-#: Damping of the first step where the options give none.
-FIRST_DAMPING = 1e-5
-#: With more cameras than this the reduced system is not formed: it would take 2 GB and more on every process.
+#: With more cameras than this the reduced system is not formed: it would take 2 GB and more on every process (cost:
+#: memory).
 MAX_FORMED = 50_000
 #: How much longer a step is made, at most. Over 24 random scenes under a Cauchy loss shards were visited 1136 times in
 #: all without it, 781 times with it, 907 times with a limit of 3.
@@ -162,7 +161,7 @@ class ShardedProblem:
             wanted == "auto" and (poses <= MAX_FORMED or options.linear_solver not in ("auto", "pcg"))
         )
         self._sums = SharedSystem(self._kept, self._reducer, formed)
-        first = replace(options, initial_damping=options.initial_damping or FIRST_DAMPING)
+        first = replace(options, initial_damping=options.initial_damping or DAMPING.points)
         self._damping = damping_from(first_damping(variables, first))
         self._last_ratio = self._curvature = 1.0
         self._here = ShardedTrial(cost=np.nan, states={name: group.state for name, group in variables.items()})

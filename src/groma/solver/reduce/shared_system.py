@@ -21,7 +21,7 @@ from groma.solver.reduce.contract import Reducer
 from groma.solver.reduce.scattered import ScatteredBlocks
 from groma.solver.steps import States, largest_slope
 
-#: Numbers that are summed with the system: the cost and such.
+#: Numbers that are summed with the system: the cost and such (a format of messages).
 NUM_FOUND = 10
 
 
@@ -256,6 +256,3 @@ class SharedSystem:
                 blocks[member.blocks(np.arange(count)), member.offset : member.offset + dof] = delta
             parts.append(blocks.reshape(-1))
         return parts
-
-
-__all__ = ["SharedSystem"]

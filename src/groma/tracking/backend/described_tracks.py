@@ -87,6 +87,3 @@ def _add(
     table = PointMeasurements(index, pixel, np.full(len(rows), sigma), unknown, unknown, right)
     measured = replace(Measurements.empty(), points=table)
     out.keyframes.append(replace(keyframe, index=len(out.keyframes), pose=keyframe.pose.copy(), measured=measured))
-
-
-__all__ = ["described_tracks"]

@@ -15,7 +15,7 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.adjustment.assemble import AssemblyOptions, assemble, first_camera_gauge
 from groma.geometry import se3
 from groma.problem.problem import Problem
-from groma.scene import Lines, Relations
+from groma.scene import Lines, Relations, Scene
 from groma.solver.options import SolverOptions
 from groma.solver.report import SolveReport
 from groma.solver.solve import solve
@@ -46,7 +46,9 @@ class AdjustmentJob:
     points: IntArray
     lines: IntArray
     planes: IntArray
-    problem: Problem
+    #: What takes part, as it was when the job was prepared, and how it is adjusted.
+    scene: Scene
+    options: AssemblyOptions
     #: Measurements of points and lines, with the keyframe (position in ``keyframes``) and the row in its table.
     point_table: PointMeasurements
     point_rows: IntArray
@@ -60,11 +62,11 @@ class AdjustmentJob:
     solved: Problem | None = field(default=None)
 
     def solve(self) -> None:
-        """Solve; reads and changes nothing but this job."""
+        """Make a problem of the scene and solve it; reads and changes nothing but this job."""
         options = SolverOptions(
             max_iterations=self.max_iterations, function_tolerance=self.function_tolerance, threads=1
         )
-        solution = solve(self.problem, options)
+        solution = solve(assemble(self.scene, self.options).problem, options)
         self.solved, self.report = solution.problem, solution.report
 
     def apply(self, track_map: TrackMap) -> FloatArray:
@@ -112,16 +114,11 @@ class AdjustmentJob:
             gone = self.points[left[self.points] < 1]
             track_map.drop_points(gone)
         if len(lines):
-            wrong = np.zeros(len(lines), dtype=bool)
-            for k in np.unique(self.line_pose):
-                of = np.flatnonzero(self.line_pose == k)
-                ends, good = line_ends(self.camera, poses[k], track_map.lines.plucker[lines.index[of]], lines.ends[of])
-                first, second = (self.camera.project(into(poses[k], ends[:, side])) for side in (0, 1))
-                away = np.maximum(
-                    np.linalg.norm(first - lines.ends[of, :2], axis=1),
-                    np.linalg.norm(second - lines.ends[of, 2:], axis=1),
-                )
-                wrong[of] = ~(good & (away < GATE * 1.2 * lines.sigma[of] + 1.0))
+            seen_from = poses[self.line_pose]
+            ends, good = line_ends(self.camera, seen_from, track_map.lines.plucker[lines.index], lines.ends)
+            pixels = [self.camera.project(se3.transform_points(seen_from, ends[:, side])) for side in (0, 1)]
+            away = np.linalg.norm((np.hstack(pixels) - lines.ends).reshape(-1, 2, 2), axis=2).max(axis=1)
+            wrong = ~(good & (away < GATE * 1.2 * lines.sigma + 1.0))
             self._forget("lines", wrong, self.line_pose, self.line_rows)
             left = np.bincount(lines.index[~wrong], minlength=len(track_map.lines))
             track_map.drop_lines(self.lines[left[self.lines] < 1])
@@ -238,13 +235,9 @@ def job_of(
     if held.sum() == 1 and len(scene.relations):
         # Distances between landmarks cost less in a smaller map: unless it is metric, its scale is held too.
         coordinates = first_camera_gauge(scene, first=int(held.argmax()))
-    problem = assemble(scene, replace(options, held_frames=coordinates)).problem
-    if not problem.factors:
+    if not (len(points) or len(lines) or len(planes)):
         return None
     return AdjustmentJob(
-        camera, keyframes, held, point_ids, line_ids, plane_ids, problem,
+        camera, keyframes, held, point_ids, line_ids, plane_ids, scene, replace(options, held_frames=coordinates),
         points, point_rows, point_pose, lines, line_rows, line_pose, max_iterations,
     )  # fmt: skip
-
-
-__all__ = ["AdjustmentJob", "job_of", "window_job"]

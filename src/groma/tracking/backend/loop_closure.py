@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Places seen before: recognised by described features, closed by a pose graph, and their landmarks joined.
+"""Places seen before: keyframes that recognise them by described features, and maps that are moved and joined there.
 
 Each new keyframe is compared with older ones that share nothing with it. Enough features must match, and agree on one
-pose. The error found is spread over the keyframes between by a pose graph (odometry between neighbours, and the loops).
+pose. How well it is known, :mod:`groma.tracking.backend.place_again` says; loops are closed by
+:mod:`groma.tracking.backend.metric_loops` and :mod:`groma.tracking.backend.scaled_loops`.
 """
 
 from __future__ import annotations
@@ -13,13 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from groma._typing import FloatArray, IntArray
-from groma.adjustment.graphs.pose_graph import motion_problem
-from groma.factors.losses import Huber
 from groma.geometry import se3
 from groma.scene.landmarks import Lines
-from groma.scene.pose_graph import Motions
-from groma.solver.options import SolverOptions
-from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, back, into, planes_back, planes_into
 from groma.tracking.gates import LoopGates, TrackingGates
 from groma.tracking.map.feature_points import match_features
@@ -63,50 +59,24 @@ def search_for_loop(track_map: TrackMap, newest: Keyframe, gates: TrackingGates)
     return LoopSearch(newest, [living[k] for k in chosen], gates)
 
 
-def close_loop(
-    track_map: TrackMap,
-    camera: TrackCamera,
-    newest: Keyframe,
-    pairs: list[tuple[Keyframe, IntArray, IntArray]],
-    gates: TrackingGates,
-) -> bool:
-    """Close a loop with what a search found, if the places agree on one pose; return whether the map was changed."""
-    best = None
-    for keyframe, first, second in pairs:
-        if not (keyframe.alive and newest.alive):
-            continue
-        found = agreeing_pose(track_map, camera, keyframe, newest, first, second, gates)
-        better = found is not None and (best is None or len(found[1]) > len(best[2]))
-        if found is not None and better and can_be(track_map, keyframe, newest, found[0], gates.loops):
-            best = (keyframe, *found)
-    if best is None:
-        return False
-    keyframe, pose, first, second = best
-    measured = se3.compose(keyframe.pose[None], se3.inverse(pose[None]))[0]
-    track_map.loops.append((keyframe.index, newest.index, np.append(measured, 1.0)))
-    _spread_error(track_map, gates.loops)
-    join_points(track_map, keyframe, newest, first, second)
-    return True
-
-
 def can_be(
     track_map: TrackMap,
     keyframe: Keyframe,
     newest: Keyframe,
     pose: FloatArray,
     gates: LoopGates,
-    log_scale: float = 0.0,
+    log_scale: float,
 ) -> bool:
     """Whether errors that add up at random between two keyframes explain how far the newest is from a pose (7,).
 
-    With one camera the scale is among them: ``log_scale`` is the logarithm of how much it has changed.
+    The scale of a single camera is among them: ``log_scale`` is the logarithm of how much it has changed.
     """
     way = [one for one in track_map.living() if keyframe.index <= one.index <= newest.index]
     centers = se3.inverse(np.array([one.pose for one in way]))[:, 4:]
     lever = float(np.linalg.norm(centers - centers[-1], axis=1).max())
     away = se3.log(se3.compose(pose[None], se3.inverse(newest.pose[None])))[0]
     many = gates.jump * math.sqrt(newest.index - keyframe.index)
-    turned = gates.turn_sigma if log_scale == 0.0 else math.hypot(gates.turn_sigma, gates.scale_sigma)
+    turned = math.hypot(gates.turn_sigma, gates.scale_sigma)
     went = np.linalg.norm(away[:3]) < many * (gates.shift_sigma * newest.depth + turned * lever)
     grew = abs(log_scale) < many * gates.scale_sigma
     return bool(went and grew and np.linalg.norm(away[3:]) < many * gates.turn_sigma)
@@ -134,25 +104,6 @@ def agreeing_pose(
     if through > gates.depth_check.denies:
         return None
     return found[0], first[found[1]], second[found[1]]
-
-
-def _spread_error(track_map: TrackMap, gates: LoopGates) -> None:
-    """Solve the pose graph and move keyframes with what they first saw."""
-    living = track_map.living()
-    poses = np.array([keyframe.pose for keyframe in living])
-    first, second = neighbours(track_map, living, gates)
-    relative = [se3.compose(poses[first], se3.inverse(poses[second]))]
-    ends, measured = known_loops(track_map, living)
-    first, second = np.concatenate([first, ends[:, 0]]), np.concatenate([second, ends[:, 1]])
-    relative.append(measured[:, :7])
-    held = np.zeros(len(living), dtype=bool)
-    held[0] = True
-    sigma = np.array([gates.shift_sigma] * 3 + [gates.turn_sigma] * 3)
-    weights = np.tile(np.diag((1.0 / sigma) ** 2), (len(first), 1, 1))
-    motions = Motions(first, second, np.concatenate(relative), weights)
-    problem = motion_problem(poses, held, motions, [(np.arange(len(motions)), Huber(gates.loss))])
-    solved = solve(problem, SolverOptions(max_iterations=gates.max_iterations, threads=1))["poses"]
-    move(track_map, living, np.column_stack([solved, np.ones(len(solved))]))
 
 
 def neighbours(track_map: TrackMap, living: list[Keyframe], gates: LoopGates) -> tuple[IntArray, IntArray]:
@@ -249,17 +200,3 @@ def join_lines(track_map: TrackMap, pairs: IntArray) -> None:
         if (index != table.index).any():
             unique = np.unique(index, return_index=True)[1]
             keyframe.measured = replace(keyframe.measured, lines=replace(table, index=index).take(unique))
-
-
-__all__ = [
-    "LoopSearch",
-    "agreeing_pose",
-    "can_be",
-    "close_loop",
-    "join_lines",
-    "join_points",
-    "known_loops",
-    "move",
-    "neighbours",
-    "search_for_loop",
-]

@@ -14,8 +14,10 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.geometry import se3
 from groma.solver.report import SolveReport
+from groma.tracking.backend.depth_calibration import DepthOffset, correct_depths, estimate_depth_offset
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
-from groma.tracking.backend.loop_closure import LoopSearch, close_loop, search_for_loop
+from groma.tracking.backend.loop_closure import LoopSearch, search_for_loop
+from groma.tracking.backend.metric_loops import close_loop
 from groma.tracking.backend.plane_outcome import PlaneOutcome, drop_what_failed
 from groma.tracking.backend.scaled_loops import close_scaled_loops
 from groma.tracking.backend.stereo_calibration import correct_map, estimate_turn, shift_between, tells_yaw
@@ -101,6 +103,9 @@ class Mapper:
         #: How the right camera is turned, if so far from what was taken that the track should start over.
         self.better_turn: RightTurn | None = None
         self.metric = first is None or first.is_metric
+        #: By how much inverse depths of a depth camera are off. Maps of earlier tracks were corrected then.
+        self.depth_offset: DepthOffset | None = None
+        self._begun_here = first is None
         self.loops = 0
         #: A frame that is to become a keyframe; its features are being found meanwhile.
         self.due: _Chosen | None = None
@@ -127,6 +132,7 @@ class Mapper:
             "maps": max(sum(bool(submap.keyframes) for submap in self.maps), 1),
             "maps_joined": len(self.joints),
             "metric": self.metric,
+            **({} if self.depth_offset is None else {"depth_camera": self.depth_offset.numbers()}),
         }
 
     def begin_anew(self, present: Present) -> None:
@@ -260,7 +266,7 @@ class Mapper:
             return
         last = self.map.last
         before = last.pose.copy()
-        if close_loop(self.map, self.camera, search.newest, pairs, self.options.gates):
+        if close_loop(self.map, self.camera, search.newest, pairs, self.options):
             self.loops += 1
             _follow_world(present, se3.compose(se3.inverse(last.pose[None]), before[None])[0])
 
@@ -328,7 +334,10 @@ class Mapper:
         self.loops += close_scaled_loops(self.maps[number], self.camera, self.options)
 
     def adjust_at_end(self, number: int) -> tuple[SolveReport | None, RightTurn]:
-        """Adjust all keyframes of a map together; return the report and how the right camera is turned."""
+        """Adjust all keyframes of a map together; return the report and how the right camera is turned.
+
+        What is wrong with right images or depths is estimated and corrected first.
+        """
         self.current = number
         turn = self.right.turn
         if not self.options.adjust_at_end or len(self.map.living()) < 2:
@@ -341,6 +350,11 @@ class Mapper:
                 correct_map(self.map, self.camera, self.right.turn, turn, self.options, job)
                 report = self._adjust_all()
             turn = turn.confirming(self._began_with or turn)
+        elif self._begun_here:
+            self.depth_offset = estimate_depth_offset(self.map, self.camera, self.options)
+            if self.depth_offset is not None and self.depth_offset.used:
+                correct_depths(self.map, self.depth_offset.offset)
+                report = self._adjust_all()
         return report, turn
 
     def adjust_with_planes(self, number: int) -> tuple[SolveReport | None, PlaneOutcome | None]:

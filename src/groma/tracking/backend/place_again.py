@@ -18,21 +18,19 @@ from scipy.spatial import KDTree
 from groma._typing import FloatArray, IntArray
 from groma.gates import chi_square_gate
 from groma.geometry import se3
+from groma.localization.pose.matches import Matches
+from groma.localization.pose.refinement import refine
 from groma.mapping.noise.landmarks import point_noise
-from groma.tracking.backend.loop_closure import agreeing_pose
+from groma.tracking.backend.loop_closure import agreeing_pose, join_lines
 from groma.tracking.frame.camera import TrackCamera, into, rotation
-from groma.tracking.frame.measurements import Measurements, PointMeasurements
+from groma.tracking.frame.measurements import PointMeasurements
 from groma.tracking.gates import TrackingGates
 from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.lines import assign, expected_segments
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
-from groma.tracking.pose.estimate import PoseEstimate, estimate_pose
-from groma.tracking.pose.relocalise import KnownFeatures, Places, known_features, match_near
+from groma.tracking.pose.relocalise import KnownFeatures, known_features, match_near
 from groma.tracking.result import map_to_scene
-
-#: A pose without a prior.
-_ANYWHERE = np.array([1e3] * 3 + [10.0] * 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +39,11 @@ class KnownMap:
 
     track_map: TrackMap
     camera: TrackCamera
+
+    @cached_property
+    def is_metric(self) -> bool:
+        """Whether its unit is a length that was measured."""
+        return self.track_map.is_metric
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -111,15 +114,15 @@ def measure_place(
     refined = _refined(older, known, newest, found[0], options)
     if refined is None:
         return None
-    estimate, pairs = refined
-    pose, scale = estimate.pose, _scale(older, newer, near, newest, estimate.pose, gates)
+    pose, own, pairs = refined
+    scale = (0.0, 0.0) if older.is_metric and newer.is_metric else _scale(older, newer, near, newest, pose, gates)
     if scale is None:
         return None
     log_scale, variance = scale
     relative = se3.compose(keyframe.pose[None], se3.inverse(pose[None]))[0]
     covariance = np.zeros((7, 7))
     unit = np.exp([-log_scale] * 3 + [0.0] * 3)
-    covariance[:6, :6] = unit[:, None] * np.linalg.inv(estimate.information) * unit
+    covariance[:6, :6] = unit[:, None] * own * unit
     covariance[6, 6] = variance
     similarity = np.append(relative, math.exp(log_scale))
     lines = _same_lines(older, newer, near, newest, pose, gates)
@@ -128,23 +131,55 @@ def measure_place(
 
 def _refined(
     older: KnownMap, known: KnownFeatures, newest: Keyframe, pose: FloatArray, options: TrackOptions
-) -> tuple[PoseEstimate, IntArray] | None:
-    """Return the pose of the newest by all known features that agree near it, and their pairs; None where few do."""
-    gates, refined = options.gates, None
+) -> tuple[FloatArray, FloatArray, IntArray] | None:
+    """Return the pose of the newest by all known features that agree near it, its covariance (6, 6), and their pairs.
+
+    Features count by their own noise and by that of their points; None where few agree.
+    """
+    gates, query, features = options.gates, older.camera.query, newest.features
+    point = np.array([known.keyframes[k].features.point[row] for k, row in zip(known.of, known.row, strict=True)])
+    mapped = (point >= 0) & np.isfinite(older.covariance[point, 0, 0])
+    matches, found, pairs = Matches(), None, np.zeros((0, 2), np.int64)
     for factor in gates.finding.rounds:
-        pairs = match_near(older.camera, known, newest.features, pose, factor * gates.finding.near)
+        reach = factor * gates.finding.near
+        pairs = match_near(older.camera, known, features, pose, reach)
+        pairs = pairs[mapped[pairs[:, 0]]]
         if len(pairs) < gates.loops.min_inliers:
             return None
-        measured = replace(Measurements.empty(), points=described(newest, pairs[:, 1], options))
-        view = replace(older.track_map.view, points=Places(known.places[pairs[:, 0]]))
-        estimate = estimate_pose(older.camera, view, measured, pose, _ANYWHERE, pose)
-        pose, refined = estimate.pose, (estimate, pairs[estimate.points])
-    if refined is None or len(refined[1]) < gates.loops.min_inliers or refined[0].weak:
+        matches = Matches(
+            features.pixel[pairs[:, 1]],
+            known.places[pairs[:, 0]],
+            point_sigma=options.point_sigma_px * features.scale[pairs[:, 1]],
+            point_covariance=older.covariance[point[pairs[:, 0]]],
+        )
+        found = refine(query, matches, pose, (reach, reach))
+        pose = found.pose
+    if found is None or found.point_inliers.sum() < gates.loops.min_inliers:
         return None
-    return refined
+    covariance = found.covariance(matches)
+    return (pose, covariance, pairs[found.point_inliers]) if np.isfinite(covariance).all() else None
 
 
-def described(keyframe: Keyframe, rows: IntArray, options: TrackOptions) -> PointMeasurements:
+def join_place(track_map: TrackMap, place: PlaceAgain, options: TrackOptions) -> None:
+    """Let the newest keyframe see the points that a place had before, and make one of lines that it has twice.
+
+    Points at matched features stay apart: features match to a pixel or two, which followed points know far better.
+    """
+    newest = place.newest
+    join_lines(track_map, place.lines)
+    for k, keyframe in enumerate(place.known.keyframes):
+        first, second = place.matches(k)
+        old = keyframe.features.point[first]
+        rows = np.unique(old, return_index=True)[1]
+        rows = rows[(track_map.points.state[old[rows]] == ALIVE) & ~np.isin(old[rows], newest.measured.points.index)]
+        table = replace(_described(newest, second[rows], options), index=old[rows])
+        points = PointMeasurements.stack([newest.measured.points, table])
+        newest.measured = replace(newest.measured, points=points)
+        free = rows[newest.features.point[second[rows]] < 0]
+        newest.features = newest.features.linked(second[free], old[free])
+
+
+def _described(keyframe: Keyframe, rows: IntArray, options: TrackOptions) -> PointMeasurements:
     """Return described features of a keyframe as measurements of the points 0, 1, ..."""
     count, features = len(rows), keyframe.features
     unknown = np.full(count, np.nan)
@@ -230,6 +265,3 @@ def _common(values: FloatArray, variance: FloatArray, least: int, floor: float) 
         weight = agree / variance
         middle = float((weight * values).sum() / weight.sum())
     return middle, float(1.0 / weight.sum())
-
-
-__all__ = ["KnownMap", "PlaceAgain", "described", "measure_place"]

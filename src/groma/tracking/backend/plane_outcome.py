@@ -76,6 +76,3 @@ def drop_what_failed(
     forget(track_map, gone)
     track_map.planes.support[own] = support[own]
     return dropped, len(gone)
-
-
-__all__ = ["PlaneOutcome", "drop_what_failed"]

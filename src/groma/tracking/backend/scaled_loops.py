@@ -9,8 +9,6 @@ first, and what was matched becomes one.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from groma.adjustment.graphs.similarity_graph import SimilarityGraphResult, SimilarityMotions, adjust_similarity_graph
@@ -18,18 +16,14 @@ from groma.geometry import sim3
 from groma.solver.options import SolverOptions
 from groma.tracking.backend.loop_closure import (
     can_be,
-    join_lines,
-    join_points,
     known_loops,
     move,
     neighbours,
     search_for_loop,
 )
-from groma.tracking.backend.place_again import KnownMap, PlaceAgain, described, measure_place
+from groma.tracking.backend.place_again import KnownMap, PlaceAgain, join_place, measure_place
 from groma.tracking.frame.camera import TrackCamera
-from groma.tracking.frame.measurements import PointMeasurements
 from groma.tracking.gates import LoopGates
-from groma.tracking.map.landmarks import ALIVE
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 
@@ -51,23 +45,6 @@ def close_scaled_loops(track_map: TrackMap, camera: TrackCamera, options: TrackO
             break
         loops.pop(int(errors.argmax()))
     return len(loops)
-
-
-def join_place(track_map: TrackMap, place: PlaceAgain, options: TrackOptions) -> None:
-    """Make one of landmarks that a place has twice; points that it has once the newest keyframe sees, too."""
-    newest = place.newest
-    join_lines(track_map, place.lines)
-    for k, keyframe in enumerate(place.known.keyframes):
-        first, second = place.matches(k)
-        join_points(track_map, keyframe, newest, first, second)
-        old, own = keyframe.features.point[first], newest.features.point[second]
-        alone = (own < 0) | (track_map.points.state[own] != ALIVE)
-        alone &= (old >= 0) & (track_map.points.state[old] == ALIVE) & ~np.isin(old, newest.measured.points.index)
-        rows = np.flatnonzero(alone)[np.unique(old[alone], return_index=True)[1]]
-        table = replace(described(newest, second[rows], options), index=old[rows])
-        points = PointMeasurements.stack([newest.measured.points, table])
-        newest.measured = replace(newest.measured, points=points)
-        newest.features = newest.features.linked(second[rows], old[rows])
 
 
 def _find_loops(track_map: TrackMap, camera: TrackCamera, options: TrackOptions) -> list[PlaceAgain]:
@@ -109,6 +86,3 @@ def _solved(track_map: TrackMap, loops: list[PlaceAgain], gates: LoopGates) -> S
     motions = SimilarityMotions(every[:, 0], every[:, 1], measured, covariance)
     options = SolverOptions(max_iterations=gates.max_iterations, threads=1)
     return adjust_similarity_graph(poses, motions, options=options)
-
-
-__all__ = ["close_scaled_loops", "join_place"]

@@ -45,7 +45,7 @@ from groma.tracking.map.map_scene import TRACKING
 from groma.tracking.map.track_map import Keyframe, TrackMap
 from groma.tracking.options import TrackOptions
 
-#: Of the increments of a right camera.
+#: Of the increments of a right camera (the format of an increment).
 YAW = 4
 
 
@@ -256,6 +256,3 @@ def _exp(angles: FloatArray) -> FloatArray:
 
 def _log(rotation: FloatArray) -> FloatArray:
     return so3.log(rotation[None])[0]
-
-
-__all__ = ["correct_map", "estimate_turn", "shift_between", "tells_yaw"]

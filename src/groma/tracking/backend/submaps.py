@@ -16,7 +16,6 @@ from groma.scene import Scene
 from groma.scene.landmarks import Lines
 from groma.tracking.backend.loop_closure import (
     LoopSearch,
-    agreeing_pose,
     join_points,
 )
 from groma.tracking.backend.place_again import KnownMap, measure_place
@@ -109,19 +108,13 @@ def find_joint(
         older = next((k for k, submap in enumerate(maps) if keyframe in submap.living()), newer)
         if older == newer:
             continue
-        joint = None
-        if all(maps[k].is_metric for k in (older, newer)):
-            found = agreeing_pose(maps[older], camera, keyframe, newest, first, second, options.gates)
-            if found is not None:
-                relative = np.append(se3.compose(keyframe.pose[None], se3.inverse(found[0][None]))[0], 1.0)
-                joint = Joint(older, keyframe.index, newer, newest.index, relative, *found[1:])
-        else:
-            known = [KnownMap(maps[k], camera) for k in (older, newer)]
-            place = measure_place(known[0], known[1], keyframe, newest, (first, second), options)
-            if place is not None:
-                relative, matches = place.keyframe_from_newest, place.matches(0)
-                joint = Joint(older, keyframe.index, newer, newest.index, relative, *matches)
-        if joint is not None and (best is None or len(joint.first) > len(best.first)):
+        known = [KnownMap(maps[k], camera) for k in (older, newer)]
+        place = measure_place(known[0], known[1], keyframe, newest, (first, second), options)
+        if place is None:
+            continue
+        relative, matches = place.keyframe_from_newest, place.matches(0)
+        joint = Joint(older, keyframe.index, newer, newest.index, relative, *matches)
+        if best is None or len(joint.first) > len(best.first):
             best = joint
     return best
 
@@ -224,6 +217,3 @@ def about_submaps(breaks: list[tuple[float, float]], where: Sequence[tuple[int, 
 
 def _shifted(index: IntArray, by: int) -> IntArray:
     return np.where(index >= 0, index + by, -1)
-
-
-__all__ = ["Joint", "Places", "Submap", "about_submaps", "best_joint", "find_joint", "joined_map", "search_older_maps"]

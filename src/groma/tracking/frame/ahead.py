@@ -29,6 +29,3 @@ class LookAhead:
         if frame is not None and pool is not None:
             self._next = FrameFeatures(frame, *self._given)
             self._next.prepare_ahead(pool, searching)
-
-
-__all__ = ["LookAhead"]

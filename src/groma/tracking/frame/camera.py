@@ -142,6 +142,3 @@ def planes_into(pose: FloatArray, planes: FloatArray) -> FloatArray:
 def planes_back(pose: FloatArray, planes: FloatArray) -> FloatArray:
     """Planes (K, 4) with unit normals, moved by the inverse of one pose (7,)."""
     return np.hstack([planes[:, :3] @ rotation(pose), (planes[:, 3] + planes[:, :3] @ pose[4:])[:, None]])
-
-
-__all__ = ["NEAR", "PINHOLE", "TrackCamera", "back", "into", "planes_back", "planes_into", "rotation"]

@@ -75,6 +75,3 @@ class FrameChecks:
                 raise InputError(f"Frame.{name} must be {np.dtype(dtype).name}; got {image.dtype}. Convert it.")
         if frame.right is not None and not self._camera.baseline > 0:
             raise InputError("Frames have a right image, but the camera has no baseline. Set SequenceCamera.baseline.")
-
-
-__all__ = ["FrameChecks"]

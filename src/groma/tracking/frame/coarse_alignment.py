@@ -220,6 +220,3 @@ def turned_prediction(
     scores = [agree(pose, *every)[1] for pose in (stayed, went)]
     k = int(np.argmax(scores))
     return (stayed, went)[k] if scores[k] > expected + gates.gain else None
-
-
-__all__ = ["small_image", "surroundings_agree", "turn_between", "turned", "turned_prediction"]

@@ -35,6 +35,3 @@ def segment_inverse_depths(
     sigma = np.sqrt(np.diagonal(found.inverse_depth_covariances, axis1=1, axis2=2))
     good = found.good[:, None]
     return np.where(good, found.inverse_depth, np.nan), np.where(good, sigma, np.nan)
-
-
-__all__ = ["DepthImage", "depth_sigma", "segment_inverse_depths"]

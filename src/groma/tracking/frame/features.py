@@ -343,6 +343,3 @@ def _in_turn(pixel: FloatArray, response: FloatArray, octave: IntArray, count: i
     of = np.bincount(octave)
     place = np.arange(len(order)) - np.repeat(np.cumsum(of) - of, of)
     return np.sort(order[place < count / len(order) * of[octave[order]]])
-
-
-__all__ = ["Descriptors", "DetectedSegments", "Features", "FrameFeatures", "grid_pixels", "grid_shape", "segment_noise"]

@@ -113,6 +113,3 @@ class Measurements:
     def empty(cls) -> Measurements:
         """Return nothing measured."""
         return cls(PointMeasurements.empty(), LineMeasurements.empty(), PlaneMeasurements.empty())
-
-
-__all__ = ["DEPTH_BASELINE", "LineMeasurements", "Measurements", "PlaneMeasurements", "PointMeasurements"]

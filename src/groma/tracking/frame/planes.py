@@ -76,6 +76,3 @@ def _sqrt_information(planes: FloatArray, covariances: FloatArray) -> FloatArray
     basis[:, 3, 2] = 1.0
     own = basis.transpose(0, 2, 1) @ covariances @ basis
     return np.asarray(np.linalg.cholesky(np.linalg.inv(own)), np.float64).transpose(0, 2, 1)
-
-
-__all__ = ["FramePlanes", "frame_planes"]

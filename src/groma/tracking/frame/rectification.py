@@ -233,18 +233,3 @@ def cells_of(camera: TrackCamera, pixels: FloatArray, gates: RectificationGates 
     size = camera.width / gates.cells
     column, row = np.clip((pixels / size).astype(np.int64), 0, (gates.cells - 1, 10_000)).T
     return row * gates.cells + column
-
-
-__all__ = [
-    "RightCamera",
-    "RightTurn",
-    "cells_of",
-    "find_pairs",
-    "fit_rows",
-    "retargeted",
-    "retargeted_depths",
-    "retargeted_ends",
-    "rows_turned_back",
-    "turned_disparities",
-    "turned_pixels",
-]

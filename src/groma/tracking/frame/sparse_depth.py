@@ -54,6 +54,3 @@ def fill_sparse(depth: DepthImage, max_depth: float, gates: TrackingGates = DEFA
     fill = wide[0] & ~inside & (reading > 1.0 / max_depth)
     filled[: rows * cell, : columns * cell][fill] = 1.0 / reading[fill]
     return filled
-
-
-__all__ = ["fill_sparse"]

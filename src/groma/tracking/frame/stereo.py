@@ -83,6 +83,3 @@ def _places_around(reach: int) -> IntArray:
     """Offsets (25, 2) in pixels at which a disparity is looked for beside a pixel that has none, nearest first."""
     steps = (-reach, -(reach // 2), 0, reach // 2, reach)
     return np.array(sorted(((v, u) for v in steps for u in steps), key=lambda at: at[0] ** 2 + at[1] ** 2))
-
-
-__all__ = ["Disparities", "dense_disparities", "match_right"]

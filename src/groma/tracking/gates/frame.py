@@ -65,6 +65,12 @@ class DepthGates:
     near: float = gate(0.5, "px", "depth beside a segment is read from this distance on", SEQUENCES)
     far: float = gate(4.5, "px", "and up to this distance, so that narrow faces are not missed", SEQUENCES)
     correlation: float = gate(6.0, "samples", "neighbouring samples that err alike count as one", SEQUENCES)
+    min_images: int = gate(
+        8, "images", "that tell an offset of inverse depths", "derived from the samples of a variance good to a half"
+    )
+    max_offset: float = gate(
+        3.0, "sigma", "offset of inverse depths that is believed", "derived from normal noise: 1 in 370"
+    )
     grid: int = gate(20, "px", "distance of the places whose depth is kept, and on planes", "cost: 768 in 640 x 480")
     far_share: float = gate(
         0.25, "share", "largest noise of a stereo depth; far points serve as well as near ones", SEQUENCES

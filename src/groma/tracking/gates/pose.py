@@ -137,10 +137,11 @@ class LoopGates:
     scale_sigma: float = gate(
         0.02, "1", "noise of the logarithm of a relative scale, of one camera", "derived from that of positions"
     )
-    jump: float = gate(6.0, "sigma", "a loop moves the newest keyframe by less: places are alike", SEQUENCES)
+    jump: float = gate(
+        6.0, "sigma", "a loop is nearer to the path, on the average of its components: places are alike", SEQUENCES
+    )
     held_by: int = gate(
         8, "keyframes", "earlier keyframes that hold each one in the pose graph", "cost: time of a loop"
     )
-    loss: float = gate(3.0, "sigma", "scale of the Huber loss of the pose graph", "derived from normal noise: 1 in 370")
     max_iterations: int = gate(30, "steps", "steps of the pose graph", "cost: converges in fewer")
     final_iterations: int = gate(15, "steps", "steps of the adjustment at the end, twice", "cost: converges in fewer")

@@ -60,6 +60,3 @@ def _drop(track_map: TrackMap, keyframe: Keyframe, living: list[Keyframe], num_h
             pixel[table.index[of]] = table.pixel[of]
             owner[table.index[of]] = other.index
     keyframe.forget()
-
-
-__all__ = ["drop_repeating_keyframes", "drop_unseen"]

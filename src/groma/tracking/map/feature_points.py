@@ -115,6 +115,3 @@ def place_by_motion(
     tracks = PointTracks(index, features.pixel[second])
     tracks = tracks.take(np.unique(index, return_index=True)[1])
     return tracks.take(~np.isin(tracks.index, taken)), features.linked(second, index)
-
-
-__all__ = ["match_descriptors", "match_features", "place_by_motion", "points_of_features"]

@@ -344,6 +344,3 @@ def _add_planes(track_map: TrackMap, data: FrameFeatures, pose: FloatArray) -> P
     index = np.concatenate([index, add_planes(track_map.planes, seen, rest, pose, gates)])
     rows = np.concatenate([rows, rest])
     return PlaneMeasurements(index, seen.plane[rows], seen.sqrt_information[rows])
-
-
-__all__ = ["Followed", "add_keyframe", "measure_points", "wants_keyframe"]

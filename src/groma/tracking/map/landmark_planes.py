@@ -116,6 +116,3 @@ def _claims(scene: Scene, sigma_px: float, gates: LandmarkPlaneGates) -> Iterato
     for k, (hesse, false_alarms, band) in enumerate(zip(*columns, strict=True)):
         points, lines = (pairs[pairs[:, 1] == k, 0] for pairs in (relations.point_on_plane, relations.line_on_plane))
         yield _Claim(hesse, float(false_alarms), float(band), points, lines, float(flatness[k]))
-
-
-__all__ = ["LINE", "find_planes", "forget"]

@@ -154,6 +154,3 @@ class MapView:
     points: PointTable
     lines: LineTable
     planes: PlaneTable
-
-
-__all__ = ["ALIVE", "DEAD", "PENDING", "LineTable", "MapView", "PlaneTable", "PointTable"]

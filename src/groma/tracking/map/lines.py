@@ -18,8 +18,8 @@ from groma._typing import BoolArray, FloatArray, IntArray
 from groma.features.edge_fit import measure_edges
 from groma.features.images import GrayImage
 from groma.features.matching.flow import Flow
-from groma.geometry import segment2
-from groma.tracking.frame.camera import TrackCamera, into, rotation
+from groma.geometry import quaternion, se3, segment2
+from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.gates import DEFAULT, LineGates
 from groma.tracking.map.landmarks import LineTable
 
@@ -172,34 +172,27 @@ def assign(
 
 
 def line_ends(
-    camera: TrackCamera, pose: FloatArray, plucker: FloatArray, ends: FloatArray
+    camera: TrackCamera, poses: FloatArray, plucker: FloatArray, ends: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Points (n, 2, 3) of lines in the world nearest to the rays through their segments' ends, and where defined."""
-    direction = plucker[:, 3:] / np.linalg.norm(plucker[:, 3:], axis=1, keepdims=True)
-    foot = np.cross(direction, plucker[:, :3]) / np.linalg.norm(plucker[:, 3:], axis=1, keepdims=True)
-    R = rotation(pose)
-    center = -R.T @ pose[4:]
+    """Points (n, 2, 3) of lines in the world nearest to the rays through their segments' ends, and where defined.
+
+    ``poses`` are those of the cameras that saw each of them (n, 7), or of one that saw all (7,).
+    """
+    poses = np.broadcast_to(poses, (len(ends), 7))
+    size = np.linalg.norm(plucker[:, 3:], axis=1, keepdims=True)
+    direction = plucker[:, 3:] / size
+    foot = np.cross(direction, plucker[:, :3]) / size
+    back = quaternion.conjugate(poses[:, :4])
+    away = -quaternion.rotate(back, poses[:, 4:]) - foot
     out = np.zeros((len(ends), 2, 3))
     good = np.ones(len(ends), dtype=bool)
     for k in (0, 1):
-        ray = camera.bearings(ends[:, 2 * k : 2 * k + 2]) @ R
+        ray = quaternion.rotate(back, camera.bearings(ends[:, 2 * k : 2 * k + 2]))
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         cosine = (ray * direction).sum(axis=1)
-        away = center - foot
         sine2 = 1.0 - cosine**2
         good &= sine2 > 1e-3
         share = ((away * direction).sum(axis=1) - cosine * (away * ray).sum(axis=1)) / np.maximum(sine2, 1e-3)
         out[:, k] = foot + share[:, None] * direction
-    good &= (into(pose, out)[..., 2] > 0).all(axis=1)
+        good &= se3.transform_points(poses, out[:, k])[:, 2] > 0
     return out, good
-
-
-__all__ = [
-    "FollowedSegments",
-    "assign",
-    "carried",
-    "coarse_flow",
-    "expected_segments",
-    "line_ends",
-    "measured_edges",
-]

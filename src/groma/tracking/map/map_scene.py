@@ -140,6 +140,3 @@ def _line_tables(table: LineMeasurements, image: IntArray) -> dict[str, object]:
         baseline = np.full(len(rows), DEPTH_BASELINE)
         tables["line_depths"] = LineDepths(rows, table.inverse_depth[rows], table.inverse_depth_sigma[rows], baseline)
     return tables
-
-
-__all__ = ["TRACKING", "SeenLines", "SeenPlanes", "SeenPoints", "map_scene"]

@@ -117,6 +117,3 @@ def _overlap(samples: FloatArray, places: FloatArray, gates: PlaneGates) -> bool
         return False
     thinned = places[:: max(1, len(places) // gates.compared)]
     return bool(np.linalg.norm(samples[:, None] - thinned[None], axis=2).min() < gates.reach)
-
-
-__all__ = ["add_planes", "assign_planes", "grow", "merge_planes"]

@@ -118,6 +118,3 @@ def find_again(
         points.misses[rows[of[good]]] = 0
         found = found.joined(PointTracks(rows[of[good]], there[good]))
     return found
-
-
-__all__ = ["PointTracks", "find_again", "follow_points"]

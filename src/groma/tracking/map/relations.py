@@ -75,6 +75,3 @@ def find_relations(track_map: TrackMap, points: IntArray, lines: IntArray, plane
         perpendicular_planes=perpendicular,
         perpendicular_planes_sigma=np.full(len(perpendicular), SQUARE_SIGMA),
     )
-
-
-__all__ = ["find_lines_on_planes", "find_relations", "plane_pairs"]

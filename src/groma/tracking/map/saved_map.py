@@ -179,6 +179,3 @@ def _note_views(track_map: TrackMap) -> None:
 def _note_first(first: IntArray, place: np.ndarray, index: IntArray, measured: np.ndarray, number: int) -> None:
     new = first[index] < 0
     first[index[new]], place[index[new]] = number, measured[new]
-
-
-__all__ = ["is_metric", "map_of_scene"]

@@ -160,6 +160,3 @@ class TrackMap:
             lines.take(self.lines.state[lines.index] == ALIVE),
             planes.take(self.planes.state[planes.index] == ALIVE),
         )
-
-
-__all__ = ["Keyframe", "TrackMap", "in_unit"]

@@ -43,6 +43,3 @@ def triangulate(
         error2 = np.linalg.norm(camera.project(into(second, places)) - second_pixel, axis=1)
         good &= (error1 < gates.max_error) & (error2 < gates.max_error)
     return places, good
-
-
-__all__ = ["triangulate"]

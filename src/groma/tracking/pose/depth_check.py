@@ -72,6 +72,3 @@ def _read(camera: TrackCamera, grid: FloatArray, pixel: FloatArray, gates: Track
     weight = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
     smooth = near.max(axis=0) < (1.0 + gates.depth_check.smooth) * near.min(axis=0)
     return np.where(inside & smooth, (weight * near).sum(axis=0), np.nan)
-
-
-__all__ = ["depth_agreement"]

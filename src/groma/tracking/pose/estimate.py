@@ -10,40 +10,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from dataclasses import dataclass
 
 import numpy as np
 
 from groma._typing import BoolArray, FloatArray
-from groma.adjustment.assemble import assemble
-from groma.adjustment.stages import with_loss
-from groma.factors.contract import Factor
+from groma.adjustment.pose_fit import (
+    SeenMap,
+    equations_at,
+    fit_pose,
+    line_rows,
+    plane_rows,
+    point_rows,
+    seen_map,
+    without_prior,
+)
 from groma.factors.losses import Cauchy, GemanMcClure, Loss
-from groma.problem.problem import Problem
-from groma.scene import PosePriors
-from groma.solver.options import SolverOptions
-from groma.solver.solve import solve
 from groma.tracking.frame.camera import TrackCamera, into
-from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
+from groma.tracking.frame.measurements import DEPTH_BASELINE, Measurements
 from groma.tracking.map.landmarks import MapView
-from groma.tracking.map.map_scene import TRACKING, SeenLines, SeenPlanes, SeenPoints, map_scene
 
-Table = TypeVar("Table", PointMeasurements, LineMeasurements, PlaneMeasurements)
 #: A residual beyond this many standard deviations is an outlier.
 GATE = 3.5
 #: What counts as a well-known direction: share of the median depth, and radians.
 WEAK_SHARE, WEAK_ANGLE = 0.02, math.radians(1.0)
 #: Losses, one after the other, under held landmarks.
 LOSSES: tuple[Loss, ...] = (Cauchy(1.5), GemanMcClure(3.0))
-_ASSEMBLY = replace(TRACKING, refine_landmarks=False, loss=LOSSES[0])
-_SOLVER = SolverOptions(
-    max_iterations=8, function_tolerance=1e-3, initial_damping=1e-6, threads=1, eliminate=("frames",)
-)
-#: Types of factors that tell which points, lines and planes agree.
-_TELLING = (("point_reprojection", "stereo_point"), ("line_reprojection",), ("plane_observation",))
-#: The order in which three arrays are multiplied that numpy finds by itself.
-_ORDER = ["einsum_path", (0, 1), (0, 1)]
 _NAMES = ("x", "y", "z", "turn about x", "turn about y", "turn about z")
 
 
@@ -92,18 +84,14 @@ def estimate_pose(
     losses : sequence of Loss, optional
         Of the measurements, one after the other. From a :func:`rough_pose` the last one will do.
     """
-    problem = _problem_of(camera, view, measured, predicted, prior_sigma, start)
+    seen = _seen(camera, view, measured, predicted, prior_sigma)
+    pose = predicted if start is None else start
     for loss in losses:
-        problem = solve(with_loss(problem, loss), _SOLVER).problem
-    every = problem.factors[:-1]  # all but the prior
-    pose = problem.variables["frames"].state[0]
-    kept = [
-        _agreeing(problem, [factor for factor in every if factor.type_name in names], len(table))
-        for names, table in zip(_TELLING, (measured.points, measured.lines, measured.planes), strict=True)
-    ]
-    information = pose_information(problem, every)
+        pose = fit_pose(seen, pose, loss)
+    alone = equations_at(without_prior(seen), pose, GemanMcClure(GATE))  # weights that fall for large residuals
     depth = _median_depth(view, measured, pose)
-    return PoseEstimate(pose, kept[0], kept[1], kept[2], information, weak_directions(information, depth))
+    points, lines, planes = (worst < GATE for worst in alone.worst)
+    return PoseEstimate(pose, points, lines, planes, alone.H, weak_directions(alone.H, depth))
 
 
 def rough_pose(
@@ -115,73 +103,25 @@ def rough_pose(
     start: FloatArray,
 ) -> FloatArray:
     """Return a pose (7,) by measurements of which some are wrong, from where :func:`estimate_pose` may go on."""
-    problem = _problem_of(camera, view, measured, predicted, prior_sigma, start)
-    return solve(with_loss(problem, LOSSES[0]), _SOLVER)["frames"][0]
+    return fit_pose(_seen(camera, view, measured, predicted, prior_sigma), start, LOSSES[0])
 
 
-def _problem_of(
-    camera: TrackCamera,
-    view: MapView,
-    measured: Measurements,
-    predicted: FloatArray,
-    prior_sigma: FloatArray,
-    start: FloatArray | None,
-) -> Problem:
-    tables = (measured.points, measured.lines, measured.planes)
-    # Each landmark in question is one of its own, numbered anew.
-    image = [np.zeros(len(table), np.int64) for table in tables]
-    scene = map_scene(
-        camera,
-        view,
-        (predicted if start is None else start)[None],
-        ["frame"],
-        SeenPoints(tables[0].index, _renumbered(tables[0]), image[0]),
-        SeenLines(tables[1].index, _renumbered(tables[1]), image[1]),
-        SeenPlanes(tables[2].index, _renumbered(tables[2]), image[2]),
-        pose_priors=PosePriors(np.zeros(1, np.int64), predicted[None], prior_sigma[None]),
+def _seen(
+    camera: TrackCamera, view: MapView, measured: Measurements, predicted: FloatArray, prior_sigma: FloatArray
+) -> SeenMap:
+    """Return what a frame measures of the map beside where that is."""
+    points, lines, planes, K = measured.points, measured.lines, measured.planes, camera.params
+    place = view.points.xyz[points.index]
+    segments = lines.ends, lines.sigma, lines.inverse_depth, lines.inverse_depth_sigma
+    return seen_map(
+        K,
+        (camera.baseline, DEPTH_BASELINE),
+        point_rows(place, points.pixel, points.sigma, points.right[:, 0], points.depth, points.depth_sigma),
+        line_rows(view.lines.plucker[lines.index], *segments, K, DEPTH_BASELINE),
+        plane_rows(view.planes.hesse[planes.index], planes.plane, planes.sqrt_information),
+        predicted,
+        prior_sigma,
     )
-    return assemble(scene, _ASSEMBLY).problem
-
-
-def _renumbered(table: Table) -> Table:
-    """Return a table whose rows refer to landmarks 0, 1, ..."""
-    return replace(table, index=np.arange(len(table)))
-
-
-def _whitened(problem: Problem, factor: Factor, wanted: tuple[int, ...], width: int) -> FloatArray:
-    """Records (N, m, width) of a factor group, multiplied by its square root information."""
-    ambients = tuple(problem.variables[ref.group].ambient() for _, ref in factor.references())
-    record = np.zeros((len(factor), factor.residual_size, width))
-    factor.linearize(factor.prepare(ambients), 0, len(factor), wanted, record)
-    weight = np.asarray(factor.sqrt_information)
-    return np.einsum("nij,njk->nik", weight, record) if weight.ndim == 3 else record * weight.reshape(-1, 1, 1)
-
-
-def _agreeing(problem: Problem, group: list[Factor], count: int) -> BoolArray:
-    """Which measurements have no row beyond the gate in the factors that cover all of them."""
-    good = np.zeros(count, dtype=bool)
-    landmark = ("point", "line", "plane")
-    for factor in group:
-        if getattr(factor, "extrinsics", None) is not None:  # inverse depths of segments
-            continue
-        columns = (-1,) * len(factor.references())
-        residual = _whitened(problem, factor, columns, 1)[..., 0]
-        rows = next(ref.index for slot, ref in factor.references() if slot.name in landmark)
-        # A degenerate factor (behind the camera) has a residual of exactly zero in all rows.
-        good[rows] = (np.abs(residual) < GATE).all(axis=1) & (residual != 0).any(axis=1)
-    return good
-
-
-def pose_information(problem: Problem, factors: Sequence[Factor]) -> FloatArray:
-    """(6, 6) information of factors on pose 0, with weights that fall for large residuals."""
-    total = np.zeros((6, 6))
-    for factor in factors:
-        columns = tuple(0 if slot.name == "pose" else -1 for slot, _ in factor.references())
-        record = _whitened(problem, factor, columns, 7)
-        weight = 1.0 / (1.0 + (record[..., 6] ** 2).sum(axis=1) / GATE**2) ** 2
-        J = record[..., :6]
-        total += np.einsum("n,nij,nik->jk", weight, J, J, optimize=_ORDER)
-    return total
 
 
 def weak_directions(information: FloatArray, depth: float) -> tuple[str, ...]:
@@ -196,6 +136,3 @@ def _median_depth(view: MapView, measured: Measurements, pose: FloatArray) -> fl
     depths = into(pose, np.concatenate(places))[:, 2]
     depths = depths[depths > 0]
     return float(np.median(depths)) if len(depths) else 1.0
-
-
-__all__ = ["GATE", "LOSSES", "PoseEstimate", "estimate_pose", "pose_information", "rough_pose", "weak_directions"]

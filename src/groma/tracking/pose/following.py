@@ -197,6 +197,3 @@ def _find_lines_again(
     away = np.abs(found.ends - expected[of]).max(axis=1)
     good = away < gates.again_distance
     return segments.joined(FollowedSegments(rows[of[good]], found.ends[good], found.sigma[good], found.strength[good]))
-
-
-__all__ = ["Attempt", "carry", "find_points_again", "follow_frame", "follow_lines", "measure_lines"]

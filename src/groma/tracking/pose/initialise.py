@@ -135,6 +135,3 @@ def _shift_near(places: FloatArray, shift: FloatArray, wanted: FloatArray) -> Fl
     """Median shift of the four nearest of some places."""
     near = KDTree(places).query(wanted, k=min(4, len(places)))[1].reshape(len(wanted), -1)
     return np.median(shift[near], axis=1)
-
-
-__all__ = ["Initialiser"]

@@ -94,6 +94,3 @@ def pair_near(
     rows = rows[partner[n + partner[rows]] == rows]
     rows = rows[np.lexsort((distance[rows], bits[rows]))]
     return np.column_stack([rows, order[partner[rows]]])
-
-
-__all__ = ["pair_near"]

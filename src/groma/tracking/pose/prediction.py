@@ -54,6 +54,3 @@ class MotionModel:
             self._velocity = np.zeros(6)
             self._error = np.full(6, self._gates.start)
         self._last_time = timestamp
-
-
-__all__ = ["MotionModel"]

@@ -175,11 +175,15 @@ class _Search:
         self.gates, self.all_gates = data.options.gates.finding, data.options.gates
         self._best: Found | None = None
         self._tried: list[FloatArray] = []
+        self._near: dict[tuple[bytes, float], IntArray] = {}
 
     def near(self, pose: FloatArray, radius: float) -> IntArray:
-        """Pairs (n, 2) of known features and features of the frame, near where a pose says."""
-        max_bits = self.all_gates.features.max_bits_near
-        return match_near(self.camera, self.known, self.data.features, pose, radius, max_bits)
+        """Pairs (n, 2) of known features and features of the frame, near where a pose says; poses are asked again."""
+        asked = pose.tobytes(), radius
+        if asked not in self._near:
+            max_bits = self.all_gates.features.max_bits_near
+            self._near[asked] = match_near(self.camera, self.known, self.data.features, pose, radius, max_bits)
+        return self._near[asked]
 
     def proposal_near(self, guess: FloatArray) -> FloatArray | None:
         """Pose from features matched in wide surroundings of where a guess says."""
@@ -361,18 +365,3 @@ def match_planes(
         return PlaneMeasurements.empty()
     index, rows = assign_planes(track_map.planes, data.planes, pose, angle, distance, data.options.gates.planes)
     return PlaneMeasurements(index, data.planes.plane[rows], data.planes.sqrt_information[rows])
-
-
-__all__ = [
-    "Found",
-    "KnownFeatures",
-    "Places",
-    "feature_places",
-    "find_pose",
-    "known_features",
-    "match_lines",
-    "match_near",
-    "match_planes",
-    "pose_from_matches",
-    "promote",
-]

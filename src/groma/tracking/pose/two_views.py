@@ -190,6 +190,3 @@ def _same(one: FloatArray, two: FloatArray, gates: StartGates) -> bool:
     turn = 2.0 * np.arccos(min(1.0, abs(float(one[:4] @ two[:4]))))
     shift, length = np.linalg.norm(one[4:] - two[4:]), np.linalg.norm(one[4:])
     return bool(turn < gates.same_turn and shift < gates.same_shift * length)
-
-
-__all__ = ["IDENTITY", "Candidate", "adjusted", "continued", "intersected", "likely", "motions"]

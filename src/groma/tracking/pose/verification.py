@@ -154,6 +154,3 @@ def _share(estimate: PoseEstimate) -> float:
     """Share of the points and lines looked at that agree."""
     looked_at = len(estimate.points) + len(estimate.lines)
     return (estimate.counts["points"] + estimate.counts["lines"]) / looked_at if looked_at else 1.0
-
-
-__all__ = ["PoseVerification"]

@@ -147,6 +147,3 @@ def _of_images(scene: Scene, centers: FloatArray, frames: IntArray) -> FloatArra
     if scene.has_trivial_rigs:
         found[known] = centers[frames[known]]
     return found
-
-
-__all__ = ["LandmarkCovariances", "Uncertainty", "covariances_of", "read_covariances"]

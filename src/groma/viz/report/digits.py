@@ -64,6 +64,3 @@ def round_step(extent: float, most: int) -> float:
 def ticks(low: float, high: float, step: float) -> list[float]:
     """Return the multiples of a step from ``low`` to ``high``."""
     return [step * k for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
-
-
-__all__ = ["even", "fixed", "round_step", "short", "tick", "tick_of_step", "ticks"]

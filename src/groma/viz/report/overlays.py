@@ -281,6 +281,3 @@ def _path(name: str, colour: str, places: FloatArray, more: str = 'stroke-width=
         f'<path class="{name}" d="{_points(places)}" stroke="{colour}" fill="none" stroke-linecap="round" '
         f'vector-effect="non-scaling-stroke" {more}/>'
     )
-
-
-__all__ = ["line_overlays", "observation_crop", "overlay_section", "projected_segments", "residual_top"]

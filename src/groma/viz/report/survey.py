@@ -37,7 +37,7 @@ def _measurements(numbers: Mapping[str, Any]) -> str:
         cells = [f"{one['kind']} {one['name']} {one['coordinate']}".rstrip(), f"{one['sigma']:.4g}"]
         cells += [f"{one['residual']:.4f}", f"{one['redundancy']:.2f}"]
         cells += ["-" if one[name] is None else f"{one[name]:.3g}" for name in ("normalized", "detectable")]
-        rows.append([*cells, "suspect" if one["is_suspect"] else ""])
+        rows.append([*cells, "taken out" if one["is_rejected"] else "suspect" if one["is_suspect"] else ""])
     left = len(order) - len(rows)
     caption = (
         "Residuals (measured less computed), worst first. r: how far the others check a measurement, from 0 to 1; "
@@ -61,6 +61,3 @@ def _check_points(points: Sequence[Mapping[str, Any]]) -> str:
     caption = "Points whose coordinates took no part: computed less measured, with the standard deviation of that. "
     caption += "Chi-square is 3 on average."
     return table("Check points", caption, ["point", "x", "y", "z", "chi-square"], rows)
-
-
-__all__ = ["MAX_LISTED", "survey_card"]

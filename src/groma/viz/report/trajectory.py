@@ -302,6 +302,3 @@ def _scores(scores: TrajectoryScores | None) -> str:
     if scores.drift_percent is not None:
         caption += f". Drift {scores.drift_percent:.3g} %, {scores.drift_deg_per_metre:.3g} degrees per unit"
     return _page_tables.table("Against the reference", caption + ".", ["error", "rms", "median", "largest"], rows)
-
-
-__all__ = ["Frame", "Track", "write_track_report"]

@@ -120,6 +120,3 @@ def timeline(statuses: Statuses) -> str:
         f'<div style="padding:0 1em;font-size:.8em"><svg width="100%" height="{_HEIGHT + 6}">{"".join(bars)}</svg>'
         f"{key}; height: points and lines that agree; ticks: keyframes</div>"
     )
-
-
-__all__ = ["Statuses", "read_now", "read_statuses", "timeline"]

@@ -284,6 +284,3 @@ def following(output: Path, port: int = 8080, host: str = "127.0.0.1", say: Say 
         yield LiveView(server, output)
     finally:
         stop_server(server)
-
-
-__all__ = ["FINISHED", "RUNNING", "WAITING", "LiveView", "following", "read_frames"]

@@ -145,6 +145,3 @@ def _checked(doorkeeper: Doorkeeper) -> Iterator[list[bool]]:
             yield applied
         finally:
             sockets.serve = serve
-
-
-__all__ = ["Doorkeeper", "silenced", "start_server", "stop_server"]

@@ -45,6 +45,3 @@ def not_duplicates(
         pairs = pairs[(votes >= AGREEMENT.min_common * weak) & (weak - votes < min_images)]
         good[pairs[~seen_apart(tracks, pairs), 1]] = False
     return good
-
-
-__all__ = ["DuplicateGates", "not_duplicates"]

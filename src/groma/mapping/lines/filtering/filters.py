@@ -127,6 +127,3 @@ def _distance(tracks: Tracks) -> FloatArray:
     away = np.linalg.norm(tracks.lines[line].mean(1) - views.center[views.image_idx[rows]], axis=1)
     number = np.bincount(line, minlength=tracks.num_lines)
     return np.bincount(line, away, minlength=tracks.num_lines) / np.maximum(number, 1)
-
-
-__all__ = ["FILTERS", "Evidence", "Filter", "FilterGates", "Verdict", "filtered", "is_certain"]

@@ -39,7 +39,7 @@ class KindGates:
     top_quantile: float = gate(0.9, "quantile", "of p that stands for the best kind", "chosen on benchmarks/lines.py")
 
 
-#: Newton steps of the fit at most.
+#: Newton steps of the fit at most (cost: none are made after convergence).
 _STEPS = 50
 
 
@@ -110,6 +110,3 @@ def found_again(
     number = np.bincount(line_of[member], minlength=num_lines)
     mean = np.bincount(line_of[member], p[member], minlength=num_lines) / np.maximum(number, 1)
     return mean >= asked
-
-
-__all__ = ["KindGates", "features_of", "found_again", "repeatability"]

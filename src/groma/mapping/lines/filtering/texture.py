@@ -168,6 +168,3 @@ def _beta_binomial(hits: FloatArray, tries: FloatArray, kind: tuple[float, float
     hits = np.minimum(hits, tries)
     number = gammaln(tries + 1) - gammaln(hits + 1) - gammaln(tries - hits + 1)
     return number + betaln(hits + a, tries - hits + b) - betaln(a, b)
-
-
-__all__ = ["TextureGates", "edge_odds", "load_minimiser", "num_expected"]

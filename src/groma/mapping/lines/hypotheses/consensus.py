@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from groma._numba import inline_kernel, kernel, loop
+from groma._ordering import ascending
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
@@ -63,7 +64,7 @@ def _sort(segment, neighbor, other, values, pointers, sorted_neighbor, sorted_ot
         first = np.empty(end - begin)
         for k in range(begin, end):
             first[k - begin] = values[order[k], 0]
-        by_depth = np.argsort(first, kind="mergesort")  # stable
+        by_depth = ascending(first)
         for k in range(begin, end):
             p = order[begin + by_depth[k - begin]]
             sorted_neighbor[k], sorted_other[k] = neighbor[p], other[p]

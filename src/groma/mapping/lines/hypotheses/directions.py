@@ -85,6 +85,3 @@ def _ratios(ray: FloatArray, direction: FloatArray, sigma: FloatArray, max_sigma
     ratio = above / below
     slope = np.linalg.norm(np.cross(normal, second) - ratio[:, None] * np.cross(normal, first), axis=1)
     return np.where(usable[:, None], np.column_stack([ratio, sigma * slope / np.abs(below)]), 0.0)
-
-
-__all__ = ["DirectionGates", "depth_ratios"]

@@ -114,6 +114,3 @@ def _pixels(before: Scene, after: Scene, image: int, places: FloatArray) -> Floa
     straight[front, :2] = model.undistort_pixels(after.cameras.params_of(camera), pixels[front])
     straight[:, 2] = 1.0
     return straight
-
-
-__all__ = ["EarlierGates", "EarlierMap", "Known"]

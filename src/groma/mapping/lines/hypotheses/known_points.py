@@ -19,7 +19,7 @@ from groma.gates import gate
 from groma.mapping.lines.gates import AGREEMENT
 from groma.mapping.lines.views import LineViews
 
-#: Points of one segment that are looked at.
+#: Points of one segment that are looked at (cost: time).
 _MAX_POINTS = 16
 
 
@@ -171,6 +171,3 @@ def lines_through_points(
         gates.tolerance, AGREEMENT.min_overlap, slot, index, values,
     )  # fmt: skip
     return index[:count], values[:count]
-
-
-__all__ = ["KnownPointGates", "lines_through_points"]

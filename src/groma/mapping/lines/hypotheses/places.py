@@ -195,6 +195,3 @@ def _points_by_image(scene: Scene, views: LineViews) -> list[tuple[FloatArray, F
         x = x[x[:, 2] > 0.0]
         near.append((x[:, :2] / x[:, 2:], 1.0 / x[:, 2]))
     return near
-
-
-__all__ = ["Places", "find_places"]

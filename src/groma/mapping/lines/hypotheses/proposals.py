@@ -38,11 +38,12 @@ from groma.mapping.lines.hypotheses.known_points import lines_through_points
 from groma.mapping.lines.options import MapLinesOptions
 from groma.mapping.lines.views import LineViews
 
-#: Bins of the angle about the baseline: only how long it takes depends on them.
+#: Bins of the angle about the baseline: only how long it takes depends on them (cost: memory against time).
 _NUM_BINS = 2048
 # How far a candidate got; the best of all candidates of a segment is reported.
 NOTHING, OUT_OF_BEAM, WEAK, PROPOSED = 0, 1, 2, 3
-#: Proposals of a segment by one other image for which there is room at first; what is not written takes no memory.
+#: Proposals of a segment by one other image for which there is room at first; what is not written takes no memory
+#: (cost: memory, which grows where it is too little).
 _ROOM = 64
 
 
@@ -373,15 +374,3 @@ def _sorted_beams(beam_i: FloatArray, beam_j: FloatArray) -> tuple[FloatArray | 
     order = np.argsort(beam_j[:, 0], kind="stable")
     first = beam_j[order, 0]
     return beam_j, pointers, members, order, np.searchsorted(np.append(first, first + 2.0 * np.pi), beam_i, "right")
-
-
-__all__ = [
-    "OUT_OF_BEAM",
-    "PROPOSED",
-    "WEAK",
-    "ProposalGates",
-    "Proposals",
-    "Proposer",
-    "Questions",
-    "angles_about_baseline",
-]

@@ -180,6 +180,3 @@ def _noise_scale(tracks: Tracks) -> float:
     spread = 2.0 / (9.0 * freedom)
     expected = freedom * (1.0 - spread + ndtri(tracks.gates.noise_quantile) * np.sqrt(spread)) ** 3
     return float(np.sqrt(np.quantile(tracks.squared[rows] / expected, tracks.gates.noise_quantile)))
-
-
-__all__ = ["grow", "near_lines", "votes_for_same"]

@@ -316,6 +316,3 @@ def _joined(tracks: Tracks, pairs: _Pairs, pose_px: float, gates: MergeGates) ->
     alias[lines[:, 1]] = lines[:, 0]
     deviation[lines] = np.where(excess > gates.pose_px[0], pose_px, 0.0)[:, None]
     return tracks.joined(alias, deviation)
-
-
-__all__ = ["MergeGates", "merge_agreeing", "seen_apart"]

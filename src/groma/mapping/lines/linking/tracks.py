@@ -219,6 +219,3 @@ class Tracks:
         """(S,) the :class:`Outcome` of every segment."""
         mapped = np.where(self.linked, Outcome.MAPPED, Outcome.RECOVERED)
         return np.where(self.line_of >= 0, mapped, self.rejection)
-
-
-__all__ = ["TrackGates", "Tracks"]

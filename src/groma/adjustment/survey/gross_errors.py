@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Gross errors among measurements: taken out, and accepted again where they fit without each other.
+
+A robust loss limits what a wrong measurement does; it goes on pulling, and makes its neighbours look wrong, too. So
+the worst of what the test calls gross errors (:func:`~groma.adjustment.survey.records.gross_errors`) are rejected
+together, the scene is adjusted without them, each is tested against what is left, and the next are taken. Those that
+fit take part again, once for all, and so do those without which hardly anything checks others: of two scale bars that
+contradict each other nobody knows which is wrong, and both keep what the loss leaves them. Nothing is rejected without
+which less of the scene's place, turn and scale would be known.
+
+References: W. Baarda, *A testing procedure for use in geodetic networks*, 1968; W. Foerstner, *Reliability and
+discernability of extended Gauss-Markov models*, 1983, on tests that are correlated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from groma.adjustment.report import AdjustResult
+from groma.adjustment.stages import keeps_loss
+from groma.adjustment.survey.records import GATES, Reliability, gross_errors, rejection_limit
+from groma.adjustment.survey.reliability import reliability
+from groma.adjustment.terms.open_motions import num_open_motions
+from groma.errors import ProblemError
+from groma.factors.losses import Huber
+from groma.problem.problem import Problem
+from groma.scene import Scene
+from groma.scene.survey import rejected_rows, with_rejected
+
+#: Standard deviations that no residual has.
+_NEVER = 1e12
+
+
+def without_gross_errors(
+    result: AdjustResult, adjust_again: Callable[[Scene], AdjustResult]
+) -> tuple[AdjustResult, Reliability | None]:
+    """Reject gross errors of measurements, and adjust without them.
+
+    Parameters
+    ----------
+    result : AdjustResult
+        An adjustment with all measurements.
+    adjust_again : callable
+        Adjusts a scene that differs in what is rejected.
+
+    Returns
+    -------
+    result, reliability
+        The last adjustment, of a scene whose tables say what is rejected, and what it says of the measurements; None
+        where the poses are not determined.
+    """
+    found = reliability_of(result.scene, result.problem)
+    returned: set[tuple[str, int]] = set()
+    for _ in range(GATES.max_rounds):
+        if found is None:
+            break
+        before = rejected_rows(result.scene)
+        wrong = gross_errors(found.measurements)
+        returned |= before - wrong.keys()
+        new = {place: size for place, size in wrong.items() if place not in returned | before}
+        wanted = (before & wrong.keys()) | _worst(new)
+        if wanted == before:
+            break
+        scene = with_rejected(result.scene, wanted)
+        if num_open_motions(scene) > num_open_motions(with_rejected(scene, ())):
+            break
+        again = adjust_again(scene)
+        if (told := reliability_of(again.scene, again.problem)) is None:
+            break
+        doubted = {place: size for place, size in new.items() if place in wanted}
+        full = reliability_of(result.scene, _at_full_weight(result.problem))
+        if doubted and (unclear := _no_longer_checked(full, told, min(doubted.values()))):
+            returned |= {place for place in doubted if place[0] in unclear} or doubted.keys()
+        else:
+            result, found = again, told
+    return result, found
+
+
+def _worst(wrong: dict[tuple[str, int], float]) -> set[tuple[str, int]]:
+    """Return the worst of each table: the others may only look wrong beside them."""
+    most = {table: max(size for (of, _), size in wrong.items() if of == table) for table, _ in wrong}
+    return {place for place, size in wrong.items() if size >= GATES.at_once * most[place[0]]}
+
+
+def _no_longer_checked(before: Reliability | None, after: Reliability, size: float) -> set[str]:
+    """Return the tables of measurements that may be wrong in place of what was rejected.
+
+    If the tests of two measurements have the correlation rho, one has 1 - rho^2 of its redundancy without the other.
+    With the first rejected in place of the second, the normalised residual w of that is w sqrt(1 - rho^2): if this is
+    still beyond the limit, it is not the first that is wrong.
+    """
+    if before is None:
+        return set()
+    share = {(one.place, one.coordinate): one.redundancy for one in before.measurements}
+    pairs = [(one, share[one.place, one.coordinate]) for one in after.measurements if not one.is_rejected]
+    least = (rejection_limit(after.measurements) / size) ** 2
+    return {one.place[0] for one, had in pairs if had > GATES.checked and one.redundancy < least * had}
+
+
+def _at_full_weight(problem: Problem | None) -> Problem | None:
+    """Return a problem in which no loss lowers the weight of a measurement: what it could check, whatever it says."""
+    if problem is None:
+        return None
+    return problem.with_losses([
+        Huber(_NEVER) if keeps_loss(factor) and isinstance(factor.loss, Huber) else factor.loss
+        for factor in problem.factors
+    ])  # fmt: skip
+
+
+def reliability_of(scene: Scene, problem: Problem | None) -> Reliability | None:
+    """Return :func:`~groma.adjustment.survey.reliability.reliability`; None where the poses are not determined."""
+    try:
+        return reliability(scene, problem)
+    except ProblemError:
+        return None
+
+
+__all__ = ["reliability_of", "without_gross_errors"]

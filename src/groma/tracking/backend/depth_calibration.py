@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: BSD-3-Clause
+r"""By how much the depths of a depth camera are off, estimated from a map, and the map corrected.
+
+A depth camera measures a disparity; where that is off by a constant, so are inverse depths,
+
+.. math:: \frac1z = \frac1{\tilde z} + c ,
+
+and depths by a share that grows with the depth. A camera that moves sees the same from far and near, so the map tells
+the offset c: the cost of all measurements, least over poses and landmarks, is a function of c alone. Its slope at the
+least cost is that of the depths by themselves, poses and landmarks held; where the slope vanishes, between two solved
+maps, is c. (A common factor of all depths is that of the whole map, which images do not tell.)
+
+Errors of one image go together: its depths, planes and segments come from the same disparities. Images count as samples
+therefore, not depths: the variance is larger than the curvature of the cost says by what the slopes of images show, and
+the offset is kept where an information criterion (BIC) with as many samples as images finds it worth a parameter. One
+far larger than the noise of depths is no offset: something else is wrong, a focal length perhaps, and it is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from groma._typing import FloatArray
+from groma.adjustment.assemble import assemble
+from groma.problem.problem import Problem
+from groma.problem.residuals import squared_norms
+from groma.solver.options import SolverOptions
+from groma.solver.solve import solve
+from groma.tracking.backend.local_adjustment import job_of
+from groma.tracking.frame.camera import TrackCamera
+from groma.tracking.map.track_map import Keyframe, TrackMap
+from groma.tracking.options import TrackOptions
+
+#: Step of the differences of costs, of the deviation known beforehand.
+_STEP = 0.05
+
+
+@dataclass(frozen=True)
+class DepthOffset:
+    """What is added to inverse depths, one over scene units, and how well it is known."""
+
+    offset: float
+    sigma: float
+    #: Whether the map was corrected by it: statistics support it.
+    used: bool
+
+    def numbers(self) -> dict[str, float | bool]:
+        """Return it as plain values."""
+        return {"inverse_offset": self.offset, "sigma": self.sigma, "used": self.used}
+
+
+def estimate_depth_offset(track_map: TrackMap, camera: TrackCamera, options: TrackOptions) -> DepthOffset | None:
+    """Return by how much the inverse depths of a map are off; None where there are none to tell.
+
+    What is known beforehand is that the common error is no larger than the noise of a single depth.
+    """
+    prior, count = options.gates.depth.inverse_sigma, len(track_map.living())
+    if count < options.gates.depth.min_images or not has_depths(track_map):
+        return None
+    maps = _Maps(track_map, camera, options)
+    settled = maps.solved(0.0, None)
+    slope = maps.slopes(0.0, settled).sum()
+    # One step of the size of the prior tells the curvature, and a second one the place where the slope vanishes.
+    first = -math.copysign(prior, slope)
+    there = maps.solved(first, settled)
+    curvature = (maps.slopes(first, there).sum() - slope) / first
+    if not curvature > 0.0:
+        return None
+    least = -slope / curvature
+    there = maps.solved(least, there)
+    slopes, alone = maps.slopes(least, there), maps.curvature(least, there)
+    alike = max(float(count / (count - 1) * (slopes**2).sum()) / max(alone, 1e-300), 1.0)
+    information = curvature / alike
+    total = information + 1.0 / prior**2
+    offset = least * information / total
+    used = least**2 * information > math.log(count) and abs(offset) < options.gates.depth.max_offset * prior
+    return DepthOffset(float(offset), float(total**-0.5), bool(used))
+
+
+def has_depths(track_map: TrackMap) -> bool:
+    """Whether keyframes measured depths themselves."""
+    return any(np.isfinite(keyframe.measured.points.depth).any() for keyframe in track_map.living())
+
+
+class _Maps:
+    """A map with depths corrected by several offsets."""
+
+    def __init__(self, track_map: TrackMap, camera: TrackCamera, options: TrackOptions) -> None:
+        self._map, self._camera, self._options = track_map, camera, options
+
+    def problem(self, offset: float, at: Problem | None) -> Problem:
+        """Return the adjustment of all keyframes with an offset, at the states of another one."""
+        moved = self._map.copy()
+        correct_depths(moved, offset)
+        living = moved.living()
+        job = job_of(moved, self._camera, living, np.arange(len(living)) == 0, self._options.relations)
+        assert job is not None
+        problem = assemble(job.scene, job.options).problem
+        return problem if at is None else Problem(at.variables, problem.factors)
+
+    def solved(self, offset: float, near: Problem | None) -> Problem:
+        """Return the same, solved."""
+        settings = SolverOptions(max_iterations=60, function_tolerance=1e-7, threads=1)
+        return solve(self.problem(offset, near), settings).problem
+
+    def slopes(self, offset: float, solved: Problem) -> FloatArray:
+        """Return how the cost of each image (K,) changes with the offset, poses and landmarks held."""
+        step = _STEP * self._options.gates.depth.inverse_sigma
+        more, less = (_costs(self.problem(offset + sign * step, solved)) for sign in (1.0, -1.0))
+        return (more - less) / (2.0 * step)
+
+    def curvature(self, offset: float, solved: Problem) -> float:
+        """Return how the slope changes with the offset, poses and landmarks held."""
+        step = self._options.gates.depth.inverse_sigma
+        more, less = (self.slopes(offset + sign * step, solved).sum() for sign in (0.5, -0.5))
+        return float(more - less) / step
+
+
+def _costs(problem: Problem) -> FloatArray:
+    """Costs (K,) of what each image measured."""
+    frames = len(problem.variables["frames"])
+    total = np.zeros(frames)
+    for factor in problem.factors:
+        image = next((ref.index for slot, ref in factor.references() if slot.name == "pose"), None)
+        if image is not None:
+            cost = 0.5 * factor.loss.evaluate(squared_norms(factor, problem.variables))[0]
+            total += np.bincount(image, weights=cost, minlength=frames)
+    return total
+
+
+def correct_depths(track_map: TrackMap, offset: float) -> None:
+    """Add an offset to all inverse depths that the keyframes of a map measured; landmarks and poses stay."""
+    for keyframe in track_map.keyframes:
+        _correct(keyframe, offset)
+
+
+def _correct(keyframe: Keyframe, offset: float) -> None:
+    points, lines, planes = keyframe.measured.points, keyframe.measured.lines, keyframe.measured.planes
+    depth = _corrected(points.depth, offset)
+    points = replace(points, depth=depth, depth_sigma=points.depth_sigma * (depth / points.depth) ** 2)
+    lines = replace(lines, inverse_depth=lines.inverse_depth + offset)
+    if len(planes):
+        # A plane n . X + w = 0 has the inverse depth -n/w . (x, y, 1).
+        plane = planes.plane.copy()
+        plane[:, 2] -= offset * plane[:, 3]
+        planes = replace(planes, plane=plane / np.linalg.norm(plane[:, :3], axis=1, keepdims=True))
+    keyframe.measured = replace(keyframe.measured, points=points, lines=lines, planes=planes)
+    keyframe.features = replace(keyframe.features, depth=_corrected(keyframe.features.depth, offset))
+    keyframe.depth_grid = _corrected(keyframe.depth_grid, offset)
+
+
+def _corrected(depth: FloatArray, offset: float) -> FloatArray:
+    """Depths (...) with an offset of their inverse; NaN where none is left."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        inverse = 1.0 / depth + offset
+        return np.where(inverse > 0.0, 1.0 / inverse, np.nan)
+
+
+__all__ = ["DepthOffset", "correct_depths", "estimate_depth_offset", "has_depths"]

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Gross errors of measurements are taken out: the result is that without them, and nothing else goes."""
+
+import numpy as np
+import pytest
+from _survey import control, made, positions, with_everything, with_objects
+
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.survey.gross_errors import without_gross_errors
+from groma.adjustment.survey.reliability import reliability
+from groma.adjustment.terms.open_motions import num_open_motions
+from groma.io.archive import read_archive, write_archive
+from groma.mapping.surveyed import adjust_surveyed
+from groma.scene import Distances
+from groma.scene.survey import REJECTABLE, Kind, accepted, rejected_rows, with_rejected
+
+OPTIONS = AdjustOptions(loss="none", point_sigma_px=0.5, check_lens=False, function_tolerance=1e-12)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return made()[0]
+
+
+def cleaned(scene):
+    return without_gross_errors(adjust(scene, OPTIONS), lambda one: adjust(one, OPTIONS))
+
+
+def off(scene, name, row, column, by):
+    """The scene with a row of a table off by so much."""
+    table = getattr(scene, name)
+    values = getattr(table, column).copy()
+    values[row] += by
+    return scene.replace(**{name: table.replace(**{column: values})})
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "column", "by", "kind"),
+    [
+        ("camera_positions", 2, "xyz", [0.3, 0.0, 0.0], "camera position"),
+        ("camera_poses", 3, "cam_from_world", [0, 0, 0, 0, 0.2, 0.3, 0.0], "camera pose"),
+        ("control_points", 1, "measured", [0.0, 0.0, 0.4], "control point"),
+        ("marks", 5, "pixel", [20.0, 0.0], "mark"),
+        ("distances", 0, "distance", 0.2, "distance"),
+        ("known_planes", 4, "hesse", [0.0, 0.0, 0.0, 0.3], "known plane"),
+    ],
+)
+def test_what_is_wrong_pulls_no_more(truth, name, row, column, by, kind):
+    rng = np.random.default_rng(3)
+    scene = with_objects(with_everything(truth, rng), rng)
+    good, _ = cleaned(scene)
+    assert rejected_rows(good.scene) == set()
+    result, found = cleaned(off(scene, name, row, column, by))
+    assert rejected_rows(result.scene) == {(name, row)}
+    without = adjust(with_rejected(scene, {(name, row)}), OPTIONS)
+    moved = result.scene.cam_centers_in_world - without.scene.cam_centers_in_world
+    assert np.abs(moved).max() < 1e-6
+    mine = [one for one in found.measurements if one.is_rejected]
+    assert {one.place for one in mine} == {(name, row)} and {one.kind for one in mine} == {kind}
+    assert all(one.weight == 0.0 for one in mine) and found.suspects[0].is_rejected
+    assert f"{kind} {mine[0].name}" == found.to_dict()["rejected"][0]
+
+
+def test_what_is_rejected_is_tested_against_the_others(truth):
+    """Its normalised residual is the deviation from what the others predict, in units of both covariances."""
+    scene = truth.replace(camera_positions=positions(truth, np.random.default_rng(0)))
+    result = adjust(with_rejected(off(scene, "camera_positions", 2, "xyz", [0.3, 0.1, 0.0]), {("camera_positions", 2)}))
+    table = result.scene.camera_positions
+    found = [one for one in reliability(result.scene, result.problem).measurements if one.is_rejected]
+    total = np.linalg.inv(table.covariance[2] + result.uncertainty().centers[2])
+    away = table.xyz[2] - result.scene.cam_centers_in_world[2]
+    np.testing.assert_allclose(
+        [one.normalized for one in found], total @ away / np.sqrt(np.diag(total)), rtol=0.01, atol=0.02
+    )
+    assert [one.name for one in found] == [truth.images.names[2]] * 3
+    np.testing.assert_allclose([one.residual for one in found], away, atol=1e-6)
+
+
+def test_several_gross_errors_and_a_good_row_that_was_rejected(truth):
+    rng = np.random.default_rng(1)
+    scene = with_everything(truth, rng)
+    for row, by in ((1, [0.5, 0, 0]), (6, [0, -2.0, 1.0])):
+        scene = off(scene, "camera_positions", row, "xyz", by)
+    scene = with_rejected(off(scene, "marks", 3, "pixel", [0.0, 30.0]), {("camera_positions", 4), ("distances", 1)})
+    result, _ = cleaned(scene)
+    assert rejected_rows(result.scene) == {("camera_positions", 1), ("camera_positions", 6), ("marks", 3)}
+
+
+def test_nobody_knows_which_of_two_scale_bars_is_wrong(truth):
+    points, marks, xyz = control(truth, np.random.default_rng(1))
+    apart = [np.linalg.norm(xyz[1] - xyz[0]), 1.2 * np.linalg.norm(xyz[3] - xyz[2])]
+    bars = Distances.between(Kind.CONTROL_POINT, [0, 2], [1, 3], apart, [0.005, 0.005])
+    scene = truth.replace(control_points=points.replace(role=np.zeros(6, int)), marks=marks, distances=bars)
+    result, found = cleaned(scene)
+    assert rejected_rows(result.scene) == set() and len(found.suspects) == 2
+
+
+def test_the_frame_is_not_given_up(truth):
+    """Of three positions one is wrong: without it the turn about the others would be open."""
+    scene = truth.replace(camera_positions=positions(truth, np.random.default_rng(0)).take([0, 2, 5]))
+    scene = off(scene, "camera_positions", 1, "xyz", [0.0, 0.0, 1.0])
+    result, found = cleaned(scene)
+    assert rejected_rows(result.scene) == set() and found.suspects
+    assert num_open_motions(scene) == 0 and num_open_motions(with_rejected(scene, {("camera_positions", 1)})) == 1
+
+
+def test_standard_deviations_stated_too_small_reject_nothing(truth):
+    """All positions are ten times worse than stated: that is told, and all stay."""
+    table = positions(truth, np.random.default_rng(0), 0.2)
+    scene = truth.replace(camera_positions=table.replace(covariance=table.covariance / 100.0))
+    result, found = cleaned(scene)
+    assert rejected_rows(result.scene) == set()
+    assert len(found.suspects) > 4 and found.components["camera position"] > 5.0
+
+
+def test_the_archive_keeps_what_was_rejected(truth, tmp_path):
+    rng = np.random.default_rng(3)
+    scene = with_objects(with_everything(truth, rng), rng)
+    rows = {(name, 1) for name in REJECTABLE} | {("control_points", 2)}
+    marked = with_rejected(scene, rows)
+    assert rejected_rows(marked) == rows and not marked.control_points.is_control[2]
+    write_archive(marked, tmp_path / "scene.npz")
+    assert rejected_rows(read_archive(tmp_path / "scene.npz")) == rows
+    assert all(len(getattr(accepted(marked), name)) == len(getattr(scene, name)) - 1 for name in REJECTABLE)
+    write_archive(scene, tmp_path / "before.npz")  # no column where nothing is rejected, as in earlier archives
+    assert rejected_rows(read_archive(tmp_path / "before.npz")) == set()
+
+
+def test_later_adjustments_leave_it_out(truth):
+    """Adjusted again with its measurements alone, the scene stays where it was without the gross error."""
+    scene = off(with_everything(truth, np.random.default_rng(2)), "camera_positions", 2, "xyz", [0.0, 5.0, 0.0])
+    first = adjust_surveyed(scene)
+    assert rejected_rows(first.result.scene) == {("camera_positions", 2)}
+    again = adjust(first.result.scene, OPTIONS)
+    assert np.abs(again.scene.cam_centers_in_world - first.result.scene.cam_centers_in_world).max() < 2e-3

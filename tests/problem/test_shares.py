@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The work on a problem divided among threads: what each share has, and costs evaluated many chunks at once."""
+
+import numpy as np
+import pytest
+
+from groma.adjustment.assemble import AssemblyOptions, assemble
+from groma.factors.losses import Cauchy
+from groma.problem import parallel
+from groma.problem.lay_out import lay_out
+from groma.problem.linearization import NormalEquations, to_solver_order
+from groma.problem.parallel import Workers, shares_of
+from groma.scene import synthetic
+
+
+@pytest.fixture
+def layout(monkeypatch):
+    """A scene whose lines stay in the reduced system, in many small chunks and three shares."""
+    scene = synthetic.holistic(8, seed=1).start
+    problem = assemble(scene, AssemblyOptions(loss=Cauchy(2.0))).problem
+    monkeypatch.setattr(parallel, "num_shares", lambda layout: 3)
+    return lay_out(problem, chunk_size=12)
+
+
+def test_every_share_has_a_third_of_each_kind_of_factor(layout):
+    shares = shares_of(layout)
+    chunks = [id(chunk) for share in shares for chunk in share]
+    assert sorted(chunks) == sorted(map(id, layout.chunks))
+    parts = np.zeros((3, len(layout.factors)))
+    for k, share in enumerate(shares):
+        for chunk in share:
+            for f, begin, end in chunk.factors:
+                parts[k, f] += end - begin
+    totals = parts.sum(axis=0)
+    assert (totals == [len(factor.factor) for factor in layout.factors]).all()
+    alone = [f for f, factor in enumerate(layout.factors) if factor.eliminated is None and totals[f] > 36]
+    assert alone, "the scene should have factors of lines alone"
+    for f in alone:  # to the size of a chunk
+        assert np.abs(parts[:, f] - totals[f] / 3).max() <= 12
+    assert np.abs(parts.sum(axis=1) - totals.sum() / 3).max() <= 0.2 * totals.sum()
+
+
+def test_costs_are_those_of_all_factors_whatever_the_runs(layout):
+    """The cost by runs of chunks is the sum over factors; of each landmark, the sum over its own; in any threads."""
+    states = to_solver_order(layout)
+    found = []
+    for threads in (1, 3):
+        workers = Workers(threads)
+        equations = NormalEquations(layout, workers)
+        inputs = equations.prepare(states)
+        of_landmarks = [np.zeros(group.count) for group in layout.eliminated]
+        found.append((equations.cost(inputs, of_landmarks), *map(np.copy, of_landmarks)))
+        workers.close()
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+    total, wanted = 0.0, [np.zeros(group.count) for group in layout.eliminated]
+    for f, factor in enumerate(layout.factors):
+        residual = np.zeros((len(factor.factor), factor.factor.residual_size))
+        factor.factor.residuals(inputs[f], 0, len(residual), residual)
+        information = np.asarray(factor.factor.sqrt_information)
+        if information.ndim == 3:
+            residual = np.einsum("nij,nj->ni", information, residual)
+        else:
+            residual = residual * information.reshape(-1, 1)
+        rho = 0.5 * factor.factor.loss.evaluate((residual**2).sum(axis=1))[0]
+        total += rho.sum()
+        if factor.eliminated is not None:
+            np.add.at(wanted[factor.eliminated], factor.landmark, rho)
+    assert found[0][0] == pytest.approx(total, rel=1e-12)
+    for one, other in zip(found[0][1:], wanted, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-12)
+
+
+def test_chunks_that_are_not_wanted_are_left_out(layout):
+    states = to_solver_order(layout)
+    equations = NormalEquations(layout, Workers(1))
+    inputs = equations.prepare(states)
+    chosen = {id(chunk) for chunk in layout.chunks[::2]}
+    some = equations.cost(inputs, wanted=lambda chunk: id(chunk) in chosen)
+    others = equations.cost(inputs, wanted=lambda chunk: id(chunk) not in chosen)
+    assert some > 0.0 and others > 0.0
+    assert some + others == pytest.approx(equations.cost(inputs), rel=1e-12)
