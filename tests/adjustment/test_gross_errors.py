@@ -101,6 +101,10 @@ def test_the_frame_is_not_given_up(truth):
     scene = off(scene, "camera_positions", 1, "xyz", [0.0, 0.0, 1.0])
     result, found = cleaned(scene)
     assert rejected_rows(result.scene) == set() and found.suspects
+    points, marks, _ = control(truth, np.random.default_rng(1))
+    marked = scene.replace(control_points=points.replace(role=np.zeros(6, int)), marks=marks)
+    result, _ = cleaned(off(marked, "marks", 5, "pixel", [20.0, 0.0]))  # what is elsewhere goes all the same
+    assert rejected_rows(result.scene) == {("marks", 5)}
     assert num_open_motions(scene) == 0 and num_open_motions(with_rejected(scene, {("camera_positions", 1)})) == 1
 
 

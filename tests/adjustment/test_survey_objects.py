@@ -341,3 +341,38 @@ def test_poses_whose_noise_is_known_replace_estimated_ones(truth):
     given = Survey(poses=measured_poses(truth, np.random.default_rng(3)))
     found = with_survey(truth.replace(pose_priors=priors), given).scene
     assert len(found.pose_priors) == 0 and len(found.camera_poses) == 8
+
+
+@pytest.mark.parametrize(
+    ("written", "words"),
+    [
+        (lambda t, q, c: (c, quaternion.multiply(q, np.array([[1.0, 0.0, 0.0, 0.0]]))), "the axes of OpenGL"),
+        (lambda t, q, c: (c, q[:, [3, 0, 1, 2]]), "begin with qw"),
+        (lambda t, q, c: (t, quaternion.conjugate(q)), "are of the world in the camera"),
+        (lambda t, q, c: (c, quaternion.multiply(q, np.array([[0.5, -0.5, 0.5, 0.5]]))), "the axes of a vehicle"),
+    ],
+)
+def test_poses_that_are_written_in_another_way_are_named(truth, written, words):
+    """As they should be the scene is brought to them, whatever its frame; else one line says how they are written."""
+    turn = quaternion.conjugate(truth.cam_from_world[:, :4])
+    shift, centers = truth.cam_from_world[:, 4:], truth.cam_centers_in_world
+
+    def given(places, turns):
+        covariance = np.tile(np.diag(np.repeat([1e-4, 1e-4], 3)), (len(turn), 1, 1))
+        return Survey(poses=PosesFile(truth.images.names, np.hstack([places, turns]), covariance, "poses.txt"))
+
+    start = truth.points_only().transformed(ELSEWHERE)
+    found = with_survey(start, given(centers, turn))
+    np.testing.assert_allclose(found.scene.cam_centers_in_world, centers, atol=1e-6)
+    with pytest.raises(InputError, match=words):
+        with_survey(start, given(*written(shift, turn, centers)))
+
+
+def test_gravity_with_turned_signs_beside_positions_is_named(truth):
+    rng = np.random.default_rng(4)
+    places = measured_positions(truth, rng)
+    given = gravity_file(truth, rng)
+    assert with_survey(truth, Survey(positions=places, directions=given)).alignment is not None
+    turned = replace(given, vectors=-given.vectors)
+    with pytest.raises(InputError, match="the signs turned"):
+        with_survey(truth, Survey(positions=places, directions=turned))

@@ -6,7 +6,7 @@ full of ``J[0, 3]``, so half of what LLVM parses and optimises, and much of what
 Here only the fields that are used are read. The address is computed by the same formula, so the numbers are the same.
 
 In come Numba's statements; out comes ``NativeLowering``, the step of the compiler that turns them into LLVM's code.
-Whatever is not one number of an array by integers goes the way of Numba.
+Whatever is not one number of an array by integers goes the way of Numba, and so does all if bounds are to be checked.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class _Lower(Lower):
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
         """Read one number."""
         array = self.typeof(value.name)
-        kinds = _kinds(array, self.typeof(index.name))
+        kinds = self._kinds(array, index)
         if kinds is None or signature.return_type != array.dtype:
             return super().lower_getitem(resty, expr, value, index, signature)
         found = load_item(self.context, self.builder, array, self._place(value.name, array, index.name, kinds))
@@ -66,11 +66,15 @@ class _Lower(Lower):
     def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
         """Write one number."""
         array, kind = self.typeof(target_var.name), self.typeof(value_var.name)
-        kinds = _kinds(array, self.typeof(index_var.name))
+        kinds = self._kinds(array, index_var)
         if kinds is None or not isinstance(types.unliteral(kind), types.Number | types.Boolean):
             return super().lower_setitem(target_var, index_var, value_var, signature)
         value = self.context.cast(self.builder, self.loadvar(value_var.name), kind, array.dtype)
         store_item(self.context, self.builder, array, value, self._place(target_var.name, array, index_var.name, kinds))
+
+    def _kinds(self, array: Any, index: Any) -> tuple[Any, ...] | None:
+        """As above; None where Numba is asked to check bounds, too."""
+        return None if self.context.enable_boundscheck else _kinds(array, self.typeof(index.name))
 
     def _place(self, name: str, array: Any, index_name: str, kinds: tuple[Any, ...]) -> Any:
         """Return the address of a number."""

@@ -205,4 +205,4 @@ def _without_own(leverage: FloatArray, residual: FloatArray) -> FloatArray:
         shares, axes = np.linalg.eigh(leverage[bold])
         along = np.swapaxes(axes, 1, 2) @ residual[bold]
         error[bold] = axes @ (along / (1.0 - np.minimum(shares, GATES.max_leverage))[:, :, None])
-    return error
+    return np.asarray(error, np.float64)

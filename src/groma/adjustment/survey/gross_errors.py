@@ -57,20 +57,19 @@ def without_gross_errors(
         before = rejected_rows(result.scene)
         wrong = gross_errors(found.measurements)
         returned |= before - wrong.keys()
-        new = {place: size for place, size in wrong.items() if place not in returned | before}
-        wanted = (before & wrong.keys()) | _worst(new)
-        if wanted == before:
+        kept = before & wrong.keys()
+        doubted = _worst({place: size for place, size in wrong.items() if place not in returned | before})
+        if kept | doubted == before:
             break
-        scene = with_rejected(result.scene, wanted)
-        if num_open_motions(scene) > num_open_motions(with_rejected(scene, ())):
-            break
-        again = adjust_again(scene)
+        if needed := _needed(result.scene, kept, doubted):
+            returned |= needed
+            continue
+        again = adjust_again(with_rejected(result.scene, kept | doubted))
         if (told := reliability_of(again.scene, again.problem)) is None:
             break
-        doubted = {place: size for place, size in new.items() if place in wanted}
         full = reliability_of(result.scene, _at_full_weight(result.problem))
-        if doubted and (unclear := _no_longer_checked(full, told, min(doubted.values()))):
-            returned |= {place for place in doubted if place[0] in unclear} or doubted.keys()
+        if doubted and (unclear := _no_longer_checked(full, told, min(wrong[place] for place in doubted))):
+            returned |= {place for place in doubted if place[0] in unclear} or doubted
         else:
             result, found = again, told
     return result, found
@@ -80,6 +79,18 @@ def _worst(wrong: dict[tuple[str, int], float]) -> set[tuple[str, int]]:
     """Return the worst of each table: the others may only look wrong beside them."""
     most = {table: max(size for (of, _), size in wrong.items() if of == table) for table, _ in wrong}
     return {place for place, size in wrong.items() if size >= GATES.at_once * most[place[0]]}
+
+
+def _needed(scene: Scene, rejected: set[tuple[str, int]], doubted: set[tuple[str, int]]) -> set[tuple[str, int]]:
+    """Return what of the doubted the place, turn and scale of the scene need, tables as a whole."""
+    known = num_open_motions(with_rejected(scene, ()))
+
+    def opens(rows: set[tuple[str, int]]) -> bool:
+        return num_open_motions(with_rejected(scene, rejected | rows)) > known
+
+    parts = [{place for place in doubted if place[0] == table} for table in {table for table, _ in doubted}]
+    needed = [part for part in parts if opens(part)]
+    return set().union(*needed) if needed else doubted if opens(doubted) else set()
 
 
 def _no_longer_checked(before: Reliability | None, after: Reliability, size: float) -> set[str]:

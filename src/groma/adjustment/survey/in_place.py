@@ -14,8 +14,9 @@ import numpy as np
 
 from groma._typing import FloatArray
 from groma.adjustment.survey.given import Survey
-from groma.adjustment.survey.level import level
+from groma.adjustment.survey.level import check_directions, level
 from groma.adjustment.survey.names import rows_by_name
+from groma.adjustment.survey.orientations import check_orientations
 from groma.adjustment.survey.place import measured_at_places
 from groma.adjustment.survey.similarity import GATES, RobustSimilarity, robust_similarity, upright
 from groma.adjustment.survey.tables import listed
@@ -75,7 +76,9 @@ def placing(before: Scene, scene: Scene, survey: Survey, frame: WorldFrame, note
         fit = robust_similarity(source, target)
     except InputError:
         _check_exchanged(scene, survey, source, None)
+        check_orientations(scene, None)
         raise
+    check_orientations(scene, None if fit.on_line else fit.similarity.rotation)
     _check_exchanged(scene, survey, source, fit)
     _check_units(scene, source, target, fit)
     if fit.on_line and len(scene.camera_poses) > 1:
@@ -86,6 +89,7 @@ def placing(before: Scene, scene: Scene, survey: Survey, frame: WorldFrame, note
             "The measured places are on a line: they do not tell how the scene is turned about it. It was turned so "
             "that the cameras stand upright."
         )
+    check_directions(scene, fit.similarity.rotation)
     if len(far := np.flatnonzero(~fit.inliers)):
         rows = far[np.argsort(-np.linalg.norm(fit.residuals[far], axis=1))]
         told = [f"{names[row]} ({np.linalg.norm(fit.residuals[row]):.3g})" for row in rows]

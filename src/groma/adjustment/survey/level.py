@@ -42,6 +42,7 @@ _OTHER_AXES = {
     "axes turned by -90 degrees (photographs stored turned?)": np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
     "axes turned by 180 degrees (photographs stored upside down?)": np.diag([-1.0, -1.0, 1.0]),
     "x forward, y left, z up (a vehicle or a robot)": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+    "the signs turned (accelerometers measure up)": -np.eye(3),
 }
 
 
@@ -135,19 +136,37 @@ def _median_angle(rotation: FloatArray, seen: FloatArray, wanted: FloatArray) ->
     return float(np.degrees(np.median(np.arccos(np.clip(np.einsum("ni,ni->n", seen @ rotation.T, wanted), -1, 1)))))
 
 
-def _check_axes(scene: Scene, rows: np.ndarray, wanted: FloatArray, apart: float) -> None:
-    """Refuse directions in cameras that contradict each other at the poses of the scene."""
+def check_directions(scene: Scene, rotation: FloatArray) -> None:
+    """Refuse directions measured in cameras that contradict the poses of a scene which places turn.
+
+    Raises
+    ------
+    InputError
+        With the axes that fit, if there are some.
+    """
+    table = scene.known_directions
+    rows = np.flatnonzero(table.kind == Kind.IMAGE)
+    if len(rows):
+        seen = _in_world(scene, rows, np.eye(3))
+        _check_axes(scene, rows, table.vector[rows], _median_angle(rotation, seen, table.vector[rows]), rotation)
+
+
+def _check_axes(
+    scene: Scene, rows: np.ndarray, wanted: FloatArray, apart: float, rotation: FloatArray | None = None
+) -> None:
+    """Refuse directions in cameras that contradict each other at the poses of the scene, turned freely or as given."""
     noise = float(np.degrees(np.median(scene.known_directions.sigma[rows])))
     if apart <= max(GATES.apart_deg, 3.0 * noise):
         return
     angles = {}
     for words, axes in _OTHER_AXES.items():
         seen = _in_world(scene, rows, axes)
-        angles[words] = _median_angle(_rotation(seen, wanted), seen, wanted)
+        angles[words] = _median_angle(_rotation(seen, wanted) if rotation is None else rotation, seen, wanted)
     best = min(angles, key=lambda words: angles[words])
-    hint = f" With {best} it is {angles[best]:.2g}." if angles[best] * GATES.better < apart else ""
+    fitting = " or ".join(words for words, angle in angles.items() if angle <= angles[best] + noise)
+    hint = f" With {fitting} it is {angles[best]:.2g}." if angles[best] * GATES.better < apart else ""
     raise InputError(
-        f"The directions measured in the photographs contradict their poses: most are off by {apart:.2g} degrees or "
+        f"The directions measured in the photographs contradict their poses: most are off by {apart:.0f} degrees or "
         f"more.{hint} Expected are the axes of the camera: x right, y down, z forward."
     )
 
@@ -175,4 +194,4 @@ def _places(scene: Scene) -> FloatArray:
     return found
 
 
-__all__ = ["GATES", "LevelGates", "level"]
+__all__ = ["GATES", "LevelGates", "check_directions", "level"]
