@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from groma.estimators._chance import chi_square_quantile, log10_poisson_tail
+from groma.estimators.association import log10_poisson_tail
+from groma.gates import chi_square_gate
 
 
 @pytest.mark.parametrize("dof", [1, 2, 3, 7, 400])
 def test_quantiles_of_chi_squares(dof):
     for share in (0.001, 0.5, 0.99, 0.9973, 1 - 1e-9):
-        assert chi_square_quantile(share, dof) == pytest.approx(stats.chi2.ppf(share, dof), rel=1e-12)
+        assert chi_square_gate(1.0 - share, dof) == pytest.approx(stats.chi2.isf(1.0 - share, dof), rel=1e-12)
 
 
 @pytest.mark.filterwarnings("error")

@@ -160,3 +160,79 @@ def test_no_direction_among_lines_without_one(count, sigma):
         directions = unit(rng.normal(size=(count, 3)))
         spread = sigma * np.exp(rng.normal(0.0, 0.7, count))
         assert len(directions_from_lines(directions, spread[:, None, None] ** 2 * np.eye(3))) == 0
+
+
+@pytest.mark.parametrize("scatter", [1e-3, 3.5e-3])
+def test_how_parallel_lines_are_is_estimated(scatter):
+    """Lines that are far better known than they are parallel are along one direction, not along several."""
+    rng = np.random.default_rng(11)
+    directions, _ = lines_along(rng, FRAME, 80, scatter)
+    found = directions_from_lines(directions, np.tile(2e-4**2 * np.eye(3), (240, 1, 1)))
+    assert len(found) == 3
+    assert angles(found.vectors, FRAME).min(axis=1).max() < scatter
+    assert (found.probability > 0.9).mean() > 0.95
+
+
+def test_how_far_ends_deviate_is_estimated():
+    """A pixel turns short lines more; lines off by several usual deviations still belong, and are held by less."""
+    rng = np.random.default_rng(12)
+    turned = np.exp(rng.uniform(np.log(1e-3), np.log(1e-2), 200))
+    off = 0.3 * turned
+    off[::10] *= 3.0
+    truth = np.repeat(FRAME[:2], 100, axis=0)
+    directions = unit(truth + off[:, None] * rng.normal(size=(200, 3)))
+    found = directions_from_lines(
+        directions, np.tile(1e-4**2 * np.eye(3), (200, 1, 1)), DirectionOptions(level=0.99), None, turned
+    )
+    assert len(found) == 2
+    assert np.median(found.deviation) == pytest.approx(0.3, rel=0.4)
+    assert found.deviation[::10].mean() > 1.2 * found.deviation[1::10].mean()
+    assert (found.label[::10] >= 0).mean() >= 0.9 and (found.label >= 0).mean() > 0.97
+
+
+def test_directions_near_each_other_stay_apart_and_heavy_tails_are_none():
+    rng = np.random.default_rng(13)
+    near = unit(FRAME[0] + np.radians(1.0) * FRAME[1])
+    directions, covariance = lines_along(rng, np.array([FRAME[0], near]), 30, 2e-3)
+    found = directions_from_lines(directions, covariance)
+    assert len(found) == 2
+    assert angles(found.vectors, np.array([FRAME[0], near])).min(axis=1).max() < 2e-3
+    right = angles(found.vectors, FRAME[:1]).argmin()
+    assert (found.label == np.repeat([right, 1 - right], 30)).mean() > 0.95
+    tails = 2e-3 * np.sqrt(4.0 / rng.chisquare(4.0, 150))[:, None]
+    directions = unit(FRAME[0] + tails * rng.normal(size=(150, 3)))
+    assert len(directions_from_lines(directions, np.tile(2e-3**2 * np.eye(3), (150, 1, 1)))) == 1
+
+
+def test_horizontal_lines_at_any_angle_share_no_direction():
+    """Among many lines perpendicular to one direction some are nearly parallel by chance: surely so are few."""
+    options, sure = DirectionOptions(min_coincidences=2), 0
+    for seed in range(10):
+        rng = np.random.default_rng([14, seed])
+        angle = rng.uniform(0.0, np.pi, 60)
+        level = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(60)])
+        true = np.concatenate([np.tile([0.0, 0.0, 1.0], (40, 1)), level])
+        directions = unit(true + 3e-3 * rng.normal(size=(100, 3)))
+        found = directions_from_lines(directions, np.tile(3e-3**2 * np.eye(3), (100, 1, 1)), options)
+        certain = (found.label >= 0) & (found.probability > 0.9)
+        assert certain[:40].sum() >= 38
+        sure += certain[40:].sum()
+    assert sure <= 12  # of 600
+
+
+def test_nearly_parallel_lines_are_told_from_parallel_ones():
+    """Shutters open by one to nine degrees, among lines of a facade that deviate by a pixel or less."""
+    wrong = right = 0
+    for seed in range(10):
+        rng = np.random.default_rng([15, seed])
+        turned = np.exp(rng.uniform(np.log(2e-3), np.log(1e-2), 60))
+        opened = np.radians(rng.uniform(1.0, 9.0, 16))[:, None] * unit(rng.normal(size=(16, 3)))
+        truth = np.tile(FRAME[0], (60, 1))
+        truth[:16] = unit(truth[:16] + opened)
+        directions = unit(truth + 0.4 * turned[:, None] * rng.normal(size=(60, 3)))
+        found = directions_from_lines(
+            directions, np.tile(5e-4**2 * np.eye(3), (60, 1, 1)), DirectionOptions(level=0.99), None, turned
+        )
+        along = (found.label == 0) & (found.probability > 0.9)
+        wrong, right = wrong + along[:16].sum(), right + along[16:].sum()
+    assert wrong <= 12 and right > 0.9 * 440  # of 160; some of the shutters are as good as closed

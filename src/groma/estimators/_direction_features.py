@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a common direction is tested against: normals perpendicular to it, or directions parallel to it.
 
-Both whiten their residuals and say with which probability they agree with a random direction; the formulas stand in
-:mod:`groma.estimators.directions`.
+Both whiten their residuals; the formulas stand in :mod:`groma.estimators.directions` and
+:mod:`groma.estimators._parallel_lines`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ class Perpendicular:
     normals: FloatArray
     factors: FloatArray
     sigma: float
-    freedom: int = 1
 
     def take(self, rows: IntArray | BoolArray) -> Perpendicular:
         return Perpendicular(self.normals[rows], self.factors[rows], self.sigma)
@@ -51,33 +50,24 @@ class Perpendicular:
 class Parallel:
     """Directions to which the direction is parallel: whitened bases and the square roots of their determinants."""
 
+    directions: FloatArray
     whitened: FloatArray
     area: FloatArray
-    freedom: int = 2
 
     @classmethod
-    def of(cls, directions: FloatArray, covariance: FloatArray, sigma: float) -> Parallel:
+    def of(cls, directions: FloatArray, covariance: FloatArray, sigma: FloatArray) -> Parallel:
         basis = np.stack(perpendicular(directions), axis=1)
-        inner = basis @ covariance @ np.swapaxes(basis, 1, 2) + sigma**2 * np.eye(2)
+        inner = basis @ covariance @ np.swapaxes(basis, 1, 2) + sigma[:, None, None] ** 2 * np.eye(2)
         values, axes = np.linalg.eigh(inner)
         scaled = np.swapaxes(axes, 1, 2) / np.sqrt(values)[..., None]
-        return cls(scaled @ basis, np.sqrt(values.prod(axis=1)))
-
-    def take(self, rows: IntArray | BoolArray) -> Parallel:
-        return Parallel(self.whitened[rows], self.area[rows])
+        return cls(directions, scaled @ basis, np.sqrt(values.prod(axis=1)))
 
     def __len__(self) -> int:
         return len(self.area)
 
     def squared(self, directions: FloatArray) -> FloatArray:
+        """Squared whitened residuals."""
         return (directions @ self.whitened[:, 0].T) ** 2 + (directions @ self.whitened[:, 1].T) ** 2
-
-    def chance(self, directions: FloatArray, gate: float) -> FloatArray:
-        # An ellipse of area pi gate area on the half sphere of area 2 pi.
-        return np.minimum(0.5 * gate * self.area, 1.0)[None]
-
-    def rows(self, direction: FloatArray) -> FloatArray:
-        return self.whitened
 
 
 def crossings(pool: Perpendicular, count: int, min_sine: float, rng: np.random.Generator) -> FloatArray:

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
-from groma.estimators._chance import log10_poisson_tail
 from groma.estimators._plane_candidates import Features
 from groma.estimators._plane_loops import (
     ball_loop,
@@ -23,7 +22,7 @@ from groma.estimators._plane_loops import (
 )
 from groma.estimators._plane_options import PLANE_SEARCH as GATES
 from groma.estimators._plane_options import PlaneOptions
-from groma.estimators.association import inlier_probability
+from groma.estimators.association import inlier_probability, log10_poisson_tail
 from groma.estimators.plane_fit import PlaneFit, fit_plane, tilt_sigma
 from groma.geometry.algebra import norm, perpendicular
 

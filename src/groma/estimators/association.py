@@ -15,7 +15,10 @@ probability.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from scipy.special import pdtrc
 
 from groma._numba import loop
 from groma._typing import FloatArray, IntArray
@@ -109,3 +112,16 @@ def maximise_shares(
     share, count = np.full(num, float(together[0])), np.bincount(owner, minlength=num)
     _maximise(density, clutter, owner, count, pooled, float(together[0]), rounds, share, probability)
     return share
+
+
+def log10_poisson_tail(count: float, mean: float) -> float:
+    """Return the logarithm of the probability of more than ``count`` events where ``mean`` are expected."""
+    if count < 0:
+        return 0.0
+    if mean <= 0.0:
+        return -math.inf
+    tail = float(pdtrc(count, mean))
+    # Below the smallest number the first term is nearly all of the sum.
+    first = math.floor(count) + 1
+    log_tail = math.log(tail) if tail > 0.0 else first * math.log(mean) - mean - math.lgamma(first + 1)
+    return log_tail / math.log(10.0)

@@ -4,11 +4,7 @@ r"""Directions that many features share: perpendicular to plane normals, or para
 A segment in an image fixes a plane through the camera centre; the direction of its 3D line is perpendicular to the
 plane's normal, whatever the camera model. Lines that are parallel in space therefore share a direction v with
 
-.. math:: z_i = \frac{n_i^\top v}{\sqrt{v^\top \Sigma_i v + \sigma_0^2}} \sim N(0, 1),
-
-and directions of 3D lines, with :math:`B_i` two unit vectors across :math:`d_i`, have
-
-.. math:: z_i = (B_i^\top \Sigma_i B_i + \sigma_0^2 I)^{-1/2} B_i^\top v \sim N(0, I_2).
+.. math:: z_i = \frac{n_i^\top v}{\sqrt{v^\top \Sigma_i v + \sigma_0^2}} \sim N(0, 1).
 
 :math:`\sigma_0` says how parallel things are that are built to be parallel. Directions are found one after the other:
 the candidate that explains most, refined by robust least squares, then taken out. A feature agrees with a random
@@ -17,6 +13,9 @@ segments count more, and a direction is kept when fewer than ``max_false_alarms`
 among all that could be tried:
 
 .. math:: N_\text{tried}\; P(\text{Poisson}(\textstyle\sum p_i) \ge k) < N_\text{false}.
+
+Directions of 3D lines are components of a mixture (:mod:`groma.estimators._parallel_lines`); the same bound holds there
+for the evidence of each.
 
 The sign of a direction has no meaning.
 """
@@ -29,9 +28,10 @@ import numpy as np
 
 from groma._typing import FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.estimators._chance import chi_square_quantile, log10_poisson_tail
-from groma.estimators._direction_features import Parallel, Perpendicular, crossings
-from groma.gates import gate
+from groma.estimators._direction_features import Perpendicular, crossings
+from groma.estimators._parallel_lines import Acceptance, ParallelGates, parallel_lines
+from groma.estimators.association import log10_poisson_tail
+from groma.gates import chi_square_gate, gate
 from groma.geometry.algebra import dot, norm, perpendicular, unit, vectors
 
 
@@ -67,8 +67,9 @@ class DirectionGates:
     )
 
 
-#: The numbers in use.
+#: The numbers in use, of normals and of lines.
 DIRECTIONS = DirectionGates()
+PARALLEL = ParallelGates()
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,10 @@ class DirectionSet:
     label: IntArray
     #: (M, 2) pairs of directions that are orthogonal within their uncertainty.
     orthogonal: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    #: Of 3D lines: (N,) probability that they are along their direction, and how far their ends deviate from it beyond
+    #: their noise, pixels.
+    probability: FloatArray = field(default_factory=lambda: np.zeros(0))
+    deviation: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.vectors)
@@ -165,7 +170,7 @@ def directions_from_lines(
     covariance: FloatArray,
     options: DirectionOptions | None = None,
     candidates: FloatArray | None = None,
-    groups: IntArray | None = None,
+    turned: FloatArray | None = None,
 ) -> DirectionSet:
     """Find directions shared by 3D lines; either sign of a line's direction is the same.
 
@@ -179,8 +184,9 @@ def directions_from_lines(
         What counts as a direction.
     candidates : (H, 3) float64, optional
         Further directions to try, such as vanishing directions of images.
-    groups : (N,) int, optional
-        Group of each line, for ``min_groups``.
+    turned : (N,) float64, optional
+        Angle by which a pixel at both ends turns each line, radians: how far edges deviate from what they are parallel
+        to is estimated. By default they do not.
 
     Returns
     -------
@@ -201,12 +207,22 @@ def directions_from_lines(
             f"{covariance.shape}."
         )
     _check_finite(directions, covariance)
-    features = Parallel.of(unit(directions), covariance, options.parallel_sigma)
-    best = np.argsort(features.area, kind="stable")[: DIRECTIONS.max_candidates]
-    tried = unit(directions)[best]
-    if candidates is not None:
-        tried = np.concatenate([tried, unit(vectors(candidates, 3, "candidates"))])
-    return _search(features, options, groups, tried)
+    guesses = np.zeros((0, 3)) if candidates is None else unit(vectors(candidates, 3, "candidates"))
+    sigma, bound = options.parallel_sigma, options.max_false_alarms
+    apart = PARALLEL.same * sigma
+    wanted = Acceptance(options.min_coincidences + 1, options.max_directions, options.max_sigma, apart, bound)
+    found = parallel_lines(unit(directions), covariance, sigma, turned, guesses, wanted, PARALLEL)
+    agrees = (found.probability > 0.5) & (found.squared < PARALLEL.quantile(options.level))
+    return DirectionSet(
+        found.vectors,
+        found.covariance,
+        np.bincount(found.label[agrees], minlength=len(found.vectors)),
+        -found.evidence / np.log(10.0),
+        np.where(agrees, found.label, -1),
+        orthogonal_pairs(found.vectors, found.covariance, DIRECTIONS.same * sigma),
+        found.probability,
+        found.deviation,
+    )
 
 
 def orthogonal_pairs(
@@ -243,7 +259,7 @@ def orthogonal_pairs(
     cosine = dot(directions[first], directions[second])
     variance = np.einsum("mi,mij,mj->m", directions[first], covariance[second], directions[first])
     variance += np.einsum("mi,mij,mj->m", directions[second], covariance[first], directions[second])
-    passed = cosine**2 < chi_square_quantile(level, 1) * (variance + sigma**2)
+    passed = cosine**2 < chi_square_gate(1.0 - level, 1) * (variance + sigma**2)
     passed &= variance < max_sigma**2
     return np.column_stack([first, second])[passed]
 
@@ -255,32 +271,27 @@ def _check_finite(*arrays: FloatArray) -> None:
 
 
 def _search(
-    features: Perpendicular | Parallel,
+    features: Perpendicular,
     options: DirectionOptions,
     groups: IntArray | None,
     candidates: FloatArray | None,
 ) -> DirectionSet:
     """Take directions one after the other; see the module."""
     rng = np.random.default_rng(options.seed)
-    gate = chi_square_quantile(options.level, features.freedom)
+    gate = chi_square_gate(1.0 - options.level, 1)
     # Features out to where one in 10^4 ends are taken out together: what is left must not repeat the direction.
-    wide = chi_square_quantile(DIRECTIONS.taken, features.freedom)
-    tried = max(len(features), 2) ** (3 - features.freedom)
+    wide = chi_square_gate(1.0 - DIRECTIONS.taken, 1)
+    tried = max(len(features), 2) ** 2
     remaining = np.arange(len(features))
     found: list[FloatArray] = []
     covariances: list[FloatArray] = []
     alarms: list[float] = []
-    least = options.min_coincidences + 3 - features.freedom
+    least = options.min_coincidences + 2
     while len(found) < options.max_directions and len(remaining) >= max(least, 2):
         pool = features.take(remaining)
-        if candidates is not None:
-            guesses = candidates
-        else:
-            guesses = (
-                crossings(pool, DIRECTIONS.max_candidates, DIRECTIONS.min_sine, rng)
-                if isinstance(pool, Perpendicular)
-                else np.zeros((0, 3))
-            )
+        guesses = candidates
+        if guesses is None:
+            guesses = crossings(pool, DIRECTIONS.max_candidates, DIRECTIONS.min_sine, rng)
         if len(guesses) == 0:
             break
         scored = pool
@@ -314,7 +325,7 @@ def _search(
 
 
 def _collect(
-    features: Perpendicular | Parallel,
+    features: Perpendicular,
     found: list[FloatArray],
     covariances: list[FloatArray],
     alarms: list[float],
@@ -335,13 +346,13 @@ def _collect(
     return DirectionSet(directions, covariance, support, np.array(alarms), label, pairs)
 
 
-def _score(pool: Perpendicular | Parallel, candidates: FloatArray, gate: float) -> FloatArray:
+def _score(pool: Perpendicular, candidates: FloatArray, gate: float) -> FloatArray:
     """Information (H,) that candidates explain: certain features count more, those near the gate less."""
     agreement = np.maximum(1.0 - pool.squared(candidates) / gate, 0.0)
     return -(agreement * np.log(np.maximum(pool.chance(candidates, gate), 1e-12))).sum(axis=1)
 
 
-def _refine(pool: Perpendicular | Parallel, start: FloatArray, gate: float) -> tuple[FloatArray, FloatArray]:
+def _refine(pool: Perpendicular, start: FloatArray, gate: float) -> tuple[FloatArray, FloatArray]:
     """Robust least squares: Gauss-Newton with Geman-McClure weights inside twice the gate's radius."""
     direction = unit(start)
     information, basis, scale = np.eye(2), np.zeros((2, 3)), 1.0

@@ -69,9 +69,7 @@ class Membership:
     deviation: FloatArray
 
 
-def memberships(
-    found: Candidates, most: FloatArray, common: bool = False, gates: MembershipGates = MembershipGates()
-) -> Membership:
+def memberships(found: Candidates, most: FloatArray, gates: MembershipGates = MembershipGates()) -> Membership:
     """Estimate how far members of structures deviate, and with which probability features are members.
 
     Parameters
@@ -80,8 +78,6 @@ def memberships(
         Pairs of features and structures.
     most : (K,) float64
         Largest deviation that members of each structure may have; deviations down to a fiftieth are tried.
-    common : bool
-        Whether all structures have the same deviation: few members cannot tell their own.
     gates : MembershipGates
         How they are estimated.
     """
@@ -99,8 +95,6 @@ def memberships(
         shares.append(share)
         mixed = share[found.group] * density + (1.0 - share[found.group]) * found.clutter
         likelihood[k] = np.bincount(found.owner[rows], np.log(mixed[rows]), num)
-    if common:
-        likelihood[:] = likelihood.sum(axis=1, keepdims=True)
     best = likelihood.argmax(axis=0)
     gain = likelihood.max(axis=0) - likelihood[0]
     # Where the widest fits best nothing stands out from clutter, whatever it is.

@@ -27,11 +27,11 @@ import numpy as np
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.errors import InputError, ShapeError
-from groma.estimators._chance import chi_square_quantile
 from groma.estimators._plane_candidates import Features, Scores, features_of, from_neighbours, from_segments
 from groma.estimators._plane_growth import Grower, Grown, connected_to
 from groma.estimators._plane_options import PLANE_SEARCH, PlaneOptions
 from groma.execution import map_in_threads, num_threads
+from groma.gates import chi_square_gate
 from groma.geometry.algebra import vectors
 
 #: Half thickness of the layer around a plane in which it must stand out, in standard deviations of its points.
@@ -159,7 +159,7 @@ def _extract(
     """Take planes out one after the other; ``labels`` is filled."""
     rng = np.random.default_rng(options.seed)
     features = features_of(places, noise, partner, carrier)
-    gate = chi_square_quantile(options.level, 1)
+    gate = chi_square_gate(1.0 - options.level, 1)
     first, first_homes = from_neighbours(features, gate, rng)
     second, second_homes, num_pairs = from_segments(features, num_points, gate)
     candidates, homes = np.concatenate([first, second]), np.concatenate([first_homes, second_homes])

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -34,7 +34,7 @@ from groma.mapping.groups import num_distinct
 from groma.mapping.noise.landmarks import LineNoise, PointNoise, line_noise, point_noise
 from groma.mapping.structure.angles import Vector, angles_between, vertical_of
 from groma.mapping.structure.junctions import meetings
-from groma.mapping.structure.relations import Landmarks, Pairs, along_directions, on_lines, on_planes, spacings
+from groma.mapping.structure.relations import Landmarks, Pairs, on_lines, on_planes, spacings
 from groma.scene import Directions, Held, Planes, Relations, Scene
 from groma.scene.survey import Kind
 
@@ -147,13 +147,13 @@ def detect_structure(
     on_line = on_lines(marks, level, least)
     planes = _planes_in(marks, on_line, options, partial(report, "finding planes"))
     report("finding directions", 0, 1)
-    directions = _directions_in(scene, marks, options, candidates, options.surface_sigma_px)
+    directions, along = _parallels(scene, marks, options, candidates)
     report("finding what lies on what", 0, 1)
     point_on_plane, line_on_plane = on_planes(marks, planes, level, (least, least_line))
     support = point_on_plane.counts(len(planes)) + 2 * line_on_plane.counts(len(planes))
     planes, new = _only(planes, support >= (options.planes.min_support + 1) // 2)
     found = {"point_on_plane": point_on_plane.renumbered(new), "line_on_plane": line_on_plane.renumbered(new)}
-    directions, found["line_along_direction"] = _parallels(scene, marks, options, candidates)
+    found["line_along_direction"] = along
     found["point_on_line"] = on_line if options.points_on_lines else Pairs.none()
     found["lines_meeting"] = meetings(marks, level, least_line)
     vertical = vertical_of(scene)
@@ -198,26 +198,23 @@ def _planes_in(
     )
 
 
-def _directions_in(
-    scene: Scene, marks: Landmarks, options: StructureOptions, candidates: FloatArray | None, deviation_px: float
-) -> DirectionSet:
-    """Directions that usable lines share."""
-    lines = np.flatnonzero(marks.line_usable)
-    noise = marks.own_line_noise.widened(deviation_px * marks.line_pixel)
-    turning = noise.directions(norm(marks.segments[:, 1] - marks.segments[:, 0]))
-    return directions_from_lines(scene.lines.plucker[lines, 3:], turning[lines], options.directions, candidates)
-
-
 def _parallels(
     scene: Scene, marks: Landmarks, options: StructureOptions, candidates: FloatArray | None
 ) -> tuple[DirectionSet, Pairs]:
-    """Directions and lines along them, sought twice: how exactly lines are parallel is known after the first time."""
-    sigma, level, least = options.directions.parallel_sigma, options.level, options.min_line_probability
-    directions = _directions_in(scene, marks, options, candidates, options.surface_sigma_px)
-    _, deviation = along_directions(marks, directions, sigma, level, least)
-    directions = _directions_in(scene, marks, options, candidates, deviation)
-    along, _ = along_directions(marks, directions, sigma, level, least)
-    directions, new = _only_directions(directions, along.counts(len(directions)) >= _MIN_PARALLEL)
+    """Directions that usable lines share, and the lines along them."""
+    lines, length = np.flatnonzero(marks.line_usable), norm(marks.segments[:, 1] - marks.segments[:, 0])
+    found = directions_from_lines(
+        scene.lines.plucker[lines, 3:],
+        marks.own_line_noise.directions(length)[lines],
+        replace(options.directions, level=options.level),
+        candidates,
+        math.sqrt(2.0) * marks.line_pixel[lines] / length[lines],
+    )
+    rows = np.flatnonzero(found.label >= 0)
+    rows = rows[found.probability[rows] > options.min_line_probability]
+    pairs = np.column_stack([lines[rows], found.label[rows]])
+    along = Pairs(pairs, found.probability[rows], found.deviation[rows])
+    directions, new = _only_directions(found, along.counts(len(found)) >= _MIN_PARALLEL)
     return directions, along.renumbered(new)
 
 
@@ -313,6 +310,8 @@ def _only_directions(directions: DirectionSet, kept: np.ndarray) -> tuple[Direct
         directions.log10_false_alarms[kept],
         np.append(new, -1)[directions.label],
         right[(right >= 0).all(axis=1)],
+        directions.probability,
+        directions.deviation,
     )
     return chosen, new
 

@@ -16,12 +16,11 @@ from scipy.spatial import KDTree
 
 from groma._typing import BoolArray, FloatArray, IntArray
 from groma.estimators.association import inlier_probability
-from groma.estimators.directions import DirectionSet
 from groma.estimators.membership import Candidates, memberships
 from groma.estimators.plane_search import BAND, PlaneSet, connected_to
 from groma.execution import map_in_threads, num_threads
 from groma.gates import chi_square_gate, gate
-from groma.geometry.algebra import dot, norm, perpendicular, unit
+from groma.geometry.algebra import dot, norm
 from groma.mapping.groups import distinct_pairs
 from groma.mapping.noise.landmarks import LineNoise, PointNoise
 from groma.scene import LineIntervals
@@ -48,12 +47,6 @@ class RelationGates:
     )
     widest: float = gate(
         0.33, "layers", "that members of a plane may deviate", "derived from normal noise: the layer holds 3 deviations"
-    )
-    cap: float = gate(
-        0.15, "rad", "around a direction, in which lines are told from clutter", "chosen on benchmarks/structure.py"
-    )
-    most_px: float = gate(
-        3.0, "px", "that ends of lines along a direction may deviate", "chosen on benchmarks/structure.py"
     )
     num_nearest: int = gate(12, "samples", "of segments that a point is compared with", "cost: time of a search")
     num_samples: tuple[int, int] = gate(
@@ -216,51 +209,6 @@ def _near_plane(marks: Landmarks, found: PlaneSet, layer: float, k: int) -> tupl
     return np.column_stack(columns), np.column_stack([lines, np.full(len(lines), k), height, spread, offset, variance])
 
 
-def along_directions(
-    marks: Landmarks,
-    found: DirectionSet,
-    sigma: float,
-    level: float,
-    least: float,
-    gates: RelationGates = RelationGates(),
-) -> tuple[Pairs, float]:
-    """Lines along directions, at most one direction for each line; and how far the ends of lines deviate, pixels."""
-    rows, num = np.flatnonzero(marks.line_usable), len(found)
-    if len(rows) == 0 or num == 0:
-        return Pairs.none(), 0.0
-    length = norm(marks.segments[:, 1] - marks.segments[:, 0])
-    own = marks.own_line_noise.directions(length)[rows]
-    basis = np.stack(perpendicular(unit(marks.segments[rows, 1] - marks.segments[rows, 0])), axis=1)
-    parts = []
-    for k, vector in enumerate(found.vectors):
-        across = basis @ vector
-        near = norm(across) < gates.cap
-        noise = basis[near] @ (own[near] + found.covariance[k]) @ np.swapaxes(basis[near], 1, 2)
-        variance, axes = np.linalg.eigh(noise + sigma**2 * np.eye(2))
-        offset = np.einsum("nab,na->nb", axes, across[near])
-        parts.append((np.flatnonzero(near), np.full(near.sum(), k), offset, variance))
-    at, owner, offset, variance = (np.concatenate(column) for column in zip(*parts, strict=True))
-    label = found.label[at]
-    per_pixel = np.sqrt(2.0) * (marks.line_pixel / np.maximum(length, 1e-300))[rows[at]]
-    told = memberships(
-        Candidates(
-            owner=owner,
-            offset=offset,
-            variance=variance,
-            unit=per_pixel,
-            clutter=np.full(len(at), 1.0 / (np.pi * gates.cap**2)),
-            counted=(label < 0) | (label == owner),
-            group=owner,
-        ),
-        np.full(num, gates.most_px),
-        common=True,
-    )
-    squared = (offset**2 / (variance + ((told.deviation[owner] * per_pixel) ** 2)[:, None])).sum(axis=1)
-    passed = (squared < chi_square_gate(1.0 - level, 2)) & (told.probability > least)
-    pairs = Pairs(np.column_stack([rows[at], owner]), told.probability, told.deviation[owner]).take(passed)
-    return _best_of_competing(pairs, np.ones((num, num), bool), num), float(told.deviation[0])
-
-
 def on_lines(marks: Landmarks, level: float, least: float, gates: RelationGates = RelationGates()) -> Pairs:
     """Points on lines: where images support them, not in gaps nor beyond their ends."""
     rows = np.flatnonzero(marks.line_usable)
@@ -366,4 +314,4 @@ def _best_of_competing(found: Pairs, competing: BoolArray, num: int) -> Pairs:
     return found.take(kept)
 
 
-__all__ = ["Landmarks", "Pairs", "RelationGates", "along_directions", "on_lines", "on_planes", "spacings"]
+__all__ = ["Landmarks", "Pairs", "RelationGates", "on_lines", "on_planes", "spacings"]
