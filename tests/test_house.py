@@ -27,8 +27,6 @@ MAX_FILES, MAX_LINES, MAX_FUNCTION = 20, 400, 80
 LONG_MODULES: set[str] = set()
 LONG_FUNCTIONS: set[str] = set()
 BORROWED: set[tuple[str, str]] = set()
-#: Rooms whose modules still list their names.
-BUSY = tuple(f"groma.{room}" for room in "_kernels adjustment compilation localization mapping scene tracking".split())
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
@@ -104,7 +102,6 @@ def test_names_are_listed_where_they_are_supported():
         }
         if lists and passed.isdisjoint(name.value for name in ast.walk(lists[0]) if isinstance(name, ast.Constant)):
             listing.add(module)
-    listing -= {module for module in listing if module.startswith(BUSY)}
     assert listing - set(PACKAGES) - supported == set()
 
 

@@ -78,6 +78,3 @@ def rebuilt(context: Any, reduced: tuple) -> CompileResult:
     entry = reduced[1].llvm_cpython_wrapper_name
     context.codegen()._engine._defined_symbols.add(entry)  # it is there, or there were nothing to call
     return CompileResult._rebuild(_Context(context), *reduced)._replace(target_context=context)
-
-
-__all__ = ["rebuilt"]

@@ -28,6 +28,3 @@ def compilation_time() -> Iterator[Compilation]:
         yield found
     found.seconds = listener.duration if listener.done else 0.0
     found.compiled = counts.compiled + counts.unsaved + counts.missed > before
-
-
-__all__ = ["Compilation", "compilation_time"]

@@ -102,6 +102,3 @@ def place() -> str:
     """Return the folder with what is compiled, for the user; empty where there is none."""
     folder = kernel_cache.folder()
     return "" if folder is None else str(folder.parent)
-
-
-__all__ = ["PARTS", "is_ready", "place", "warm_up"]

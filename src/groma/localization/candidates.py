@@ -147,6 +147,3 @@ def _points_near(
         best[side, np.unique(pairs[:, side], return_index=True)[1]] = True
     kept = best.all(axis=0)
     return pairs[kept], far[order[kept]]
-
-
-__all__ = ["Candidates", "described_alike", "found_near"]

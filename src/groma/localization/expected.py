@@ -169,6 +169,3 @@ def _lengths(camera: QueryCamera, pose: FloatArray, ends: FloatArray) -> tuple[F
     length = np.linalg.norm(pixel[:, 1:] - pixel[:, :-1], axis=2).ravel()
     middle = (0.5 * (pixel[:, 1:] + pixel[:, :-1])).reshape(-1, 2)
     return middle, np.nan_to_num(length)
-
-
-__all__ = ["FoundAgain", "nearest_images", "shown_of"]

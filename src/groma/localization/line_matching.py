@@ -175,6 +175,3 @@ def _projected(camera: QueryCamera, pose: FloatArray, ends: FloatArray) -> tuple
     cut[~visible] = 1.0
     K = camera.matrix
     return cut[..., :2] / cut[..., 2:] * K[[0, 1], [0, 1]] + K[:2, 2], visible
-
-
-__all__ = ["GATES", "GuidedLineGates", "SeenLines", "lines_near"]

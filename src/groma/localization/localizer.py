@@ -278,15 +278,3 @@ def check_map(scene: Scene) -> None:
     if not scene.num_images:
         raise InputError("The map has no images with poses. Pass an output of groma map or groma track.")
     check_cameras(scene.cameras.models)
-
-
-__all__ = [
-    "GATES",
-    "LocalizeOptions",
-    "LocalizedImage",
-    "Localizer",
-    "LocalizerGates",
-    "index_file",
-    "photographs_of",
-    "unknown_camera",
-]

@@ -299,6 +299,3 @@ def _common_folder(scene: Scene, files: Sequence[Path]) -> Path:
     folder = first.parents[len(Path(scene.images.names[0]).parts) - 1]
     every = all(file.absolute() == folder / name for name, file in zip(scene.images.names, files, strict=True))
     return folder if every else Path(os.path.commonpath([file.absolute().parent for file in files]))
-
-
-__all__ = ["MapIndex", "build_index", "digest_of", "images_told", "kept_index", "read_index"]

@@ -215,15 +215,3 @@ def pairs_near(
 
 def _distance(product: npt.NDArray[np.float32]) -> FloatArray:
     return np.sqrt(np.maximum(2.0 - 2.0 * product.astype(np.float64), 0.0))
-
-
-__all__ = [
-    "MATCHES",
-    "Bytes",
-    "MatchGates",
-    "Vectors",
-    "alike_elsewhere",
-    "lengths_of",
-    "match_descriptors",
-    "pairs_near",
-]

@@ -100,6 +100,3 @@ def _alike_elsewhere(work: tuple[Described, float]) -> FloatArray:
         rows = upright == kind
         out[rows] = alike_elsewhere(unit(descriptor[rows]), pixel[rows], beyond)
     return out
-
-
-__all__ = ["GATES", "Described", "RepeatedGates", "alike_limits", "unique_points"]

@@ -63,6 +63,3 @@ class VladRetrieval:
         stop = (cv2.TERM_CRITERIA_MAX_ITER, 12, 0.0)
         words = cv2.kmeans(unit(every[rows]), WORDS, None, stop, 1, cv2.KMEANS_PP_CENTERS)[2]  # type: ignore[call-overload]
         return VladRetrieval(np.asarray(words, np.float32))
-
-
-__all__ = ["WORDS", "VladRetrieval"]

@@ -124,6 +124,3 @@ def reliability_of(scene: Scene, problem: Problem | None) -> Reliability | None:
         return reliability(scene, problem)
     except ProblemError:
         return None
-
-
-__all__ = ["reliability_of", "without_gross_errors"]

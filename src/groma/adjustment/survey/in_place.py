@@ -194,6 +194,3 @@ def _ratios(scene: Scene) -> FloatArray:
             apart = abs(scene.planes.hesse[index] @ np.append(first, 1.0))
         ratios.append(table.distance[row] / apart if apart > 0.0 else np.nan)
     return np.array([ratio for ratio in ratios if np.isfinite(ratio)])
-
-
-__all__ = ["Placing", "placing"]

@@ -192,6 +192,3 @@ def _places(scene: Scene) -> FloatArray:
         rows = np.flatnonzero(table.kind == kind)
         found[rows] = places[table.idx[rows]]
     return found
-
-
-__all__ = ["GATES", "LevelGates", "check_directions", "level"]

@@ -76,6 +76,3 @@ def _apart(given: FloatArray, own: FloatArray, rotation: FloatArray | None) -> f
         off = quaternion.multiply(quaternion.conjugate(given), quaternion.multiply(whole[None], own))
         medians.append(np.median(np.linalg.norm(quaternion.log(off), axis=1)))
     return float(np.degrees(min(medians)))
-
-
-__all__ = ["check_orientations"]

@@ -322,6 +322,3 @@ def _failed(camera: QueryCamera, matches: Matches) -> AbsolutePose:
 
 def _or_none(value: npt.ArrayLike | None, *shape: int) -> npt.ArrayLike:
     return np.zeros((0, *shape)) if value is None else value
-
-
-__all__ = ["UNKNOWN_LENS", "AbsolutePose", "PoseOptions", "estimate_absolute_pose", "pose_from_matches"]

@@ -83,4 +83,3 @@ class VerdictGates:
 
 #: The numbers in use.
 HYPOTHESES, REFINEMENT, VERDICT = HypothesisGates(), RefinementGates(), VerdictGates()
-__all__ = ["HYPOTHESES", "REFINEMENT", "VERDICT", "HypothesisGates", "RefinementGates", "VerdictGates"]

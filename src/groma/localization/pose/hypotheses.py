@@ -119,6 +119,3 @@ def _trials(share: float, gates: HypothesisGates) -> int:
         return gates.max_trials
     wanted = 3.0 * np.log1p(-gates.confidence) / np.log1p(-(min(share, 0.99) ** 3))
     return int(np.clip(wanted, gates.min_trials, gates.max_trials))
-
-
-__all__ = ["Straight", "max_errors", "propose", "straightened"]

@@ -378,6 +378,3 @@ def _camera_of(problem: Problem, camera: QueryCamera) -> QueryCamera | None:
     if not (np.isfinite(state).all() and (focal > 0.0).all()):
         return None
     return QueryCamera(camera.model, state, camera.width, camera.height)
-
-
-__all__ = ["Refined", "cells_of", "fitted", "problem_of", "refine"]

@@ -278,21 +278,3 @@ def _open(sigma: FloatArray) -> str:
         return "the camera could move without any of them noticing"
     shift, turn = float(np.linalg.norm(sigma[:3])), float(np.rad2deg(np.linalg.norm(sigma[3:])))
     return f"its standard deviation is {shift:.3g} scene units and {turn:.2g} degrees"
-
-
-__all__ = [
-    "Evidence",
-    "Status",
-    "Verdict",
-    "doubted_if_in_pieces",
-    "doubted_if_mirrored",
-    "doubted_if_missing",
-    "doubted_if_repeated",
-    "evidence_of",
-    "judge",
-    "median_distance",
-    "most_votes",
-    "moved",
-    "votes_of_a_part",
-    "votes_of_a_rival",
-]

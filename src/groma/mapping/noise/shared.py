@@ -163,6 +163,3 @@ def _covariance(grid: _Grid, cells: IntArray, residual: FloatArray, sigma: Float
             break
         covariance[ring], inner = least, outer
     return covariance
-
-
-__all__ = ["with_shared_noise"]

@@ -314,6 +314,3 @@ def _only_directions(directions: DirectionSet, kept: np.ndarray) -> tuple[Direct
         directions.deviation,
     )
     return chosen, new
-
-
-__all__ = ["Structure", "StructureOptions", "detect_structure", "find_structure"]

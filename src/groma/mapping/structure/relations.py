@@ -312,6 +312,3 @@ def _best_of_competing(found: Pairs, competing: BoolArray, num: int) -> Pairs:
         kept[rows[free]] = True
         taken[owner[free], structure[free]] = True
     return found.take(kept)
-
-
-__all__ = ["Landmarks", "Pairs", "RelationGates", "on_lines", "on_planes", "spacings"]

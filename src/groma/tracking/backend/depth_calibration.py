@@ -157,6 +157,3 @@ def _corrected(depth: FloatArray, offset: float) -> FloatArray:
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = 1.0 / depth + offset
         return np.where(inverse > 0.0, 1.0 / inverse, np.nan)
-
-
-__all__ = ["DepthOffset", "correct_depths", "estimate_depth_offset", "has_depths"]

@@ -383,6 +383,3 @@ class Mapper:
 def _follow_world(present: Present, new_from_old: FloatArray) -> None:
     """Move the present pose with the map around the last keyframe."""
     present.pose = se3.compose(present.pose[None], se3.inverse(new_from_old[None]))[0]
-
-
-__all__ = ["DELAY", "Mapper", "Present"]

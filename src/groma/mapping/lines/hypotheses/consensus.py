@@ -228,6 +228,3 @@ def choose(
         gates.fusing_rounds, min_support, q, covariance, score, supporters, rival,
     )  # fmt: skip
     return Choice(score > 0.0, q, covariance, score, rival, supporters)
-
-
-__all__ = ["Choice", "ConsensusGates", "choose"]
