@@ -78,7 +78,7 @@ def test_a_part_of_the_points_tells_a_lens_as_well(scene):
     some = LensGates(max_observations=2_000)
     assert scene.num_point_observations > 3 * some.max_observations
     bent, plain = (groma.adjust(s, POINTS).problem for s in (through_lens(scene, -0.05), scene))
-    assert "--camera-model OPENCV" in unmodelled_distortion(bent, gates=some)
+    assert "--camera-model OPENCV" in unmodelled_distortion(bent, gates=some).sentence
     assert unmodelled_distortion(plain, gates=replace(some, false_alarm=0.999)) is None
 
 

@@ -247,7 +247,8 @@ def _adjusted(scene: Scene, options: AdjustOptions, progress: Callable[[Progress
         adjusted = with_seen_ends(adjusted, np.unique(np.concatenate(moved)))
     outcome = _outcome(scene, assembly, problem, report, relations, stage_entries(stages, reports))
     if options.check_lens:
-        found = unmodelled_distortion(problem, options.threads), rig_that_does_not_fit(scene, problem, options.threads)
+        lens = unmodelled_distortion(problem, options.threads)
+        found = lens and lens.sentence, rig_that_does_not_fit(scene, problem, options.threads)
         outcome = replace(outcome, warnings=(*outcome.warnings, *filter(None, found)))
     _log(outcome)
     return AdjustResult(adjusted, outcome, problem)

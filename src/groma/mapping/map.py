@@ -127,8 +127,9 @@ class MapOptions:
     threads: int | None = None
     #: Most steps of each adjustment (cost: time; most end before).
     max_iterations: int = 50
-    #: The camera model: where points are reconstructed, of all cameras (None: SIMPLE_RADIAL); else the model that the
-    #: given cameras are changed to (None: they keep theirs), and what it adds is estimated with the calibration.
+    #: The camera model: where points are reconstructed, of all cameras (None: SIMPLE_RADIAL, or RADIAL where residuals
+    #: show a second coefficient of distortion); else the model that the given cameras are changed to (None: they keep
+    #: theirs), and what it adds is estimated with the calibration.
     camera_model: str | None = None
     #: Where points are reconstructed: the parameters of the cameras if they are known, seed.
     camera_params: tuple[float, ...] | None = None

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The first stage of a map: poses and points, given, reconstructed from photographs, or found at given poses."""
+"""The first stage of a map: poses and points, given, reconstructed from photographs, or found at given poses.
+
+Where nothing is known of the cameras, their distortion is estimated with one coefficient first, which is what few
+photographs determine; where the residuals show that the lens needs a second one, it gets it.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from groma.adjustment.adjust import AdjustOptions, adjust
+from groma.adjustment.misfit.lens import unmodelled_distortion
 from groma.io.colmap.sfm import reconstruct_points
 from groma.mapping.checkpoint_files import PLACED, SCENE
 from groma.mapping.checkpoints import Stages, stage
@@ -16,6 +22,10 @@ from groma.scene import Scene
 
 if TYPE_CHECKING:
     from groma.mapping.map import MapOptions, StageProgress
+
+#: Models with one and with two coefficients of radial distortion.
+SIMPLE_LENS, WIDER_LENS = "SIMPLE_RADIAL", "RADIAL"
+LENS_NOTE = f"The lens needs two coefficients of distortion ({WIDER_LENS}): one left more in the residuals than noise."
 
 
 def start_of(folder: Path, names: list[str], model: Scene | None, stages: Stages[MapOptions]) -> PlacedPhotographs:
@@ -34,7 +44,9 @@ def start_of(folder: Path, names: list[str], model: Scene | None, stages: Stages
     """
     if model is not None and not model.num_point_observations:
         return stages.run(place_at_poses, folder, model, stages.place)
-    return PlacedPhotographs(stages.run(find_start, folder, names, model, stages.place))
+    scene = stages.run(find_start, folder, names, model, stages.place)
+    widened = model is None and _is_unknown(stages.options) and WIDER_LENS in scene.cameras.models
+    return PlacedPhotographs(scene, (LENS_NOTE,) if widened else ())
 
 
 @stage("model", SCENE, lambda options: options.point_model(threads=False))
@@ -47,7 +59,24 @@ def find_start(
     say: StageProgress,
 ) -> Scene:
     """Poses and points: the given ones, or reconstructed from the images."""
-    return reconstruct_points(folder, place("sfm"), names, options.point_model(), say) if model is None else model
+    if model is not None:
+        return model
+    found = reconstruct_points(folder, place("sfm"), names, options.point_model(), say)
+    return with_fitting_lens(found, options.threads) if _is_unknown(options) else found
+
+
+def with_fitting_lens(scene: Scene, threads: int | None = None) -> Scene:
+    """Return a reconstruction with a second coefficient of radial distortion where its residuals show that it lacks."""
+    alone = AdjustOptions(lines=False, planes=False, refine_intrinsics=True, check_lens=False, threads=threads)
+    one = adjust(scene, alone)
+    if one.problem is None or unmodelled_distortion(one.problem, threads, wider={SIMPLE_LENS: WIDER_LENS}) is None:
+        return scene
+    return adjust(one.scene.replace(cameras=one.scene.cameras.with_model(WIDER_LENS)), alone).scene
+
+
+def _is_unknown(options: MapOptions) -> bool:
+    """Whether nothing was said about the cameras."""
+    return options.camera_model is None and not options.point_model().is_calibrated
 
 
 @stage("placed", PLACED, lambda o: (o.point_model(threads=False), o.refine_poses, o.refine_intrinsics))

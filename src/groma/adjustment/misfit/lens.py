@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 r"""Lens distortion that the cameras do not model, recognised by what it leaves in the residuals of points.
 
-In come an adjusted problem; out comes a sentence, or none. Two tests, the second where the first finds something:
+In comes an adjusted problem; out comes what is missing, or nothing. Two tests, the second where the first finds some:
 
 * Is there anything? The components of the residuals along the radius, averaged over rings of equal area around each
   principal point, are normal with variance :math:`\sigma^2 / n` if there is nothing but noise, so that
@@ -16,6 +16,7 @@ In come an adjusted problem; out comes a sentence, or none. Two tests, the secon
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,8 +60,33 @@ class LensGates:
 LENS = LensGates()
 
 
-def unmodelled_distortion(problem: Problem, threads: int | None = None, gates: LensGates = LENS) -> str | None:
-    """Return a sentence on distortion that the cameras of an adjusted problem lack, and its remedy; None where none is.
+@dataclass(frozen=True)
+class Lens:
+    """What a wider camera model would bring."""
+
+    #: The models of the cameras, and the wider ones.
+    models: tuple[str, ...]
+    wider: tuple[str, ...]
+    #: Median residuals of points as they are, and with the wider model, pixels.
+    before_px: float
+    after_px: float
+
+    @property
+    def sentence(self) -> str:
+        """What to do about it."""
+        others = sorted({*self.wider} - {*self.models})
+        remedy = f"--camera-model {others[0]}" if others else "--refine-intrinsics"
+        return (
+            f"The residuals show lens distortion that the cameras ({', '.join(self.models)}) do not have: with it the "
+            f"median residual of points would fall from {self.before_px:.2f} to {self.after_px:.2f} px. Repeat with "
+            f"{remedy}, or undistort the photographs."
+        )
+
+
+def unmodelled_distortion(
+    problem: Problem, threads: int | None = None, gates: LensGates = LENS, wider: Mapping[str, str] = WIDER
+) -> Lens | None:
+    """Return the distortion that the cameras of an adjusted problem lack; None where there is none.
 
     Parameters
     ----------
@@ -70,9 +96,15 @@ def unmodelled_distortion(problem: Problem, threads: int | None = None, gates: L
         For the few steps of the second test.
     gates : LensGates
         What counts.
+    wider : mapping
+        The model that a camera may lack, by the model that it has.
     """
     groups = {f.intrinsics.group: f.camera for f in problem.factors if isinstance(f, PointReprojection) and len(f)}
-    groups = {name: model for name, model in groups.items() if _may_lack(problem.variables[name], model)}
+    groups = {
+        name: camera_model(wider[model.name])
+        for name, model in groups.items()
+        if model.name in wider and _may_lack(problem.variables[name], model, wider[model.name])
+    }
     seen = [f for f in problem.factors if isinstance(f, PointReprojection) and f.intrinsics.group in groups]
     if not any(radial_field(f, problem, gates) for f in seen):
         return None
@@ -84,7 +116,8 @@ def unmodelled_distortion(problem: Problem, threads: int | None = None, gates: L
     before, after = (median_px([f for f in p.factors if isinstance(f, PointReprojection)], p) for p in (begun, freed))
     if not before > 0.0 or 1.0 - (after / before) ** 2 < gates.share:
         return None
-    return _sentence(groups, begun, freed, before, after)
+    models = sorted({factor.camera.name for factor in seen})
+    return Lens(tuple(models), tuple(sorted({model.name for model in groups.values()})), before, after)
 
 
 def radial_field(factor: PointReprojection, problem: Problem, gates: LensGates = LENS) -> bool:
@@ -117,11 +150,10 @@ def _rings(camera: IntArray, radius: FloatArray, cameras: int, rings: int) -> In
     return camera.astype(np.int64) * rings + np.minimum((share * rings).astype(np.int64), rings - 1)
 
 
-def _may_lack(group: Variables, model: CameraModel) -> bool:
+def _may_lack(group: Variables, model: CameraModel, wider: str) -> bool:
     """Whether a wider model would free something that is not free already."""
-    wider = WIDER.get(model.name)
     free = group.free_coordinates()
-    return wider is not None and (wider != model.name or (free is not None and not free.any()))
+    return wider != model.name or (free is not None and not free.any())
 
 
 def of_points(problem: Problem, most: int) -> Problem:
@@ -141,16 +173,17 @@ def of_points(problem: Problem, most: int) -> Problem:
 
 
 def _with_free_lens(problem: Problem, groups: dict[str, CameraModel]) -> Problem:
-    """Return the problem with cameras in a wider model, of which the distortion may move besides what moves already."""
+    """Return the problem with cameras in wider models, of which the distortion may move besides what moves already."""
     variables = dict(problem.variables)
-    for name, model in groups.items():
-        wider, old = camera_model(WIDER[model.name]), problem.variables[name]
-        state = np.array([in_model(row, model, wider) for row in old.state])
-        free, constant = old.free_coordinates(), np.ones(state.shape, bool)
-        constant[:, list(wider.extra_indices)] = False
-        if free is None or free[:, list(model.focal_indices)].any():
-            constant[:, list(wider.focal_indices)] = False
-        variables[_wide(name)] = Variables(Euclidean(wider.num_parameters, "intrinsics"), state, constant)
+    for factor in problem.factors:
+        if isinstance(factor, PointReprojection) and (name := factor.intrinsics.group) in groups:
+            wider, old = groups[name], problem.variables[name]
+            state = np.array([in_model(row, factor.camera, wider) for row in old.state])
+            free, constant = old.free_coordinates(), np.ones(state.shape, bool)
+            constant[:, list(wider.extra_indices)] = False
+            if free is None or free[:, list(factor.camera.focal_indices)].any():
+                constant[:, list(wider.focal_indices)] = False
+            variables[_wide(name)] = Variables(Euclidean(wider.num_parameters, "intrinsics"), state, constant)
     return Problem(variables, [_in_wider_model(factor, groups) for factor in problem.factors])
 
 
@@ -158,7 +191,7 @@ def _in_wider_model(factor: Factor, groups: dict[str, CameraModel]) -> Factor:
     if not isinstance(factor, PointReprojection) or factor.intrinsics.group not in groups:
         return factor
     intrinsics = Ref(_wide(factor.intrinsics.group), factor.intrinsics.index)
-    return replace(factor, intrinsics=intrinsics, camera_model=camera_model(WIDER[factor.camera.name]))
+    return replace(factor, intrinsics=intrinsics, camera_model=groups[factor.intrinsics.group])
 
 
 def _wide(group: str) -> str:
@@ -169,13 +202,3 @@ def median_px(factors: list[PointReprojection], problem: Problem) -> float:
     """Return the median reprojection error of points, pixels."""
     squares = [np.einsum("ni,ni->n", r, r) for r in (residuals_of(f, problem.variables) for f in factors)]
     return float(np.sqrt(np.median(np.concatenate(squares))))
-
-
-def _sentence(groups: dict[str, CameraModel], begun: Problem, freed: Problem, before: float, after: float) -> str:
-    names = ", ".join(sorted({model.name for model in groups.values()}))
-    wider = sorted({WIDER[model.name] for model in groups.values()} - {model.name for model in groups.values()})
-    remedy = f"--camera-model {wider[0]}" if wider else "--refine-intrinsics"
-    return (
-        f"The residuals show lens distortion that the cameras ({names}) do not have: with it the median residual of "
-        f"points would fall from {before:.2f} to {after:.2f} px. Repeat with {remedy}, or undistort the photographs."
-    )

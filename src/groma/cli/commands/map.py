@@ -56,8 +56,8 @@ def map_(
     camera_model: Annotated[
         str | None,
         _options.CAMERAS.option(
-            "Lens model, by COLMAP's name. Without --model the one to estimate (SIMPLE_RADIAL); with it the one "
-            "that its cameras are changed to, and what it adds is estimated.",
+            "Lens model, COLMAP's name. Without --model the one to estimate (SIMPLE_RADIAL, if need be RADIAL); with "
+            "it the one that its cameras are changed to, and what it adds is estimated.",
             choices=_complete.CAMERA_MODELS,
             metavar="NAME",
         ),
