@@ -18,7 +18,6 @@ from numba.core import types
 from numba.core.compiler_machinery import register_pass
 from numba.core.lowering import Lower
 from numba.core.typed_passes import NativeLowering as NumbaLowering
-from numba.np.arrayobj import load_item, store_item
 
 _WORD = llvm.IntType(64)
 _ZERO, _HALF = llvm.Constant(_WORD, 0), llvm.IntType(32)
@@ -60,6 +59,8 @@ class _Lower(Lower):
         kinds = self._kinds(array, index)
         if kinds is None or signature.return_type != array.dtype:
             return super().lower_getitem(resty, expr, value, index, signature)
+        from numba.np.arrayobj import load_item  # with much else that loaded code does not need
+
         found = load_item(self.context, self.builder, array, self._place(value.name, array, index.name, kinds))
         return self.context.cast(self.builder, found, array.dtype, resty)
 
@@ -69,6 +70,8 @@ class _Lower(Lower):
         kinds = self._kinds(array, index_var)
         if kinds is None or not isinstance(types.unliteral(kind), types.Number | types.Boolean):
             return super().lower_setitem(target_var, index_var, value_var, signature)
+        from numba.np.arrayobj import store_item
+
         value = self.context.cast(self.builder, self.loadvar(value_var.name), kind, array.dtype)
         store_item(self.context, self.builder, array, value, self._place(target_var.name, array, index_var.name, kinds))
 
