@@ -49,7 +49,8 @@ def _load(work: str, is_over: threading.Event) -> None:
         if is_over.is_set():
             return
         wanted = function(module, name)
-        if wanted is None or kinds in wanted.overloads:
+        here = getattr(wanted, "overloads", None)
+        if here is None or kinds in here:  # it is not there, or plain Python (NUMBA_DISABLE_JIT=1), or loaded
             continue
         with suppress(Exception), global_compiler_lock:  # whoever calls it meets what is wrong, and can say so
             if wanted._cache.is_kept(kinds, cpu_target.target_context):
