@@ -4,7 +4,7 @@
 import cv2
 import numpy as np
 
-from groma.geometry import quaternion, se3
+from groma.geometry import quaternion, se3, so3
 from groma.io.sequences import Frame, SequenceCamera
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 260.0, 0.12
@@ -92,3 +92,11 @@ def position_error(trajectory, truth: np.ndarray, rate: float = 30.0, scale: boo
     S = np.diag([1, 1, np.sign(np.linalg.det(U @ V))])
     factor = (D * np.diag(S)).sum() / (a0**2).sum() if scale else 1.0
     return float(np.sqrt(((factor * a0 @ (U @ S @ V).T - b0) ** 2).sum(axis=1).mean()))
+
+
+def lap(count: int) -> np.ndarray:
+    """A lap and a fifth around the middle of the room, looking outward and ahead; (count, 7) cam_from_world."""
+    angle = 2 * np.pi * 1.2 * np.arange(count) / (count - 1)
+    center = np.stack([np.sin(angle), 0.1 * np.sin(3 * angle), np.cos(angle)], axis=1)
+    R = so3.exp(np.outer(angle + 0.4, [0.0, 1.0, 0.0]))
+    return se3.inverse(np.hstack([quaternion.from_matrix(R), center]))

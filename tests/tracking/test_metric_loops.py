@@ -5,7 +5,7 @@ import _room
 import numpy as np
 import pytest
 
-from groma.geometry import quaternion, se3, so3
+from groma.geometry import se3
 from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.loop_closure import search_for_loop
 from groma.tracking.backend.metric_loops import adjusted_with
@@ -17,17 +17,9 @@ COUNT = 160
 OPTIONS = {"num_points": 100, "lines": False, "planes": False}
 
 
-def _poses() -> np.ndarray:
-    """A lap and a fifth around the middle of the room, looking outward and ahead; (COUNT, 7) cam_from_world."""
-    angle = 2 * np.pi * 1.2 * np.arange(COUNT) / (COUNT - 1)
-    center = np.stack([np.sin(angle), 0.1 * np.sin(3 * angle), np.cos(angle)], axis=1)
-    R = so3.exp(np.outer(angle + 0.4, [0.0, 1.0, 0.0]))
-    return se3.inverse(np.hstack([quaternion.from_matrix(R), center]))
-
-
 @pytest.fixture(scope="module")
 def lap():
-    return _room.frames("stereo", _poses())
+    return _room.frames("stereo", _room.lap(COUNT))
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +38,7 @@ def _track(frames, **options) -> Tracker:
 def _relative(first, second) -> np.ndarray:
     """True pose of a keyframe's camera in that of another (7,): second_from_first."""
     rows = [round(keyframe.timestamp * 30) for keyframe in (first, second)]
-    poses = _poses()[rows]
+    poses = _room.lap(COUNT)[rows]
     return se3.compose(poses[1:], se3.inverse(poses[:1]))[0]
 
 
@@ -92,7 +84,7 @@ def test_a_lap_is_closed(lap):
     for close_loops in (False, True):
         result = _track(lap, close_loops=close_loops).finish()
         assert (result.statistics["loops"] > 0) == close_loops
-        error[close_loops] = _room.position_error(result.trajectory, _poses())
+        error[close_loops] = _room.position_error(result.trajectory, _room.lap(COUNT))
     assert error[False] > 0.02
     assert error[True] < 0.6 * error[False]
 

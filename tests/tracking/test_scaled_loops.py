@@ -5,7 +5,7 @@ import _room
 import numpy as np
 import pytest
 
-from groma.geometry import quaternion, se3, sim3, so3
+from groma.geometry import se3, sim3
 from groma.tracking import Tracker, TrackOptions
 from groma.tracking.backend.loop_closure import move
 from groma.tracking.backend.scaled_loops import close_scaled_loops
@@ -15,17 +15,9 @@ FEW = {"num_points": 100, "lines": False}
 COUNT = 160
 
 
-def _poses() -> np.ndarray:
-    """A lap and a fifth around the middle of the room, looking outward and ahead; (COUNT, 7) cam_from_world."""
-    angle = 2 * np.pi * 1.2 * np.arange(COUNT) / (COUNT - 1)
-    center = np.stack([np.sin(angle), 0.1 * np.sin(3 * angle), np.cos(angle)], axis=1)
-    R = so3.exp(np.outer(angle + 0.4, [0.0, 1.0, 0.0]))
-    return se3.inverse(np.hstack([quaternion.from_matrix(R), center]))
-
-
 @pytest.fixture(scope="module")
 def ring():
-    return _room.frames("mono", _poses())
+    return _room.frames("mono", _room.lap(COUNT))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +39,7 @@ def test_a_lap_of_one_camera_is_closed_with_its_scale(tracked):
     for close_loops, (_, result) in tracked.items():
         assert (result.statistics["loops"] > 0) == close_loops
         assert result.statistics["metric"] is False
-        error[close_loops] = _room.position_error(result.trajectory, _poses(), scale=True)
+        error[close_loops] = _room.position_error(result.trajectory, _room.lap(COUNT), scale=True)
     assert error[False] > 0.025
     assert error[True] < 0.6 * error[False]
 
@@ -78,7 +70,7 @@ def test_drift_of_scale_that_is_put_in_is_taken_out(tracked, growth):
 
 
 def _error(tracker: Tracker) -> float:
-    return _room.position_error(tracker.trajectory(), _poses(), scale=True)
+    return _room.position_error(tracker.trajectory(), _room.lap(COUNT), scale=True)
 
 
 def test_maps_of_one_camera_are_joined_with_their_scale(ring):
@@ -92,7 +84,7 @@ def test_maps_of_one_camera_are_joined_with_their_scale(ring):
     # The first frame of each map is placed when the second keyframe is.
     _no_segment_tells_two_lines(tracker)
     assert len(result.trajectory) == sum(row.pose is not None for row in rows) + 2
-    assert _room.position_error(result.trajectory, _poses(), scale=True) < 0.02
+    assert _room.position_error(result.trajectory, _room.lap(COUNT), scale=True) < 0.02
 
 
 def _no_segment_tells_two_lines(tracker: Tracker) -> None:
