@@ -61,6 +61,8 @@ _POSE = SolverOptions(
 #: Information of scaled unknowns below which they are not determined.
 _SINGULAR = 1e-10
 _LENS = SolverOptions(max_iterations=30, function_tolerance=1e-6, threads=1)
+#: Before the last fit a pose is only to collect what is near (cost: of steps).
+_ROUGHLY = 1e-3
 
 
 # ---------------------------------------------------------------------------------------------------------- Kernels
@@ -235,7 +237,8 @@ def refine(
         before, near = near, (wide | (squares[0] <= limits[0]), wide | (squares[1] <= limits[1]))
         last = round_ == gates.rounds or (before is not None and all(map(np.array_equal, near, before)))
         loss = GemanMcClure(last_scale(_agreeing(squares, gates), gates)) if last else Cauchy(gates.wide_loss)
-        solved = solve(with_loss(without_far(weighted, near), loss), options).problem
+        steps = options if last or refine_lens else replace(options, function_tolerance=_ROUGHLY)
+        solved = solve(with_loss(without_far(weighted, near), loss), steps).problem
         estimated = _camera_of(solved, camera) if refine_lens else camera
         if estimated is None:
             break
