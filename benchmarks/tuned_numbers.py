@@ -37,8 +37,8 @@ shapes
 formulas
     Factors that are units (percent, milli, seconds and minutes, bytes), degrees of a circle and the largest number of
     eight bits anywhere, powers and logarithms of ten, divisors 3, 4, 6, 8 and 12 (means, moments), 1.4826 (the
-    deviation of normal noise in median absolute deviations) and versions of Python; in exponents the numbers from 30 on,
-    which keep them from overflowing (1 + exp(-30) is 1 to 13 digits).
+    deviation of normal noise in median absolute deviations) and versions of Python; in exponents the numbers from 30
+    on, which keep them from overflowing (1 + exp(-30) is 1 to 13 digits).
 
 Not counted anywhere: 0, 1, -1, 2 and one half, and numerical guards, which are below 1e-5 or from 1e5 on.
 
