@@ -128,11 +128,10 @@ def _named(node: ast.stmt, lines: list[str]) -> Iterator[Number]:
     if names and all(name.isupper() for name in names):
         comment = _comment(node, lines)
         kind = "formats" if re.search(r"\bformat", comment) else "stated" if STATED.search(comment) else "named"
-        numbers = _numbers(node.value)
-        counted = isinstance(node.value, ast.Tuple) and ast.unparse(node.value) == str(
-            tuple(range(len(node.value.elts)))
-        )
-        yield from (("shapes" if counted else kind, node.lineno, value) for value in numbers)
+        values = node.value.elts if isinstance(node.value, ast.Tuple) else []
+        if [getattr(value, "value", None) for value in values] == list(range(len(values))) != []:
+            kind = "shapes"
+        yield from ((kind, node.lineno, value) for value in _numbers(node.value))
 
 
 def _comment(node: ast.stmt, lines: list[str]) -> str:
