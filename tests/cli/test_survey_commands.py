@@ -57,7 +57,9 @@ def test_adjust_with_everything(folder, tmp_path, capsys, monkeypatch):
     assert run(words.split()) == 0
     said = capsys.readouterr()
     assert "brought into UTM zone 33 north (EPSG:32633)" in said.out and "Check point p4: off by" in said.out
-    assert "Taken out: camera position 00003.png y disagrees with photographs and other measurements by 0.98" in said.err
+    assert (
+        "Taken out: camera position 00003.png y disagrees with photographs and other measurements by 0.98" in said.err
+    )
     scene, truth = read_scene("out.npz"), read_scene(folder / "truth.npz")
     off = scene.cam_centers_in_world - truth.cam_centers_in_world - UTM
     assert np.sqrt((off**2).mean()) < 0.8 * SIGMA

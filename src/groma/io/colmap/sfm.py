@@ -232,7 +232,7 @@ def _find_features(
     for start in range(0, len(missing), batch):
         say("finding points in images", len(names) - len(missing) + start, len(names))
         wanted = missing[start : start + batch]
-        _check_room(database.parent, len(wanted) * _IMAGE_ROOM)
+        _check_room(database.parent, 2 * len(wanted) * _IMAGE_ROOM)  # large ones are in two databases for a moment
         wanted = features_of_large(pycolmap, database, images, wanted, extraction)
         if wanted:
             pycolmap.extract_features(
