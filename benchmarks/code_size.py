@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The size and form of the sources as one table of counts, read from the syntax and not run.
 
-    python benchmarks/code_size.py [--since COMMIT] [--root DIR] [--list ROW]
+    python benchmarks/code_size.py [--since COMMIT] [--root DIR] [--list ROW] [--rooms]
 
 ``--since`` shows a commit of this checkout beside it (the state before the house was rebuilt is 961f0a1), ``--root``
-counts another checkout, ``--list`` prints what a row counts.
+counts another checkout, ``--list`` prints what a row counts, ``--rooms`` the source lines of every room.
 
 ==========================  ==========================================================================================
 Row                         Rule
@@ -67,6 +67,11 @@ def modules_of(root: Path) -> list[Module]:
         is_package = parts[-1] == "__init__"
         found.append(Module(".".join(parts[: len(parts) - is_package]), is_package, text, ast.parse(text)))
     return found
+
+
+def room_of(module: Module) -> str:
+    """Return the package that a module is in."""
+    return module.name if module.is_package else module.name.rpartition(".")[0]
 
 
 def docstring_lines(node: ast.AST) -> set[int]:
@@ -245,7 +250,7 @@ ROWS: dict[str, Callable[[list[Module]], Found]] = {
 def counts(root: Path) -> dict[str, int]:
     """Return the table of a checkout."""
     modules = modules_of(root)
-    rooms = Counter(module.name if module.is_package else module.name.rpartition(".")[0] for module in modules)
+    rooms = Counter(map(room_of, modules))
     sizes = {module.name: len(source_lines(module)) for module in modules}
     table = {"lines": sum(len(module.text.splitlines()) for module in modules)}
     table["source lines"] = sum(sizes.values())
@@ -277,7 +282,14 @@ def main() -> None:
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[1], help="checkout to measure")
     parser.add_argument("--since", metavar="COMMIT", help="show a commit of the checkout before it")
     parser.add_argument("--list", metavar="ROW", choices=ROWS, help="print what a row counts")
+    parser.add_argument("--rooms", action="store_true", help="print the source lines of every room")
     arguments = parser.parse_args()
+    if arguments.rooms:
+        rooms = Counter()
+        for module in modules_of(arguments.root):
+            rooms[room_of(module)] += len(source_lines(module))
+        print(*(f"{room:<40}{lines:>8,}" for room, lines in sorted(rooms.items())), sep="\n")
+        return
     if arguments.list:
         print(*ROWS[arguments.list](modules_of(arguments.root)), sep="\n")
         return

@@ -18,8 +18,6 @@ from groma.scene import Planes, Relations, Similarity, synthetic
 from groma.viz.report.charts import spreads
 from groma.viz.report.tables import contributions_card
 
-pytestmark = pytest.mark.kernels
-
 OPTIONS = groma.AdjustOptions(loss="none", threads=1)
 
 
@@ -33,7 +31,6 @@ def found(scenes):
     return contributions(scenes.start, OPTIONS, scenes.truth)
 
 
-@pytest.mark.compiled
 def test_every_kind_adds_something(found, scenes):
     assert tuple(entry.added for entry in found) == KINDS
     relations = scenes.start.relations
@@ -64,7 +61,6 @@ def test_more_is_more_certain_and_nearer_to_the_truth(found):
         assert 0.2 < entry.center_error / entry.center_sigma < 2.0
 
 
-@pytest.mark.compiled
 def test_each_entry_is_the_adjustment_itself(scenes, found):
     plain = groma.adjust(
         scenes.start.replace(relations=Relations()), groma.AdjustOptions(loss="none", planes=False, threads=1)
@@ -73,7 +69,6 @@ def test_each_entry_is_the_adjustment_itself(scenes, found):
     assert found[1].iterations == plain.report.solve.iterations
 
 
-@pytest.mark.compiled
 def test_kinds_that_are_not_there_are_left_out(scenes):
     bare = scenes.start.points_only()
     assert [entry.added for entry in contributions(bare, OPTIONS)] == ["points"]
@@ -81,7 +76,6 @@ def test_kinds_that_are_not_there_are_left_out(scenes):
         contributions(scenes.start, groma.AdjustOptions(points=False))
 
 
-@pytest.mark.compiled
 def test_command_says_shows_and_writes_them(tmp_path, scenes, capsys):
     start, page, numbers = tmp_path / "start.npz", tmp_path / "page.html", tmp_path / "numbers.json"
     groma.write_scene(scenes.start, start)
@@ -100,7 +94,6 @@ def test_command_says_shows_and_writes_them(tmp_path, scenes, capsys):
     assert f"{entries[-1]['center_error']:.3f}" in text
 
 
-@pytest.mark.compiled
 def test_lengths_are_in_units_of_the_reference(scenes, found):
     tenfold = scenes.truth.transformed(Similarity(10.0, translation=np.array([1.0, 2.0, 3.0])))
     for entry, before in zip(contributions(scenes.start, OPTIONS, tenfold), found, strict=True):
@@ -109,7 +102,6 @@ def test_lengths_are_in_units_of_the_reference(scenes, found):
         assert entry.rotation_error_deg == pytest.approx(before.rotation_error_deg)
 
 
-@pytest.mark.compiled
 def test_open_landmarks_are_counted_and_do_no_harm(scenes, found):
     """Thirty planes through two points each: they can turn, and the centres are known as without them."""
     start, rng = scenes.start, np.random.default_rng(4)

@@ -3,16 +3,12 @@
 import sys
 
 import numpy as np
-import pytest
 from _mpi import mpiexec, needs_mpi
 
 import groma
 from groma.cli.main import run
 
-pytestmark = pytest.mark.kernels
 
-
-@pytest.mark.compiled
 @needs_mpi
 def test_ranks_map_what_one_process_maps(corner, tmp_path):
     folder = corner[0]
@@ -27,7 +23,6 @@ def test_ranks_map_what_one_process_maps(corner, tmp_path):
         np.testing.assert_array_equal(getattr(getattr(two, table), column), getattr(getattr(one, table), column))
 
 
-@pytest.mark.compiled
 @needs_mpi
 def test_what_goes_wrong_is_told_once_and_all_end(corner, tmp_path):
     folder = corner[0]
