@@ -3,16 +3,17 @@
 
 ::
 
-    each frame      check it - predict - follow points and lines, assign planes - estimate the pose
-                    if that fails: find the pose by described features, lines and planes
-    now and then    make a keyframe - add landmarks - adjust the window - look for loops
-    at the end      adjust all keyframes
+    each frame            check it - predict - follow points and lines, assign planes - estimate the pose
+                          if that fails: find the pose by described features, lines and planes
+    behind the answer     now and then: make a keyframe - add landmarks - adjust the window - look for loops
+    at the end            adjust all keyframes
 """
 
 from __future__ import annotations
 
 import math
 import time
+from concurrent.futures import Future, wait
 from dataclasses import replace
 from functools import partial
 
@@ -25,7 +26,7 @@ from groma.geometry import se3
 from groma.io.sequences.frame import Frame, SequenceCamera
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
-from groma.tracking.backend.mapper import Mapper, Present
+from groma.tracking.backend.mapper import Mapper, OnDemand, Present
 from groma.tracking.backend.submaps import about_submaps
 from groma.tracking.ending import Ending
 from groma.tracking.frame.ahead import LookAhead
@@ -96,6 +97,9 @@ class Tracker:
         self._guess = np.zeros((0, 0), np.uint8), self._present.pose
         #: What happened to the track between its maps, for the reader.
         self._breaks: list[tuple[float, float]] = []
+        #: What follows the answer of the frame before, and how the right camera is turned if not as was taken.
+        self._behind: Future | OnDemand | None = None
+        self._better: RightTurn | None = None
         #: Whether the frame before had to be searched.
         self._searched = False
         self._finished = False
@@ -103,16 +107,18 @@ class Tracker:
     @property
     def map(self) -> TrackMap:
         """The map so far."""
+        self._settle()
         return self._mapper.map
 
     def begun_anew(self) -> Tracker | None:
         """End this track and return one for the same frames, if the right camera is turned far from what was taken."""
-        if self._mapper.better_turn is None:
+        if self._better is None:
             return None
         self._finished = True
+        self._settle()
         self._mapper.abandon()
         self._mapper.close()
-        return Tracker(self._given, self.options, self._mapper.better_turn, self._saved)
+        return Tracker(self._given, self.options, self._better, self._saved)
 
     # ------------------------------------------------------------------------------------------------- each frame
 
@@ -123,6 +129,8 @@ class Tracker:
         ----------
         frame, following
             The frame, and the one after it if it is there already: its planes are found meanwhile, to the same result.
+
+        The answer does not wait for the work on the map that this frame causes: that goes on until the next one.
 
         Returns
         -------
@@ -144,17 +152,18 @@ class Tracker:
             return self._skip(frame, reason, began)
         present, mapper = self._present, self._mapper
         data = self._ahead.take(frame)
-        mapper.advance(present, watch)
         self._ahead.announce(following, mapper.frame_pool, mapper.workers if self._searched else None)
+        with watch("map"):
+            self._settle()
         if not self.map.keyframes:
-            return self._start(data, began, watch)
+            return self._answer(self._start(data, began, watch))
         attempt, found = self._follow(data, watch), None
         self._searched = attempt.estimate is None
         if self._searched:
             attempt, found = self._search(data, attempt, watch)
         estimate, followed = attempt.estimate, attempt.followed
         if estimate is None:
-            return self._lose(data, attempt.predicted, began, watch)
+            return self._answer(self._lose(data, attempt.predicted, began, watch))
         pose, status = estimate.pose, FOUND if self._lost_for else TRACKED
         with watch("again"):
             followed = find_points_again(self.map, data, pose, followed)
@@ -174,10 +183,35 @@ class Tracker:
         ):
             mapper.choose(present, data)
             is_keyframe = True
-            if found is not None:
-                # What was found by features alone cannot be followed; the next frame needs this one's landmarks.
-                mapper.make_keyframe(present, watch)
-        return self._report(frame, status, estimate, is_keyframe, began, watch)
+        # What was found by features alone cannot be followed; the next frame needs this one's landmarks.
+        at_once = is_keyframe and found is not None
+        return self._answer(self._report(frame, status, estimate, is_keyframe, began, watch), at_once)
+
+    def _answer(self, tracked: TrackedFrame, at_once: bool = False) -> TrackedFrame:
+        """Begin with what follows the answer of a frame: keyframes and results that are due, one perhaps at once."""
+
+        def go_on() -> Stopwatch:
+            watch = Stopwatch()
+            if at_once:
+                self._mapper.make_keyframe(self._present, watch)
+            self._mapper.advance(self._present, watch)
+            return watch
+
+        self._behind = self._mapper.begin_behind(go_on)
+        return tracked
+
+    def _settle(self) -> None:
+        """Wait for what follows the answer of the frame before."""
+        self._stand_still()
+        if self._behind is not None:
+            behind, self._behind = self._behind, None
+            self._history.note_stages(behind.result().seconds)
+            self._better = self._mapper.better_turn
+
+    def _stand_still(self) -> None:
+        """Wait until no other thread changes the map."""
+        if isinstance(self._behind, Future):
+            wait([self._behind])  # if that is interrupted, the work still is there
 
     def _follow(self, data: FrameFeatures, watch: Stopwatch) -> Attempt:
         """Predict the pose and follow the frame before, if that is not long ago."""
@@ -360,6 +394,8 @@ class Tracker:
         """
         self._finished, mapper, history = True, self._mapper, self._history
         ending = Ending(mapper, history)
+        self._stand_still()
+        ending.attempt("what followed the last frame", self._settle, None)
         ending.settle(self._present)
         where = ending.join()
         roots = sorted({root for root, _ in where if mapper.maps[root].keyframes}) or [0]
@@ -381,6 +417,7 @@ class Tracker:
 
     def statistics(self) -> dict:
         """Return counts and times so far as plain numbers."""
+        self._settle()
         out: dict = {
             "frames": dict(self._history.statuses),
             **self._mapper.numbers(),

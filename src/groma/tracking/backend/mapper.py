@@ -66,7 +66,7 @@ class _Chosen:
         return self.age >= delay
 
 
-class _OnDemand:
+class OnDemand:
     """Stands for a future where there are no threads: the work is done when its result is asked for."""
 
     def __init__(self, work: Callable[[], Any]) -> None:
@@ -76,7 +76,7 @@ class _OnDemand:
 @dataclass
 class _Pending:
     job: AdjustmentJob
-    future: Future | _OnDemand
+    future: Future | OnDemand
     due: int
 
 
@@ -109,12 +109,13 @@ class Mapper:
         self.loops = 0
         #: A frame that is to become a keyframe; its features are being found meanwhile.
         self.due: _Chosen | None = None
+        self._behind = ThreadPoolExecutor(1, thread_name_prefix="groma-behind") if options.threaded else None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="groma-adjust") if options.threaded else None
         self.workers = ThreadPoolExecutor(2, thread_name_prefix="groma-detect") if options.threaded else None
         #: For what belongs to a frame, which keyframes must not hold up.
         self.frame_pool = ThreadPoolExecutor(1, thread_name_prefix="groma-frame") if options.threaded else None
         self._pending: _Pending | None = None
-        self._search: tuple[LoopSearch, Future | _OnDemand] | None = None
+        self._search: tuple[LoopSearch, Future | OnDemand] | None = None
 
     @property
     def map(self) -> TrackMap:
@@ -158,7 +159,7 @@ class Mapper:
         return self._pending is not None
 
     def advance(self, present: Present, watch: Stopwatch) -> None:
-        """Before each frame: take up results that are due, and make the chosen keyframe if it is."""
+        """Between two frames: take up results that are due, and make the chosen keyframe if it is."""
         with watch("take up"):
             self.take_up(present)
         if self.due is not None and self.due.is_ready(DELAY if self.metric else 1):
@@ -196,7 +197,7 @@ class Mapper:
         """Make a keyframe of the frame that was chosen."""
         assert self.due is not None
         chosen, self.due = self.due, None
-        with watch("wait"):
+        with watch("features"):
             chosen.data.wait()
         with watch("take up"):
             self.take_up(present, now=True)
@@ -228,8 +229,12 @@ class Mapper:
             busy = self._pending.job.keyframes if self._pending else []
             drop_repeating_keyframes(self.map, busy, self.options.gates.culling)
 
-    def _begin(self, work: Callable[[], Any]) -> Future | _OnDemand:
-        return _OnDemand(work) if self._pool is None else self._pool.submit(work)
+    def _begin(self, work: Callable[[], Any]) -> Future | OnDemand:
+        return OnDemand(work) if self._pool is None else self._pool.submit(work)
+
+    def begin_behind(self, work: Callable[[], Any]) -> Future | OnDemand:
+        """Begin with what follows the answer of a frame."""
+        return OnDemand(work) if self._behind is None else self._behind.submit(work)
 
     def take_up(self, present: Present, now: bool = False) -> None:
         """Take up the result of the thread when it is due."""
@@ -323,8 +328,8 @@ class Mapper:
 
     def close(self) -> None:
         """End the threads."""
-        pools = self._pool, self.workers, self.frame_pool
-        self._pool = self.workers = self.frame_pool = None
+        pools = self._behind, self._pool, self.workers, self.frame_pool
+        self._behind = self._pool = self.workers = self.frame_pool = None
         for pool in pools:
             if pool is not None:
                 pool.shutdown(wait=True, cancel_futures=True)
