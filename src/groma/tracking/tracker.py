@@ -165,39 +165,48 @@ class Tracker:
         if estimate is None:
             return self._answer(self._lose(data, attempt.predicted, began, watch))
         pose, status = estimate.pose, FOUND if self._lost_for else TRACKED
-        with watch("again"):
-            followed = find_points_again(self.map, data, pose, followed)
         self._motion.update(present.pose if self._lost_for == 0 else None, pose, frame.timestamp)
         if estimate.weak and status == TRACKED:
             status = WEAK
         self._lost_for = 0
         present.pose, present.data, present.followed = pose, data, followed
         present.frames_since_keyframe += 1
-        is_keyframe = False
-        if mapper.due is None and (
-            found is not None
-            or (
-                wants_keyframe(self.map, pose, followed, present.frames_since_keyframe, self.options)
-                and not self._visit_nearby(data)
-            )
-        ):
-            mapper.choose(present, data)
-            is_keyframe = True
         # What was found by features alone cannot be followed; the next frame needs this one's landmarks.
-        at_once = is_keyframe and found is not None
+        at_once = found is not None and mapper.due is None
+        is_keyframe = at_once or self._follow_more(data, watch)
         return self._answer(self._report(frame, status, estimate, is_keyframe, began, watch), at_once)
 
+    def _follow_more(self, data: FrameFeatures, watch: Stopwatch) -> bool:
+        """Find points again where there are few; choose the frame as a keyframe if it should be one."""
+        present, mapper = self._present, self._mapper
+        with watch("again"):
+            present.followed = find_points_again(mapper.map, data, present.pose, present.followed)
+        since = present.frames_since_keyframe
+        if (
+            mapper.due is not None
+            or not wants_keyframe(mapper.map, present.pose, present.followed, since, self.options)
+            or self._visit_nearby(data)
+        ):
+            return False
+        mapper.choose(present, data)
+        return True
+
     def _answer(self, tracked: TrackedFrame, at_once: bool = False) -> TrackedFrame:
-        """Begin with what follows the answer of a frame: keyframes and results that are due, one perhaps at once."""
+        """Begin with what follows the answer of a frame: results and keyframes that are due, one perhaps at once."""
+        present, mapper = self._present, self._mapper
 
         def go_on() -> Stopwatch:
             watch = Stopwatch()
             if at_once:
-                self._mapper.make_keyframe(self._present, watch)
-            self._mapper.advance(self._present, watch)
+                assert present.data is not None
+                with watch("again"):
+                    present.followed = find_points_again(mapper.map, present.data, present.pose, present.followed)
+                mapper.choose(present, present.data)
+                mapper.make_keyframe(present, watch)
+            mapper.advance(present, watch)
             return watch
 
-        self._behind = self._mapper.begin_behind(go_on)
+        self._behind = mapper.begin_behind(go_on)
         return tracked
 
     def _settle(self) -> None:

@@ -182,16 +182,13 @@ class Mapper:
         self.due = _Chosen(data, near.index, relative, present.followed)
 
     def keep_present(self, present: Present, watch: Stopwatch) -> None:
-        """Make a keyframe of the present frame, unless one stands for it, and take up all that is being worked out."""
+        """Make a keyframe of the present frame, unless one stands for it."""
         if self.due is not None:
             self.make_keyframe(present, watch)
         if present.frames_since_keyframe > 0:
             assert present.data is not None
             self.choose(present, present.data)
             self.make_keyframe(present, watch)
-        else:
-            with watch("take up"):
-                self.take_up(present, now=True)
 
     def make_keyframe(self, present: Present, watch: Stopwatch) -> None:
         """Make a keyframe of the frame that was chosen."""
