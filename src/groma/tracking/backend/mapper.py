@@ -37,7 +37,7 @@ from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
 
 #: A chosen frame becomes a keyframe, and the result of a window's adjustment is taken up, after this many frames.
-DELAY = 2
+READY, DELAY = 2, 2
 
 
 @dataclass
@@ -162,7 +162,7 @@ class Mapper:
         """Between two frames: take up results that are due, and make the chosen keyframe if it is."""
         with watch("take up"):
             self.take_up(present)
-        if self.due is not None and self.due.is_ready(DELAY if self.metric else 1):
+        if self.due is not None and self.due.is_ready(READY if self.metric else 1):
             self.make_keyframe(present, watch)
 
     def adjust_start(self, present: Present) -> None:
