@@ -11,6 +11,7 @@ over the frames of the CPU time of all threads, and the position error. On a mac
 
 import argparse
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,8 @@ def fed(sequence, frames: list, rate: float) -> str:
         own.append(time.thread_time() - cpu)
     every = time.process_time() - every
     error = score_trajectory(tracker.finish().trajectory, sequence.reference, "se3", 0.02).ate.rmse
-    cells = [f"{1e3 * number:.1f}" for times in (answers, own) for number in (np.median(times), np.percentile(times, 95))]
+    numbers = [spread(times) for times in (answers, own) for spread in (np.median, partial(np.percentile, q=95))]
+    cells = [f"{1e3 * number:.1f}" for number in numbers]
     cells += [f"{1e3 * every / len(frames):.1f}", f"{100 * error:.2f} cm"]
     return f"| {f'{rate:g} a second' if rate else 'as fast as answered'} | {' | '.join(cells)} |"
 

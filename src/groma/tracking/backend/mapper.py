@@ -205,8 +205,9 @@ class Mapper:
                 present.followed = followed
             elif present.data is not None:
                 present.followed = carry(
-                    self.map, self.camera, chosen.data, present.data, followed, present.followed, present.pose
-                )
+                    self.map, self.camera, chosen.data, present.data, followed, present.followed, present.pose,
+                    self.frame_pool,
+                )  # fmt: skip
             merge_planes(self.map.planes, self.options.gates.planes)
             if self.options.relations:
                 find_lines_on_planes(self.map)
