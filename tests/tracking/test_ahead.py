@@ -60,7 +60,8 @@ def test_a_frame_is_answered_while_the_map_is_at_work(monkeypatch):
 
     def held_up(*given):
         assert may_go_on.wait(60.0)
-        done.append(advance(*given))
+        done.append(given)
+        return advance(*given)
 
     monkeypatch.setattr(tracker._mapper, "advance", held_up)
     assert tracker.process(frames[0]).pose is not None

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 import time
-from concurrent.futures import Future, wait
 from dataclasses import replace
 from functools import partial
 
@@ -26,7 +25,8 @@ from groma.geometry import se3
 from groma.io.sequences.frame import Frame, SequenceCamera
 from groma.io.trajectories import Trajectory
 from groma.scene import Scene
-from groma.tracking.backend.mapper import Mapper, OnDemand, Present
+from groma.tracking.backend.behind import Behind
+from groma.tracking.backend.mapper import Mapper, Present
 from groma.tracking.backend.submaps import about_submaps
 from groma.tracking.ending import Ending
 from groma.tracking.frame.ahead import LookAhead
@@ -35,8 +35,7 @@ from groma.tracking.frame.checks import FrameChecks
 from groma.tracking.frame.coarse_alignment import turned, turned_prediction
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.frame.rectification import RightTurn
-from groma.tracking.map.keyframes import Followed, keyframe_nearby, wants_keyframe
-from groma.tracking.map.points import find_again
+from groma.tracking.map.keyframes import Followed, wants_keyframe
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
 from groma.tracking.outcome import (
@@ -51,8 +50,7 @@ from groma.tracking.outcome import (
     TrackedFrame,
     TrackResult,
 )
-from groma.tracking.pose.estimate import PoseEstimate
-from groma.tracking.pose.following import Attempt, find_points_again, follow_frame
+from groma.tracking.pose.following import Attempt, find_points_again, follow_frame, follow_nearby
 from groma.tracking.pose.initialise import Initialiser
 from groma.tracking.pose.prediction import MotionModel
 from groma.tracking.pose.relocalise import Found, promote
@@ -98,7 +96,7 @@ class Tracker:
         #: What happened to the track between its maps, for the reader.
         self._breaks: list[tuple[float, float]] = []
         #: What follows the answer of the frame before, and how the right camera is turned if not as was taken.
-        self._behind: Future | OnDemand | None = None
+        self._behind = Behind(self.options.threaded)
         self._better: RightTurn | None = None
         #: Whether the frame before had to be searched.
         self._searched = False
@@ -116,6 +114,7 @@ class Tracker:
             return None
         self._finished = True
         self._settle()
+        self._behind.close()
         self._mapper.abandon()
         self._mapper.close()
         return Tracker(self._given, self.options, self._better, self._saved)
@@ -182,45 +181,28 @@ class Tracker:
         with watch("again"):
             present.followed = find_points_again(mapper.map, data, present.pose, present.followed)
         since = present.frames_since_keyframe
-        if (
-            mapper.due is not None
-            or not wants_keyframe(mapper.map, present.pose, present.followed, since, self.options)
-            or self._visit_nearby(data)
+        if mapper.due is not None or not wants_keyframe(
+            mapper.map, present.pose, present.followed, since, self.options
         ):
+            return False
+        nearby = None if mapper.busy else follow_nearby(mapper.map, data, present.pose, present.followed)
+        if nearby is not None:
+            present.followed, present.frames_since_keyframe = nearby, 0
             return False
         mapper.choose(present, data)
         return True
 
     def _answer(self, tracked: TrackedFrame, at_once: bool = False) -> TrackedFrame:
-        """Begin with what follows the answer of a frame: results and keyframes that are due, one perhaps at once."""
-        present, mapper = self._present, self._mapper
-
-        def go_on() -> Stopwatch:
-            watch = Stopwatch()
-            if at_once:
-                assert present.data is not None
-                with watch("again"):
-                    present.followed = find_points_again(mapper.map, present.data, present.pose, present.followed)
-                mapper.choose(present, present.data)
-                mapper.make_keyframe(present, watch)
-            mapper.advance(present, watch)
-            return watch
-
-        self._behind = mapper.begin_behind(go_on)
+        """Begin with what follows the answer of a frame in the map, perhaps with a keyframe of it at once."""
+        self._behind.begin(partial(self._mapper.advance, self._present, at_once))
         return tracked
 
     def _settle(self) -> None:
         """Wait for what follows the answer of the frame before."""
-        self._stand_still()
-        if self._behind is not None:
-            behind, self._behind = self._behind, None
-            self._history.note_stages(behind.result().seconds)
+        watch = self._behind.result()
+        if watch is not None:
+            self._history.note_stages(watch.seconds)
             self._better = self._mapper.better_turn
-
-    def _stand_still(self) -> None:
-        """Wait until no other thread changes the map."""
-        if isinstance(self._behind, Future):
-            wait([self._behind])  # if that is interrupted, the work still is there
 
     def _follow(self, data: FrameFeatures, watch: Stopwatch) -> Attempt:
         """Predict the pose and follow the frame before, if that is not long ago."""
@@ -251,7 +233,10 @@ class Tracker:
             # The frame before is the nearest there is to look for.
             mapper.keep_present(present, watch)
         with watch("find"), work_with(None if mapper.threaded else 1):
-            found = self._find(data, attempt.predicted, attempt.prior_sigma, unconfirmed)
+            guesses = [attempt.predicted, present.pose] + ([unconfirmed.pose] if unconfirmed is not None else [])
+            found = self._verification.find(
+                self.map, data, guesses, attempt.predicted, attempt.prior_sigma, self._lost_for
+            )
         if found is not None and not (
             attempt.trusted and unconfirmed is not None and self._verification.score(unconfirmed) >= found.score
         ):
@@ -284,36 +269,6 @@ class Tracker:
         if better is None:
             return predicted, prior_sigma
         return better, np.maximum(prior_sigma, [0.0] * 3 + [gates.sigma] * 3)
-
-    def _find(self, data, predicted, prior_sigma, unconfirmed: PoseEstimate | None) -> Found | None:
-        """Find a pose by described features: near the last keyframes first, then anywhere."""
-        if self._lost_for <= self._gates.lost_frames:
-            guesses = [predicted, self._present.pose] + ([unconfirmed.pose] if unconfirmed is not None else [])
-            found = self._verification.find_near(self.map, data, guesses, predicted, prior_sigma)
-            if found is not None:
-                return found
-        found = self._verification.find_anywhere(self.map, data)
-        if found is None or self._lost_for > self._gates.lost_frames:
-            return found
-        return found if self._verification.is_near(found.estimate.pose, predicted, prior_sigma) else None
-
-    def _visit_nearby(self, data: FrameFeatures) -> bool:
-        """Follow an older keyframe that stands for the present pose; return whether there is one, still seen well."""
-        keyframe = keyframe_nearby(self.map, self._present.pose, self.options)
-        if keyframe is None or self._mapper.busy:
-            return False
-        self.map.visit(keyframe)
-        points, most = self._present.followed.points, self.options.num_points
-        found = find_again(
-            self.map, self.camera, data.gray, self._present.pose, points, most, self.options.gates.points
-        )
-        points = points.joined(found)
-        seen = np.isin(keyframe.measured.points.index, points.index).sum()
-        if seen < self.options.keyframe_share * len(keyframe.measured.points):
-            return False
-        self._present.followed = Followed(points, self._present.followed.lines)
-        self._present.frames_since_keyframe = 0
-        return True
 
     # -------------------------------------------------------------------------------------------------- keyframes
 
@@ -403,8 +358,9 @@ class Tracker:
         """
         self._finished, mapper, history = True, self._mapper, self._history
         ending = Ending(mapper, history)
-        self._stand_still()
+        self._behind.stand_still()
         ending.attempt("what followed the last frame", self._settle, None)
+        self._behind.close()
         ending.settle(self._present)
         where = ending.join()
         roots = sorted({root for root, _ in where if mapper.maps[root].keyframes}) or [0]

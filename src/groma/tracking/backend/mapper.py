@@ -14,6 +14,7 @@ import numpy as np
 from groma._typing import FloatArray
 from groma.geometry import se3
 from groma.solver.report import SolveReport
+from groma.tracking.backend.behind import OnDemand
 from groma.tracking.backend.depth_calibration import DepthOffset, correct_depths, estimate_depth_offset
 from groma.tracking.backend.local_adjustment import AdjustmentJob, job_of, window_job
 from groma.tracking.backend.loop_closure import LoopSearch, search_for_loop
@@ -32,7 +33,7 @@ from groma.tracking.map.planes import merge_planes
 from groma.tracking.map.relations import find_lines_on_planes
 from groma.tracking.map.track_map import TrackMap
 from groma.tracking.options import TrackOptions
-from groma.tracking.pose.following import carry
+from groma.tracking.pose.following import carry, find_points_again
 from groma.tracking.result import map_to_scene
 from groma.tracking.stopwatch import Stopwatch
 
@@ -64,13 +65,6 @@ class _Chosen:
         """Whether frames have passed in which its features were found. Counted, so that runs repeat exactly."""
         self.age += 1
         return self.age >= delay
-
-
-class OnDemand:
-    """Stands for a future where there are no threads: the work is done when its result is asked for."""
-
-    def __init__(self, work: Callable[[], Any]) -> None:
-        self.result = work
 
 
 @dataclass
@@ -109,7 +103,6 @@ class Mapper:
         self.loops = 0
         #: A frame that is to become a keyframe; its features are being found meanwhile.
         self.due: _Chosen | None = None
-        self._behind = ThreadPoolExecutor(1, thread_name_prefix="groma-behind") if options.threaded else None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="groma-adjust") if options.threaded else None
         self.workers = ThreadPoolExecutor(2, thread_name_prefix="groma-detect") if options.threaded else None
         #: For what belongs to a frame, which keyframes must not hold up.
@@ -158,12 +151,24 @@ class Mapper:
         """Whether a window is being adjusted."""
         return self._pending is not None
 
-    def advance(self, present: Present, watch: Stopwatch) -> None:
-        """Between two frames: take up results that are due, and make the chosen keyframe if it is."""
+    def advance(self, present: Present, at_once: bool = False) -> Stopwatch:
+        """Between two frames: take up results and make the keyframe that are due, or one of the present frame
+        at once.
+
+        Returns where the time went.
+        """
+        watch = Stopwatch()
+        if at_once:
+            assert present.data is not None
+            with watch("again"):
+                present.followed = find_points_again(self.map, present.data, present.pose, present.followed)
+            self.choose(present, present.data)
+            self.make_keyframe(present, watch)
         with watch("take up"):
             self.take_up(present)
         if self.due is not None and self.due.is_ready(READY if self.metric else 1):
             self.make_keyframe(present, watch)
+        return watch
 
     def adjust_start(self, present: Present) -> None:
         """Adjust the first keyframes of a single camera."""
@@ -229,10 +234,6 @@ class Mapper:
 
     def _begin(self, work: Callable[[], Any]) -> Future | OnDemand:
         return OnDemand(work) if self._pool is None else self._pool.submit(work)
-
-    def begin_behind(self, work: Callable[[], Any]) -> Future | OnDemand:
-        """Begin with what follows the answer of a frame."""
-        return OnDemand(work) if self._behind is None else self._behind.submit(work)
 
     def take_up(self, present: Present, now: bool = False) -> None:
         """Take up the result of the thread when it is due."""
@@ -326,8 +327,8 @@ class Mapper:
 
     def close(self) -> None:
         """End the threads."""
-        pools = self._behind, self._pool, self.workers, self.frame_pool
-        self._behind = self._pool = self.workers = self.frame_pool = None
+        pools = self._pool, self.workers, self.frame_pool
+        self._pool = self.workers = self.frame_pool = None
         for pool in pools:
             if pool is not None:
                 pool.shutdown(wait=True, cancel_futures=True)

@@ -15,7 +15,7 @@ from groma.features.point_tracks import follow
 from groma.tracking.frame.camera import TrackCamera, into
 from groma.tracking.frame.features import FrameFeatures
 from groma.tracking.frame.measurements import LineMeasurements, Measurements, PlaneMeasurements, PointMeasurements
-from groma.tracking.map.keyframes import Followed, measure_points
+from groma.tracking.map.keyframes import Followed, keyframe_nearby, measure_points
 from groma.tracking.map.landmarks import DEAD
 from groma.tracking.map.lines import FollowedSegments, carried, coarse_flow, expected_segments, measured_edges
 from groma.tracking.map.points import PointTracks, find_again, follow_points
@@ -100,6 +100,22 @@ def find_points_again(track_map: TrackMap, data: FrameFeatures, pose: FloatArray
         return followed
     found = find_again(track_map, data.camera, data.gray, pose, followed.points, room, gates)
     return Followed(followed.points.joined(found), followed.lines)
+
+
+def follow_nearby(track_map: TrackMap, data: FrameFeatures, pose: FloatArray, followed: Followed) -> Followed | None:
+    """Follow an older keyframe that stands for a pose; None unless there is one, still seen well."""
+    options = data.options
+    keyframe = keyframe_nearby(track_map, pose, options)
+    if keyframe is None:
+        return None
+    track_map.visit(keyframe)
+    found = find_again(
+        track_map, data.camera, data.gray, pose, followed.points, options.num_points, options.gates.points
+    )
+    points = followed.points.joined(found)
+    seen = np.isin(keyframe.measured.points.index, points.index).sum()
+    enough = seen >= options.keyframe_share * len(keyframe.measured.points)
+    return Followed(points, followed.lines) if enough else None
 
 
 def carry(
