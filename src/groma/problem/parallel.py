@@ -60,8 +60,9 @@ class Workers:
             self._pool = None
 
 
-#: Problems with fewer factors are one share: they are not worth a thread (cost: time only).
-FACTORS_FOR_THREADS = 50_000
+#: Problems with fewer factors are one share: they are not worth a thread (cost: time only). Where nothing is summed but
+#: costs, because nothing stays in a reduced system, fewer are.
+FACTORS_FOR_THREADS, FACTORS_ALONE = 50_000, 10_000
 #: Most shares, and most bytes that their copies of the reduced system take for every factor, about twice what its
 #: measurement does, unless two copies take more: even one thread has them all (cost: memory).
 MAX_SHARES, MAX_BYTES = 16, 96
@@ -73,7 +74,7 @@ USES_OF_A_BLOCK = 20
 def num_shares(layout: Layout) -> int:
     """Return into how many shares the work on a problem is divided, whatever the number of threads."""
     size = sum(chunk.size for chunk in layout.chunks)
-    if size < FACTORS_FOR_THREADS:
+    if size < (FACTORS_FOR_THREADS if layout.kept else FACTORS_ALONE):
         return 1
     numbers = blocks = uses = 0
     for (a, b), (rows, _) in layout.blocks.items():
