@@ -117,9 +117,7 @@ def landmark_jackknife(covariances: Covariances) -> tuple[FloatArray, FloatArray
     return blocks[0], blocks[1]
 
 
-def _rows_of(
-    factor: Factor, kind: str, problem: Problem, first: dict[str, int], curvature: FloatArray
-) -> _Rows | None:
+def _rows_of(factor: Factor, kind: str, problem: Problem, first: dict[str, int], curvature: FloatArray) -> _Rows | None:
     """Return the rows of a group of factors that observe landmarks of a kind; add to sums of psi' and weights."""
     slot = next((slot.name for slot, ref in factor.references() if ref.group == kind), None)
     if slot is None or len(factor) == 0:
