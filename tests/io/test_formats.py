@@ -85,7 +85,7 @@ def test_binary_models_are_read_as_pycolmap_reads_them(tmp_path):
     """2D points are taken from the file, all else from pycolmap; those without a point in space are keypoints."""
     import pycolmap
 
-    scene = rig_scene()
+    scene = rig_scene().points_only()
     write_colmap(scene, tmp_path / "model")
     found, expected = read_colmap(tmp_path / "model"), from_pycolmap(pycolmap.Reconstruction(str(tmp_path / "model")))
     assert len(found.keypoints) > 0

@@ -30,7 +30,8 @@ class Cluster:
     def of(images: IntArray, neighbors: list[IntArray], views: LineViews) -> Cluster:
         """Return the cluster of some images."""
         known = np.unique(np.concatenate([images, *(neighbors[i] for i in images)]))
-        rows = np.concatenate([np.arange(views.pointers[i], views.pointers[i + 1]) for i in known])
+        spans = (views.rows(int(i)) for i in known)
+        rows = np.concatenate([np.arange(span.start, span.stop) for span in spans])
         return Cluster(np.sort(images), known, rows)
 
     def views(self, views: LineViews) -> LineViews:
