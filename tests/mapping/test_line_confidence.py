@@ -89,7 +89,7 @@ def test_accuracy_is_the_share_of_repetitions_that_are_within_the_tolerance():
     gates, x, stated, within = replace(GATES, edge_px=1e9), centers[:, 0], [], []
     for seed in range(150):  # upright lines: each end alone is x = f (X - c) / Z, solved for (X / Z, 1 / Z)
         scene = scene_of(ends, centers, noise=0.8, seed=seed)
-        stated.append(line_accuracy(scene, gates)[0])
+        stated.append(line_accuracy(scene, gates=gates)[0])
         u = scene.line_observations.segment[:, 0] - 500.0
         b = np.linalg.lstsq(np.column_stack([np.ones(7), -x]), u / FOCAL, rcond=None)[0][1]
         within.append(abs(1.0 / b - 10.0) < gates.tolerance * 10.0)
