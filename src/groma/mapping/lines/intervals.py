@@ -12,10 +12,13 @@ where one place in space explains a mean square distance of more than the width 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from groma._typing import BoolArray
 from groma.estimators.line_intervals import supported_intervals
+from groma.gates import gate
 from groma.geometry import segment2
 from groma.geometry.algebra import ratio
 from groma.mapping.lines.gates import AGREEMENT
@@ -23,10 +26,18 @@ from groma.mapping.noise.landmarks import line_end_rows, line_noise
 from groma.scene import LineIntervals, Scene
 from groma.scene.line_intervals import observed_shares
 
-#: Parts of a line that are judged on their own (cost: time; ends are known to a pixel or two of a hundred).
-_PARTS = 24
-#: Observed segments that must leave the line there (convention: one alone may belong to something else).
-_MIN_LEAVING = 2
+
+@dataclass(frozen=True)
+class SupportGates:
+    """Beside which parts of a line its edge lies, in addition to when segments agree."""
+
+    parts: int = gate(24, "parts", "of a line, judged each on its own", "cost: memory; most ends are known no better")
+    min_leaving: int = gate(
+        2, "segments", "that leave a line where its edge lies beside it", "convention: one alone may be of another edge"
+    )
+
+
+GATES = SupportGates()
 #: Smallest share of an eigenvalue that counts (convention: rounding): a single image leaves one direction open.
 _SINGULAR = 1e-9
 
@@ -39,10 +50,10 @@ def with_supported_intervals(scene: Scene) -> Scene:
     seen = scene.line_observations
     share, length = observed_shares(scene), segment2.length(seen.segment)
     size = np.maximum(share[:, 1] - share[:, 0], 1e-12) / np.maximum(length, 1e-12)
-    beside = parts_beside_edges(scene)
+    beside = _beside_edges(scene)
     known, bent = np.isfinite(share).all(axis=1), beside.any(axis=1)[seen.line_idx]
     whole, cut = np.flatnonzero(known & ~bent), np.flatnonzero(known & bent)
-    bounds = np.arange(_PARTS + 1) / _PARTS
+    bounds = np.arange(GATES.parts + 1) / GATES.parts
     low, high = np.maximum(share[cut, :1], bounds[:-1]), np.minimum(share[cut, 1:], bounds[1:])
     kept = (low < high) & ~beside[seen.line_idx[cut]]
     rows = np.concatenate([whole, cut[np.nonzero(kept)[0]]])
@@ -65,17 +76,17 @@ def with_supported_intervals(scene: Scene) -> Scene:
     )
 
 
-def parts_beside_edges(scene: Scene) -> BoolArray:
+def _beside_edges(scene: Scene) -> BoolArray:
     """Tell beside which parts (L, 24) of lines their edges lie."""
     share, residual, row = line_end_rows(scene)
-    middle, width = (np.arange(_PARTS) + 0.5) / _PARTS, AGREEMENT.same_edge
+    middle, width = (np.arange(GATES.parts) + 0.5) / GATES.parts, AGREEMENT.same_edge
     known = np.isfinite(residual).all(axis=1) & np.isfinite(row).all(axis=(1, 2))
     low, high = np.sort(share, axis=1).T
     seen, part = np.nonzero((low[:, None] <= middle) & (middle <= high[:, None]) & known[:, None])
     weight = (middle[part] - share[seen, 0]) / (share[seen, 1] - share[seen, 0])
     away = residual[seen, 0] + weight * (residual[seen, 1] - residual[seen, 0])
     x, y = (row[seen, 0] + weight[:, None] * (row[seen, 1] - row[seen, 0])).T
-    place, size = scene.line_observations.line_idx[seen] * _PARTS + part, scene.num_lines * _PARTS
+    place, size = scene.line_observations.line_idx[seen] * GATES.parts + part, scene.num_lines * GATES.parts
     count, leaving, xx, xy, yy, xr, yr = (
         np.bincount(place, value, size)
         for value in (np.ones(len(x)), np.abs(away) > width, x * x, x * y, y * y, x * away, y * away)
@@ -84,4 +95,4 @@ def parts_beside_edges(scene: Scene) -> BoolArray:
     determinant = xx * yy - xy**2
     explained = ratio(yy * xr**2 - 2.0 * xy * xr * yr + xx * yr**2, determinant, determinant > 0.0, 0.0)
     noise = AGREEMENT.max_squared(2) * line_noise(scene).sigma_px ** 2
-    return ((explained > width**2 * count + noise) & (leaving >= _MIN_LEAVING)).reshape(-1, _PARTS)
+    return ((explained > width**2 * count + noise) & (leaving >= GATES.min_leaving)).reshape(-1, GATES.parts)
