@@ -33,7 +33,7 @@ _Result = TypeVar("_Result")
 
 #: Pieces of work that wait for each worker; more would only take memory.
 _WAITING = 2
-#: What glibc's ``mallopt`` calls the number of places that memory is taken from.
+#: What glibc's ``mallopt`` calls the number of places that memory is taken from (the format of the call).
 _M_ARENA_MAX = -8
 #: Calls to an executor of processes that each of its workers gets, so that all end at about the same time (cost: of
 #: waiting for the last).

@@ -30,7 +30,6 @@ def test_the_next_step_is_foreseen(decrease, previous, gain_ratio, withheld, con
     assert cost_converged(decrease, previous, gain_ratio, withheld, 1e-6) == converged
 
 
-@pytest.mark.kernels
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_left_after_convergence_is_less_than_the_tolerance(seed):
     problem = scene_problem(seed=seed, num_cameras=8, num_points=60, num_lines=10, disturb=0.05, noise=1.0)

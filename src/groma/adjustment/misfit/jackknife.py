@@ -35,7 +35,8 @@ from groma.solver.covariance.marginals import Covariances
 
 #: What is left out, one after the other, and what only relations refer to.
 _LANDMARKS, _STRUCTURE = ("points", "lines"), ("planes", "directions")
-#: Numbers in the largest arrays of one batch of landmarks, and batches that are worked on before they are added.
+#: Numbers in the largest arrays of one batch of landmarks, and batches that are worked on before they are added
+#: (cost: memory).
 _BATCH, _AT_ONCE = 300_000, 16
 
 
