@@ -9,9 +9,9 @@ the usual distance of lines from their cameras. Three things must be true of it:
 
 The first factor, that there is an edge at all, is a logistic model of four quantities (:func:`line_evidence`). The
 second is the probability of a normal error within :math:`\tau = 0.0025`, where u is the standard deviation across the
-line that half of its places do not exceed, over the usual distance. The third is the share of normal residuals of r pixels root mean square within the width of an
-edge, a pixel: contours that move with the view and chords of curves fit no single line, and where segments of a
-curve are bowed their standard deviations, and with them r, say so.
+line that half of its places do not exceed, over the usual distance. The third is the share of normal residuals of r
+pixels root mean square within the width of an edge, a pixel: contours that move with the view and chords of curves fit
+no single line, and where segments of a curve are bowed their standard deviations, and with them r, say so.
 
 No quantity depends on the unit of length or on how many pixels an image has. The weights were fitted on rendered scenes
 of boxes and round bodies whose edges are known exactly, and the probabilities compared with those of other scenes

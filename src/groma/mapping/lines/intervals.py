@@ -51,7 +51,7 @@ def with_supported_intervals(scene: Scene) -> Scene:
     share, length = observed_shares(scene), segment2.length(seen.segment)
     size = np.maximum(share[:, 1] - share[:, 0], 1e-12) / np.maximum(length, 1e-12)
     beside = _beside_edges(scene)
-    known, bent = np.isfinite(share).all(axis=1), beside.any(axis=1)[seen.line_idx]
+    known, bent = np.isfinite(share.sum(axis=1)), np.asarray(beside.any(axis=1))[seen.line_idx]
     whole, cut = np.flatnonzero(known & ~bent), np.flatnonzero(known & bent)
     bounds = np.arange(GATES.parts + 1) / GATES.parts
     low, high = np.maximum(share[cut, :1], bounds[:-1]), np.minimum(share[cut, 1:], bounds[1:])
@@ -80,7 +80,7 @@ def _beside_edges(scene: Scene) -> BoolArray:
     """Tell beside which parts (L, 24) of lines their edges lie."""
     share, residual, row = line_end_rows(scene)
     middle, width = (np.arange(GATES.parts) + 0.5) / GATES.parts, AGREEMENT.same_edge
-    known = np.isfinite(residual).all(axis=1) & np.isfinite(row).all(axis=(1, 2))
+    known = np.isfinite(np.column_stack([residual, row.reshape(len(row), 4)]).sum(axis=1))
     low, high = np.sort(share, axis=1).T
     seen, part = np.nonzero((low[:, None] <= middle) & (middle <= high[:, None]) & known[:, None])
     weight = (middle[part] - share[seen, 0]) / (share[seen, 1] - share[seen, 0])
