@@ -109,8 +109,8 @@ def test_half_of_a_line_decides_though_one_end_is_uncertain():
     noise, middle = line_noise(longer), np.array([0.5])
     deviation = np.sqrt(np.linalg.eigvalsh(noise.at(middle, middle, np.array([0])))[0, 1]) * max(noise.misfit[0], 1.0)
     expected = erf(gates.tolerance * usual_distance(longer) / (np.sqrt(2.0) * deviation))
-    assert line_accuracy(longer, gates)[0] == pytest.approx(expected)
-    assert expected < 0.8 * line_accuracy(scene, gates)[0]
+    assert line_accuracy(longer, gates=gates)[0] == pytest.approx(expected)
+    assert expected < 0.8 * line_accuracy(scene, gates=gates)[0]
 
 
 def test_contours_of_a_pillar_are_no_edges():
