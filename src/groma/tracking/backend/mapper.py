@@ -187,13 +187,19 @@ class Mapper:
         self.due = _Chosen(data, near.index, relative, present.followed)
 
     def keep_present(self, present: Present, watch: Stopwatch) -> None:
-        """Make a keyframe of the present frame, unless one stands for it."""
+        """Make a keyframe of the present frame, unless one stands for it, and take up all that is being worked out.
+
+        Before its window is adjusted, a keyframe that was found by features alone leads the next one astray.
+        """
         if self.due is not None:
             self.make_keyframe(present, watch)
         if present.frames_since_keyframe > 0:
             assert present.data is not None
             self.choose(present, present.data)
             self.make_keyframe(present, watch)
+        else:
+            with watch("take up"):
+                self.take_up(present, now=True)
 
     def make_keyframe(self, present: Present, watch: Stopwatch) -> None:
         """Make a keyframe of the frame that was chosen."""
