@@ -105,7 +105,8 @@ def _table(queries: Sequence[PlacedImage]) -> str:
     count = sum(one.status == "localized" for one in queries)
     return (
         '<section class="card wide"><h2>Queries</h2><p class="caption">'
-        f"{count} of {counted(len(queries), 'photographs')} localised. The images show what of the map was found in each.</p>"
+        f"{count} of {counted(len(queries), 'photographs')} localised. "
+        "The images show what of the map was found in each.</p>"
         "<table><thead><tr><th>photograph</th><th>status</th><th>points</th><th>lines</th><th></th></tr></thead>"
         f"<tbody>{rows}</tbody></table></section>"
     )
