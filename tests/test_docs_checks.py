@@ -9,6 +9,7 @@ import re
 import runpy
 import shlex
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -30,14 +31,18 @@ COMMANDS = [
 ]
 
 
-def options_of(words: list[str]) -> tuple[str, set[str]]:
-    """Return the command that words begin with, and its options."""
+@cache
+def whole_command():
     import typer.main
 
     from groma.cli.app import app
 
-    command = typer.main.get_command(app)
-    name = "groma"
+    return typer.main.get_command(app)
+
+
+def options_of(words: list[str]) -> tuple[str, set[str]]:
+    """Return the command that words begin with, and its options."""
+    command, name = whole_command(), "groma"
     for word in words:
         if not hasattr(command, "commands") or word.startswith("-"):
             break
