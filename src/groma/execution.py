@@ -128,6 +128,12 @@ def num_threads() -> int:
     return 1 if crew is None else crew.here.workers
 
 
+def num_calls() -> int:
+    """Return into how many calls work is divided that is sent to other processes; zero where they share memory."""
+    crew = _CREW.get()
+    return 0 if crew is None or crew.executor is None or crew.shares_memory else _CALLS * crew.workers
+
+
 def map_work(
     function: Callable[[_Item], _Result],
     items: Sequence[_Item],

@@ -92,7 +92,7 @@ def test_accuracy_is_the_share_of_repetitions_of_which_half_is_within_the_tolera
     gates, x, stated, within = replace(GATES, edge_px=1e9), centers[:, 0], [], []
     for seed in range(150):  # upright lines: each end alone is x = f (X - c) / Z, solved for (X / Z, 1 / Z)
         scene = scene_of(ends, centers, noise=0.8, seed=seed)
-        stated.append(line_accuracy(scene, gates)[0])
+        stated.append(line_accuracy(scene, gates=gates)[0])
         u = scene.line_observations.segment[:, [0, 2]] - 500.0
         depth = 1.0 / np.linalg.lstsq(np.column_stack([np.ones(7), -x]), u / FOCAL, rcond=None)[0][1]
         along = np.interp(np.linspace(0.0, 1.0, 99), [0.0, 1.0], depth)
@@ -109,8 +109,8 @@ def test_half_of_a_line_decides_though_one_end_is_uncertain():
     noise, middle = line_noise(longer), np.array([0.5])
     deviation = np.sqrt(np.linalg.eigvalsh(noise.at(middle, middle, np.array([0])))[0, 1]) * max(noise.misfit[0], 1.0)
     expected = erf(gates.tolerance * usual_distance(longer) / (np.sqrt(2.0) * deviation))
-    assert line_accuracy(longer, gates)[0] == pytest.approx(expected)
-    assert expected < 0.8 * line_accuracy(scene, gates)[0]
+    assert line_accuracy(longer, gates=gates)[0] == pytest.approx(expected)
+    assert expected < 0.8 * line_accuracy(scene, gates=gates)[0]
 
 
 def test_contours_of_a_pillar_are_no_edges():

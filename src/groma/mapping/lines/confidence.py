@@ -81,19 +81,22 @@ def left_out(kept: BoolArray, min_confidence: float) -> str:
 
 def line_confidence(scene: Scene) -> FloatArray:
     """Return the probability (L,) that each line is right."""
-    return expit(line_evidence(scene) @ np.array(list(WEIGHTS.values()))) * line_accuracy(scene)
-
-
-def line_accuracy(scene: Scene, gates: ConfidenceGates = GATES) -> FloatArray:
-    """Return the probability (L,) that each line lies along its edge, given that there is one."""
     noise = line_noise(scene)
+    return expit(line_evidence(scene, noise) @ np.array(list(WEIGHTS.values()))) * line_accuracy(scene, noise)
+
+
+def line_accuracy(scene: Scene, noise: LineNoise | None = None, gates: ConfidenceGates = GATES) -> FloatArray:
+    """Return the probability (L,) that each line lies along its edge, given that there is one; ``noise`` if known."""
+    noise = line_noise(scene) if noise is None else noise
     deviation = _deviation(noise) * np.maximum(noise.misfit, 1.0) / usual_distance(scene)
     within = erf(gates.tolerance / (math.sqrt(2.0) * deviation))
     return within * erf(gates.edge_px / (math.sqrt(2.0) * _residual_px(scene, noise)))
 
 
-def line_evidence(scene: Scene) -> FloatArray:
+def line_evidence(scene: Scene, noise: LineNoise | None = None) -> FloatArray:
     r"""Return what the probability that there is an edge is computed from, (L, 5), in the order of ``WEIGHTS``.
+
+    ``noise`` is that of the lines, if it is known.
 
     ============  =================================================================================================
     ``constant``  1
@@ -104,7 +107,7 @@ def line_evidence(scene: Scene) -> FloatArray:
     ``residual``  logarithm of the root mean square of its residuals, pixels
     ============  =================================================================================================
     """
-    seen, noise = scene.line_observations, line_noise(scene)
+    seen, noise = scene.line_observations, line_noise(scene) if noise is None else noise
     images = num_distinct(seen.line_idx, seen.image_idx, scene.num_lines)
     expected = np.maximum(_num_in_frame(scene), images)
     longest = np.ones(scene.num_lines)
