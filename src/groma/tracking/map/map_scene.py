@@ -119,18 +119,13 @@ def _point_tables(camera: TrackCamera, table: PointMeasurements, image: IntArray
     tables: dict[str, object] = {
         "point_observations": PointObservations.numbered(image, table.index, table.pixel, table.sigma)
     }
-    depth, column = table.depth, table.right[:, 0]
-    if camera.baseline > 0:
-        # What a pair tells of a depth is a column: where it is seen depends on how the right camera is turned.
-        column = np.where(np.isnan(column), table.pixel[:, 0] - camera.fx * camera.baseline / depth, column)
-        depth = np.full(len(depth), np.nan)
-    rows = np.flatnonzero(np.isfinite(depth))
+    rows = np.flatnonzero(np.isfinite(table.depth))
     if len(rows):
-        tables["point_depths"] = PointDepths(image[rows], table.index[rows], depth[rows], table.depth_sigma[rows])
-    rows = np.flatnonzero(np.isfinite(column))
+        tables["point_depths"] = PointDepths(image[rows], table.index[rows], table.depth[rows], table.depth_sigma[rows])
+    rows = np.flatnonzero(np.isfinite(table.right[:, 0]))
     if len(rows):
         baseline = np.full(len(rows), camera.baseline)
-        tables["right_columns"] = RightColumns(rows, column[rows], baseline, table.sigma[rows])
+        tables["right_columns"] = RightColumns(rows, table.right[rows, 0], baseline, table.sigma[rows])
     return tables
 
 

@@ -213,11 +213,16 @@ class _Search:
         return found[0] if found is not None else None
 
     def best_of(self, starts: list[FloatArray], most: int) -> Found | None:
-        """Refine the starts that most agrees with, and more than with the best pose so far; return the best then."""
+        """Refine the starts that most agrees with, unless clearly more does with the best pose; return the best then.
+
+        Beside what repeats itself a wrong pose agrees with about as much as the right one, before both are refined.
+        """
         judged = [self._agreeing(start) for start in starts]
         for k in np.argsort(-np.array(judged), kind="stable")[:most]:
-            if self._best is not None and judged[k] <= self._agreeing(self._best.estimate.pose):
-                break
+            if self._best is not None:
+                agreeing = self._agreeing(self._best.estimate.pose)
+                if judged[k] < agreeing - self.gates.even * math.sqrt(agreeing):
+                    break
             if self._is_known(starts[k]):
                 continue
             found = self._refine(starts[k])
