@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Points, landmarks and lines that match: against the same searches written without any shortcut."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from worlds import CAMERA, make_world, project
@@ -13,13 +15,15 @@ from groma.localization.line_matching import SeenLines, lines_near
 from groma.localization.map_index import MapIndex
 from groma.localization.matching import MATCHES, alike_elsewhere, lengths_of, match_descriptors, pairs_near
 
+pytestmark = pytest.mark.kernels
+
 
 def _vectors(rng, count, size=32):
     values = rng.normal(size=(count, size)).astype(np.float32)
     return values / np.linalg.norm(values, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(300, 5000), (70, 30), (1, 50)])
+@pytest.mark.parametrize(("rows", "columns"), [pytest.param(300, 5000, marks=pytest.mark.compiled), (70, 30), (1, 50)])
 def test_matches_are_the_best_of_both_and_clear(rows, columns):
     rng = np.random.default_rng(rows)
     first, second = _vectors(rng, rows), _vectors(rng, columns)
@@ -118,6 +122,8 @@ def test_landmarks_are_matched_once_and_by_their_kind():
     found = described.match(points, seen_in(index, np.array([0, 1, 2])))
     assert set(map(tuple, found.tolist())) == {(0, 5), (1, 150), (2, 250), (3, 350), (4, 351)}
     np.testing.assert_array_equal(seen_in(index, np.array([1])), np.arange(100, 300))
+    few = replace(GATES, landmarks=150)  # points 100 to 199 by two of the images, then those of the first image
+    np.testing.assert_array_equal(seen_in(index, np.array([1, 0]), few), np.arange(100, 250))
     np.testing.assert_array_equal(counted_in(index, np.array([2, 0, 1]), shown), [2, 3, 2])
 
 

@@ -21,7 +21,7 @@ from numba.core.typed_passes import NativeLowering as NumbaLowering
 
 _WORD = llvm.IntType(64)
 _ZERO, _HALF = llvm.Constant(_WORD, 0), llvm.IntType(32)
-#: Places in an array's description.
+#: Places in an array's description (Numba's format).
 _DATA, _SHAPE, _STRIDES = 4, 5, 6
 
 
