@@ -126,7 +126,7 @@ def _search(agreeing, scores):
 
 @pytest.mark.parametrize(("others", "best"), [(371, 2.0), (353, 1.0)])
 def test_poses_that_about_as_much_agrees_with_are_both_refined(others, best):
-    """A bar of a radiator beside the right pose 393 features agree, and 371 at it: the better fit wins. 353 are fewer."""
+    """One bar of a radiator away 393 features agree, at the right pose 371: the better fit wins. 353 are fewer."""
     wrong, right = (np.array([0, 0, 0, 1.0, x, 0, 0]) for x in (1.0, 2.0))
     search = _search({1.0: 393.0, 2.0: float(others)}, {1.0: 366.0, 2.0: 375.0})
     search.best_of([wrong], 1)
