@@ -3,6 +3,7 @@
 
 import io
 import struct
+import zipfile
 
 import cv2
 import numpy as np
@@ -116,6 +117,16 @@ def test_arrays(tmp_path):
         (tmp_path / "b.npy").write_bytes(damaged)
         with pytest.raises(FileFormatError):
             read_array(tmp_path / "b.npy")
+
+
+def test_archives_of_a_later_version_of_the_format(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, a=np.arange(3.0))
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\x01\x02") + 6] = 156  # version needed to read it
+    path.write_bytes(content)
+    with pytest.raises(zipfile.BadZipFile, match="version"), opened_arrays(path):
+        pass
 
 
 def test_text_that_is_none(tmp_path):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+import struct
 import sys
 import zipfile
 import zlib
@@ -130,8 +131,12 @@ def form(kinds: str, *shape: int | None) -> Check:
 
 @contextmanager
 def opened_arrays(path: str | os.PathLike[str]) -> Iterator[ArrayMembers]:
-    """Open an ``.npz`` file; what is wrong with the zip file itself is raised as :mod:`zipfile` does."""
-    with zipfile.ZipFile(path) as file:
+    """Open an ``.npz`` file; what is wrong with the zip file itself is a :class:`zipfile.BadZipFile`."""
+    try:
+        opened = zipfile.ZipFile(path)
+    except (NotImplementedError, struct.error) as error:  # a version of the format that Python does not read
+        raise zipfile.BadZipFile(str(error)) from error
+    with opened as file:
         yield ArrayMembers(file, path, os.stat(path).st_size)
 
 

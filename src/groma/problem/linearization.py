@@ -11,6 +11,7 @@ V, W and the landmarks' gradient belong to a chunk alone; H and the cameras' gra
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -68,7 +69,7 @@ class NormalEquations:
             for f, begin, end in chunk.factors:
                 self._sizes[f] = max(self._sizes[f], end - begin)
         self.shares = shares_of(layout)
-        self._scratch: list[dict[int, FloatArray]] = [{} for _ in self.shares]
+        self._scratch = threading.local()  # one per thread, not per share: it stays in cache
         self._references = [tuple(ref for _, ref in factor.factor.references()) for factor in layout.factors]
         self._known: dict[str, tuple[FloatArray, FloatArray]] = {}
         self._free = {}
@@ -139,7 +140,7 @@ class NormalEquations:
         def work(share: int) -> tuple[list[float], list[int]]:
             sums, hidden = [0.0] * len(self.layout.factors), [0] * len(self.layout.factors)
             for f, begin, end in self._runs(share, wanted):
-                value, rho, degenerate = self._chunk_cost(share, f, inputs[f], begin, end)
+                value, rho, degenerate = self._chunk_cost(f, inputs[f], begin, end)
                 sums[f] += value
                 hidden[f] += degenerate
                 layout = self.layout.factors[f]
@@ -164,7 +165,7 @@ class NormalEquations:
             for f, begin, end in (piece for piece in chunk.factors if piece[1] < piece[2]):
                 first, last = runs.get(f, (begin, begin))
                 size = self.layout.factors[f].factor.residual_size
-                if last != begin or (end - first) * (size + 1) > len(self._record(share, f)):
+                if last != begin or (end - first) * (size + 1) > len(self._record(f)):
                     yield f, first, last
                     first = begin
                 runs[f] = first, end
@@ -181,10 +182,10 @@ class NormalEquations:
                 self.costs[f], self.hidden[f] = costs[f], hidden[f]
         return float(sum(self.costs))
 
-    def _chunk_cost(self, share: int, f: int, inputs: tuple, begin: int, end: int) -> tuple[float, FloatArray, int]:
+    def _chunk_cost(self, f: int, inputs: tuple, begin: int, end: int) -> tuple[float, FloatArray, int]:
         layout, noise = self.layout.factors[f], self._noise[f]
         n, m = end - begin, layout.factor.residual_size
-        flat = self._record(share, f)
+        flat = self._record(f)
         out = flat[: n * m].reshape(n, m)
         rho = flat[n * m : n * m + n]
         degenerate = layout.factor.residuals(inputs, begin, end, out)
@@ -194,8 +195,8 @@ class NormalEquations:
             value = cost_scaled(out, begin, noise.scale, noise.step, *noise.loss, rho)
         return value, rho, degenerate
 
-    def _record(self, share: int, f: int) -> FloatArray:
-        scratch = self._scratch[share]
+    def _record(self, f: int) -> FloatArray:
+        scratch = self._scratch.__dict__.setdefault("records", {})
         if f not in scratch:
             layout = self.layout.factors[f]
             size = self._sizes[f] * (layout.factor.residual_size * layout.width + 1)
@@ -300,7 +301,7 @@ class NormalEquations:
         """Write, weigh, chain and sum the records of one factor group in one chunk."""
         layout, noise = self.layout.factors[f], self._noise[f]
         n, m = end - begin, layout.factor.residual_size
-        flat = self._record(share, f)
+        flat = self._record(f)
         record = flat[: n * m * layout.width].reshape(n, m, layout.width)
         norms = flat[len(flat) - n :]
         if layout.has_gaps:

@@ -7,7 +7,7 @@ the order of the shares. The result is therefore the same to the last digit for 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from queue import Empty, SimpleQueue
@@ -60,7 +60,8 @@ class Workers:
             self._pool = None
 
 
-#: Problems with fewer factors are one share: they are not worth a thread (cost: time only).
+#: Problems with fewer factors are one share: they are not worth a thread; nor is a share of less than half of it
+#: (cost: time only).
 FACTORS_FOR_THREADS = 50_000
 #: Most shares, and most bytes that their copies of the reduced system take for every factor, about twice what its
 #: measurement does, unless two copies take more: even one thread has them all (cost: memory).
@@ -82,6 +83,7 @@ def num_shares(layout: Layout) -> int:
         uses += sum(len(seen.pair_slots) for seen in group.incidences.values())
         uses += sum(len(slots) for slots, _ in group.cross.values())
     count = min(MAX_SHARES, MAX_BYTES * size // max(8 * numbers, 1), len(layout.chunks) // 2)
+    count = min(count, 2 * size // max(FACTORS_FOR_THREADS, 1))
     if layout.eliminated:
         count = min(count, uses // max(USES_OF_A_BLOCK * blocks, 1)) if blocks else count
     return max(2, count)
@@ -113,15 +115,20 @@ def shares_of(layout: Layout) -> list[list[Chunk]]:
 _SUM_IN_THREADS = 200_000
 
 
-def sum_of(parts: list[FloatArray], workers: Workers) -> FloatArray:
-    """Add the other arrays to the first one, and return that."""
+def sum_of(
+    parts: list[FloatArray], workers: Workers, spans: Sequence[Sequence[tuple[int, int]]] | None = None
+) -> FloatArray:
+    """Add the other arrays to the first one, and return that; ``spans`` say where each is not zero: (begin, end)."""
     total = parts[0]
+    spans = [[(0, total.size)]] * len(parts) if spans is None else spans
     tasks = workers.count if total.size > _SUM_IN_THREADS else 1
     cuts = [total.size * i // tasks for i in range(tasks + 1)]
 
     def add(task: int) -> None:
-        for part in parts[1:]:
-            total[cuts[task] : cuts[task + 1]] += part[cuts[task] : cuts[task + 1]]
+        for part, filled in zip(parts[1:], spans[1:], strict=True):
+            for begin, end in filled:
+                own = slice(max(begin, cuts[task]), max(min(end, cuts[task + 1]), cuts[task]))
+                total[own] += part[own]
 
     if len(parts) > 1:
         workers.map(add, tasks)

@@ -158,8 +158,9 @@ def _say(console: Console, numbers: dict[str, Any]) -> None:
             for name, angle, sigma in zip(("pitch", "yaw", "roll"), turn["angles_deg"], turn["sigma_deg"], strict=True)
         )
         console.say(f"The right camera is turned by {angles} degrees; this is taken into account.")
-    if numbers.get("depth_camera", {}).get("used"):
-        offset, sigma = (numbers["depth_camera"][key] for key in ("inverse_offset", "sigma"))
+    depth = numbers.get("depth_camera", {})
+    if depth.get("used") and abs(depth["inverse_offset"]) > depth["sigma"]:
+        offset, sigma = depth["inverse_offset"], depth["sigma"]
         console.say(f"Inverse depths are off by {offset:+.4f} ± {sigma:.4f}; this is taken into account.")
     scores = numbers.get("reference", {})
     if "ate_rmse" in scores:

@@ -24,8 +24,8 @@ import numpy as np
 
 from groma._numba import loop
 from groma._simd import add_matvec, add_product, set_product, width
-from groma._typing import FloatArray
-from groma.problem.layout import Chunk, Layout
+from groma._typing import FloatArray, IntArray
+from groma.problem.layout import Chunk, Eliminated, Layout
 from groma.problem.linearization import NormalEquations
 from groma.problem.parallel import sum_of
 
@@ -184,6 +184,9 @@ class ReducedSystem:
             }
             for _ in range(shares)
         ]
+        # A copy is cleared and added where its share fills it: of a street that is a small part, and the rest of the
+        # copy never takes memory.
+        self._spans = [_spans(layout, share) for share in equations.shares]
         self._g = [[np.zeros(c.count * c.width) for c in layout.kept] for _ in range(shares)]
         widest = max([c.width for c in layout.kept], default=0)
         tallest = max([e.dof for e in layout.eliminated], default=0)
@@ -191,15 +194,22 @@ class ReducedSystem:
         kinds = [layout.problem.variables[e.group].manifold.kind for e in layout.eliminated]
         self._landmark_damping = [LANDMARK_DAMPING.get(kind, 1.0) for kind in kinds]
         self._singular = [0] * shares
+        self._new = True
         self.num_singular_landmarks = 0
         #: Of the last steps of the landmarks: the sums of delta D delta, with D as their damping takes it, and g delta.
         self.landmark_squares = self.landmark_slope = 0.0
 
     def clear(self) -> None:
         """Set all sums to zero."""
-        for parts in self._S:
-            for S in parts.values():
-                S[:] = 0.0
+        if self._new:
+            self._new = False
+            return
+        for S in self._S[0].values():
+            S[:] = 0.0  # the sum of all is formed there
+        for parts, spans in zip(self._S[1:], self._spans[1:], strict=True):
+            for pair, S in parts.items():
+                for begin, end in spans[pair]:
+                    S[begin:end] = 0.0
         for gradients in self._g:
             for g in gradients:
                 g[:] = 0.0
@@ -250,7 +260,8 @@ class ReducedSystem:
         self.S: dict[tuple[int, int], FloatArray] = {}
         for pair in layout.blocks:
             a, b = layout.kept[pair[0]].width, layout.kept[pair[1]].width
-            S = sum_of([parts[pair] for parts in self._S], self.equations.workers)
+            spans = [spans[pair] for spans in self._spans]
+            S = sum_of([parts[pair] for parts in self._S], self.equations.workers, spans)
             direct = layout.num_direct[pair] * a * b
             S[:direct] += self.equations.H[pair]
             S = S.reshape(-1, a, b)
@@ -311,3 +322,32 @@ class ReducedSystem:
         parts = self.equations.workers.map(work, len(self.equations.shares))
         self.landmark_squares, self.landmark_slope = (sum(part[i] for part in parts) for i in range(2))
         return deltas
+
+
+def _spans(layout: Layout, share: list[Chunk]) -> dict[tuple[int, int], list[tuple[int, int]]]:
+    """Return which numbers (begin, end) of each array of blocks the landmarks of a share add to.
+
+    Blocks that factors fill directly come first, the others in the order of the landmarks that fill them.
+    """
+    spans = {}
+    for pair, direct in layout.num_direct.items():
+        begin, end = len(layout.blocks[pair][0]), direct
+        for e, eliminated in enumerate(layout.eliminated):
+            slots = _slots(eliminated, pair, [chunk for chunk in share if chunk.eliminated == e])
+            if len(slots) and slots.max() >= direct:
+                end = max(end, int(slots.max()) + 1)
+                begin = min(begin, int((slots - direct).view(f"u{slots.itemsize}").min()) + direct)  # direct ones wrap
+        size = layout.kept[pair[0]].width * layout.kept[pair[1]].width
+        spans[pair] = [(0, direct * size), (begin * size, max(begin, end) * size)]
+    return spans
+
+
+def _slots(eliminated: Eliminated, pair: tuple[int, int], chunks: list[Chunk]) -> IntArray:
+    """Blocks of one pair of classes that the landmarks of consecutive chunks add to."""
+    if pair in eliminated.cross:
+        slots, pointer = eliminated.cross[pair]
+    elif pair[0] == pair[1] and pair[0] in eliminated.incidences:
+        slots, pointer = eliminated.incidences[pair[0]].pair_slots, eliminated.incidences[pair[0]].pair_pointer
+    else:
+        return np.zeros(0, np.int32)
+    return slots[pointer[chunks[0].begin] : pointer[chunks[-1].end]] if chunks else slots[:0]

@@ -11,9 +11,10 @@ least cost is that of the depths by themselves, poses and landmarks held; where 
 maps, is c. (A common factor of all depths is that of the whole map, which images do not tell.)
 
 Errors of one image go together: its depths, planes and segments come from the same disparities. Images count as samples
-therefore, not depths: the variance is larger than the curvature of the cost says by what the slopes of images show, and
-the offset is kept where an information criterion (BIC) with as many samples as images finds it worth a parameter. One
-far larger than the noise of depths is no offset: something else is wrong, a focal length perhaps, and it is left out.
+therefore, not depths: the variance is larger than the curvature of the cost says by what the slopes of images show.
+With what is known beforehand (the offset is about as large as the noise of a single depth) this gives the mean of the
+posterior, the offset of least expected squared error; where the map tells little, it is close to zero. One far larger
+than the noise of depths is no offset: something else is wrong, a focal length perhaps, and it is left out.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class DepthOffset:
 
     offset: float
     sigma: float
-    #: Whether the map was corrected by it: statistics support it.
+    #: Whether the map was corrected by it: it is no larger than such errors are.
     used: bool
 
     def numbers(self) -> dict[str, float | bool]:
@@ -76,7 +77,7 @@ def estimate_depth_offset(track_map: TrackMap, camera: TrackCamera, options: Tra
     information = curvature / alike
     total = information + 1.0 / prior**2
     offset = least * information / total
-    used = least**2 * information > math.log(count) and abs(offset) < options.gates.depth.max_offset * prior
+    used = abs(offset) < options.gates.depth.max_offset * prior
     return DepthOffset(float(offset), float(total**-0.5), bool(used))
 
 
