@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What packages are made from says the same everywhere: version, Pythons, dependencies, and links that lead somewhere."""
+"""What packages are made from says the same everywhere: version, Pythons, dependencies; links lead somewhere."""
 
 import json
 import re
@@ -51,4 +51,4 @@ def test_links_of_the_readme_lead_somewhere_here_and_on_the_package_index():
     assert not made["_LINK"].search(linked)
     for place in places:
         assert f"https://example.org/groma/blob/v1.2.3/{place}" in linked or f"/raw/v1.2.3/{place}" in linked
-    assert "![A photograph of a filing cabinet" in linked and "(https://example.org/groma/raw/v1.2.3/docs/images/demo.jpg)" in linked
+    assert "](https://example.org/groma/raw/v1.2.3/docs/images/demo.jpg)" in linked

@@ -5,8 +5,8 @@ Bundle adjustment spends its time in products of tiny blocks (3x9, 9x9). LLVM do
 them, because a store might alias a load. Here the blocks are loaded into vector registers by hand.
 
 Block sizes must be known when a loop is compiled. They are passed as *widths*: a tuple of ``None`` whose length is
-the size, ``width(9) == (None,) * 9``. The size is then part of the argument's type, so one loop at module level is compiled
-once for each size and cached on disk as such.
+the size, ``width(9) == (None,) * 9``. The size is then part of the argument's type, so one loop at module level is
+compiled once for each size and cached on disk as such.
 
 With ``NUMBA_DISABLE_JIT=1`` the same names are plain NumPy.
 """

@@ -77,7 +77,7 @@ class _Lower(Lower):
     def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
         """Store a number without reading what was there before."""
         kind = self.typeof(name)
-        if not self._is_plain or argidx is None and self._is_counted(kind):
+        if not self._is_plain or (argidx is None and self._is_counted(kind)):
             super().storevar(value, name, argidx)
             return
         self._alloca_var(name, kind)

@@ -25,8 +25,8 @@ _meanings: dict[tuple[int, tuple[Any, ...]], tuple[Any, Any]] = {}
 
 def is_simple(kind: Any) -> bool:
     """Whether a type is that of an array, a number, nothing, or a tuple of such."""
-    if isinstance(kind, types.BaseTuple):
-        return all(map(is_simple, kind))
+    if isinstance(kind, types.Tuple | types.UniTuple):
+        return all(map(is_simple, kind.types))
     return isinstance(kind, types.Number | types.Array | types.Boolean | types.NoneType)
 
 
@@ -58,7 +58,7 @@ class TypeInference(NopythonTypeInference):
 
     _name = "groma_type_inference"
 
-    def run_pass(self, state: Any) -> bool:
+    def run_pass(self, state: Any) -> Any:
         """Find the types of all variables."""
         context = state.typingctx
         state.typingctx = _Typing(context)
@@ -86,9 +86,9 @@ def _variables(found: list[ir.Var], value: Any) -> None:
         found.extend(value.list_vars())
 
 
-def _variables_in(_: Any, value: Any) -> list[ir.Var]:
+def _variables_in(self: ir.Inst, val: Any) -> list[ir.Var]:
     found: list[ir.Var] = []
-    _variables(found, value)
+    _variables(found, val)
     return found
 
 
