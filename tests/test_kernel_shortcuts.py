@@ -56,6 +56,21 @@ def test_arguments_are_borrowed_and_come_back_as_they_were():
     assert (sys.getrefcount(values), sys.getrefcount(sizes[0])) == before
 
 
+@loop
+def _of_each_kind(number, single, count, short, is_set, nothing, pairs):
+    (first, second), third = pairs
+    total = number + single + count + short + first + second[0] + third
+    return total if is_set and nothing is None else -total
+
+
+def test_arguments_of_each_kind():
+    pairs = (1, np.array([2.0])), 4.0
+    for count in (8, np.int64(8), True):
+        found = _of_each_kind(0.5, np.float32(0.25), count, np.int16(-16), np.bool_(True), None, pairs)
+        assert found == 0.5 + 0.25 + int(count) - 16 + 1 + 2 + 4
+    assert _of_each_kind(np.float64(1.0), np.float32(0.0), 2**40, np.int16(0), False, None, pairs) == -(8.0 + 2**40)
+
+
 def test_what_is_returned_of_an_argument_outlives_it():
     values = np.arange(1000.0)
     whole, part = _given_back(values)

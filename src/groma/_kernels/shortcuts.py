@@ -23,10 +23,10 @@ _OPERATORS = frozenset(value for value in vars(operator).values() if callable(va
 _meanings: dict[tuple[int, tuple[Any, ...]], tuple[Any, Any]] = {}
 
 
-def is_simple(kind: Any) -> bool:
+def _is_simple(kind: Any) -> bool:
     """Whether a type is that of an array, a number, nothing, or a tuple of such."""
     if isinstance(kind, types.Tuple | types.UniTuple):
-        return all(map(is_simple, kind.types))
+        return all(map(_is_simple, kind.types))
     return isinstance(kind, types.Number | types.Array | types.Boolean | types.NoneType)
 
 
@@ -44,7 +44,7 @@ class _Typing:
         rules = func if isinstance(func, types.Function) else None
         if rules is None and func in _OPERATORS:
             rules = self._context._lookup_global(func)
-        if kws or rules is None or rules.typing_key not in _OPERATORS or not all(map(is_simple, args)):
+        if kws or rules is None or rules.typing_key not in _OPERATORS or not all(map(_is_simple, args)):
             return self._context.resolve_function_type(func, args, kws)
         key = id(rules), tuple(args)
         if key not in _meanings:
